@@ -1,0 +1,1 @@
+"""The experiment's design and its execution: chart, lights, plan, and the session that is taken."""

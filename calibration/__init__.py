@@ -1,0 +1,1 @@
+"""From a session's raw frames to a look-up table: registration, radiometry, sampling."""

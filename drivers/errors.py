@@ -1,0 +1,94 @@
+"""Every error that a user of CroP can meet, in one tree.
+
+The tree says whose move it is::
+
+    CropError                 1   anything foreseeable; never raised itself
+    ├── InputError            2   what the user gave cannot be used: arguments, files, folders
+    │   ├── ConfigurationError    LAB.toml: a key, a value
+    │   └── FormatError           a file is not what it should be: raw, chart, session, table, picture
+    ├── DeviceError           3   a device or its cable
+    │   ├── LinkError             the cable: nothing comes through
+    │   │   ├── LinkTimeout       nothing came in time; the device may still be there
+    │   │   └── LinkClosed        the other side hung up; a new connection is needed
+    │   ├── ProtocolError         the device said something that its standard does not allow
+    │   ├── DeviceRefused         the device understood and said no
+    │   └── DeviceFault           the device is ill: lamp, temperature, fan, cover
+    ├── QualityError          4   the data are not good enough to go on
+    │   └── RegistrationError     the chart cannot be found, or is not the one expected
+    └── StorageError          5   the disk: full, read-only, gone
+
+The number is the exit code of a command that ends with it (0 success, 130 interrupted). A message holds the value,
+what was expected, the file or device it is about, and the remedy. Errors of libraries are raised again as one of
+these at the place where the library is called, with ``from error``.
+"""
+
+from __future__ import annotations
+
+EXIT_INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C ended; 128 + SIGINT, as shells have it."""
+
+
+class CropError(Exception):
+    """Root of the tree: a foreseeable fault, told in one sentence."""
+
+    exit_code = 1
+
+
+class InputError(CropError):
+    """What the user gave cannot be used; nothing has been changed."""
+
+    exit_code = 2
+
+
+class ConfigurationError(InputError):
+    """A settings file holds an unknown key or an unusable value."""
+
+
+class FormatError(InputError):
+    """A file or folder is not in the format expected of it, or is damaged."""
+
+
+class DeviceError(CropError):
+    """A device cannot do its part; data already taken are safe."""
+
+    exit_code = 3
+
+
+class LinkError(DeviceError):
+    """The cable to a device fails; see the two kinds for what helps."""
+
+
+class LinkTimeout(LinkError):
+    """Nothing came through within the time limit."""
+
+
+class LinkClosed(LinkError):
+    """The other side closed the connection, or it could not be opened."""
+
+
+class ProtocolError(DeviceError):
+    """A device sent bytes that its standard does not allow."""
+
+
+class DeviceRefused(DeviceError):
+    """A device understood the command and declined it."""
+
+
+class DeviceFault(DeviceError):
+    """A device reports that it is ill."""
+
+
+class QualityError(CropError):
+    """The data were taken and read, but are not good enough."""
+
+    exit_code = 4
+
+
+class RegistrationError(QualityError):
+    """The chart was not found in a frame, or is not the chart expected."""
+
+
+class StorageError(CropError):
+    """The disk is full, read-only or gone; what was complete before is untouched."""
+
+    exit_code = 5

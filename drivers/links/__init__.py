@@ -1,0 +1,1 @@
+"""The cables: the only files that import socket, pyserial or pyusb."""

@@ -1,0 +1,42 @@
+"""What the suite asks of whatever fills the projector's picture with one plain colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+
+@dataclass(frozen=True)
+class Colour:
+    """The codes of a plain frame as the projector receives them, each 0 … 255."""
+
+    red: int
+    green: int
+    blue: int
+
+    def __post_init__(self) -> None:
+        for name, code in (("red", self.red), ("green", self.green), ("blue", self.blue)):
+            if not 0 <= code <= 255:
+                raise ValueError(f"{name} is {code}; a code is 0 … 255")
+
+
+BLACK = Colour(0, 0, 0)
+WHITE = Colour(255, 255, 255)
+
+
+class Presenter(Protocol):
+    """A full-screen plain colour."""
+
+    def show(self, colour: Colour) -> None:
+        """Fill the picture with exactly `colour`; returns when it is known to be on the screen.
+
+        Raises
+        ------
+        DeviceError
+            The colour is not, or not exactly, on the screen.
+        """
+        ...
+
+    def close(self) -> None:
+        """Leave the screen black and release it; a second call does nothing."""
+        ...

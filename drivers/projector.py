@@ -1,0 +1,91 @@
+"""What the suite asks of a projector's control port: its lamp, its health, its name.
+
+What the projector *shows* is not asked here; see `drivers.presenter`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+
+class Power(Enum):
+    """The four states of a lamp projector (PJLink 1.04, POWR)."""
+
+    STANDBY = "standby"
+    ON = "on"
+    COOLING = "cooling"
+    WARMING = "warm-up"
+
+
+class Severity(Enum):
+    """How bad a reported fault is (PJLink 1.04, ERST)."""
+
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault that a projector reports: `part` is fan, lamp, temperature, cover, filter or other."""
+
+    part: str
+    severity: Severity
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """One lamp: its accumulated hours and whether it is lit."""
+
+    hours: int
+    lit: bool
+
+
+@dataclass(frozen=True)
+class ProjectorIdentity:
+    """Which projector answers, as it names itself; empty where it does not say."""
+
+    maker: str
+    model: str
+    name: str
+
+
+class Projector(Protocol):
+    """A projector whose control port has been opened."""
+
+    def identity(self) -> ProjectorIdentity:
+        """Return maker, model and name."""
+        ...
+
+    def power(self) -> Power:
+        """Return the power state now."""
+        ...
+
+    def switch_on(self) -> None:
+        """Begin to switch on; returns at once, `power` tells when it is done."""
+        ...
+
+    def switch_off(self) -> None:
+        """Begin to switch off; returns at once, `power` tells when it is done."""
+        ...
+
+    def muted(self) -> bool:
+        """Return whether the picture is blanked by mute."""
+        ...
+
+    def set_muted(self, muted: bool) -> None:
+        """Blank the picture, or show it."""
+        ...
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Return every fault reported now; empty when healthy."""
+        ...
+
+    def lamps(self) -> tuple[Lamp, ...]:
+        """Return every lamp; empty for a lampless projector."""
+        ...
+
+    def close(self) -> None:
+        """Release the control port; a second call does nothing. The power state stays."""
+        ...

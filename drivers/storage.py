@@ -1,0 +1,140 @@
+"""Files and folders that appear whole or not at all.
+
+Everything that CroP writes under a final name goes through here: written beside its place under a hidden name,
+flushed to the disk, then renamed. A crash leaves a hidden leftover, never a half file; nothing is ever overwritten
+that the caller did not mean to replace.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from drivers.errors import InputError, StorageError
+
+_PARTIAL = ".partial"
+_DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EACCES, errno.EPERM}
+
+
+def partial_path(path: Path) -> Path:
+    """Return the hidden name under which `path` is written before it is complete."""
+    return path.with_name(f".{path.name}{_PARTIAL}")
+
+
+def is_partial(path: Path) -> bool:
+    """Return whether `path` is a leftover of a write that never finished."""
+    return path.name.startswith(".") and path.name.endswith(_PARTIAL)
+
+
+def storage_error(path: Path, error: OSError) -> StorageError:
+    """Return what went wrong at `path` as one sentence with its remedy."""
+    reason = error.strerror or str(error)
+    return StorageError(
+        f"cannot write {path}: {reason}; free space or choose another disk, then run the same command again"
+    )
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in `folder` durable; does nothing where the system cannot."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(handle)
+    except OSError:
+        pass
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def whole_file(path: Path) -> Generator[BinaryIO]:
+    """Open `path` for writing so that it appears complete, or not at all.
+
+    An existing file of that name is replaced at the very end.
+
+    Raises
+    ------
+    StorageError
+        The disk is full, read-only or gone. Nothing is left behind.
+    """
+    partial = partial_path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(path)
+        sync_folder(path.parent)
+    except BaseException as error:
+        partial.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno in _DISK_FAULTS:
+            raise storage_error(path, error) from error
+        raise
+
+
+def write_whole(path: Path, data: bytes | str) -> None:
+    """Write `data` (text as UTF-8) to `path`, complete or not at all; see `whole_file`."""
+    with whole_file(path) as stream:
+        stream.write(data.encode() if isinstance(data, str) else data)
+
+
+def require_free(path: Path, what: str) -> None:
+    """Refuse when `path` exists and is not an empty folder.
+
+    Raises
+    ------
+    InputError
+        Something is there already; the message says how to go on.
+    """
+    if path.is_dir() and not any(path.iterdir()):
+        return
+    if path.exists() or path.is_symlink():
+        raise InputError(f"{path} already exists; name a new folder for {what}, or remove it first")
+
+
+@contextmanager
+def whole_folder(path: Path, what: str) -> Generator[Path]:
+    """Build a folder under a hidden name and give it its final name when the block ends well.
+
+    Parameters
+    ----------
+    path
+        The final name; must be free, or an empty folder.
+    what
+        What the folder holds, for the message: "the table", "the dataset".
+
+    Yields
+    ------
+    Path
+        The hidden folder to fill.
+
+    Raises
+    ------
+    InputError
+        `path` is taken.
+    StorageError
+        The disk is full, read-only or gone. Nothing is left behind.
+    """
+    require_free(path, what)
+    partial = partial_path(path)
+    try:
+        if partial.exists():
+            shutil.rmtree(partial)
+        partial.mkdir(parents=True)
+        yield partial
+        require_free(path, what)
+        partial.replace(path)
+        sync_folder(path.parent)
+    except BaseException as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        if isinstance(error, OSError) and error.errno in _DISK_FAULTS:
+            raise storage_error(path, error) from error
+        raise
