@@ -143,7 +143,7 @@ def open_lut(folder: Path) -> Lut:
         raise FormatError(f"{path} is no table of CroP: its format is not {FORMAT!r}; name a folder made by build-lut")
     if head.version != VERSION:
         raise FormatError(
-            f"{folder} is a table of version {head.get('version')!r}, this software reads version {VERSION}; "  # pyright: ignore[reportUnknownMemberType]
+            f"{folder} is a table of version {head.version!r}, this software reads version {VERSION}; "
             "build it again from its session with build-lut, or install the software that wrote it"
         )
     try:
