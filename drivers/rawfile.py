@@ -1,0 +1,446 @@
+"""Raw files become mosaics: the sensor's counts exactly as the camera stored them.
+
+Rules that hold inside:
+
+- Nothing is subtracted, scaled, rotated or interpolated: `Mosaic.counts` equals what ``dcraw -D -4 -T`` writes, but for
+  the rotation that dcraw applies.
+- Whatever the bytes, the outcome is a `Mosaic` or one `FormatError`. A file that has been cut is an error wherever its
+  structure betrays it, since LibRaw fills what is missing with zeros in some formats.
+- LibRaw is called here and nowhere else in the suite.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import io
+import struct
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import FormatError
+from drivers.tiff import CFA, Directory, Tag, TiffDamaged, is_tiff, read_directories
+
+if TYPE_CHECKING:
+    from rawpy import RawPy
+
+BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+
+_SKIPPED_COLUMNS = 4
+"""The first columns of a masked area are disturbed by the readout of the row (seen on the 550D)."""
+
+_LEAST_MASKED = 256
+"""Photosites per phase below which a masked mean says less than the metadata."""
+
+
+@dataclass(frozen=True)
+class Area:
+    """A rectangle of photosites: first row and column, counted from 0, and how many of each."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+
+@dataclass(frozen=True, eq=False)
+class Mosaic:
+    """One raw frame as the sensor gave it; every array is read-only.
+
+    Attributes
+    ----------
+    counts
+        (H, W) uint16, the visible area, unprocessed counts, not rotated; a view into `sensor`. H and W may be odd.
+    pattern
+        Colours of the 2×2 block at the visible top-left, row by row: one of `BAYER_PATTERNS`.
+    black
+        (2, 2) float64, counts, the black level that the file's metadata states for each position of that block.
+    white_level
+        Counts, as the metadata or LibRaw's table states it. It is not the saturation: 15 831 is stated for a 550D that
+        saturates at 13 584 (ISO 100). Measure that from an overexposed frame.
+    camera
+        Maker and model, ``Canon EOS 550D``; empty where the file does not say.
+    sensor
+        (RH, RW) uint16, the whole sensor with its masked borders.
+    visible
+        Where `counts` lies on the sensor.
+    masked
+        Optically black areas in sensor coordinates; empty if none is known.
+    iso, aperture, shutter_s
+        The exposure as the file states it: ISO speed, f-number, seconds; None where it does not.
+    """
+
+    counts: NDArray[np.uint16]
+    pattern: str
+    black: NDArray[np.float64]
+    white_level: int
+    camera: str
+    sensor: NDArray[np.uint16]
+    visible: Area
+    masked: tuple[Area, ...]
+    iso: int | None = None
+    aperture: float | None = None
+    shutter_s: float | None = None
+
+    def masked_black(self) -> NDArray[np.float64] | None:
+        """Return the black level measured in the masked areas.
+
+        Returns
+        -------
+        (2, 2) float64 or None
+            Counts, the mean for each position of the visible top-left block, over photosites within six robust
+            standard deviations of the median; the first four columns of each area are left out. None where no masked
+            area is known or it is too small. Kept as a float: an integer would lose up to one count (LibRaw's 2047
+            for 2047.98).
+        """
+        means = np.empty((2, 2))
+        for row in range(2):
+            for column in range(2):
+                found = [self._masked_phase(area, row, column) for area in self.masked]
+                values = np.concatenate(found) if found else np.empty(0)
+                if values.size < _LEAST_MASKED:
+                    return None
+                median = np.median(values)
+                spread = 1.4826 * np.median(np.abs(values - median))
+                means[row, column] = values[np.abs(values - median) <= 6 * max(spread, 1.0)].mean()
+        return means
+
+    def block_planes(self) -> NDArray[np.uint16]:
+        """Return the four positions of the 2×2 blocks as planes.
+
+        Returns
+        -------
+        (2, 2, H // 2, W // 2) uint16
+            ``[r, c, i, j]`` is ``counts[2 i + r, 2 j + c]``; a view, nothing is copied. An odd last row or column is
+            left out.
+        """
+        height, width = (size // 2 for size in self.counts.shape)
+        down, right = self.counts.strides
+        return np.lib.stride_tricks.as_strided(
+            self.counts, (2, 2, height, width), (down, right, 2 * down, 2 * right), writeable=False
+        )
+
+    def _masked_phase(self, area: Area, row: int, column: int) -> NDArray[np.float64]:
+        """Return the masked photosites of `area` that lie in phase with (`row`, `column`) of the visible block."""
+        top, left = area.top, area.left + _SKIPPED_COLUMNS
+        top += (self.visible.top + row - top) % 2
+        left += (self.visible.left + column - left) % 2
+        block = self.sensor[top : area.top + area.height : 2, left : area.left + area.width : 2]
+        return block.astype(np.float64).ravel()
+
+
+@dataclass(frozen=True)
+class _KnownSensor:
+    """What is known of a sensor beyond LibRaw.
+
+    Attributes
+    ----------
+    cameras
+        Names by which the body is sold.
+    raw
+        Rows and columns of the whole sensor.
+    libraw, dcraw
+        Visible areas, when the two differ: dcraw's replaces exactly this one of LibRaw's.
+    masked
+        Optically black areas (rawspeed's cameras.xml).
+    """
+
+    cameras: tuple[str, ...]
+    raw: tuple[int, int]
+    masked: tuple[Area, ...]
+    libraw: Area | None = None
+    dcraw: Area | None = None
+
+
+_KNOWN_SENSORS = (
+    _KnownSensor(
+        cameras=("Canon EOS 550D", "Canon EOS REBEL T2i", "Canon EOS Kiss X4"),
+        raw=(3516, 5344),
+        masked=(Area(0, 0, 3516, 140), Area(4, 140, 44, 5204)),
+        libraw=Area(52, 142, 3464, 5202),
+        dcraw=Area(51, 142, 3465, 5202),
+    ),
+    _KnownSensor(
+        cameras=("Canon EOS 6D Mark II",),
+        raw=(4224, 6384),
+        masked=(Area(0, 2, 4224, 116), Area(8, 118, 32, 6266)),
+    ),
+)
+
+
+def read_raw(path: Path) -> Mosaic:
+    """Read a camera's raw file: CR2, CRW, DNG or whatever else LibRaw knows with a Bayer sensor.
+
+    Raises
+    ------
+    FormatError
+        The file is missing, no raw file, cut or damaged, or its sensor is not of the Bayer kind.
+    """
+    data = _read_bytes(path)
+    directories = _check_structure(path, data)
+    import rawpy
+
+    with _libraw_silenced():
+        try:
+            with rawpy.imread(io.BytesIO(data)) as raw:
+                return _mosaic(path, raw, data, directories)
+        except (rawpy.LibRawError, rawpy.NotSupportedError) as error:
+            raise _unreadable(path, f"LibRaw says {_reason(error)}") from error
+        except (MemoryError, NotImplementedError, RuntimeError, ValueError) as error:
+            raise _unreadable(path, str(error) or type(error).__name__) from error
+
+
+def _mosaic(path: Path, raw: RawPy, data: bytes, directories: list[Directory]) -> Mosaic:
+    import rawpy
+
+    pattern = raw.raw_pattern
+    if raw.raw_type is not rawpy.RawType.Flat or pattern is None or pattern.shape != (2, 2):
+        raise _not_bayer(path, "its pixels do not follow a 2×2 pattern of colour filters")
+    sizes = raw.sizes
+    sensor = np.array(raw.raw_image, dtype=np.uint16)
+    sensor.setflags(write=False)
+    camera = _camera_name(data, directories)
+    framed = Area(sizes.top_margin, sizes.left_margin, sizes.height, sizes.width)
+    rows, columns = sensor.shape
+    if (
+        framed.top + framed.height > rows
+        or framed.left + framed.width > columns
+        or min(framed.height, framed.width) < 2
+    ):
+        raise _unreadable(path, f"its visible area {framed} does not lie on its {columns}×{rows} sensor")
+    known = _known_sensor(camera, (rows, columns))
+    visible = _visible_area(known, framed)
+    # rawpy's pattern is aligned with the sensor's corner, whatever the margins; ours with the visible one.
+    colours = np.roll(pattern, (-visible.top, -visible.left), axis=(0, 1))
+    names = raw.color_desc.decode("ascii", "replace")
+    letters = "".join(names[index] for index in colours.ravel())
+    if letters not in BAYER_PATTERNS:
+        raise _not_bayer(path, f"its colour filters are {letters}")
+    black = np.array(raw.black_level_per_channel, dtype=np.float64)[colours]
+    stated = _stated_black(_pixels(directories))
+    if stated is not None:
+        black = stated
+    black.setflags(write=False)
+    exposure = raw.other
+    # LibRaw makes up 1 s at f/1 for a file that states nothing; such a file has no ISO speed either.
+    stated_exposure = exposure.iso_speed > 0
+    return Mosaic(
+        counts=sensor[visible.top : visible.top + visible.height, visible.left : visible.left + visible.width],
+        pattern=letters,
+        black=black,
+        white_level=int(raw.white_level),
+        camera=camera,
+        sensor=sensor,
+        visible=visible,
+        masked=_masked_areas(directories, known, camera, visible, (rows, columns)),
+        iso=round(exposure.iso_speed) if stated_exposure else None,
+        aperture=(round(exposure.aperture, 4) or None) if stated_exposure else None,
+        shutter_s=(exposure.shutter_speed or None) if stated_exposure else None,
+    )
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FormatError(f"there is no raw file {path}; check the name") from error
+    except IsADirectoryError as error:
+        raise FormatError(f"{path} is a folder, a raw file was expected; name one file") from error
+    except OSError as error:
+        raise FormatError(
+            f"cannot read {path}: {error.strerror or error}; check its permissions and the disk"
+        ) from error
+    if not data:
+        raise _unreadable(path, "it is empty")
+    return data
+
+
+def _check_structure(path: Path, data: bytes) -> list[Directory]:
+    """Return the file's TIFF directories, none for other formats; refuse a file that ends before its pixels do."""
+    if not is_tiff(data):
+        return []
+    try:
+        directories = read_directories(data)
+    except TiffDamaged as error:
+        raise _unreadable(path, str(error)) from error
+    pixels = _pixels(directories)
+    if pixels is not None:
+        for offset, size in pixels.extents():
+            if offset + size > len(data):
+                raise _unreadable(path, f"its pixels reach to byte {offset + size}, and it has only {len(data)}")
+    return directories
+
+
+def _pixels(directories: list[Directory]) -> Directory | None:
+    """Return the directory that describes the raw pixels: the widest with a colour filter array, or CR2's own."""
+    found = [
+        directory
+        for directory in directories
+        if directory.integers(Tag.PHOTOMETRIC) == (CFA,) or directory.integers(Tag.CR2_SLICES)
+    ]
+    return max(found, key=lambda directory: directory.integers(Tag.WIDTH), default=None)
+
+
+def _stated_black(pixels: Directory | None) -> NDArray[np.float64] | None:
+    """Return DNG's BlackLevel for the visible block, (2, 2) float64; None where LibRaw has to say it.
+
+    LibRaw cuts the level to an integer. The rows and columns of BlackLevel count from the active area's corner
+    (DNG 1.7, BlackLevel); deltas per row and column enter by their mean, as in LibRaw.
+    """
+    if pixels is None or not pixels.numbers(Tag.BLACK_LEVEL):
+        return None
+    levels = np.array(pixels.numbers(Tag.BLACK_LEVEL), dtype=np.float64)
+    shape = pixels.integers(Tag.BLACK_LEVEL_REPEAT_DIM) or (1, 1)
+    if shape not in ((1, 1), (1, 2), (2, 1), (2, 2)) or levels.size != shape[0] * shape[1]:
+        return None
+    deltas = [pixels.numbers(tag) for tag in (Tag.BLACK_LEVEL_DELTA_H, Tag.BLACK_LEVEL_DELTA_V)]
+    extra = sum(float(np.mean(delta)) for delta in deltas if delta)
+    return np.broadcast_to(levels.reshape(shape), (2, 2)) + extra
+
+
+def _camera_name(data: bytes, directories: list[Directory]) -> str:
+    for directory in directories:
+        maker, model = directory.text(Tag.MAKE), directory.text(Tag.MODEL)
+        if model:
+            return _joined(maker, model)
+    for directory in directories:
+        if directory.text(Tag.UNIQUE_CAMERA_MODEL):
+            return directory.text(Tag.UNIQUE_CAMERA_MODEL)
+    return _joined(*_ciff_camera(data))
+
+
+def _joined(maker: str, model: str) -> str:
+    """Return maker and model without saying the maker twice, as ``Canon`` with ``Canon EOS 550D`` would."""
+    if not maker or model.split(" ")[0].casefold() == maker.split(" ")[0].casefold():
+        return model
+    return f"{maker} {model}"
+
+
+def _ciff_camera(data: bytes) -> tuple[str, str]:
+    """Return maker and model from Canon's CRW heap; two empty strings for any other file.
+
+    Source: Canon, CIFF 1.0 revision 4: a heap ends with the offset of its table; 0x300A is the heap of the
+    picture's properties, 0x2807 in it that of the camera, 0x080A in that the text of maker and model.
+    """
+    if data[6:14] != b"HEAPCCDR":
+        return "", ""
+    try:
+        start, end = struct.unpack_from("<I", data, 2)[0], len(data)
+        for wanted in (0x300A, 0x2807, 0x080A):
+            table = start + struct.unpack_from("<I", data, end - 4)[0]
+            (count,) = struct.unpack_from("<H", data, table)
+            for number in range(count):
+                kind, size, offset = struct.unpack_from("<HII", data, table + 2 + 10 * number)
+                if kind == wanted:
+                    start, end = start + offset, start + offset + size
+                    break
+            else:
+                return "", ""
+        maker, model, *_ = data[start:end].split(b"\0")
+    except (struct.error, ValueError):
+        return "", ""
+    return maker.decode("ascii", "replace"), model.decode("ascii", "replace")
+
+
+def _known_sensor(camera: str, raw: tuple[int, int]) -> _KnownSensor | None:
+    for known in _KNOWN_SENSORS:
+        if camera in known.cameras and known.raw == raw:
+            return known
+    return None
+
+
+def _visible_area(known: _KnownSensor | None, framed: Area) -> Area:
+    """Return dcraw's visible area, given LibRaw's."""
+    if known is not None and known.dcraw is not None and framed == known.libraw:
+        return known.dcraw
+    return framed
+
+
+def _masked_areas(
+    directories: list[Directory], known: _KnownSensor | None, camera: str, visible: Area, raw: tuple[int, int]
+) -> tuple[Area, ...]:
+    """Return the optically black areas that the file states, that are known of the sensor, or that Canon always has."""
+    pixels = _pixels(directories)
+    corners = () if pixels is None else pixels.integers(Tag.MASKED_AREAS)
+    if corners:
+        areas = [
+            Area(top, left, bottom - top, right - left)
+            for top, left, bottom, right in zip(*(iter(corners),) * 4, strict=False)
+        ]
+        return tuple(
+            area
+            for area in areas
+            if min(area.height, area.width) > 0
+            and area.top + area.height <= raw[0]
+            and area.left + area.width <= raw[1]
+        )
+    if known is not None:
+        return known.masked
+    # Every Canon sensor has black columns at its left; the four beside the picture are left out, lest light leaks in.
+    if camera.startswith("Canon") and visible.left >= 2 * _SKIPPED_COLUMNS + 2:
+        return (Area(visible.top, 0, visible.height, visible.left - 4),)
+    return ()
+
+
+def _unreadable(path: Path, reason: str) -> FormatError:
+    return FormatError(
+        f"{path} cannot be read as a raw file: {reason}; expected a camera's complete raw file such as CR2 or DNG: "
+        "copy it from the camera again, or take the frame again"
+    )
+
+
+def _not_bayer(path: Path, reason: str) -> FormatError:
+    return FormatError(
+        f"{path} is not of a Bayer sensor: {reason}; expected a 2×2 pattern of red, green, green and blue: "
+        "use a camera with a Bayer sensor, and its full raw format"
+    )
+
+
+def _reason(error: Exception) -> str:
+    text = error.args[0] if error.args else type(error).__name__
+    return repr(text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text))
+
+
+_silence = threading.Lock()
+_silenced = 0
+_kept_stream: int | None = None
+
+
+@contextmanager
+def _libraw_silenced() -> Generator[None]:
+    """Keep LibRaw's remarks on damaged data off the terminal; they come back as an error anyway.
+
+    LibRaw prints through C's ``stderr`` and rawpy gives no handle on it. Here that stream alone is turned to
+    ``/dev/null`` while any thread decodes; Python's own stderr, a progress display on it included, is not touched.
+    Where the C library has no variable of that name, nothing is done.
+    """
+    _turn_c_stderr(1)
+    try:
+        yield
+    finally:
+        _turn_c_stderr(-1)
+
+
+def _turn_c_stderr(step: int) -> None:
+    global _silenced, _kept_stream
+    with _silence:
+        _silenced += step
+        try:
+            libc = ctypes.CDLL(None)
+            stream = ctypes.c_void_p.in_dll(libc, "stderr")
+        except (OSError, ValueError, TypeError):
+            return
+        if step > 0 and _silenced == 1:
+            libc.fopen.restype = ctypes.c_void_p
+            null = libc.fopen(b"/dev/null", b"w")
+            if null:
+                _kept_stream, stream.value = stream.value, null
+        elif _silenced == 0 and _kept_stream is not None:
+            libc.fclose(ctypes.c_void_p(stream.value))
+            stream.value, _kept_stream = _kept_stream, None
