@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import FormatError
+from drivers.errors import FormatError, InputError
 from drivers.presenter import Colour
 from drivers.storage import write_whole
 
@@ -145,3 +145,26 @@ def load_illuminations(path: Path) -> tuple[Illumination, ...]:
         except (TypeError, ValueError) as error:
             raise FormatError(f"{path}, light {number}: {error}") from error
     return tuple(lights)
+
+
+def parse_ccts(text: str) -> tuple[float, ...]:
+    """Return the temperatures in ``FIRST:LAST:STEP`` or ``K,K,…``, kelvin; empty text gives none.
+
+    Raises
+    ------
+    InputError
+        The text is neither, or a temperature is not within 1000 … 100 000 K.
+    """
+    try:
+        if ":" in text:
+            first, last, step = (float(part) for part in text.split(":"))
+            count = int(np.floor((last - first) / step + 1e-9)) + 1
+            ccts = tuple(first + step * number for number in range(count))
+        else:
+            ccts = tuple(float(part) for part in text.split(",") if part.strip())
+    except (ValueError, ZeroDivisionError, OverflowError) as error:
+        raise InputError(f"black bodies {text!r}: expected FIRST:LAST:STEP or K,K,… in kelvin") from error
+    for cct_k in ccts:
+        if not 1000 <= cct_k <= 100_000:
+            raise InputError(f"black bodies {text!r}: {cct_k:g} K is not within 1000 … 100 000 K")
+    return ccts

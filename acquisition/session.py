@@ -12,25 +12,29 @@ Rules that hold inside:
 from __future__ import annotations
 
 import csv
+import fcntl
 import hashlib
 import io
 import sqlite3
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO, Literal
 
 from acquisition.chart import Chart, load_chart
 from acquisition.illuminations import Illumination, load_illuminations, save_illuminations
-from drivers.errors import FormatError, StorageError
+from drivers.camera import CapturedFrame
+from drivers.errors import DeviceError, FormatError, InputError, StorageError
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.storage import is_partial, require_free, whole_file, whole_folder, write_whole
 
 FrameKind = Literal["light", "white", "dark"]
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 ACCEPTED = "accepted"
+REFUSED = "refused"
+FAILED = "failed"
 JOURNAL_VERSION = 1
 
 _SCHEMA = """
@@ -48,6 +52,10 @@ CREATE TABLE attempts (
     sha256 TEXT,
     verdict TEXT,
     reason TEXT NOT NULL DEFAULT ''
+);
+CREATE TABLE plan (
+    step INTEGER PRIMARY KEY, kind TEXT NOT NULL, illumination INTEGER,
+    red INTEGER NOT NULL, green INTEGER NOT NULL, blue INTEGER NOT NULL
 );
 CREATE TABLE events (id INTEGER PRIMARY KEY, at TEXT NOT NULL, what TEXT NOT NULL, detail TEXT NOT NULL);
 """
@@ -118,7 +126,10 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class Attempt:
-    """One try at a step as the journal has it; `verdict` is None while it is under way, or if it was cut off."""
+    """One try at a step as the journal has it.
+
+    `verdict` is None while it is under way, or if it was cut off; `has_frame` tells whether a raw file came of it.
+    """
 
     id: int
     step: int
@@ -129,6 +140,7 @@ class Attempt:
     ended_at: datetime | None
     verdict: str | None
     reason: str
+    has_frame: bool
 
 
 @dataclass(frozen=True)
@@ -140,6 +152,16 @@ class Event:
     detail: str
 
 
+@dataclass(frozen=True)
+class Received:
+    """A raw file that is complete on the disk, not yet counted."""
+
+    path: Path
+    size: int
+    sha256: str
+    captured: CapturedFrame
+
+
 class Session:
     """An open session folder; close it, or use it in a `with` block."""
 
@@ -148,6 +170,8 @@ class Session:
         self._journal = journal
         self.chart: Chart = load_chart(folder / "chart.json")
         self.illuminations: tuple[Illumination, ...] = load_illuminations(folder / "illuminations.csv")
+        rows = journal.execute("SELECT step, kind, illumination, red, green, blue FROM plan ORDER BY step")
+        self.steps: tuple[Step, ...] = tuple(Step(row[0], row[1], row[2], Colour(*row[3:])) for row in rows)
 
     @property
     def frames_folder(self) -> Path:
@@ -155,13 +179,22 @@ class Session:
         return self.folder / "frames"
 
     @classmethod
-    def create(cls, folder: Path, settings: str, chart: Chart, illuminations: Sequence[Illumination]) -> Session:
+    def create(
+        cls,
+        folder: Path,
+        settings: str,
+        chart: Chart,
+        illuminations: Sequence[Illumination],
+        steps: Sequence[Step] = (),
+    ) -> Session:
         """Make a new session folder, whole or not at all, and open it.
 
         Parameters
         ----------
         settings
             Text of `session.toml`: the settings as used.
+        steps
+            The plan: every frame to take, in order.
 
         Raises
         ------
@@ -177,6 +210,11 @@ class Session:
             save_illuminations(illuminations, new / "illuminations.csv")
             journal = _connect(new / "journal.sqlite")
             journal.executescript(_SCHEMA)
+            with journal:
+                journal.executemany(
+                    "INSERT INTO plan VALUES (?, ?, ?, ?, ?, ?)",
+                    [(step.number, step.kind, step.illumination, *astuple(step.colour)) for step in steps],
+                )
             journal.execute(f"PRAGMA user_version = {JOURNAL_VERSION}")
             journal.close()
         session = cls.open(folder)
@@ -222,6 +260,24 @@ class Session:
         """Release the journal; a second call does nothing."""
         self._journal.close()
 
+    @contextmanager
+    def held(self) -> Generator[None]:
+        """Hold the session for writing, so that two programs never take it at once.
+
+        Raises
+        ------
+        InputError
+            Another program holds it.
+        """
+        with (self.folder / ".lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise InputError(
+                    f"{self.folder} is being taken by another program; wait for it, or look with acquire status"
+                ) from error
+            yield
+
     def settings(self) -> str:
         """Return the text of `session.toml`."""
         return (self.folder / "session.toml").read_text(encoding="utf-8")
@@ -236,11 +292,35 @@ class Session:
         assert cursor.lastrowid is not None
         return cursor.lastrowid
 
-    @contextmanager
-    def receiving(self, path: Path) -> Generator[BinaryIO]:
-        """Open a raw file for the camera to write: complete under its name at the end, or not there at all."""
-        with whole_file(path) as stream:
-            yield stream
+    def receive(self, stem: str, capture: Callable[[BinaryIO], CapturedFrame]) -> Received:
+        """Let the camera write a raw file into `frames/`; it is complete and on the disk when this returns.
+
+        Parameters
+        ----------
+        stem
+            Name without suffix; the suffix is that of the camera's own file name.
+        capture
+            Writes the whole raw file into the stream it is given; `drivers.camera.Camera.capture`.
+
+        Raises
+        ------
+        DeviceError
+            The camera failed, or wrote another number of bytes than it says. Nothing is left behind.
+        StorageError
+            The disk is full, read-only or gone. Nothing is left behind.
+        """
+        path = self.frames_folder / stem
+        with whole_file(path, lambda: path) as stream:
+            captured = capture(stream)
+            size = stream.seek(0, 2)
+            if size != captured.size or size == 0:
+                raise DeviceError(
+                    f"{captured.name}: the camera says {captured.size} bytes, {size} arrived; the frame is taken again"
+                )
+            stream.seek(0)
+            sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+            path = path.with_name(stem + Path(captured.name).suffix.lower())
+        return Received(path, size, sha256, captured)
 
     def commit(
         self,
@@ -268,7 +348,7 @@ class Session:
         """Note that an attempt gave no frame."""
         with self._writing():
             self._journal.execute(
-                "UPDATE attempts SET ended_at=?, verdict='failed', reason=? WHERE id=?", (_text(at), reason, attempt)
+                "UPDATE attempts SET ended_at=?, verdict=?, reason=? WHERE id=?", (_text(at), FAILED, reason, attempt)
             )
 
     def note(self, at: datetime, what: str, detail: str = "") -> None:
@@ -279,7 +359,8 @@ class Session:
     def attempts(self) -> list[Attempt]:
         """Return every attempt, oldest first."""
         rows = self._journal.execute(
-            "SELECT id, step, kind, illumination, file, started_at, ended_at, verdict, reason FROM attempts ORDER BY id"
+            "SELECT id, step, kind, illumination, file, started_at, ended_at, verdict, reason, sha256 IS NOT NULL"
+            " FROM attempts ORDER BY id"
         )
         return [
             Attempt(
@@ -292,6 +373,7 @@ class Session:
                 datetime.fromisoformat(row[6]) if row[6] else None,
                 row[7],
                 row[8],
+                bool(row[9]),
             )
             for row in rows
         ]
@@ -305,6 +387,11 @@ class Session:
         """Return the numbers of the steps whose frame was taken, accepted, and is still there in full size."""
         rows = self._journal.execute("SELECT step, file, size FROM attempts WHERE verdict=?", (ACCEPTED,))
         return {step for step, file, size in rows if _has_size(self.folder / file, size)}
+
+    def kept_files(self, step: Step) -> int:
+        """Return how many raw files, accepted or refused, `step` has already."""
+        query = "SELECT COUNT(*) FROM attempts WHERE step=? AND sha256 IS NOT NULL"
+        return int(self._journal.execute(query, (step.number,)).fetchone()[0])
 
     def frames(self) -> list[FrameRecord]:
         """Return every frame that was taken and judged, in the order of the plan, refused ones included."""

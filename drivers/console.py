@@ -8,7 +8,8 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 
 from drivers.errors import EXIT_INTERRUPTED, CropError, StorageError
 
@@ -31,8 +32,7 @@ def run(command: Callable[[], object]) -> int:
         say_error(str(error))
         return error.exit_code
     except KeyboardInterrupt:
-        say_error("interrupted; run the same command again to go on")
-        return EXIT_INTERRUPTED
+        return _interrupted()
     except BrokenPipeError:
         # The reader of our output left (head, a closed pager): not a fault, but nothing more can be printed.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -43,5 +43,49 @@ def run(command: Callable[[], object]) -> int:
             return StorageError.exit_code
         raise
     except SystemExit as error:
+        if error.code == EXIT_INTERRUPTED:
+            return _interrupted()
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     return 0
+
+
+def _interrupted() -> int:
+    say_error("interrupted; run the same command again to go on")
+    return EXIT_INTERRUPTED
+
+
+@contextmanager
+def progress(unit: str) -> Generator[Callable[[int, int], None]]:
+    """Show a progress bar with the time left on stderr while the block runs.
+
+    Parameters
+    ----------
+    unit
+        What is counted: "frames".
+
+    Yields
+    ------
+    callable
+        Takes how many are done and how many there are.
+    """
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(unit),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(unit, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

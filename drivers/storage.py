@@ -10,10 +10,10 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from io import BufferedRandom
 from pathlib import Path
-from typing import BinaryIO
 
 from drivers.errors import InputError, StorageError
 
@@ -54,10 +54,18 @@ def sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def whole_file(path: Path) -> Generator[BinaryIO]:
-    """Open `path` for writing so that it appears complete, or not at all.
+def whole_file(path: Path, final: Callable[[], Path] | None = None) -> Generator[BufferedRandom]:
+    """Open `path` for writing (and reading back) so that it appears complete, or not at all.
 
     An existing file of that name is replaced at the very end.
+
+    Parameters
+    ----------
+    path
+        The final name, or what it begins with if `final` is given.
+    final
+        Called when the content is complete and on the disk; returns the final name, in the same folder. For names
+        that are known only by then, such as a raw file's suffix.
 
     Raises
     ------
@@ -67,11 +75,11 @@ def whole_file(path: Path) -> Generator[BinaryIO]:
     partial = partial_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as stream:
+        with partial.open("w+b") as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
-        partial.replace(path)
+        partial.replace(final() if final else path)
         sync_folder(path.parent)
     except BaseException as error:
         partial.unlink(missing_ok=True)

@@ -1,0 +1,58 @@
+# Two commands on a fresh machine with Python 3.11+ and make: `make demo` and `make test`.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+DEMO := build/demo
+ROOMS := drivers sim acquisition calibration generator evaluation
+
+.PHONY: demo test lint bench lock clean
+
+$(READY): requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; name one with make PYTHON=python3.12 ...")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	touch $@
+
+# The main job in the simulated lab: print, light, photograph, calibrate, generate. About 12 lights, full-size frames.
+demo: $(READY)
+	rm -rf $(DEMO)
+	mkdir -p $(DEMO)
+	$(BIN)/acquire chart $(DEMO)/chart --no-tiff
+	$(BIN)/acquire illuminations $(DEMO)/illuminations.csv --grid 2 --blackbodies 2500:10000:1500
+	cp examples/demo.toml $(DEMO)/LAB.toml
+	$(BIN)/acquire check $(DEMO)/LAB.toml --picture $(DEMO)/check.png
+	$(BIN)/acquire run $(DEMO)/LAB.toml $(DEMO)/session
+	$(BIN)/build-lut $(DEMO)/session $(DEMO)/lut
+	$(BIN)/python examples/photographs.py $(DEMO)/photographs
+	$(BIN)/generate $(DEMO)/lut $(DEMO)/dataset --sources $(DEMO)/photographs --contact-sheet $(DEMO)/contact_sheet.png
+	$(BIN)/evaluate $(DEMO)/dataset
+	@echo
+	@echo "Raw linear images with their ground truth:  $(CURDIR)/$(DEMO)/dataset"
+	@echo "How the table was measured:                 $(CURDIR)/$(DEMO)/lut/report.html"
+	@echo "Look at this first:                         $(CURDIR)/$(DEMO)/contact_sheet.png"
+
+test: $(READY) lint
+	$(BIN)/python -m pytest -n auto
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/basedpyright
+
+bench: $(READY)
+	@for file in benchmarks/[!_]*.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
+
+# Rewrites the lock from pyproject.toml; needs the network.
+lock:
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \
+		--no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
+		--quiet --upgrade --output-file requirements.lock
+
+clean:
+	rm -rf build $(VENV)

@@ -1,0 +1,145 @@
+"""A look before the session: do all devices answer, is the chart there, sharp, whole and well exposed.
+
+Takes one frame under white and one under black into a temporary folder and keeps neither.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.chart import Chart, load_chart
+from acquisition.config import LabSettings
+from acquisition.exposure import measure_exposure, refusal
+from acquisition.framing import MIN_MODULE_PX, Framing, Plane, blur_px, find_chart, project, strongest_plane
+from acquisition.rig import open_rig
+from acquisition.sequencer import Devices, make_ready
+from acquisition.session import FrameKind
+from drivers.errors import RegistrationError
+from drivers.presenter import BLACK, WHITE, Colour
+from drivers.rawfile import Mosaic, read_raw
+from drivers.storage import write_whole
+
+TARGET_LEVEL = 0.75
+"""Paper white under white as a share of the sensor's range: below the 0.8 at which a session is sure not to clip."""
+LEVELS = (0.3, 0.8)
+"""Between these shares the exposure is left as it is."""
+MAX_BLUR_PX = 1.0
+"""σ beyond which the 25 samples of a cell take in light from its neighbours (more than 1 % at 10 px a cell)."""
+DLP_TURN_S = 1 / 60
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What was seen, line by line, and what would not do."""
+
+    lines: tuple[str, ...]
+    faults: tuple[str, ...]
+
+
+def check_lab(settings: LabSettings, picture: Path | None) -> CheckReport:
+    """Look through the rig that the settings name; record nothing.
+
+    Parameters
+    ----------
+    picture
+        Where to draw what was found on the white frame, PNG; None for nowhere.
+
+    Raises
+    ------
+    InputError, DeviceError
+        The settings or a device make a look impossible.
+    """
+    chart = load_chart(settings.chart)
+    lines: list[str] = []
+    faults: list[str] = []
+    with open_rig(settings, chart) as devices, tempfile.TemporaryDirectory() as scratch:
+        body = devices.camera.identity()
+        lines.append(f"camera      {body.maker} {body.model}, serial {body.serial}")
+        devices.camera.configure(settings.camera.exposure)
+        if devices.projector is not None:
+            make_ready(devices.projector, devices.clock, settings.sequence)
+            beamer = devices.projector.identity()
+            hours = ", ".join(f"{lamp.hours} h" for lamp in devices.projector.lamps()) or "no lamp"
+            lines.append(f"projector   {beamer.maker} {beamer.model} {beamer.name}, {hours}")
+        frames: list[tuple[FrameKind, Colour]] = [("dark", BLACK), ("white", WHITE)]
+        mosaics: dict[FrameKind, Mosaic] = {
+            kind: _look(devices, colour, settings, Path(scratch) / kind) for kind, colour in frames
+        }
+    for kind, mosaic in mosaics.items():
+        reason = refusal(measure_exposure(mosaic), kind, settings.limits)
+        if reason:
+            faults.append(f"{kind} frame: {reason}")
+    white = mosaics["white"]
+    _judge_exposure(white, settings, lines)
+    try:
+        framing = find_chart(white, chart, "the white frame")
+    except RegistrationError as error:
+        faults.append(str(error))
+        framing = None
+    else:
+        _judge_framing(framing, lines, faults)
+    if picture is not None:
+        write_whole(picture, annotated_png(framing.plane if framing else strongest_plane(white), framing, chart))
+        lines.append(f"picture     {picture}")
+    return CheckReport(tuple(lines), tuple(faults))
+
+
+def _look(devices: Devices, colour: Colour, settings: LabSettings, path: Path) -> Mosaic:
+    devices.presenter.show(colour)
+    devices.clock.sleep(settings.sequence.settle_s)
+    with path.open("wb") as stream:
+        devices.camera.capture(stream)
+    return read_raw(path)
+
+
+def _judge_exposure(white: Mosaic, settings: LabSettings, lines: list[str]) -> None:
+    exposure = measure_exposure(white)
+    line = f"exposure    paper white at {exposure.level:.0%} of saturation, {exposure.clipped:.2%} clipped"
+    if not LEVELS[0] <= exposure.level <= LEVELS[1]:
+        better = settings.camera.shutter_s * TARGET_LEVEL / max(exposure.level, 1e-3)
+        better = max(1, round(better / DLP_TURN_S)) * DLP_TURN_S
+        line += f"; {LEVELS[0]:.0%} to {LEVELS[1]:.0%} wanted, try shutter_s = {better:.3g}"
+    lines.append(line)
+
+
+def _judge_framing(framing: Framing, lines: list[str], faults: list[str]) -> None:
+    total = len(framing.tags) + len(framing.missing)
+    lines.append(
+        f"chart       {len(framing.tags)} of {total} tags, turned by {framing.rotation_deg:+.1f}°, fills "
+        f"{framing.fill:.0%} of the frame"
+    )
+    blur = blur_px(framing)
+    lines.append(f"sharpness   blur σ {blur:.2f} px, tag modules {framing.module_px:.1f} px (half-size pixels)")
+    if not framing.inside:
+        faults.append("the sheet does not lie in the frame with all four corners; move the camera back or turn it")
+    if framing.module_px < MIN_MODULE_PX:
+        faults.append(
+            f"a tag module is {framing.module_px:.1f} px wide, {MIN_MODULE_PX:g} needed; bring the camera nearer"
+        )
+    if not blur <= MAX_BLUR_PX:
+        faults.append(f"the picture is soft: blur σ {blur:.2f} px, {MAX_BLUR_PX:g} allowed; focus the lens")
+
+
+def annotated_png(plane: Plane, framing: Framing | None, chart: Chart) -> bytes:
+    """Return a plane, stretched to be seen, with the page's outline and the tags drawn on it, as PNG bytes."""
+    import cv2
+
+    white = max(float(np.percentile(plane.values[::4, ::4], 99.5)), 1.0)
+    grey = np.clip(plane.values / white, 0, 1) ** (1 / 2.2) * 255
+    image: npt.NDArray[np.uint8] = cv2.cvtColor(grey.astype(np.uint8), cv2.COLOR_GRAY2BGR).astype(np.uint8)
+    if framing is not None:
+        width, height = chart.page_mm
+        page = project(framing.homography, [(0, 0), (width, 0), (width, height), (0, height)])
+        cv2.polylines(image, [page.round().astype(np.int32)], True, (60, 200, 60), 3, cv2.LINE_AA)
+        for tag in framing.tags:
+            corners = tag.corners_px.round().astype(np.int32)
+            cv2.polylines(image, [corners], True, (40, 40, 255), 2, cv2.LINE_AA)
+            cv2.putText(
+                image, str(tag.id), corners[0].tolist(), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (40, 200, 255), 2, cv2.LINE_AA
+            )
+    return cv2.imencode(".png", image)[1].tobytes()

@@ -1,0 +1,184 @@
+"""`acquire`: designs the experiment, takes it, and tells how far it is. Parse, build, call, print; nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drivers import console
+from drivers.console import EXIT_CODES
+from drivers.errors import InputError, QualityError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    help="Plan, print and take a session: a chart photographed raw under many known lights.\n\n" + EXIT_CODES,
+)
+
+
+def main() -> int:
+    """Run `acquire` and return its exit code."""
+    return console.run(app)
+
+
+@app.command()
+def chart(
+    out: Annotated[Path, typer.Argument(help="New folder for chart.json, chart.tif, chart.pdf and preview.png.")],
+    bits: Annotated[int, typer.Option(min=1, max=5, help="Bits kept of each channel; 5 gives 32 768 colours.")] = 5,
+    page: Annotated[
+        str | None,
+        typer.Option(help="Paper, landscape: A0 … A8, or WIDTHxHEIGHT in mm; else the smallest that fits."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the order of the colours.")] = 1,
+    tiff: Annotated[bool, typer.Option(help="Write the 600-dpi TIFF.")] = True,
+) -> None:
+    """Make the print: every colour once, AprilTags and achromatic references, at true size.
+
+    Writes OUT/chart.json (what calibration reads), chart.pdf (vector), chart.tif (600 dpi) and preview.png. Print one
+    of the two with the printer's colour management off, at 100 %, on matte paper.
+    """
+    from acquisition.layout import design_chart
+    from acquisition.printing import save_pdf, save_preview, save_tiff
+    from drivers.storage import whole_folder
+
+    design = design_chart(bits, _page(page), seed)
+    with whole_folder(out, "the chart") as folder:
+        save_preview(design, folder / "preview.png")
+        save_pdf(design, folder / "chart.pdf")
+        if tiff:
+            save_tiff(design, folder / "chart.tif")
+        design.save(folder / "chart.json")
+    width, height = design.page_mm
+    print(
+        f"{out}: {design.colour_count} colours, {len(design.tags)} tags, {len(design.references)} references "
+        f"on {width:g} × {height:g} mm"
+    )
+
+
+def _page(text: str | None) -> str | tuple[float, float] | None:
+    """Return a paper's name as it is, and WIDTHxHEIGHT as numbers."""
+    try:
+        width, height = (float(part) for part in (text or "").lower().split("x"))
+    except ValueError:
+        return text
+    return width, height
+
+
+@app.command()
+def illuminations(
+    out: Annotated[Path, typer.Argument(help="New CSV file; a plot of the lights is written beside it as .png.")],
+    grid: Annotated[int, typer.Option(min=0, max=200, help="Steps along an edge of the chromaticity triangle.")] = 35,
+    blackbodies: Annotated[
+        str, typer.Option(help="Black bodies as FIRST:LAST:STEP in kelvin, or a list K,K,…; empty for none.")
+    ] = "2000:10000:200",
+) -> None:
+    """Make the lights: uniformly spread chromaticities and black bodies; 707 unless said otherwise.
+
+    Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb-chromaticities beside it.
+    """
+    from acquisition.illuminations import parse_ccts, plan_illuminations, save_illuminations
+    from acquisition.plots import plot_illuminations
+    from drivers.storage import require_free
+
+    plot = out.with_suffix(".png")
+    require_free(out, "the lights")
+    require_free(plot, "the plot of the lights")
+    lights = plan_illuminations(grid, parse_ccts(blackbodies))
+    if not lights:
+        raise InputError("no light is left: grid is 0 and there are no black bodies; name some")
+    plot_illuminations(lights, plot)
+    save_illuminations(lights, out)
+    print(f"{out}: {len(lights)} lights; plot in {plot}")
+
+
+@app.command()
+def check(
+    lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
+    picture: Annotated[Path | None, typer.Option(help="Save the frame with what was found on it as PNG.")] = None,
+) -> None:
+    """Talk to every device, find the chart, judge focus, framing and exposure; records nothing.
+
+    Reads LAB.toml and the chart it names. Ends with 4 when the frame would not do.
+    """
+    from acquisition.checking import check_lab
+    from acquisition.config import load_lab
+
+    report = check_lab(load_lab(lab), picture)
+    for line in report.lines:
+        print(line)
+    if report.faults:
+        raise QualityError("; ".join(report.faults))
+
+
+@app.command()
+def run(
+    lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
+    session: Annotated[Path, typer.Argument(help="Session folder: new, or one that was interrupted.")],
+) -> None:
+    """Take the session, or take up one that was interrupted.
+
+    Reads LAB.toml, the chart and the lights it names. Writes SESSION: session.toml, chart.json, illuminations.csv,
+    frames/, journal.sqlite, frames.csv. Interrupt it as you like and run it again. Ends with 4 when some frames were
+    refused; the next run tries those again.
+    """
+    from acquisition.config import load_lab
+    from acquisition.taking import run_session
+    from drivers.console import progress
+
+    with progress("frames") as advance:
+        outcome = run_session(load_lab(lab), session, advance)
+    if not outcome.complete:
+        raise QualityError(
+            f"{outcome.left} of {outcome.total} frames are without an accepted frame; " + "; ".join(outcome.refused)
+        )
+    print(f"{session}: complete, {outcome.total} frames; next: build-lut {session} LUT/")
+
+
+@app.command()
+def status(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
+    """Tell how far a session is, how long it will take, and what was refused."""
+    from acquisition.progress import duration_text, session_progress
+    from acquisition.session import Session
+
+    with Session.open(session) as opened:
+        state = session_progress(opened)
+    print(f"frames  {state.done} of {state.total}")
+    print(f"lights  {state.lights_done} of {state.lights_total}")
+    print(f"left    {duration_text(state.remaining_s)}")
+    print(f"refused {state.refused}, failed {state.failed}")
+    for reason in state.refusals:
+        print(f"  {reason}")
+
+
+@app.command()
+def monitor(
+    session: Annotated[Path, typer.Argument(help="Session folder.")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0 takes a free one.")] = 8707,
+) -> None:
+    """Show a session's state as a live web page on this machine, until interrupted."""
+    from acquisition.monitor import open_monitor
+
+    with open_monitor(session, port) as server:
+        print(f"http://127.0.0.1:{server.server_address[1]}/ shows {session}; Ctrl-C ends it", flush=True)
+        server.serve_forever()
+
+
+@app.command("import")
+def import_(
+    frames: Annotated[
+        Path, typer.Argument(help="CSV of raw files, columns as frames.csv; with illuminations.csv beside.")
+    ],
+    chart: Annotated[Path, typer.Argument(help="chart.json of the print.")],
+    session: Annotated[Path, typer.Argument(help="New session folder.")],
+) -> None:
+    """Make a session from raw files taken by other means; every file is copied and judged."""
+    from acquisition.importing import import_session
+    from drivers.console import progress
+
+    with progress("files") as advance:
+        refused = import_session(frames, chart, session, advance)
+    print(f"{session}: imported; {len(refused)} frames refused")
+    for line in refused:
+        print(f"  {line}")

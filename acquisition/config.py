@@ -1,0 +1,171 @@
+"""`LAB.toml`: one file to typed, frozen settings; an unknown key is an error that names the nearest known one.
+
+Nothing here opens anything: paths are resolved against the file's folder, values are checked, that is all.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tomli_w
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from drivers.camera import ExposureSettings
+from drivers.errors import ConfigurationError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class CameraSettings(_Settings):
+    """How every frame of the session is exposed; the exposure is fixed for a session."""
+
+    iso: Annotated[int, Field(gt=0)] = 100
+    """ISO speed."""
+    aperture: Positive = 8.0
+    """f-number."""
+    shutter_s: Positive = 0.5
+    """Shutter time in seconds; under a DLP projector at least 0.5 and a whole multiple of 1/60."""
+
+    @property
+    def exposure(self) -> ExposureSettings:
+        """The same as the camera drivers take it."""
+        return ExposureSettings(self.iso, self.aperture, self.shutter_s)
+
+
+class SequenceSettings(_Settings):
+    """How the session is taken."""
+
+    settle_s: NotNegative = 0.5
+    """Seconds between a colour's appearance on the screen and the release."""
+    reference_every: Annotated[int, Field(ge=1)] = 25
+    """Lights between two pairs of white and dark frames."""
+    attempts: Annotated[int, Field(ge=1, le=20)] = 3
+    """Tries at a frame before it is left for the next run."""
+    warm_up_s: NotNegative = 1200.0
+    """Seconds that the lamp burns after it was switched on before the first frame."""
+    switch_off: bool = True
+    """Whether the projector is switched off when the session is complete."""
+
+
+class LimitSettings(_Settings):
+    """When a frame is refused."""
+
+    clipped_percent: NotNegative = 0.1
+    """Largest share of photosites at or above 98 % of saturation, per cent."""
+    too_dark_dn: NotNegative = 100.0
+    """A lit frame's brightest photosites must reach this many counts above black."""
+    stray_light_percent: NotNegative = 5.0
+    """A dark frame's brightest photosites may reach this share of saturation, per cent."""
+
+
+class SimulatedSettings(_Settings):
+    """The simulated lab."""
+
+    body: str = "EOS 550D"
+    """Which camera hangs in it: EOS 550D, EOS 6D Mark II, Test."""
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Seed of everything that chance decides: paper, noise."""
+    room: dict[str, bool | int | float | str] = {}
+    """Physical parameters of the room that differ from the default; see sim.world.Room."""
+
+
+class ReplaySettings(_Settings):
+    """A recorded session to be served again."""
+
+    session: Path
+    """Folder of the recorded session."""
+
+
+class LabSettings(_Settings):
+    """Everything that LAB.toml says."""
+
+    rig: Literal["simulated", "replay", "imported"]
+    """What stands at the end of the cables: the simulated lab, or a recorded session; `imported` marks a session
+    whose frames were taken by other means."""
+    chart: Path
+    """chart.json of the print, relative to the settings file."""
+    illuminations: Path
+    """illuminations.csv of the plan, relative to the settings file."""
+    camera: CameraSettings = CameraSettings()
+    sequence: SequenceSettings = SequenceSettings()
+    limits: LimitSettings = LimitSettings()
+    simulated: SimulatedSettings = SimulatedSettings()
+    replay: ReplaySettings | None = None
+
+    def to_toml(self) -> str:
+        """Return the settings, defaults included, as the text of `session.toml`."""
+        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
+
+
+def unknown_key(key: str, known: Iterable[str], where: str) -> ConfigurationError:
+    """Return the error for a key that nobody knows, naming the nearest one that is known."""
+    names = sorted(known)
+    near = difflib.get_close_matches(key.rsplit(".", 1)[-1], names, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}"
+    return ConfigurationError(f"{where}: unknown key {key!r}; {hint}")
+
+
+def load_lab(path: Path) -> LabSettings:
+    """Read `LAB.toml`.
+
+    Returns
+    -------
+    LabSettings
+        With every path resolved against the folder of the file.
+
+    Raises
+    ------
+    ConfigurationError
+        The file is missing, not TOML, or holds an unknown key or an unusable value.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(
+            f"cannot read settings {path}: {error}; see examples/ for a file to begin with"
+        ) from error
+    settings = parse_lab(text, str(path))
+    if settings.rig == "replay" and settings.replay is None:
+        raise ConfigurationError(f"{path}: rig = 'replay' needs [replay] with session = 'FOLDER' of the recording")
+    folder = path.resolve().parent
+    changes: dict[str, Any] = {"chart": folder / settings.chart, "illuminations": folder / settings.illuminations}
+    if settings.replay is not None:
+        changes["replay"] = ReplaySettings(session=folder / settings.replay.session)
+    return settings.model_copy(update=changes)
+
+
+def parse_lab(text: str, where: str) -> LabSettings:
+    """Return the settings in a TOML text, paths as they stand there; `where` names it in errors."""
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(f"{where} is not TOML: {error}") from error
+    try:
+        settings = LabSettings.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            raise unknown_key(key, _known_keys(first["loc"][:-1]), where) from error
+        if first["type"] == "missing":
+            raise ConfigurationError(f"{where}: {key} is missing; add it") from error
+        raise ConfigurationError(f"{where}: {key} = {first['input']!r}: {first['msg']}") from error
+    return settings
+
+
+def _known_keys(location: tuple[int | str, ...]) -> Iterable[str]:
+    model: type[BaseModel] = LabSettings
+    for part in location:
+        annotation = model.model_fields[str(part)].annotation
+        options = [option for option in (annotation, *getattr(annotation, "__args__", ())) if isinstance(option, type)]
+        model = next(option for option in options if issubclass(option, BaseModel))
+    return model.model_fields

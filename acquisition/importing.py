@@ -1,0 +1,167 @@
+"""A session from raw files taken by other means: a list of frames, the chart, the lights.
+
+Every file is copied byte for byte, checked against its hash where the list has one, and judged where the list has no
+verdict. The result is a session like any other.
+"""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import BinaryIO
+
+from acquisition.chart import load_chart
+from acquisition.config import LabSettings
+from acquisition.illuminations import Illumination, load_illuminations
+from acquisition.sequencer import judge_file
+from acquisition.session import ACCEPTED, FRAME_COLUMNS, REFUSED, FrameKind, Session, Step, file_sha256
+from drivers.camera import CapturedFrame
+from drivers.errors import FormatError
+from drivers.presenter import BLACK, WHITE
+from drivers.storage import require_free
+
+
+@dataclass(frozen=True)
+class ListedFrame:
+    """One row of the list; empty text and None where it is silent."""
+
+    kind: FrameKind
+    illumination: int | None
+    path: Path
+    sha256: str
+    taken_at: datetime
+    exposure_s: float
+    verdict: str
+
+
+def read_frame_list(path: Path, lights: int) -> list[ListedFrame]:
+    """Read a list of frames: columns as `frames.csv`, files relative to the list.
+
+    Only `kind`, `illumination` and `file` must be filled.
+
+    Raises
+    ------
+    FormatError
+        The list is missing, lacks a column, or holds an unusable row; the message names it.
+    """
+    try:
+        rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise FormatError(f"cannot read the list of frames {path}: {error}") from error
+    if not rows or any(column not in rows[0] for column in FRAME_COLUMNS[:3]):
+        raise FormatError(f"{path}: expected frames under the columns {','.join(FRAME_COLUMNS)}")
+    return [_listed(row, f"{path}, line {number}", path.parent, lights) for number, row in enumerate(rows, 2)]
+
+
+def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int) -> ListedFrame:
+    def cell(column: str) -> str:
+        return (row.get(column) or "").strip()
+
+    kind = cell("kind")
+    if kind != "light" and kind != "white" and kind != "dark":
+        raise FormatError(f"{where}: kind is {kind!r}, expected light, white or dark")
+    file = folder / cell("file")
+    if not cell("file") or not file.is_file():
+        raise FormatError(f"{where}: there is no file {file}; files are named relative to the list")
+    try:
+        illumination = int(cell("illumination")) if kind == "light" else None
+        exposure_s = float(cell("exposure_s") or 0)
+        taken_at = datetime.fromisoformat(cell("taken_at")) if cell("taken_at") else _modified(file)
+    except ValueError as error:
+        raise FormatError(f"{where}: {error}") from error
+    if illumination is not None and not 0 <= illumination < lights:
+        raise FormatError(f"{where}: illumination is {illumination}, illuminations.csv has 0 … {lights - 1}")
+    if not taken_at.tzinfo:
+        taken_at = taken_at.replace(tzinfo=UTC)
+    return ListedFrame(kind, illumination, file, cell("sha256").lower(), taken_at, exposure_s, cell("verdict"))
+
+
+def import_session(
+    frame_list: Path, chart: Path, folder: Path, observe: Callable[[int, int], None] = lambda done, total: None
+) -> list[str]:
+    """Make a session of listed raw files; return what was refused, one line a frame.
+
+    Parameters
+    ----------
+    frame_list
+        The list; `illuminations.csv` lies beside it.
+    chart
+        `chart.json` of the print.
+    folder
+        The new session.
+    observe
+        Called with frames done and in all.
+
+    Raises
+    ------
+    FormatError
+        The list, the chart, the lights or a hash is wrong; no session is left behind.
+    InputError
+        `folder` holds something already.
+    """
+    require_free(folder, "the session")
+    lights = load_illuminations(frame_list.parent / "illuminations.csv")
+    frames = read_frame_list(frame_list, len(lights))
+    loaded = load_chart(chart)
+    for frame in frames:
+        if frame.sha256 and file_sha256(frame.path) != frame.sha256:
+            raise FormatError(
+                f"{frame.path} is not the file that {frame_list} lists: its SHA-256 differs; copy it again"
+            )
+    settings = LabSettings(rig="imported", chart=chart, illuminations=frame_list.parent / "illuminations.csv")
+    steps = [_step(number, frame, lights) for number, frame in enumerate(frames)]
+    refused: list[str] = []
+    with Session.create(folder, settings.to_toml(), loaded, lights, steps) as session:
+        try:
+            for step, frame in zip(steps, frames, strict=True):
+                reason = _take_over(session, step, frame, settings)
+                if reason:
+                    refused.append(f"{frame.path.name}: {reason}")
+                observe(step.number + 1, len(frames))
+            session.note(datetime.now(UTC), "import", f"{len(frames)} frames from {frame_list.name}")
+        except BaseException:
+            session.close()
+            shutil.rmtree(folder)
+            raise
+    return refused
+
+
+def _step(number: int, frame: ListedFrame, lights: tuple[Illumination, ...]) -> Step:
+    colour = WHITE if frame.kind == "white" else BLACK
+    if frame.illumination is not None:
+        colour = lights[frame.illumination].colour
+    return Step(number, frame.kind, frame.illumination, colour)
+
+
+def _take_over(session: Session, step: Step, frame: ListedFrame, settings: LabSettings) -> str | None:
+    def copy(into: BinaryIO) -> CapturedFrame:
+        with frame.path.open("rb") as stream:
+            shutil.copyfileobj(stream, into, 1 << 20)
+        return CapturedFrame(frame.path.name, frame.path.stat().st_size, frame.taken_at)
+
+    attempt = session.begin(step, f"frames/{step.stem}", frame.taken_at)
+    received = session.receive(step.stem, copy)
+    if frame.verdict:
+        reason = None if frame.verdict == ACCEPTED else frame.verdict.removeprefix(f"{REFUSED}: ")
+    else:
+        reason = judge_file(received.path, frame.kind, settings)
+    session.commit(
+        attempt,
+        file=f"frames/{received.path.name}",
+        size=received.size,
+        sha256=received.sha256,
+        taken_at=frame.taken_at,
+        exposure_s=frame.exposure_s,
+        ended_at=frame.taken_at,
+        verdict=ACCEPTED if reason is None else REFUSED,
+        reason=reason or "",
+    )
+    return reason
+
+
+def _modified(path: Path) -> datetime:
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC)

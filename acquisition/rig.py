@@ -1,0 +1,156 @@
+"""Opens what a session is taken with: the one file that knows more of devices than their contracts.
+
+`rig = "simulated"` builds the simulated lab, `rig = "replay"` puts a recorded session into the same simulated
+camera. A lab that is taken up again stands where its journal says it stood: same time, lamp burning, same pictures
+taken; so an interrupted session ends in the same bytes as an undisturbed one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from drivers.pjlink.projector import PjLinkProjector
+from sim.projector import PjLinkPeer, SimulatedProjector, memory_link
+from sim.world import Print, Room, World
+
+from acquisition.chart import Chart
+from acquisition.config import LabSettings, unknown_key
+from acquisition.printing import drawing
+from acquisition.sequencer import Devices
+from acquisition.session import Session
+from drivers.camera import CameraIdentity
+from drivers.errors import ConfigurationError, FormatError
+from drivers.presenter import Colour
+from drivers.projector import Power
+from sim.bodies import BODIES, Body
+from sim.camera import Film, SimulatedCamera, WorldFilm
+from sim.clock import OPENING, SimulatedClock
+from sim.presenter import Screen, SimulatedPresenter
+from sim.replay import RecordedFrame, ReplayFilm
+
+SERIAL = "0000000001"
+
+
+@contextmanager
+def open_rig(settings: LabSettings, chart: Chart, session: Session | None = None) -> Generator[Devices]:
+    """Open every device that the settings name; close them all at the end, whatever the end.
+
+    Parameters
+    ----------
+    settings
+        As `acquisition.config.load_lab` returns them.
+    chart
+        What hangs on the wall, for the simulated lab.
+    session
+        The session that is taken up; None for a look that records nothing.
+
+    Raises
+    ------
+    ConfigurationError
+        The settings name something that does not exist.
+    DeviceError
+        A device does not answer.
+    """
+    if settings.rig == "imported":
+        raise ConfigurationError(
+            'rig = "imported" marks a session whose frames were taken by other means; nothing more can be taken of it'
+        )
+    exposed = _exposed(session)
+    clock = SimulatedClock(_last_moment(session) if session is not None else OPENING)
+    screen = Screen()
+    beamer = SimulatedProjector(clock, power=Power.ON if exposed else Power.STANDBY)
+    if settings.rig == "simulated":
+        body = simulated_body(settings)
+        world = World(sheet(chart), body, simulated_room(settings))
+        film: Film = WorldFilm(world, screen, beamer.light, SERIAL, exposed)
+        identity = CameraIdentity(body.maker, body.model, SERIAL, "simulated")
+    else:
+        assert settings.replay is not None
+        film = ReplayFilm(_recording(settings.replay.session), screen, exposed)
+        identity = CameraIdentity("CroP", f"replay of {settings.replay.session.name}", SERIAL, "simulated")
+    peer = PjLinkPeer(beamer)
+    camera = SimulatedCamera(identity, film, clock)
+    presenter = SimulatedPresenter(screen, clock)
+    projector = PjLinkProjector(lambda: memory_link(peer))
+    try:
+        yield Devices(camera, presenter, projector, clock)
+    finally:
+        presenter.close()
+        camera.close()
+        projector.close()
+
+
+def sheet(chart: Chart) -> Print:
+    """Return the chart as the simulated room hangs it up."""
+    drawn = drawing(chart)
+    return Print(drawn.page_mm, drawn.rectangles_mm, drawn.rgb)
+
+
+def simulated_body(settings: LabSettings) -> Body:
+    """Return the simulated camera body that the settings name.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such body.
+    """
+    name = settings.simulated.body
+    if name not in BODIES:
+        raise ConfigurationError(f"simulated.body = {name!r}: known are {', '.join(sorted(BODIES))}")
+    return BODIES[name]
+
+
+def simulated_room(settings: LabSettings) -> Room:
+    """Return the default room with the seed and the changes of the settings.
+
+    Raises
+    ------
+    ConfigurationError
+        A parameter is unknown or of the wrong type.
+    """
+    room = Room(seed=settings.simulated.seed)
+    changes: dict[str, Any] = {}
+    for key, value in settings.simulated.room.items():
+        known = [field.name for field in fields(Room) if field.name != "seed"]
+        if key not in known:
+            raise unknown_key(f"simulated.room.{key}", known, "LAB.toml")
+        default = getattr(room, key)
+        if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if not isinstance(value, type(default)):
+            raise ConfigurationError(f"simulated.room.{key} = {value!r}: expected a value like {default!r}")
+        changes[key] = value
+    try:
+        return replace(room, **changes)
+    except ValueError as error:
+        raise ConfigurationError(f"simulated.room: {error}") from error
+
+
+def _exposed(session: Session | None) -> Counter[Colour]:
+    if session is None:
+        return Counter()
+    colours = {step.number: step.colour for step in session.steps}
+    return Counter(colours[attempt.step] for attempt in session.attempts() if attempt.has_frame)
+
+
+def _last_moment(session: Session) -> datetime:
+    ends = [attempt.ended_at for attempt in session.attempts() if attempt.has_frame and attempt.ended_at is not None]
+    return max(ends, default=OPENING)
+
+
+def _recording(folder: Path) -> list[RecordedFrame]:
+    with Session.open(folder) as recording:
+        colours = {(step.kind, step.illumination): step.colour for step in recording.steps}
+        frames = [
+            RecordedFrame(colours[frame.kind, frame.illumination], folder / frame.file, frame.exposure_s)
+            for frame in recording.frames()
+        ]
+    if not frames:
+        raise FormatError(f"{folder} holds no frames; name a session in which some were taken")
+    return frames

@@ -1,0 +1,201 @@
+"""Walks the plan: shows each light, settles, releases, saves, judges, and writes all of it down.
+
+Knows devices by contract only. The plan is a value, why a run ended is a value; what has been taken stays taken
+whatever happens, and a second call goes on where the first stopped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from acquisition.config import LabSettings, SequenceSettings
+from acquisition.exposure import measure_exposure, refusal
+from acquisition.session import ACCEPTED, REFUSED, FrameKind, Session, Step
+from drivers.camera import Camera
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceFault, DeviceRefused, FormatError
+from drivers.presenter import Presenter
+from drivers.projector import Power, Projector, Severity
+from drivers.rawfile import read_raw
+
+POWER_LIMIT_S = 300.0
+"""How long a lamp may take to light; makers state up to 130 s with repeated ignition."""
+REFUSED_IN_A_ROW = 3
+"""Steps refused one after another that end a run: something lasting is wrong."""
+
+
+@dataclass(frozen=True)
+class Devices:
+    """What a session is taken with; `projector` is None where its lamp is not under control."""
+
+    camera: Camera
+    presenter: Presenter
+    projector: Projector | None
+    clock: Clock
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Why a run ended: `left` steps are without an accepted frame; `refused` says why, one line a step."""
+
+    total: int
+    left: int
+    refused: tuple[str, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every step has its frame."""
+        return self.left == 0
+
+
+def take_session(
+    session: Session,
+    devices: Devices,
+    settings: LabSettings,
+    observe: Callable[[Step, bool], None] = lambda step, accepted: None,
+) -> Outcome:
+    """Take every step of the session's plan that has no accepted frame yet.
+
+    Parameters
+    ----------
+    observe
+        Called after each step with whether it got an accepted frame.
+
+    Raises
+    ------
+    DeviceError
+        A device failed beyond the allowed attempts; the session can be taken up again.
+    StorageError
+        The disk is full; likewise.
+    """
+    with session.held():
+        return _take(session, devices, settings, observe)
+
+
+def _take(session: Session, devices: Devices, settings: LabSettings, observe: Callable[[Step, bool], None]) -> Outcome:
+    clock = devices.clock
+    for stray in session.set_aside_strays():
+        session.note(clock.now(), "stray", f"{stray.name}: complete but never counted; kept, not used")
+    steps = session.steps
+    done = session.done_steps()
+    open_steps = [step for step in steps if step.number not in done]
+    if not open_steps:
+        return Outcome(len(steps), 0, ())
+    session.note(clock.now(), "start", f"{len(open_steps)} of {len(steps)} frames to take")
+    devices.camera.configure(settings.camera.exposure)
+    if devices.projector is not None:
+        make_ready(devices.projector, clock, settings.sequence)
+    refused: list[str] = []
+    taken = 0
+    in_a_row = 0
+    for step in open_steps:
+        reason = _take_step(session, step, devices, settings)
+        observe(step, reason is None)
+        if reason is None:
+            taken += 1
+            in_a_row = 0
+            continue
+        refused.append(f"{_name(step)}: {reason}")
+        in_a_row += 1
+        if in_a_row == REFUSED_IN_A_ROW:
+            break
+    outcome = Outcome(len(steps), len(open_steps) - taken, tuple(refused))
+    if outcome.complete and settings.sequence.switch_off and devices.projector is not None:
+        devices.projector.switch_off()
+    session.note(clock.now(), "complete" if outcome.complete else "incomplete", f"{outcome.left} frames left")
+    return outcome
+
+
+def make_ready(projector: Projector, clock: Clock, sequence: SequenceSettings) -> None:
+    """Switch the lamp on if need be, wait until it burns steadily, and require good health.
+
+    Raises
+    ------
+    DeviceFault
+        It reports an error, or the lamp does not light within `POWER_LIMIT_S`.
+    """
+    begun = clock.monotonic()
+    switched = False
+    while (power := projector.power()) is not Power.ON:
+        if power is Power.STANDBY and not switched:
+            projector.switch_on()
+            switched = True
+        if clock.monotonic() - begun > POWER_LIMIT_S:
+            raise DeviceFault(
+                f"the projector is still in {power.value} after {POWER_LIMIT_S:g} s; look at its lamp and its display"
+            )
+        clock.sleep(1.0)
+    if projector.muted():
+        projector.set_muted(False)
+    require_healthy(projector)
+    if clock.monotonic() > begun:
+        clock.sleep(sequence.warm_up_s)
+
+
+def require_healthy(projector: Projector) -> None:
+    """Require that light leaves the projector and that it reports no error.
+
+    Raises
+    ------
+    DeviceFault
+        It is off, muted, or reports an error.
+    """
+    errors = [fault.part for fault in projector.faults() if fault.severity is Severity.ERROR]
+    if errors:
+        raise DeviceFault(f"the projector reports an error of its {', '.join(errors)}; mend it, then run again")
+    power = projector.power()
+    if power is not Power.ON:
+        raise DeviceFault(f"the projector went to {power.value} during the session; switch it on, then run again")
+    if projector.muted():
+        raise DeviceFault("the projector's picture is muted; release mute on its remote control, then run again")
+
+
+def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None:
+    """Decode a raw file and return why it cannot be used, or None when it can."""
+    try:
+        mosaic = read_raw(path)
+    except FormatError as error:
+        return str(error)
+    return refusal(measure_exposure(mosaic), kind, settings.limits)
+
+
+def _take_step(session: Session, step: Step, devices: Devices, settings: LabSettings) -> str | None:
+    """Try a step until its frame is accepted; return None then, else the last refusal."""
+    clock = devices.clock
+    reason: str | None = None
+    for remaining in reversed(range(settings.sequence.attempts)):
+        if devices.projector is not None:
+            require_healthy(devices.projector)
+        kept = session.kept_files(step)
+        stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
+        attempt = session.begin(step, f"frames/{stem}", clock.now())
+        try:
+            devices.presenter.show(step.colour)
+            clock.sleep(settings.sequence.settle_s)
+            received = session.receive(stem, devices.camera.capture)
+        except DeviceError as error:
+            session.fail(attempt, clock.now(), str(error))
+            if remaining == 0 or isinstance(error, DeviceFault | DeviceRefused):
+                raise
+            continue
+        reason = judge_file(received.path, step.kind, settings)
+        session.commit(
+            attempt,
+            file=f"frames/{received.path.name}",
+            size=received.size,
+            sha256=received.sha256,
+            taken_at=received.captured.released_at,
+            exposure_s=settings.camera.shutter_s,
+            ended_at=clock.now(),
+            verdict=ACCEPTED if reason is None else REFUSED,
+            reason=reason or "",
+        )
+        if reason is None:
+            return None
+    return reason
+
+
+def _name(step: Step) -> str:
+    return f"light {step.illumination}" if step.illumination is not None else f"{step.kind} frame {step.number}"

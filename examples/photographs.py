@@ -1,0 +1,32 @@
+"""Save a few real photographs to generate from: those that come with scikit-image, as PNG.
+
+Usage: python examples/photographs.py FOLDER. The photographs' sources and licences are listed in scikit-image's
+data/README.txt; none of them is part of CroP.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import skimage.data
+
+NAMES = ("astronaut", "chelsea", "coffee", "rocket")
+
+
+def main(folder: Path) -> int:
+    """Write the photographs to `folder`; return the exit code."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in NAMES:
+        photograph = np.asarray(getattr(skimage.data, name)(), dtype=np.uint8)
+        cv2.imwrite(str(folder / f"{name}.png"), photograph[..., ::-1])
+    print(f"{folder}: {len(NAMES)} photographs")
+    return 0
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: python examples/photographs.py FOLDER")
+    sys.exit(main(Path(sys.argv[1])))

@@ -1,0 +1,128 @@
+"""The simulated camera: a body with a shutter whose pictures come from elsewhere.
+
+The camera knows how a body behaves (settings, file names, time); a `Film` knows what is on the picture: the `World`
+that it photographs (`WorldFilm`), or the frames of a recorded session (`sim.replay`). Nothing here draws a picture.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from typing import BinaryIO, Protocol
+
+from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceRefused
+from drivers.presenter import Colour
+from sim.clock import OPENING
+from sim.dng import write_dng
+from sim.presenter import Screen
+from sim.world import World
+
+READOUT_S = 1.0
+"""Time from the end of the exposure until the file has arrived."""
+
+
+class Film(Protocol):
+    """Where a simulated camera's pictures come from."""
+
+    @property
+    def suffix(self) -> str:
+        """Suffix of the raw files, with its dot."""
+        ...
+
+    def accept(self, settings: ExposureSettings) -> None:
+        """Refuse settings that no picture can be had with (DeviceRefused)."""
+        ...
+
+    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
+        """Write the raw file of a picture taken now; return its size in bytes."""
+        ...
+
+
+class SimulatedCamera:
+    """A `drivers.camera.Camera` around a `Film`."""
+
+    def __init__(self, identity: CameraIdentity, film: Film, clock: Clock) -> None:
+        self._identity = identity
+        self._film = film
+        self._clock = clock
+        self._settings: ExposureSettings | None = None
+        self._released = 0
+        self._open = True
+
+    def identity(self) -> CameraIdentity:
+        """Return what the body says of itself."""
+        return self._identity
+
+    def configure(self, settings: ExposureSettings) -> None:
+        """Set the exposure."""
+        self._require_open()
+        self._film.accept(settings)
+        self._settings = settings
+
+    def capture(self, into: BinaryIO) -> CapturedFrame:
+        """Take a picture of what there is to see now."""
+        self._require_open()
+        if self._settings is None:
+            raise DeviceRefused("the simulated camera has no exposure settings; configure it before the first capture")
+        released_at = self._clock.now()
+        self._released += 1
+        size = self._film.expose(self._settings, released_at, into)
+        self._clock.sleep(self._settings.shutter_s + READOUT_S)
+        return CapturedFrame(f"IMG_{self._released % 10000:04d}{self._film.suffix.upper()}", size, released_at)
+
+    def close(self) -> None:
+        """Switch the camera off."""
+        self._open = False
+
+    def _require_open(self) -> None:
+        if not self._open:
+            raise DeviceError("the simulated camera is switched off; open the rig again")
+
+
+class WorldFilm:
+    """Pictures of a `World` lit by what stands on a `Screen`.
+
+    Parameters
+    ----------
+    light
+        Tells the share of its light that leaves the projector now, 0 … 1.
+    exposed
+        How many pictures of each colour have been taken before: with it a lab that is taken up again goes on with
+        the very noise it would have had.
+    """
+
+    suffix = ".dng"
+
+    def __init__(
+        self, world: World, screen: Screen, light: Callable[[], float], serial: str, exposed: Mapping[Colour, int]
+    ) -> None:
+        self._world = world
+        self._screen = screen
+        self._light = light
+        self._serial = serial
+        self._exposed = Counter(dict(exposed))
+
+    def accept(self, settings: ExposureSettings) -> None:
+        """Refuse what no such body has."""
+        for name, value, low, high in (
+            ("iso", settings.iso, 100, 6400),
+            ("aperture", settings.aperture, 1.0, 32.0),
+            ("shutter_s", settings.shutter_s, 1 / 8000, 30.0),
+        ):
+            if not low <= value <= high:
+                raise DeviceRefused(f"the simulated camera offers {name} {low:g} … {high:g}, not {value:g}")
+
+    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
+        """Photograph the world as it is lit now."""
+        colour = self._screen.colour
+        hours = (released_at - OPENING).total_seconds() / 3600
+        lamp = self._light() * (1 - self._world.room.lamp_drift_per_hour * hours)
+        key = (colour.red, colour.green, colour.blue, self._exposed[colour])
+        counts = self._world.expose(colour, settings, key=key, lamp=lamp)
+        self._exposed[colour] += 1
+        start = into.tell()
+        write_dng(into, counts, self._world.body, settings=settings, taken_at=released_at, serial=self._serial)
+        return into.seek(0, 2) - start

@@ -1,0 +1,59 @@
+"""A small laboratory on disk: a chart of 64 colours, four lights, the small simulated body."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from acquisition.illuminations import Illumination, save_illuminations
+from acquisition.layout import design_chart
+from drivers.presenter import Colour
+
+LIGHTS = (
+    Illumination(0, "uniform", None, Colour(255, 0, 0)),
+    Illumination(1, "uniform", None, Colour(120, 255, 180)),
+    Illumination(2, "blackbody", 2500.0, Colour(255, 159, 70)),
+    Illumination(3, "blackbody", 6500.0, Colour(255, 254, 250)),
+)
+
+LAB = """
+rig = "simulated"
+chart = "chart.json"
+illuminations = "illuminations.csv"
+[sequence]
+reference_every = 2
+[simulated]
+body = "Test"
+seed = 7
+"""
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    """Return the path of a LAB.toml whose chart and lights lie beside it."""
+    design_chart(bits=2, seed=3).save(tmp_path / "chart.json")
+    save_illuminations(LIGHTS, tmp_path / "illuminations.csv")
+    path = tmp_path / "LAB.toml"
+    path.write_text(LAB)
+    return path
+
+
+@pytest.fixture
+def frame_hashes() -> Callable[[Path], dict[tuple[str, str], list[str]]]:
+    """Return a function that hashes a session's accepted frames as they lie on disk, by kind and light."""
+
+    def hashes(session: Path) -> dict[tuple[str, str], list[str]]:
+        found: dict[tuple[str, str], list[str]] = {}
+        with (session / "frames.csv").open() as stream:
+            for row in csv.DictReader(stream):
+                digest = hashlib.sha256((session / row["file"]).read_bytes()).hexdigest()
+                assert digest == row["sha256"]
+                if row["verdict"] == "accepted":
+                    found.setdefault((row["kind"], row["illumination"]), []).append(digest)
+        return found
+
+    return hashes

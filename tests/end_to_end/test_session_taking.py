@@ -1,0 +1,237 @@
+"""A session is taken, interrupted anywhere, taken up again, replayed and imported; its frames stay the same."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.cli import main
+from acquisition.config import load_lab
+from acquisition.session import Session
+from acquisition.taking import run_session
+
+Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
+
+KILLER = """
+import os, signal, sys
+from acquisition.cli import main
+import acquisition.session, drivers.storage
+
+place, count = sys.argv[1], int(sys.argv[2])
+del sys.argv[1:3]
+owner, name = {
+    "renaming": (drivers.storage.Path, "replace"),
+    "committing": (acquisition.session.Session, "commit"),
+    "deriving": (acquisition.session.Session, "write_frames_csv"),
+    "beginning": (acquisition.session.Session, "begin"),
+}[place]
+real = getattr(owner, name)
+
+def deadly(*args, **kwargs):
+    global count
+    if "frames" not in str(args[0]) and place == "renaming":
+        return real(*args, **kwargs)
+    count -= 1
+    if count == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return real(*args, **kwargs)
+
+setattr(owner, name, deadly)
+sys.exit(main())
+"""
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["acquire", *map(str, arguments)])
+    return main()
+
+
+def test_a_session_holds_every_frame_of_the_plan(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, frame_hashes: Hashes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = lab.parent / "session"
+    assert run(monkeypatch, "run", lab, folder) == 0
+    hashes = frame_hashes(folder)
+    assert {key: len(files) for key, files in hashes.items()} == {
+        ("light", "0"): 1,
+        ("light", "1"): 1,
+        ("light", "2"): 1,
+        ("light", "3"): 1,
+        ("white", ""): 3,
+        ("dark", ""): 3,
+    }
+    everything = [digest for files in hashes.values() for digest in files]
+    assert len(set(everything)) == len(everything), "two frames have the same noise"
+    capsys.readouterr()
+    assert run(monkeypatch, "status", folder) == 0
+    assert "10 of 10" in capsys.readouterr().out
+    assert run(monkeypatch, "run", lab, folder) == 0, "a complete session is complete again"
+
+
+@pytest.mark.parametrize(("place", "count"), [("renaming", 1), ("committing", 4), ("deriving", 6), ("beginning", 8)])
+def test_a_killed_session_ends_in_the_same_frames(
+    lab: Path, frame_hashes: Hashes, place: str, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    undisturbed, killed = lab.parent / "undisturbed", lab.parent / "killed"
+    assert run(monkeypatch, "run", lab, undisturbed) == 0
+    done = subprocess.run(
+        [sys.executable, "-c", KILLER, place, str(count), "run", str(lab), str(killed)],
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert run(monkeypatch, "run", lab, killed) == 0
+    assert frame_hashes(killed) == frame_hashes(undisturbed)
+    assert (killed / "frames.csv").read_text() == (undisturbed / "frames.csv").read_text()
+    assert not list(killed.rglob(".*partial*"))
+
+
+def test_ctrl_c_at_every_frame_ends_in_the_same_frames(
+    lab: Path, frame_hashes: Hashes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    undisturbed, interrupted = lab.parent / "undisturbed", lab.parent / "interrupted"
+    assert run(monkeypatch, "run", lab, undisturbed) == 0
+    settings = load_lab(lab)
+    for _ in range(50):
+        last: list[int] = []
+
+        def interrupt(done: int, total: int, last: list[int] = last) -> None:
+            last.append(done)
+            if len(last) == 3:
+                raise KeyboardInterrupt
+
+        try:
+            if run_session(settings, interrupted, interrupt).complete:
+                break
+        except KeyboardInterrupt:
+            continue
+    assert frame_hashes(interrupted) == frame_hashes(undisturbed)
+
+
+def test_a_replayed_session_has_the_same_bytes(
+    lab: Path, frame_hashes: Hashes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded, replayed = lab.parent / "recorded", lab.parent / "replayed"
+    assert run(monkeypatch, "run", lab, recorded) == 0
+    text = lab.read_text().replace('"simulated"', '"replay"')
+    lab.write_text(text + '[replay]\nsession = "recorded"\n')
+    assert run(monkeypatch, "run", lab, replayed) == 0
+    assert frame_hashes(replayed) == frame_hashes(recorded)
+
+
+def test_an_imported_session_has_the_same_frames(
+    lab: Path, frame_hashes: Hashes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken, imported = lab.parent / "taken", lab.parent / "imported"
+    assert run(monkeypatch, "run", lab, taken) == 0
+    rows = (taken / "frames.csv").read_text().replace(",accepted", ",")
+    (taken / "list.csv").write_text(rows)
+    assert run(monkeypatch, "import", taken / "list.csv", lab.parent / "chart.json", imported) == 0
+    assert frame_hashes(imported) == frame_hashes(taken)
+
+
+def test_an_import_of_a_damaged_file_leaves_nothing(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken, imported = lab.parent / "taken", lab.parent / "imported"
+    assert run(monkeypatch, "run", lab, taken) == 0
+    victim = next((taken / "frames").glob("*light_002*"))
+    victim.write_bytes(victim.read_bytes()[:-10])
+    assert run(monkeypatch, "import", taken / "frames.csv", lab.parent / "chart.json", imported) == 2
+    assert victim.name in capsys.readouterr().err
+    assert not imported.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ("[camera]\nshutter_s = 1.0\n", "'shutter_s': 0.5"),
+        ("[simulated.room]\nblur_px = 0.9\n", "simulated"),
+    ],
+)
+def test_a_session_is_not_continued_with_other_settings(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], change: str, expected: str
+) -> None:
+    folder = lab.parent / "session"
+    assert run(monkeypatch, "run", lab, folder) == 0
+    before = (folder / "frames.csv").read_bytes()
+    lab.write_text(lab.read_text() + change)
+    assert run(monkeypatch, "run", lab, folder) == 2
+    assert expected in capsys.readouterr().err
+    assert (folder / "frames.csv").read_bytes() == before
+
+
+def test_a_foreign_folder_is_left_alone(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = lab.parent / "thesis"
+    folder.mkdir()
+    (folder / "chapter1.tex").write_text("all my work")
+    assert run(monkeypatch, "run", lab, folder) == 2
+    assert "already exists" in capsys.readouterr().err
+    assert [path.name for path in folder.iterdir()] == ["chapter1.tex"]
+
+
+def test_overexposed_frames_are_refused_and_said(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab.write_text(lab.read_text() + "[camera]\nshutter_s = 2.0\n")
+    folder = lab.parent / "session"
+    assert run(monkeypatch, "run", lab, folder) == 4
+    message = capsys.readouterr().err
+    assert "clipped" in message
+    assert "0.1 % allowed" in message
+    with Session.open(folder) as session:
+        refused = [frame for frame in session.frames() if not frame.accepted]
+        assert refused
+        assert all((folder / frame.file).is_file() for frame in refused), "a refused frame is evidence and is kept"
+
+
+def test_two_programs_do_not_take_the_same_session(lab: Path) -> None:
+    settings = load_lab(lab)
+    folder = lab.parent / "session"
+    code = (
+        "import sys\nfrom acquisition.cli import main\n"
+        f"sys.argv = ['acquire', 'run', {str(lab)!r}, {str(folder)!r}]\nsys.exit(main())"
+    )
+    answers: list[subprocess.CompletedProcess[str]] = []
+
+    def meanwhile(done: int, total: int) -> None:
+        if done == 2 and not answers:
+            answers.append(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False))
+
+    assert run_session(settings, folder, meanwhile).complete
+    assert answers[0].returncode == 2
+    assert "another program" in answers[0].stderr
+
+
+def test_a_full_disk_costs_nothing_taken(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, frame_hashes: Hashes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = lab.parent / "session"
+    real: Callable[[int], None] = os.fsync
+    calls = 0
+
+    def fail(handle: int) -> None:
+        nonlocal calls
+        calls += 1
+        if calls > 40:
+            raise OSError(28, "No space left on device")
+        real(handle)
+
+    monkeypatch.setattr(os, "fsync", fail)
+    assert run(monkeypatch, "run", lab, folder) == 5
+    assert "No space left on device" in capsys.readouterr().err
+    monkeypatch.setattr(os, "fsync", real)
+    kept = frame_hashes(folder)
+    assert kept
+    assert run(monkeypatch, "run", lab, folder) == 0
+    after: dict[Any, list[str]] = frame_hashes(folder)
+    assert all(set(files) <= set(after[key]) for key, files in kept.items())
