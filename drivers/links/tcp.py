@@ -1,0 +1,183 @@
+"""Cables of the network: TCP connections, and the loopback servers of simulated devices.
+
+Rules that hold inside:
+
+- The system's errors become `LinkTimeout` and `LinkClosed` here and nowhere else; every message names host and port.
+- `TcpServer` listens on loopback unless told otherwise, has one thread for each connection, and leaves none behind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable
+from types import TracebackType
+
+from drivers.errors import LinkClosed, LinkError, LinkTimeout
+
+LOOPBACK = "127.0.0.1"
+
+
+class TcpLink:
+    """A `drivers.link.Link` over one TCP connection."""
+
+    def __init__(self, connection: socket.socket, far_end: str) -> None:
+        self._socket = connection
+        self._far_end = far_end
+        # Commands are short and each waits for its answer: to gather them into bigger packets only delays them.
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    @classmethod
+    def connect(cls, host: str, port: int, timeout: float) -> TcpLink:
+        """Open a connection within `timeout` seconds.
+
+        Raises
+        ------
+        LinkTimeout
+            Nobody answers at that address.
+        LinkClosed
+            The name is unknown, or nothing listens there.
+        """
+        far_end = f"{host}:{port}"
+        try:
+            return cls(socket.create_connection((host, port), timeout), far_end)
+        except TimeoutError as error:
+            raise LinkTimeout(
+                f"{far_end} does not answer within {timeout:g} s; check address and cable, and that the device is on"
+            ) from error
+        except socket.gaierror as error:
+            raise LinkClosed(
+                f"the name {host} is not known here ({error.strerror}); check it, or use the address"
+            ) from error
+        except ConnectionRefusedError as error:
+            raise LinkClosed(
+                f"nothing listens at {far_end}; check the port, and that network control is enabled on the device"
+            ) from error
+        except (OSError, OverflowError) as error:
+            raise LinkClosed(f"cannot connect to {far_end}: {error}; check the address and the network") from error
+
+    def write(self, data: bytes, timeout: float) -> None:
+        """Send all of `data` within `timeout` seconds."""
+        try:
+            self._socket.settimeout(timeout)
+            self._socket.sendall(data)
+        except OSError as error:
+            raise self._translated(error, f"{self._far_end} takes no data for {timeout:g} s") from error
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first."""
+        try:
+            self._socket.settimeout(timeout)
+            data = self._socket.recv(limit)
+        except OSError as error:
+            raise self._translated(error, f"{self._far_end} sent nothing for {timeout:g} s") from error
+        if not data:
+            raise LinkClosed(f"{self._far_end} hung up; open a new connection")
+        return data
+
+    def close(self) -> None:
+        """Hang up; a reader in another thread is woken."""
+        # A socket that the other side has left cannot be shut down any more, and need not be.
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+    def _translated(self, error: OSError, late: str) -> LinkError:
+        if isinstance(error, (TimeoutError, BlockingIOError)):
+            return LinkTimeout(f"{late}; check that the device is on and not busy with another controller")
+        reason = error.strerror or str(error)
+        return LinkClosed(f"the connection to {self._far_end} is lost ({reason}); open a new one")
+
+
+class TcpServer:
+    """Takes connections and gives each to `handle` in a thread of its own, until closed.
+
+    Use it in a `with` block; leaving it hangs up every connection and joins every thread.
+
+    Parameters
+    ----------
+    handle
+        Called with each new link; the link is closed when it returns. A `LinkError` that it raises ends that
+        connection quietly, for that is how connections end.
+    port
+        0 lets the system pick one; `address` tells which.
+
+    Raises
+    ------
+    LinkClosed
+        The port is taken, or may not be used.
+    """
+
+    def __init__(self, handle: Callable[[TcpLink], None], port: int = 0, host: str = LOOPBACK) -> None:
+        self._handle = handle
+        try:
+            self._listener = socket.create_server((host, port))
+        except (OSError, OverflowError) as error:
+            raise LinkClosed(
+                f"cannot listen at {host}:{port}: {error}; choose another port, 0 picks a free one"
+            ) from error
+        self._guard = threading.Lock()
+        self._links: set[TcpLink] = set()
+        self._threads: list[threading.Thread] = []
+        self._closing = False
+        self.address: tuple[str, int] = self._listener.getsockname()[:2]
+        """Host and port on which it listens."""
+        self._accepting = threading.Thread(target=self._accept, name=f"listening at {self.address[1]}", daemon=True)
+        self._accepting.start()
+
+    def __enter__(self) -> TcpServer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def hang_up(self) -> None:
+        """Close every connection there is, as a device does that restarts; new ones are still taken."""
+        with self._guard:
+            links = list(self._links)
+        for link in links:
+            link.close()
+
+    def close(self) -> None:
+        """Stop listening, hang up and wait for the threads; a second call does nothing."""
+        with self._guard:
+            if self._closing:
+                return
+            self._closing = True
+        # A connection of our own is the one portable way to wake a thread that waits in accept().
+        with contextlib.suppress(OSError):
+            socket.create_connection(self.address, 1).close()
+        self._accepting.join()
+        self._listener.close()
+        self.hang_up()
+        for thread in self._threads:
+            thread.join()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                connection, (host, port, *_) = self._listener.accept()
+            except OSError:
+                return
+            with self._guard:
+                if self._closing:
+                    connection.close()
+                    return
+                link = TcpLink(connection, f"{host}:{port}")
+                self._links.add(link)
+                thread = threading.Thread(target=self._serve, args=(link,), name=f"serving {host}:{port}", daemon=True)
+                self._threads = [other for other in self._threads if other.is_alive()]
+                self._threads.append(thread)
+                thread.start()
+
+    def _serve(self, link: TcpLink) -> None:
+        try:
+            with contextlib.suppress(LinkError):
+                self._handle(link)
+        finally:
+            link.close()
+            with self._guard:
+                self._links.discard(link)

@@ -1,0 +1,257 @@
+"""PJLink as bytes: both ends of the cable, nothing but pure functions and a line cutter.
+
+Rules that hold inside:
+
+- A line is at most 136 bytes with its CR: ``%``, class digit, four letters, a space or ``=``, up to 128 bytes of
+  parameter. Whoever sends more gets `ProtocolError`, never memory.
+- What we send follows the standard to the letter; what we accept is wider: any case, LF after or instead of CR, empty
+  lines.
+- Bytes that do not fit raise `ProtocolError`, which quotes them.
+
+Source: JBMIA, PJLink Specifications 1.04 (class 1), 2.00 (class 2: same lines, digit 2).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from drivers.errors import ProtocolError
+from drivers.projector import Fault, Lamp, Power, Severity
+
+PORT = 4352
+MAX_LINE = 136
+"""Bytes of a command or reply, its CR included."""
+DIGEST_LENGTH = 32
+MAX_PASSWORD = 32
+IDLE_LIMIT_S = 30.0
+"""Projectors hang up after about this long without a command."""
+
+QUERY = "?"
+OK = "OK"
+MUTE_ON = "31"
+MUTE_OFF = "30"
+
+
+class ErrorCode(Enum):
+    """What a projector answers instead of a value (1.04, 2.3)."""
+
+    UNDEFINED = "ERR1"
+    OUT_OF_PARAMETER = "ERR2"
+    UNAVAILABLE = "ERR3"
+    FAILURE = "ERR4"
+
+
+@dataclass(frozen=True)
+class Greeting:
+    """The projector's first line; `seed` is None where no password is wanted."""
+
+    seed: str | None = None
+
+
+class Refused(Enum):
+    """The line that answers a wrong password, in place of a greeting or reply."""
+
+    WRONG_PASSWORD = "PJLINK ERRA"
+
+
+@dataclass(frozen=True)
+class Request:
+    """A command: four capital letters and a parameter, `QUERY` to ask; `digest` on a connection's first one."""
+
+    command: str
+    parameter: str = QUERY
+    level: int = 1
+    digest: str = ""
+
+
+@dataclass(frozen=True)
+class Reply:
+    """An answer: the command it belongs to, and its value, or `OK`, or an error's code."""
+
+    command: str
+    value: str
+    level: int = 1
+
+    @property
+    def error(self) -> ErrorCode | None:
+        """The error that the value stands for, or None for a true value."""
+        try:
+            return ErrorCode(self.value.upper())
+        except ValueError:
+            return None
+
+
+class LineCutter:
+    """Cuts a stream into lines, however it was split on its way."""
+
+    def __init__(self, limit: int = MAX_LINE) -> None:
+        self._limit = limit
+        self._rest = bytearray()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Take the next bytes and return the lines that they complete, without their ends; empty lines are dropped.
+
+        Raises
+        ------
+        ProtocolError
+            A line, complete or not, is longer than the limit; the rest of the stream cannot be trusted.
+        """
+        self._rest += data
+        *lines, rest = re.split(rb"[\r\n]", bytes(self._rest))
+        self._rest = bytearray(rest)
+        for line in (*lines, rest):
+            if len(line) >= self._limit:
+                raise ProtocolError(
+                    f"a PJLink line of more than {self._limit} bytes begins {_quoted(line)}; "
+                    "check that this is a projector's control port"
+                )
+        return [line for line in lines if line]
+
+
+def authentication_digest(seed: str, password: str) -> str:
+    """Return what proves the password: MD5 of seed and password, 32 lowercase hex digits (1.04, 5.1)."""
+    return hashlib.md5((seed + password).encode(), usedforsecurity=False).hexdigest()
+
+
+def encode_greeting(greeting: Greeting) -> bytes:
+    """Return the projector's first line."""
+    return b"PJLINK 0\r" if greeting.seed is None else f"PJLINK 1 {greeting.seed}\r".encode("ascii")
+
+
+def parse_greeting(line: bytes) -> Greeting | Refused:
+    """Return what the projector's first line says."""
+    text = line.decode("ascii", "replace").strip()
+    words = text.split()
+    match [words[0].upper(), *words[1:]] if words else []:
+        case ["PJLINK", "0"]:
+            return Greeting()
+        case ["PJLINK", "1", seed] if len(seed) == 8:
+            return Greeting(seed)
+        case ["PJLINK", word] if word.upper() == "ERRA":
+            return Refused.WRONG_PASSWORD
+        case _:
+            raise ProtocolError(
+                f"the projector greets with {_quoted(line)}, PJLINK 0 or PJLINK 1 and a seed of 8 characters was "
+                f"expected; check that PJLink is enabled on it and that the port is {PORT}"
+            )
+
+
+def encode_request(request: Request) -> bytes:
+    """Return a command line.
+
+    Raises
+    ------
+    ValueError
+        Our own mistake: the command is no four letters, or the parameter is longer than 128 bytes.
+    """
+    if not re.fullmatch(r"[A-Z0-9]{4}", request.command):
+        raise ValueError(f"{request.command!r} is no PJLink command")
+    line = f"%{request.level}{request.command} {request.parameter}\r".encode()
+    if len(line) > MAX_LINE or b"\r" in line[:-1] or b"\n" in line:
+        raise ValueError(f"{request.parameter!r} is no PJLink parameter")
+    return request.digest.encode("ascii") + line
+
+
+def parse_request(line: bytes) -> Request:
+    """Return the command in a line, without its end."""
+    found = re.fullmatch(rb"([0-9A-Fa-f]{32})?%([0-9])([0-9A-Za-z]{4}) (.{1,128})", line, re.DOTALL)
+    if found is None:
+        raise ProtocolError(
+            f"{_quoted(line)} is no PJLink command; expected %1 or %2, four letters, a space, a parameter"
+        )
+    digest, level, command, parameter = found.groups(b"")
+    return Request(
+        command.decode("ascii").upper(),
+        parameter.decode("utf-8", "replace"),
+        int(level),
+        digest.decode("ascii").lower(),
+    )
+
+
+def encode_reply(reply: Reply | Refused) -> bytes:
+    """Return an answer's line."""
+    if isinstance(reply, Refused):
+        return f"{reply.value}\r".encode("ascii")
+    return f"%{reply.level}{reply.command}={reply.value}\r".encode()
+
+
+def parse_reply(line: bytes) -> Reply | Refused:
+    """Return the answer in a line, without its end; a value's case is kept, for names have one."""
+    if line.strip().upper() == b"PJLINK ERRA":
+        return Refused.WRONG_PASSWORD
+    found = re.fullmatch(rb"%([0-9])([0-9A-Za-z]{4})=(.{0,128})", line, re.DOTALL)
+    if found is None:
+        raise ProtocolError(f"the projector answers {_quoted(line)}; expected %1 or %2, four letters, = and a value")
+    level, command, value = found.groups()
+    return Reply(command.decode("ascii").upper(), value.decode("utf-8", "replace").strip(), int(level))
+
+
+_POWERS = {"0": Power.STANDBY, "1": Power.ON, "2": Power.COOLING, "3": Power.WARMING}
+_POWER_DIGITS = {power: digit for digit, power in _POWERS.items()}
+FAULT_PARTS = ("fan", "lamp", "temperature", "cover", "filter", "other")
+"""The parts in the order of ERST's six digits."""
+_SEVERITIES = {"1": Severity.WARNING, "2": Severity.ERROR}
+_SEVERITY_DIGITS = {severity: digit for digit, severity in _SEVERITIES.items()}
+
+
+def format_power(power: Power) -> str:
+    """Return POWR's digit for a power state."""
+    return _POWER_DIGITS[power]
+
+
+def parse_power(value: str) -> Power:
+    """Return the power state that POWR answers."""
+    if value not in _POWERS:
+        raise _unexpected("POWR", value, "0 standby, 1 on, 2 cooling or 3 warm-up")
+    return _POWERS[value]
+
+
+def format_mute(muted: bool) -> str:
+    """Return AVMT's code for picture and sound muted, or neither."""
+    return MUTE_ON if muted else MUTE_OFF
+
+
+def parse_mute(value: str) -> bool:
+    """Return whether AVMT's code says that the picture is muted; 21 mutes the sound alone."""
+    if not re.fullmatch("[123][01]", value):
+        raise _unexpected("AVMT", value, "11, 21, 31 or 30")
+    return value in ("11", "31")
+
+
+def format_faults(faults: Mapping[str, Severity]) -> str:
+    """Return ERST's six digits; `faults` maps a part of `FAULT_PARTS` to how bad it is."""
+    return "".join(_SEVERITY_DIGITS[faults[part]] if part in faults else "0" for part in FAULT_PARTS)
+
+
+def parse_faults(value: str) -> tuple[Fault, ...]:
+    """Return the faults in ERST's six digits."""
+    if not re.fullmatch("[012]{6}", value):
+        raise _unexpected("ERST", value, "six digits of 0, 1 or 2")
+    return tuple(
+        Fault(part, _SEVERITIES[digit]) for part, digit in zip(FAULT_PARTS, value, strict=True) if digit != "0"
+    )
+
+
+def format_lamps(lamps: Sequence[Lamp]) -> str:
+    """Return LAMP's pairs of hours and 0 or 1."""
+    return " ".join(f"{lamp.hours} {int(lamp.lit)}" for lamp in lamps)
+
+
+def parse_lamps(value: str) -> tuple[Lamp, ...]:
+    """Return the lamps in LAMP's pairs."""
+    if not re.fullmatch(r"[0-9]+ +[01]( +[0-9]+ +[01])*", value, re.ASCII):
+        raise _unexpected("LAMP", value, "pairs of hours and 0 or 1")
+    words = value.split()
+    return tuple(Lamp(int(hours), lit == "1") for hours, lit in zip(words[::2], words[1::2], strict=True))
+
+
+def _unexpected(command: str, value: str, expected: str) -> ProtocolError:
+    return ProtocolError(f"the projector answers {value!r} to {command} ?; expected {expected}")
+
+
+def _quoted(line: bytes) -> str:
+    return repr(line[:40])[1:] + ("…" if len(line) > 40 else "")

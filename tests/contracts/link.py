@@ -1,0 +1,83 @@
+"""What every cable keeps to, written once: a suite names its cable by the fixture `ends`."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.errors import LinkClosed, LinkTimeout
+from drivers.link import Link
+
+Ends = tuple[Link, Link]
+"""The near end, which is under test, and the far one, which helps."""
+
+PATIENCE_S = 10.0
+"""For what must come; nothing waits this long unless it fails."""
+
+
+def read_exactly(link: Link, size: int) -> bytes:
+    """Return `size` bytes, however the cable cuts them."""
+    data = b""
+    while len(data) < size:
+        data += link.read(size - len(data), PATIENCE_S)
+    return data
+
+
+class LinkContract:
+    """Subclass as ``TestX`` and supply the fixture `ends`."""
+
+    def test_carries_bytes_both_ways(self, ends: Ends) -> None:
+        near, far = ends
+        near.write(b"\x00question\r\n", PATIENCE_S)
+        assert read_exactly(far, 11) == b"\x00question\r\n"
+        far.write(b"answer\xff", PATIENCE_S)
+        assert read_exactly(near, 7) == b"answer\xff"
+
+    def test_keeps_order_and_loses_nothing(self, ends: Ends) -> None:
+        near, far = ends
+        pieces = [bytes([number]) * (number + 1) for number in range(100)]
+        for piece in pieces:
+            far.write(piece, PATIENCE_S)
+        assert read_exactly(near, 5050) == b"".join(pieces)
+
+    def test_reads_no_more_than_the_limit(self, ends: Ends) -> None:
+        near, far = ends
+        far.write(b"abcdef", PATIENCE_S)
+        first = near.read(2, PATIENCE_S)
+        assert 1 <= len(first) <= 2
+        assert first + read_exactly(near, 6 - len(first)) == b"abcdef"
+
+    def test_silence_is_a_timeout_and_the_link_survives_it(self, ends: Ends) -> None:
+        near, far = ends
+        with pytest.raises(LinkTimeout):
+            near.read(10, 0.0)
+        far.write(b"late", PATIENCE_S)
+        assert read_exactly(near, 4) == b"late"
+
+    def test_what_was_sent_before_hanging_up_is_still_read(self, ends: Ends) -> None:
+        near, far = ends
+        far.write(b"last words", PATIENCE_S)
+        far.close()
+        assert read_exactly(near, 10) == b"last words"
+        with pytest.raises(LinkClosed):
+            near.read(1, PATIENCE_S)
+
+    def test_a_far_end_that_left_is_noticed_by_the_next_exchange(self, ends: Ends) -> None:
+        near, far = ends
+        far.close()
+        # A cable may take the bytes before it learns that nobody is there.
+        with pytest.raises(LinkClosed):
+            _exchange(near)
+
+    def test_a_closed_end_is_closed(self, ends: Ends) -> None:
+        near, _ = ends
+        near.close()
+        near.close()
+        with pytest.raises(LinkClosed):
+            near.write(b"x", PATIENCE_S)
+        with pytest.raises(LinkClosed):
+            near.read(1, PATIENCE_S)
+
+
+def _exchange(link: Link) -> None:
+    link.write(b"anybody there?", PATIENCE_S)
+    link.read(1, PATIENCE_S)

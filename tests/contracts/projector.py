@@ -1,0 +1,122 @@
+"""What every projector keeps to, written once: a suite names its projector by the fixture `bench`.
+
+The projector is found in standby. `Bench.wait` lets seconds pass for it, by a simulated clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+
+from drivers.errors import DeviceRefused
+from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A projector under test and what is needed to play with it.
+
+    `break_part` and `repair` make it ill and well again; `identity`, `warm_up_s` and `cool_down_s` say what is true.
+    """
+
+    projector: Projector
+    wait: Callable[[float], None]
+    break_part: Callable[[str, Severity], None]
+    repair: Callable[[], None]
+    identity: ProjectorIdentity
+    warm_up_s: float
+    cool_down_s: float
+
+    def switched_on(self) -> Projector:
+        """Return the projector when it has warmed up."""
+        self.projector.switch_on()
+        self.wait(self.warm_up_s)
+        return self.projector
+
+
+class ProjectorContract:
+    """Subclass as ``TestX`` and supply the fixture `bench`."""
+
+    def test_names_itself(self, bench: Bench) -> None:
+        assert bench.projector.identity() == bench.identity
+
+    def test_goes_round_its_four_states(self, bench: Bench) -> None:
+        projector = bench.projector
+        assert projector.power() is Power.STANDBY
+        projector.switch_on()
+        assert projector.power() is Power.WARMING
+        bench.wait(bench.warm_up_s - 1)
+        assert projector.power() is Power.WARMING
+        bench.wait(1)
+        assert projector.power() is Power.ON
+        projector.switch_off()
+        assert projector.power() is Power.COOLING
+        bench.wait(bench.cool_down_s - 1)
+        assert projector.power() is Power.COOLING
+        bench.wait(1)
+        assert projector.power() is Power.STANDBY
+
+    def test_switching_to_where_it_is_changes_nothing(self, bench: Bench) -> None:
+        bench.projector.switch_off()
+        assert bench.projector.power() is Power.STANDBY
+        projector = bench.switched_on()
+        projector.switch_on()
+        assert projector.power() is Power.ON
+
+    def test_refuses_to_turn_back_half_way(self, bench: Bench) -> None:
+        projector = bench.projector
+        projector.switch_on()
+        with pytest.raises(DeviceRefused):
+            projector.switch_off()
+        bench.wait(bench.warm_up_s)
+        projector.switch_off()
+        with pytest.raises(DeviceRefused):
+            projector.switch_on()
+        assert projector.power() is Power.COOLING
+
+    def test_mutes_and_shows(self, bench: Bench) -> None:
+        projector = bench.switched_on()
+        assert not projector.muted()
+        projector.set_muted(True)
+        assert projector.muted()
+        projector.set_muted(False)
+        assert not projector.muted()
+
+    def test_refuses_to_mute_while_dark(self, bench: Bench) -> None:
+        with pytest.raises(DeviceRefused):
+            bench.projector.set_muted(True)
+
+    def test_reports_faults_and_forgets_them_when_repaired(self, bench: Bench) -> None:
+        assert bench.projector.faults() == ()
+        bench.break_part("temperature", Severity.WARNING)
+        bench.break_part("fan", Severity.ERROR)
+        assert set(bench.projector.faults()) == {
+            Fault("fan", Severity.ERROR),
+            Fault("temperature", Severity.WARNING),
+        }
+        bench.repair()
+        assert bench.projector.faults() == ()
+
+    def test_lamp_hours_count_while_lit(self, bench: Bench) -> None:
+        (before,) = bench.projector.lamps()
+        assert not before.lit
+        bench.wait(10 * 3600)
+        assert bench.projector.lamps() == (before,)
+        bench.switched_on()
+        bench.wait(10 * 3600)
+        assert bench.projector.lamps() == (Lamp(before.hours + 10, lit=True),)
+
+    def test_survives_idleness(self, bench: Bench) -> None:
+        assert bench.projector.power() is Power.STANDBY
+        bench.wait(24 * 3600)
+        assert bench.projector.power() is Power.STANDBY
+        bench.projector.switch_on()
+        assert bench.projector.power() is Power.WARMING
+
+    def test_closing_twice_leaves_the_power_alone(self, bench: Bench) -> None:
+        projector = bench.switched_on()
+        projector.close()
+        projector.close()
+        assert projector.power() is Power.ON

@@ -1,0 +1,323 @@
+"""The PJLink driver: conversations in the standard's bytes, the projector contract, and troubled cables.
+
+The conversations are written after PJLink 1.04 (sections 4 and 5), not after the codec under test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from drivers.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
+from drivers.link import Link
+from drivers.links.tcp import TcpLink
+from drivers.pjlink.projector import PjLinkProjector
+from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
+from sim.clock import SimulatedClock
+from sim.projector import PjLinkPeer, SimulatedProjector, memory_link, serve_pjlink
+from tests.contracts.projector import Bench, ProjectorContract
+from tests.drivers.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling
+
+PASSWORD = "JBMIAProjectorLink"
+DIGEST = b"5d8409bc1c3fa39749434aa3a5c38682"
+
+
+class Script:
+    """A cable that has one conversation by heart and objects to a byte too many or too few.
+
+    `lines` alternates what the projector says and what it must hear; None hangs up. Unheard answers are an error, too:
+    see `ended`.
+    """
+
+    def __init__(self, *lines: bytes | None) -> None:
+        self._lines = list(lines)
+        self.closed = False
+
+    def write(self, data: bytes, timeout: float) -> None:
+        if self._lines and self._lines[0] is None:
+            raise LinkClosed("the script hangs up")
+        assert self._lines, f"nothing more was to be said, but {data!r} was"
+        assert data == self._lines.pop(0)
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        if not self._lines:
+            raise LinkTimeout("the script has ended")
+        line = self._lines.pop(0)
+        if line is None:
+            raise LinkClosed("the script hangs up")
+        return line
+
+    def close(self) -> None:
+        self.closed = True
+
+    def ended(self) -> bool:
+        return not self._lines
+
+
+def driver(*scripts: Script, password: str | None = None) -> PjLinkProjector:
+    """Return the driver on one script after another; a connection too many is an error."""
+    waiting = list(scripts)
+    return PjLinkProjector(lambda: waiting.pop(0), password)
+
+
+def test_power_without_password() -> None:
+    script = Script(
+        b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=0\r", b"%1POWR 1\r", b"%1POWR=OK\r", b"%1POWR ?\r", b"%1POWR=3\r"
+    )
+    projector = driver(script)
+    assert projector.power() is Power.STANDBY
+    projector.switch_on()
+    assert projector.power() is Power.WARMING
+    assert script.ended()
+    projector.close()
+    assert script.closed
+
+
+def test_only_the_first_command_proves_the_password() -> None:
+    script = Script(
+        b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", b"%1AVMT 31\r", b"%1AVMT=OK\r"
+    )  # fmt: skip
+    projector = driver(script, password=PASSWORD)
+    assert projector.power() is Power.ON
+    projector.set_muted(True)
+    assert script.ended()
+
+
+def test_a_password_that_nobody_asks_for_is_not_sent() -> None:
+    script = Script(b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=1\r")
+    assert driver(script, password=PASSWORD).power() is Power.ON
+
+
+def test_a_wrong_password_is_refused_in_words() -> None:
+    script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"PJLINK ERRA\r")
+    with pytest.raises(DeviceRefused, match="refuses the password"):
+        driver(script, password=PASSWORD).power()
+    assert script.ended()
+    assert script.closed
+
+
+def test_a_missing_password_is_asked_for_before_anything_is_sent() -> None:
+    script = Script(b"PJLINK 1 498e4a67\r")
+    with pytest.raises(DeviceRefused, match="asks for a password"):
+        driver(script).power()
+    assert script.ended()
+    assert script.closed
+
+
+def test_a_server_that_wants_the_digest_each_time_gets_a_new_connection() -> None:
+    first = Script(
+        b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", b"%1ERST ?\r", b"PJLINK ERRA\r"
+    )  # fmt: skip
+    second = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1ERST ?\r", b"%1ERST=000000\r")
+    projector = driver(first, second, password=PASSWORD)
+    assert projector.power() is Power.ON
+    assert projector.faults() == ()
+    assert first.closed
+    assert second.ended()
+
+
+def test_health_and_name() -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1ERST ?\r", b"%1ERST=010020\r",
+        b"%1LAMP ?\r", b"%1LAMP=120 1 3000 0\r",
+        b"%1INF1 ?\r", b"%1INF1=Seiko\r",
+        b"%1INF2 ?\r", b"%1INF2=ERR1\r",
+        b"%1NAME ?\r", b"%1NAME=room 3\r",
+    )  # fmt: skip
+    projector = driver(script)
+    assert projector.faults() == (Fault("lamp", Severity.WARNING), Fault("filter", Severity.ERROR))
+    assert projector.lamps() == (Lamp(120, True), Lamp(3000, False))
+    assert projector.identity() == ProjectorIdentity("Seiko", "", "room 3")
+    assert script.ended()
+
+
+def test_a_lampless_projector_has_no_lamps() -> None:
+    assert driver(Script(b"PJLINK 0\r", b"%1LAMP ?\r", b"%1LAMP=ERR1\r")).lamps() == ()
+
+
+@pytest.mark.parametrize(
+    ("code", "error", "words"),
+    [
+        (b"ERR1", DeviceRefused, "does not know this command"),
+        (b"ERR2", DeviceRefused, "does not offer this value"),
+        (b"ERR3", DeviceRefused, "warming up, cooling down or in standby"),
+        (b"ERR4", DeviceFault, "failure of its own"),
+    ],
+)
+def test_each_error_has_its_sentence(code: bytes, error: type[Exception], words: str) -> None:
+    script = Script(b"PJLINK 0\r", b"%1AVMT 31\r", b"%1AVMT=" + code + b"\r", b"%1POWR ?\r", b"%1POWR=3\r")
+    projector = driver(script)
+    with pytest.raises(error, match=rf"{code.decode()} to AVMT 31: .*{words}"):
+        projector.set_muted(True)
+    # A refusal is no fault of the cable: the same connection goes on.
+    assert projector.power() is Power.WARMING
+
+
+def test_tolerates_case_line_feeds_and_pieces() -> None:
+    script = Script(b"pjlink ", b"0\r\n", b"%1POWR ?\r", b"%1po", b"wr=", b"1\r\n", b"%1POWR 0\r", b"%1POWR=ok\r\n")
+    projector = driver(script)
+    assert projector.power() is Power.ON
+    projector.switch_off()
+    assert script.ended()
+
+
+def test_an_idle_connection_that_was_dropped_is_replaced_silently() -> None:
+    first = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", None)
+    second = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r")
+    projector = driver(first, second, password=PASSWORD)
+    assert projector.power() is Power.ON
+    assert projector.power() is Power.ON
+    assert first.closed
+    assert second.ended()
+
+
+def test_a_new_connection_that_is_dropped_is_not_tried_again() -> None:
+    for script in (Script(None), Script(b"PJLINK 0\r", b"%1POWR ?\r", None)):
+        with pytest.raises(LinkClosed):
+            driver(script).power()
+        assert script.closed
+
+
+def test_a_second_drop_in_a_row_is_told() -> None:
+    first = Script(b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=1\r", None)
+    second = Script(b"PJLINK 0\r", b"%1POWR ?\r", None)
+    projector = driver(first, second)
+    projector.power()
+    with pytest.raises(LinkClosed):
+        projector.power()
+
+
+def test_a_late_answer_never_meets_a_later_question() -> None:
+    late = Script(b"PJLINK 0\r", b"%1POWR ?\r")
+    fresh = Script(b"PJLINK 0\r", b"%1ERST ?\r", b"%1ERST=000000\r")
+    projector = driver(late, fresh)
+    with pytest.raises(LinkTimeout):
+        projector.power()
+    assert late.closed
+    assert projector.faults() == ()
+
+
+@pytest.mark.parametrize(
+    "answer", [b"%1LAMP=1 1\r", b"what?\r", b"%1POWR=7\r", b"%1POWR=\r", b"x" * 500, b"\xff\r", b"%1POWR=OK\r"]
+)
+def test_an_answer_that_does_not_fit_is_a_protocol_error(answer: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        driver(Script(b"PJLINK 0\r", b"%1POWR ?\r", answer)).power()
+
+
+def test_a_set_command_must_be_answered_by_ok() -> None:
+    with pytest.raises(ProtocolError, match="expected OK"):
+        driver(Script(b"PJLINK 0\r", b"%1POWR 1\r", b"%1POWR=1\r")).switch_on()
+
+
+def test_another_service_at_that_port_is_named() -> None:
+    with pytest.raises(ProtocolError, match=r"SSH-2\.0"):
+        driver(Script(b"SSH-2.0-OpenSSH_9.2\r\n")).power()
+
+
+def test_an_answer_that_never_ends_is_a_timeout() -> None:
+    clock = SimulatedClock()
+
+    class Endless(Script):
+        def read(self, limit: int, timeout: float) -> bytes:
+            clock.sleep(1.0)
+            return b"P"
+
+    with pytest.raises(LinkTimeout, match="not finished its answer"):
+        PjLinkProjector(lambda: Endless(b""), timeout=5.0, clock=clock).power()
+
+
+def simulated_bench(connect: Callable[[SimulatedProjector], Callable[[], Link]], password: str | None = None) -> Bench:
+    """Return the driver on a simulated projector behind `connect`."""
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock)
+    return Bench(
+        PjLinkProjector(connect(device), password),
+        clock.sleep,
+        device.break_part,
+        device.repair,
+        device.traits.identity,
+        device.traits.warm_up_s,
+        device.traits.cool_down_s,
+    )
+
+
+class TestOverMemory(ProjectorContract):
+    @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
+    def bench(self, request: pytest.FixtureRequest) -> Bench:
+        return simulated_bench(lambda device: lambda: memory_link(PjLinkPeer(device, request.param)), request.param)
+
+
+class TestOverLoopback(ProjectorContract):
+    @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
+    def bench(self, request: pytest.FixtureRequest) -> Iterator[Bench]:
+        clock = SimulatedClock()
+        device = SimulatedProjector(clock)
+        with serve_pjlink(device, password=request.param) as server:
+            projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), request.param, 10.0)
+            yield Bench(
+                projector,
+                clock.sleep,
+                device.break_part,
+                device.repair,
+                device.traits.identity,
+                device.traits.warm_up_s,
+                device.traits.cool_down_s,
+            )
+            projector.close()
+
+
+class TestByteByByte(ProjectorContract):
+    @pytest.fixture
+    def bench(self) -> Bench:
+        return simulated_bench(lambda device: lambda: Dribbling(memory_link(PjLinkPeer(device))))
+
+
+class TestDroppedAtEverySecondCommand(ProjectorContract):
+    @pytest.fixture
+    def bench(self) -> Bench:
+        return simulated_bench(lambda device: lambda: DroppedAfter(memory_link(PjLinkPeer(device)), 1))
+
+
+def test_a_garbled_answer_is_told_and_the_next_connection_is_clean() -> None:
+    peer = PjLinkPeer(SimulatedProjector(SimulatedClock(), Power.ON))
+    garbles: list[Callable[[bytes], bytes]] = [lambda data: data.replace(b"POWR=", b"PO\xffR="), lambda data: data]
+    projector = PjLinkProjector(lambda: Garbling(memory_link(peer), garbles.pop(0)))
+    with pytest.raises(ProtocolError):
+        projector.power()
+    assert projector.power() is Power.ON
+
+
+def test_a_swallowed_answer_is_told_and_the_next_connection_is_clean() -> None:
+    device = SimulatedProjector(SimulatedClock())
+    made: list[Link] = []
+
+    def connect() -> Link:
+        good = memory_link(PjLinkPeer(device))
+        made.append(Deaf(good, after=1) if not made else good)
+        return made[-1]
+
+    projector = PjLinkProjector(connect)
+    with pytest.raises(LinkTimeout, match="on purpose"):
+        projector.switch_on()
+    # The command itself went through; the driver does not hide that it cannot know.
+    assert projector.power() is Power.WARMING
+
+
+def test_a_restarted_server_goes_unnoticed() -> None:
+    device = SimulatedProjector(SimulatedClock())
+    with serve_pjlink(device, password=PASSWORD) as server:
+        projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), PASSWORD, 10.0)
+        assert projector.power() is Power.STANDBY
+        server.hang_up()
+        assert projector.power() is Power.STANDBY
+        projector.close()
+
+
+def test_a_wrong_password_over_loopback() -> None:
+    with serve_pjlink(SimulatedProjector(SimulatedClock()), password=PASSWORD) as server:
+        projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), "guess", 10.0)
+        with pytest.raises(DeviceRefused, match="refuses the password"):
+            projector.power()

@@ -1,0 +1,68 @@
+"""Trouble as a wrapper around a good cable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.errors import LinkClosed, LinkTimeout
+from drivers.link import Link
+
+
+class Dribbling:
+    """Passes what it reads byte by byte."""
+
+    def __init__(self, good: Link) -> None:
+        self.good = good
+
+    def write(self, data: bytes, timeout: float) -> None:
+        self.good.write(data, timeout)
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        return self.good.read(1, timeout)
+
+    def close(self) -> None:
+        self.good.close()
+
+
+class Garbling(Dribbling):
+    """Passes what it reads through `garble`."""
+
+    def __init__(self, good: Link, garble: Callable[[bytes], bytes]) -> None:
+        super().__init__(good)
+        self._garble = garble
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        return self._garble(self.good.read(limit, timeout))
+
+
+class DroppedAfter(Dribbling):
+    """Hangs up at the write number `writes`, counted from 0, before anything has gone out."""
+
+    def __init__(self, good: Link, writes: int) -> None:
+        super().__init__(good)
+        self._left = writes
+
+    def write(self, data: bytes, timeout: float) -> None:
+        if self._left == 0:
+            self.good.close()
+            raise LinkClosed("dropped on purpose")
+        self._left -= 1
+        self.good.write(data, timeout)
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        return self.good.read(limit, timeout)
+
+
+class Deaf(Dribbling):
+    """Swallows the answers from the read number `after` on, counted from 0."""
+
+    def __init__(self, good: Link, after: int) -> None:
+        super().__init__(good)
+        self._left = after
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        data = self.good.read(limit, timeout)
+        if self._left == 0:
+            raise LinkTimeout(f"swallowed {data!r} on purpose")
+        self._left -= 1
+        return data

@@ -1,0 +1,72 @@
+"""`sim` as its user meets it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from drivers.links.tcp import TcpLink, TcpServer
+from drivers.pjlink.projector import PjLinkProjector
+from drivers.projector import Power
+from sim.cli import main
+
+SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
+
+
+def test_serves_a_projector_until_interrupted() -> None:
+    with subprocess.Popen(
+        [*SIM, "projector", "--pjlink", "0", "--password", "secret"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            host, port = line.split()[-1].split(":")
+            projector = PjLinkProjector(lambda: TcpLink.connect(host, int(port), 10.0), "secret", 10.0)
+            projector.switch_on()
+            assert projector.power() is Power.WARMING
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=30)
+            projector.close()
+        finally:
+            process.kill()
+    assert process.returncode == 0
+    assert out == "stopped\n"
+    assert err == ""
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["sim", *arguments])
+    return main()
+
+
+def test_a_taken_port_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    with TcpServer(lambda link: None) as server:
+        assert run(monkeypatch, "projector", "--pjlink", str(server.address[1])) == 3
+    error = capsys.readouterr().err
+    assert error.startswith("error: cannot listen at 127.0.0.1:")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments", [["projector"], ["projector", "--pjlink", "x"], ["projector", "--pjlink", "70000"], ["toaster"]]
+)
+def test_wrong_arguments_end_with_2(monkeypatch: pytest.MonkeyPatch, arguments: list[str]) -> None:
+    assert run(monkeypatch, *arguments) == 2
+
+
+def test_a_password_longer_than_the_standards_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "projector", "--pjlink", "0", "--password", "x" * 33) == 2
+    assert "at most 32" in capsys.readouterr().err
+
+
+def test_help_names_the_exit_codes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, "--help") == 0
+    assert "130" in capsys.readouterr().out
