@@ -15,10 +15,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from drivers.pjlink.projector import PjLinkProjector
-from sim.projector import PjLinkPeer, SimulatedProjector, memory_link
-from sim.world import Print, Room, World
-
 from acquisition.chart import Chart
 from acquisition.config import LabSettings, unknown_key
 from acquisition.printing import drawing
@@ -26,13 +22,16 @@ from acquisition.sequencer import Devices
 from acquisition.session import Session
 from drivers.camera import CameraIdentity
 from drivers.errors import ConfigurationError, FormatError
+from drivers.pjlink.projector import PjLinkProjector
 from drivers.presenter import Colour
 from drivers.projector import Power
 from sim.bodies import BODIES, Body
 from sim.camera import Film, SimulatedCamera, WorldFilm
 from sim.clock import OPENING, SimulatedClock
 from sim.presenter import Screen, SimulatedPresenter
+from sim.projector import PjLinkPeer, SimulatedProjector, memory_link
 from sim.replay import RecordedFrame, ReplayFilm
+from sim.world import Print, Room, World
 
 SERIAL = "0000000001"
 
@@ -69,7 +68,7 @@ def open_rig(settings: LabSettings, chart: Chart, session: Session | None = None
         body = simulated_body(settings)
         world = World(sheet(chart), body, simulated_room(settings))
         film: Film = WorldFilm(world, screen, beamer.light, SERIAL, exposed)
-        identity = CameraIdentity(body.maker, body.model, SERIAL, "simulated")
+        identity = CameraIdentity(body.maker, body.model.removeprefix(f"{body.maker} "), SERIAL, "simulated")
     else:
         assert settings.replay is not None
         film = ReplayFilm(_recording(settings.replay.session), screen, exposed)

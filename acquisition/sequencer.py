@@ -95,7 +95,8 @@ def _take(session: Session, devices: Devices, settings: LabSettings, observe: Ca
         observe(step, reason is None)
         if reason is None:
             taken += 1
-            in_a_row = 0
+            if step.kind != "dark":  # a dark frame is well taken in a dark room, too
+                in_a_row = 0
             continue
         refused.append(f"{_name(step)}: {reason}")
         in_a_row += 1

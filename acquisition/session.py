@@ -235,11 +235,10 @@ class Session:
             raise FormatError(
                 f"{folder} is no session: it holds no journal.sqlite; name a folder made by acquire run or import"
             )
-        journal = _connect(path)
         try:
+            journal = _connect(path)
             version = journal.execute("PRAGMA user_version").fetchone()[0]
         except sqlite3.DatabaseError as error:
-            journal.close()
             raise FormatError(f"{path} is damaged: {error}; restore it from a copy") from error
         if version != JOURNAL_VERSION:
             journal.close()
@@ -488,8 +487,12 @@ def session_exists(folder: Path) -> bool:
 
 def _connect(path: Path) -> sqlite3.Connection:
     journal = sqlite3.connect(path, timeout=10)
-    # A committed row must survive a power cut: it is what makes a frame count.
-    journal.execute("PRAGMA synchronous = FULL")
+    try:
+        # A committed row must survive a power cut: it is what makes a frame count.
+        journal.execute("PRAGMA synchronous = FULL")
+    except sqlite3.DatabaseError:
+        journal.close()
+        raise
     return journal
 
 

@@ -1,0 +1,242 @@
+"""The sequencer against scripted devices: what fails is tried again, said, and never costs what was taken."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import pytest
+
+from acquisition.config import LabSettings, SequenceSettings
+from acquisition.illuminations import Illumination
+from acquisition.layout import design_chart
+from acquisition.sequencer import POWER_LIMIT_S, Devices, make_ready, take_session
+from acquisition.session import Session, plan_steps
+from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
+from drivers.errors import DeviceError, DeviceFault, DeviceRefused, LinkTimeout
+from drivers.presenter import BLACK, Colour
+from drivers.projector import Power, Severity
+from sim.bodies import BODIES
+from sim.clock import SimulatedClock
+from sim.dng import write_dng
+from sim.projector import SimulatedProjector
+
+BODY = BODIES["Test"]
+EXPOSURE = ExposureSettings(100, 8.0, 0.5)
+LIGHTS = (
+    Illumination(0, "uniform", None, Colour(255, 0, 0)),
+    Illumination(1, "uniform", None, Colour(0, 255, 0)),
+)
+SETTINGS = LabSettings(rig="simulated", chart=Path("chart.json"), illuminations=Path("lights.csv"))
+
+
+def raw(level: int) -> bytes:
+    """Return a raw file whose every photosite has `level` counts above black."""
+    stream = io.BytesIO()
+    counts = np.full(BODY.sensor, BODY.black + level, dtype=np.uint16)
+    for area in BODY.masked:
+        counts[area.top : area.top + area.height, area.left : area.left + area.width] = BODY.black
+    write_dng(stream, counts, BODY, settings=EXPOSURE, taken_at=datetime(2026, 1, 1, tzinfo=UTC))
+    return stream.getvalue()
+
+
+WELL, NIGHT, GLARE = raw(6000), raw(0), raw(BODY.saturation - BODY.black)
+
+
+@dataclass
+class Screen:
+    """A presenter that remembers what it showed."""
+
+    shown: list[Colour] = field(default_factory=list[Colour])
+
+    def show(self, colour: Colour) -> None:
+        self.shown.append(colour)
+
+    def close(self) -> None:
+        self.shown.append(BLACK)
+
+
+class ScriptedCamera:
+    """Photographs black as dark and every other colour as well exposed, unless the script says otherwise.
+
+    The script maps the number of a capture, from 0, to the bytes it gives or the error it raises.
+    """
+
+    def __init__(self, screen: Screen, clock: SimulatedClock, script: dict[int, bytes | Exception]) -> None:
+        self.screen, self.clock, self.script = screen, clock, script
+        self.captures = 0
+        self.claims: int | None = None
+
+    def identity(self) -> CameraIdentity:
+        return CameraIdentity("Canon", "Test", "1")
+
+    def configure(self, settings: ExposureSettings) -> None:
+        self.settings = settings
+
+    def capture(self, into: BinaryIO) -> CapturedFrame:
+        usual = NIGHT if self.screen.shown[-1] == BLACK else WELL
+        scripted = self.script.get(self.captures, usual)
+        self.captures += 1
+        if isinstance(scripted, Exception):
+            into.write(b"half a frame")
+            raise scripted
+        into.write(scripted)
+        self.clock.sleep(1.5)
+        size = len(scripted) if self.claims is None else self.claims
+        self.claims = None
+        return CapturedFrame(f"IMG_{self.captures:04d}.DNG", size, self.clock.now())
+
+    def close(self) -> None: ...
+
+
+class Lab:
+    """Scripted devices around a fresh session of two lights."""
+
+    def __init__(self, folder: Path, script: dict[int, bytes | Exception] | None = None) -> None:
+        self.clock = SimulatedClock()
+        self.screen = Screen()
+        self.camera = ScriptedCamera(self.screen, self.clock, script or {})
+        self.projector = SimulatedProjector(self.clock, power=Power.ON)
+        chart = design_chart(bits=1)
+        self.session = Session.create(folder, SETTINGS.to_toml(), chart, LIGHTS, plan_steps(LIGHTS, 25))
+
+    @property
+    def devices(self) -> Devices:
+        return Devices(self.camera, self.screen, self.projector, self.clock)
+
+    def verdicts(self) -> list[str | None]:
+        return [attempt.verdict for attempt in self.session.attempts()]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "session"
+
+
+def test_every_light_is_shown_once_and_its_frame_kept(folder: Path) -> None:
+    lab = Lab(folder)
+    outcome = take_session(lab.session, lab.devices, SETTINGS)
+    assert outcome.complete
+    white = Colour(255, 255, 255)
+    assert lab.screen.shown == [white, BLACK, LIGHTS[0].colour, LIGHTS[1].colour, white, BLACK]
+    assert lab.projector.power() is Power.COOLING, "a complete session switches the lamp off"
+    assert lab.verdicts() == ["accepted"] * 6
+
+
+@pytest.mark.parametrize("fault", [LinkTimeout("no answer"), DeviceError("lost")])
+def test_a_lost_frame_is_taken_again(folder: Path, fault: Exception) -> None:
+    lab = Lab(folder, {2: fault})
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    assert lab.verdicts() == ["accepted", "accepted", "failed", "accepted", "accepted", "accepted", "accepted"]
+    assert len(list((folder / "frames").iterdir())) == 6
+
+
+def test_a_device_that_stays_silent_ends_the_run_and_costs_nothing(folder: Path) -> None:
+    lab = Lab(folder, dict.fromkeys(range(3, 6), LinkTimeout("no answer from the camera")))
+    with pytest.raises(LinkTimeout, match="no answer"):
+        take_session(lab.session, lab.devices, SETTINGS)
+    assert len(lab.session.frames()) == 3
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+
+
+def test_a_refusal_is_not_repeated(folder: Path) -> None:
+    lab = Lab(folder, {2: DeviceRefused("card full")})
+    with pytest.raises(DeviceRefused):
+        take_session(lab.session, lab.devices, SETTINGS)
+    assert lab.camera.captures == 3
+
+
+def test_a_cut_transfer_is_noticed(folder: Path) -> None:
+    lab = Lab(folder)
+    lab.camera.claims = len(WELL) + 1
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    assert "bytes" in lab.session.attempts()[0].reason
+    assert lab.verdicts()[0] == "failed"
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"), [(NIGHT, "is the projector on"), (GLARE, "clipped"), (WELL[:-5000], ""), (b"garbage", "raw")]
+)
+def test_a_bad_frame_is_kept_refused_and_taken_again(folder: Path, bad: bytes, reason: str) -> None:
+    lab = Lab(folder, {2: bad})
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    refused = [frame for frame in lab.session.frames() if not frame.accepted]
+    assert len(refused) == 1
+    assert reason in refused[0].verdict
+    assert (folder / refused[0].file).read_bytes() == bad
+    assert len(lab.session.frames()) == 7
+
+
+def test_a_lit_dark_frame_is_refused(folder: Path) -> None:
+    lab = Lab(folder, {1: WELL})
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    assert "another light" in lab.session.attempts()[1].reason
+
+
+def test_lasting_darkness_ends_the_run_with_its_reason(folder: Path) -> None:
+    lab = Lab(folder, dict.fromkeys(range(100), NIGHT))
+    outcome = take_session(lab.session, lab.devices, SETTINGS)
+    assert not outcome.complete
+    assert len(outcome.refused) == 3
+    assert "light 0" in outcome.refused[1]
+    lab.camera.script = {}
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+
+
+def test_a_failing_lamp_is_noticed_before_the_next_frame(folder: Path) -> None:
+    lab = Lab(folder)
+
+    def fail(step: object, accepted: bool) -> None:
+        if lab.camera.captures == 3:
+            lab.projector.break_part("lamp", Severity.ERROR)
+
+    with pytest.raises(DeviceFault, match="lamp"):
+        take_session(lab.session, lab.devices, SETTINGS, fail)
+    assert len(lab.session.frames()) == 3
+    lab.projector.repair()
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+
+
+def test_somebody_presses_mute(folder: Path) -> None:
+    lab = Lab(folder)
+
+    def mute(step: object, accepted: bool) -> None:
+        lab.projector.set_muted(True)
+
+    with pytest.raises(DeviceFault, match="mute"):
+        take_session(lab.session, lab.devices, SETTINGS, mute)
+
+
+def test_a_cold_lamp_is_lit_and_given_its_minutes() -> None:
+    clock = SimulatedClock()
+    projector = SimulatedProjector(clock)
+    make_ready(projector, clock, SequenceSettings(warm_up_s=600))
+    assert projector.power() is Power.ON
+    assert clock.monotonic() >= 600 + projector.traits.warm_up_s
+
+
+def test_a_warm_lamp_is_not_waited_for() -> None:
+    clock = SimulatedClock()
+    make_ready(SimulatedProjector(clock, power=Power.ON), clock, SequenceSettings(warm_up_s=600))
+    assert clock.monotonic() == 0
+
+
+def test_a_lamp_that_never_lights_is_given_up() -> None:
+    class Dead(SimulatedProjector):
+        def power(self) -> Power:
+            return Power.STANDBY
+
+    clock = SimulatedClock()
+    with pytest.raises(DeviceFault, match="standby"):
+        make_ready(Dead(clock), clock, SequenceSettings())
+    assert clock.monotonic() <= POWER_LIMIT_S + 2
+
+
+def test_a_lab_without_lamp_control_works(folder: Path) -> None:
+    lab = Lab(folder)
+    devices = Devices(lab.camera, lab.screen, None, lab.clock)
+    assert take_session(lab.session, devices, SETTINGS).complete

@@ -1,0 +1,53 @@
+"""What holds for every command and for the distribution as a whole."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import subprocess
+import sys
+
+import pytest
+
+COMMANDS = {
+    "acquire": "acquisition.cli",
+    "build-lut": "calibration.cli",
+    "generate": "generator.cli",
+    "evaluate": "evaluation.cli",
+    "sim": "sim.cli",
+}
+ROOMS = ("drivers", "sim", "acquisition", "calibration", "generator", "evaluation")
+HEAVY = ("numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO", "reportlab")
+
+
+def call(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    code = (
+        f"import sys\nfrom {module} import main\nsys.argv = ['command', *{list(arguments)!r}]\ncode = main()\n"
+        f"print('LOADED', *sorted({HEAVY!r} & sys.modules.keys()), file=sys.stderr)\nsys.exit(code)"
+    ).replace(f"{HEAVY!r} &", f"set({HEAVY!r}) &")
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_command_is_installed(command: str) -> None:
+    entries = importlib.metadata.entry_points(group="console_scripts", name=command)
+    assert {entry.value for entry in entries} == {f"{COMMANDS[command]}:main"}
+
+
+@pytest.mark.parametrize("module", COMMANDS.values())
+def test_help_tells_the_exit_codes_and_loads_nothing_heavy(module: str) -> None:
+    done = call(module, "--help")
+    assert done.returncode == 0, done.stderr
+    assert "Exit codes" in done.stdout
+    assert done.stderr.splitlines()[-1] == "LOADED"
+
+
+@pytest.mark.parametrize("module", COMMANDS.values())
+def test_an_unknown_option_is_the_users_fault(module: str) -> None:
+    done = call(module, "--no-such-option")
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_name_of_ours_has_one_owner(room: str) -> None:
+    assert set(importlib.metadata.packages_distributions()[room]) == {"croplab"}
