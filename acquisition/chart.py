@@ -12,7 +12,7 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -122,13 +122,13 @@ class Chart:
         return tuple(reference for reference in self.references if reference.is_white)
 
     def to_json(self) -> str:
-        """Return the text of `chart.json`; equal charts give equal text."""
+        """Return the text of `chart.json`; equal charts give equal text, and what is read from it gives it again."""
         document = {
             "format": FORMAT,
             "version": VERSION,
-            "page_mm": list(self.page_mm),
+            "page_mm": [float(side) for side in self.page_mm],
             "bits": self.bits,
-            "cell_mm": list(self.cell_mm),
+            "cell_mm": [float(side) for side in self.cell_mm],
             "cells": {"centre_mm": self.centres_mm.round(6).tolist(), "colour": self.colours.tolist()},
             "tags": [
                 {"family": tag.family, "id": tag.id, "corners_mm": tag.corners_mm.round(6).tolist()}
@@ -138,8 +138,8 @@ class Chart:
                 {
                     "name": reference.name,
                     "rgb": list(reference.rgb),
-                    "centre_mm": [round(value, 6) for value in reference.centre_mm],
-                    "size_mm": list(reference.size_mm),
+                    "centre_mm": [round(float(value), 6) for value in reference.centre_mm],
+                    "size_mm": [float(side) for side in reference.size_mm],
                 }
                 for reference in self.references
             ],
@@ -157,11 +157,13 @@ class Chart:
 
 
 _Point = tuple[float, float]
-_Code = Field(ge=0, le=255)
+_Length = Annotated[float, Field(gt=0)]
+_Size = tuple[_Length, _Length]
+_Code = Annotated[int, Field(ge=0, le=255)]
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False, strict=True)
 
 
 class _Cells(_Strict):
@@ -177,17 +179,17 @@ class _Tag(_Strict):
 
 class _Reference(_Strict):
     name: str
-    rgb: tuple[int, int, int]
+    rgb: tuple[_Code, _Code, _Code]
     centre_mm: _Point
-    size_mm: _Point
+    size_mm: _Size
 
 
 class _Document(_Strict):
     format: Literal["crop.chart"]
     version: Literal[1]
-    page_mm: _Point
+    page_mm: _Size
     bits: int = Field(ge=1, le=5)
-    cell_mm: _Point
+    cell_mm: _Size
     cells: _Cells
     tags: list[_Tag]
     references: list[_Reference]
@@ -199,7 +201,8 @@ def load_chart(path: Path) -> Chart:
     Raises
     ------
     FormatError
-        The file is missing, no chart, of a version not known here, or not one cell for each colour.
+        The file is missing, no chart, of a version not known here, not one cell for each colour, or two of its tags
+        have one number.
     """
     try:
         document = _Document.model_validate_json(path.read_bytes())
@@ -217,6 +220,11 @@ def load_chart(path: Path) -> Chart:
         raise FormatError(
             f"{path}: a chart of {document.bits} bits has one cell for each of its {count} colours, "
             f"this one has {len(document.cells.centre_mm)} centres and {len(colours)} colours"
+        )
+    numbers = [(tag.family, tag.id) for tag in document.tags]
+    if len(set(numbers)) != len(numbers):
+        raise FormatError(
+            f"{path}: each tag of a chart has its own number, here they are {[tag.id for tag in document.tags]}"
         )
     return Chart(
         page_mm=document.page_mm,

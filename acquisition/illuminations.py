@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -103,7 +103,8 @@ def illuminations_to_csv(illuminations: Sequence[Illumination]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     for light in illuminations:
-        cct = "" if light.cct_k is None else f"{light.cct_k:g}"
+        # Whole kelvin without a point, anything else with all its digits.
+        cct = "" if light.cct_k is None else repr(light.cct_k).removesuffix(".0")
         writer.writerow([light.index, light.kind, cct, light.colour.red, light.colour.green, light.colour.blue])
     return text.getvalue()
 
@@ -123,9 +124,12 @@ def load_illuminations(path: Path) -> tuple[Illumination, ...]:
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(f"cannot read illuminations {path}: {error}; make one with: acquire illuminations") from error
-    rows = list(csv.DictReader(io.StringIO(text)))
+        rows = list(csv.DictReader(io.StringIO(text)))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise FormatError(
+            f"cannot read illuminations {path}: {reason}; make one with: acquire illuminations"
+        ) from error
     if not rows or any(column not in rows[0] for column in COLUMNS):
         raise FormatError(f"{path}: expected lights under the columns {','.join(COLUMNS)}")
     lights: list[Illumination] = []
@@ -134,17 +138,33 @@ def load_illuminations(path: Path) -> tuple[Illumination, ...]:
             kind = row["kind"]
             if kind not in ("uniform", "blackbody"):
                 raise ValueError(f"kind is {kind!r}, expected uniform or blackbody")
-            if int(row["index"]) != number:
+            if _whole(row, "index") != number:
                 raise ValueError(f"index is {row['index']}, expected {number}")
-            cct_k = float(row["cct_k"]) if kind == "blackbody" else None
-            if cct_k is not None and not 0 < cct_k < float("inf"):
-                raise ValueError(f"cct_k is {row['cct_k']}, expected kelvin above 0")
-            lights.append(
-                Illumination(number, kind, cct_k, Colour(int(row["red"]), int(row["green"]), int(row["blue"])))
-            )
-        except (TypeError, ValueError) as error:
+            cct_k = _kelvin(row) if kind == "blackbody" else None
+            codes = Colour(_whole(row, "red"), _whole(row, "green"), _whole(row, "blue"))
+        except ValueError as error:
             raise FormatError(f"{path}, light {number}: {error}") from error
+        lights.append(Illumination(number, kind, cct_k, codes))
     return tuple(lights)
+
+
+def _whole(row: Mapping[str, str | None], column: str) -> int:
+    text = row[column]
+    # A short row holds None where its cells are missing.
+    if text is None or not text.strip().lstrip("-").isdecimal():
+        raise ValueError(f"{column} is {text or 'missing'}, expected a whole number")
+    return int(text)
+
+
+def _kelvin(row: Mapping[str, str | None]) -> float:
+    text = row["cct_k"]
+    try:
+        cct_k = float(text or "nan")
+    except ValueError:
+        cct_k = float("nan")
+    if not 0 < cct_k < float("inf"):
+        raise ValueError(f"cct_k is {text or 'missing'}, expected kelvin above 0")
+    return cct_k
 
 
 def parse_ccts(text: str) -> tuple[float, ...]:

@@ -185,7 +185,7 @@ def _page_mm(page: str | tuple[float, float]) -> tuple[float, float]:
             raise InputError(
                 f"page {page!r} is not known; name one of {', '.join(A_SERIES_MM)}, or give its size in mm"
             )
-        return size
+        return float(size[0]), float(size[1])
     width, height = page
     if not (math.isfinite(width) and math.isfinite(height) and width > 0 and height > 0):
         raise InputError(f"a page of {width:g} × {height:g} mm cannot be printed; give width and height above 0")

@@ -1,22 +1,46 @@
-"""The chart as a print: a list of rectangles, and from it TIFF, PDF and preview."""
+"""The chart as a print: a list of rectangles, and from it a TIFF, a PDF and a preview.
+
+Laws that hold here:
+
+- Everything is made of filled rectangles on bare paper; the three files show the same list.
+- A file is at true size: print it at 100 %, never "fit to page".
+- No colour profile is embedded, since the codes name inks rather than colours: what they look like is measured. The
+  printer's colour management must be off, so that the same code is the same ink everywhere, and the paper matte.
+- In the TIFF every cell and every tag module is the same whole number of pixels; a resolution at which they are not
+  is refused (300 dpi, for one), because modules of unequal size move the corners that detectors find.
+- An A0 sheet at 600 dpi has 1.7 GB of pixels; it is never held: rows that look alike are drawn once and packed strip
+  by strip.
+"""
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart import PAPER_WHITE, Chart, Tag
 from drivers.errors import InputError
+from drivers.storage import whole_file, write_whole
 
+PRINT_DPI = 600
+MM_PER_INCH = 25.4
+POINTS_PER_MM = 72 / MM_PER_INCH
+_STRIP_ROWS = 64
+_SUPERSAMPLING = 8
+_LABEL_GAP_MM = 1.5
+_LABEL_HEIGHT_MM = 2.0
 TAG_MODULES = 8
 """Modules along the black square of a tag 36h11: 6 of data inside a black border of one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """What is printed, on bare paper, in painter's order: a later rectangle covers an earlier one.
+    """The printed field, on bare paper, in painter's order: a later rectangle covers an earlier one.
 
     Attributes
     ----------
@@ -35,6 +59,8 @@ class Drawing:
 
 def drawing(chart: Chart) -> Drawing:
     """Return the rectangles of a chart: tags first (white rim, black square, white modules), cells, references.
+
+    The line of text in the margin that the files carry (`label`) is not among them.
 
     Raises
     ------
@@ -91,3 +117,203 @@ def _tag_rectangles(tag: Tag) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.u
     rgb = np.full((len(rectangles), 3), PAPER_WHITE, dtype=np.uint8)
     rgb[1] = 0
     return rectangles, rgb
+
+
+def label(chart: Chart) -> str:
+    """Return the line printed in the margin, which tells a sheet from another and how to print it."""
+    width, height = chart.page_mm
+    bits = "1 bit" if chart.bits == 1 else f"{chart.bits} bits"
+    return (
+        f"CroP chart, {bits}, {width:g} x {height:g} mm, {chart.sha256[:16]}. "
+        "Print at actual size, colour management off, on matte paper."
+    )
+
+
+def _label_rectangles(chart: Chart, field_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(N, 4) mm: the label as runs of black below the field's left end; none where the margin has no room.
+
+    Rectangles rather than text, so that neither file needs a font and both print the same.
+    """
+    import cv2
+
+    left, _, right, bottom = field_mm.tolist()
+    if bottom + _LABEL_GAP_MM + _LABEL_HEIGHT_MM > chart.page_mm[1]:
+        return np.empty((0, 4))
+    text, font, scale, stroke = label(chart), cv2.FONT_HERSHEY_SIMPLEX, 1.0, 2
+    (columns, ascent), descent = cv2.getTextSize(text, font, scale, stroke)
+    bitmap = np.zeros((ascent + descent + stroke, columns), dtype=np.uint8)
+    cv2.putText(bitmap, text, (0, ascent + stroke // 2), font, scale, 255, stroke, cv2.LINE_8)
+    edges = np.diff(np.pad((bitmap > 127).astype(np.int8), ((0, 0), (1, 1))), axis=1)
+    rows, starts = np.nonzero(edges == 1)
+    ends = np.nonzero(edges == -1)[1]
+    size = min(_LABEL_HEIGHT_MM / bitmap.shape[0], (right - left) / columns)
+    runs = np.stack([starts, rows, ends, rows + 1], axis=1).astype(np.float64) * size
+    return runs + np.array([left, bottom + _LABEL_GAP_MM, left, bottom + _LABEL_GAP_MM])
+
+
+def _sheet(chart: Chart) -> Drawing:
+    """Return the drawing with its label."""
+    field = drawing(chart)
+    extent = np.concatenate([field.rectangles_mm[:, :2].min(axis=0), field.rectangles_mm[:, 2:].max(axis=0)])
+    runs = _label_rectangles(chart, extent)
+    return Drawing(
+        chart.page_mm,
+        np.concatenate([field.rectangles_mm, runs]),
+        np.concatenate([field.rgb, np.zeros((len(runs), 3), dtype=np.uint8)]),
+    )
+
+
+@dataclass(frozen=True)
+class _Band:
+    """Pixel rows `top` … `bottom` − 1, which all look like `row`, (width, 3) uint8."""
+
+    top: int
+    bottom: int
+    row: npt.NDArray[np.uint8]
+
+
+def _bands(drawn: Drawing, pixels_per_mm: float, size: tuple[int, int]) -> Iterator[_Band]:
+    """Yield the picture from top to bottom; `size` is its width and height in pixels, edges go to the nearest pixel."""
+    width, height = size
+    edges = np.rint(drawn.rectangles_mm * pixels_per_mm).astype(np.int64)
+    edges = np.clip(edges, 0, [width, height, width, height])
+    cuts = np.unique(np.concatenate([edges[:, 1], edges[:, 3], [0, height]])).tolist()
+    for top, bottom in pairwise(cuts):
+        row = np.full((width, 3), PAPER_WHITE, dtype=np.uint8)
+        inside = (edges[:, 1] <= top) & (edges[:, 3] > top)
+        for (left, _, right, _), rgb in zip(edges[inside].tolist(), drawn.rgb[inside], strict=True):
+            row[left:right] = rgb
+        yield _Band(top, bottom, row)
+
+
+def _packed_strips(bands: Iterator[_Band], height: int) -> Iterator[bytes]:
+    """Yield the picture as deflated strips of `_STRIP_ROWS` rows, the last one shorter."""
+    rows: list[npt.NDArray[np.uint8]] = []
+    for band in bands:
+        for y in range(band.top, band.bottom):
+            rows.append(band.row)
+            if len(rows) == _STRIP_ROWS or y == height - 1:
+                # Rows repeat so much that a harder setting saves a quarter of the size for three times the time.
+                yield zlib.compress(np.stack(rows).tobytes(), 1)
+                rows = []
+
+
+def _require_whole_pixels(chart: Chart, dpi: int) -> None:
+    lengths = [*chart.cell_mm, *(float(np.ptp(tag.corners_mm[:, 0])) / TAG_MODULES for tag in chart.tags)]
+    for length in lengths:
+        pixels = length * dpi / MM_PER_INCH
+        if dpi < 1 or round(pixels) < 1 or abs(pixels - round(pixels)) > 1e-3:
+            raise InputError(
+                f"at {dpi} dpi a part of {length:.3f} mm would be {pixels:.2f} pixels, and only whole ones print "
+                "evenly; choose 600 or 360 dpi, or print the PDF"
+            )
+
+
+def save_tiff(chart: Chart, path: Path, dpi: int = PRINT_DPI) -> None:
+    """Write the sheet as an RGB TIFF at true size: 8 bits, deflate, no colour profile.
+
+    An A0 sheet at 600 dpi is 28 087 × 19 866 pixels.
+
+    Parameters
+    ----------
+    dpi
+        Dots per inch; one at which cells and tag modules are whole pixels: 600, 360, or another multiple of 24 for
+        charts of `acquisition.layout`.
+
+    Raises
+    ------
+    InputError
+        Cells or tag modules would not be whole pixels, or a tag cannot be printed.
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    import tifffile
+
+    _require_whole_pixels(chart, dpi)
+    sheet = _sheet(chart)
+    width, height = (round(side * dpi / MM_PER_INCH) for side in chart.page_mm)
+    bands = _bands(sheet, dpi / MM_PER_INCH, (width, height))
+    with whole_file(path) as stream, tifffile.TiffWriter(stream) as writer:
+        writer.write(
+            _packed_strips(bands, height),
+            shape=(height, width, 3),
+            dtype=np.uint8,
+            photometric="rgb",
+            compression="adobe_deflate",
+            rowsperstrip=_STRIP_ROWS,
+            resolution=(dpi, dpi),
+            resolutionunit="inch",
+            description=label(chart),
+            software="CroP",
+            metadata=None,
+        )
+
+
+def save_pdf(chart: Chart, path: Path) -> None:
+    """Write the sheet as a PDF of one page of exactly its size: filled rectangles in device RGB, no colour profile.
+
+    The same chart and libraries give the same bytes.
+
+    Raises
+    ------
+    InputError
+        A tag cannot be printed.
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    from reportlab.pdfgen.canvas import Canvas
+
+    sheet = _sheet(chart)
+    width, height = (side * POINTS_PER_MM for side in chart.page_mm)
+    corners = sheet.rectangles_mm * POINTS_PER_MM
+    changes = np.flatnonzero((np.diff(sheet.rgb.astype(np.int64), axis=0) != 0).any(axis=1)) + 1
+    with whole_file(path) as stream:
+        canvas = Canvas(stream, pagesize=(width, height), pageCompression=1, invariant=1)
+        canvas.setTitle(label(chart))
+        canvas.setAuthor("CroP")
+        canvas.setCreator("CroP")
+        canvas.setSubject(f"chart.json has SHA-256 {chart.sha256}")
+        # Neighbours of one colour share a path: it keeps the painter's order and saves bytes.
+        for first, last in zip([0, *changes], [*changes, len(corners)], strict=True):
+            canvas.setFillColorRGB(*(int(code) / 255 for code in sheet.rgb[first]))
+            path_ = canvas.beginPath()
+            for left, top, right, bottom in corners[first:last].tolist():
+                path_.rect(left, height - bottom, right - left, bottom - top)
+            canvas.drawPath(path_, stroke=0, fill=1)
+        canvas.showPage()
+        canvas.save()
+
+
+def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
+    """Return a small picture of the sheet, (height, width_px, 3) uint8 RGB, each pixel the mean of what it covers.
+
+    Raises
+    ------
+    InputError
+        The width is below 1, or a tag cannot be printed.
+    """
+    if width_px < 1:
+        raise InputError(f"a preview of {width_px} pixels has no width; give 1 or more")
+    height_px = max(1, round(width_px * chart.page_mm[1] / chart.page_mm[0]))
+    fine = (width_px * _SUPERSAMPLING, height_px * _SUPERSAMPLING)
+    bands = list(_bands(_sheet(chart), fine[0] / chart.page_mm[0], fine))
+    means = np.stack([band.row.reshape(width_px, _SUPERSAMPLING, 3).mean(axis=1) for band in bands])
+    tops = np.arange(height_px)[:, None] * _SUPERSAMPLING
+    band_tops, band_bottoms = np.array([[band.top, band.bottom] for band in bands]).T
+    shared = np.minimum(band_bottoms, tops + _SUPERSAMPLING) - np.maximum(band_tops, tops)
+    weights = np.maximum(shared, 0) / _SUPERSAMPLING
+    return np.rint(np.tensordot(weights, means, axes=1)).astype(np.uint8)
+
+
+def save_preview(chart: Chart, path: Path, width_px: int = 2400) -> None:
+    """Write `preview` as a PNG; see there.
+
+    Raises
+    ------
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    import cv2
+
+    _, png = cv2.imencode(".png", np.ascontiguousarray(preview(chart, width_px)[:, :, ::-1]))
+    write_whole(path, png.tobytes())
