@@ -1,1 +1,47 @@
-"""From a look-up table and any picture to raw linear images and whole datasets."""
+"""From a look-up table and any picture to raw linear images and whole datasets.
+
+Three lines from a table and a picture to the raw image a camera would have taken of the picture's print::
+
+    from generator import open_lut, read_picture, render
+    lut = open_lut("LUT")
+    raw = render(lut, read_picture("cat.jpg"), light=12, seed=0)     # (H, W, 3) uint16, linear camera RGB
+    truth = lut.ground_truth[12]                                     # (3,) float64, r + g + b = 1
+
+What is imported from here is loaded when it is first used, because compiled and imaging libraries take their time.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from calibration.lut import Lut
+    from generator.dataset import generate_dataset
+    from generator.kernel import draw_samples, render
+    from generator.scene import read_picture
+    from generator.tonemap import flash
+
+__all__ = ["draw_samples", "flash", "generate_dataset", "open_lut", "read_picture", "render"]
+
+_HOMES = {
+    "draw_samples": "generator.kernel",
+    "flash": "generator.tonemap",
+    "generate_dataset": "generator.dataset",
+    "read_picture": "generator.scene",
+    "render": "generator.kernel",
+}
+
+
+def open_lut(folder: Path | str) -> Lut:
+    """Open a table; see `calibration.lut.open_lut`."""
+    from calibration.lut import open_lut
+
+    return open_lut(Path(folder))
+
+
+def __getattr__(name: str) -> object:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,95 @@
+"""Random words as a pure function of where they are used: Philox4x32-10.
+
+Every random choice of the generator is a word of this function, so that a dataset's bytes depend on its seed alone and
+never on tiles, threads, workers or the version of a library. The key is the seed (low word, high word). The counter is
+(a, b, number, purpose): `purpose` keeps the streams below apart, `number` is the image, source or scene the word is
+for, and a, b its place in there.
+
+Source: J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011, section 3.3 and table 2.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.errors import InputError
+
+MULTIPLIERS: Final = (0xD2511F53, 0xCD9E8D57)
+KEY_STEPS: Final = (0x9E3779B9, 0xBB67AE85)
+ROUNDS: Final = 10
+
+SAMPLES: Final = 0
+"""Purpose of the words that choose one of the table's samples for each pixel."""
+LIGHTS: Final = 1
+"""Purpose of the words that choose the lights of a source picture."""
+SCENES: Final = 2
+"""Purpose of the words that are the pixels of a random scene."""
+
+_WORD: Final = 0xFFFFFFFF
+
+Words = npt.NDArray[np.uint32]
+
+
+def key_of(seed: int) -> tuple[int, int]:
+    """Return the two key words of a seed 0 … 2⁶⁴ − 1.
+
+    Raises
+    ------
+    InputError
+        The seed is outside that range.
+    """
+    if not 0 <= seed < 1 << 64:
+        raise InputError(f"the seed is {seed}, expected a whole number from 0 to 2^64 - 1")
+    return seed & _WORD, seed >> 32
+
+
+def words(
+    seed: int, a: npt.ArrayLike, b: npt.ArrayLike, number: int, purpose: int
+) -> tuple[Words, Words, Words, Words]:
+    """Return the four random words of each place.
+
+    Parameters
+    ----------
+    seed
+        0 … 2⁶⁴ − 1.
+    a, b
+        The two place words, 0 … 2³² − 1 each, of shapes that broadcast.
+    number, purpose
+        The other two counter words, 0 … 2³² − 1.
+
+    Returns
+    -------
+    tuple of four ndarray
+        uint32, of the broadcast shape of `a` and `b`.
+    """
+    keys = list(key_of(seed))
+    place_a, place_b = np.broadcast_arrays(np.asarray(a, dtype=np.uint64), np.asarray(b, dtype=np.uint64))
+    c0, c1 = place_a, place_b
+    c2, c3 = np.full_like(c0, number), np.full_like(c0, purpose)
+    low, half = np.uint64(_WORD), np.uint64(32)
+    m0, m1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
+    for _ in range(ROUNDS):
+        p0, p1 = c0 * m0, c2 * m1
+        c0, c1 = (p1 >> half) ^ c1 ^ np.uint64(keys[0]), p1 & low
+        c2, c3 = (p0 >> half) ^ c3 ^ np.uint64(keys[1]), p0 & low
+        keys = [(key + step) & _WORD for key, step in zip(keys, KEY_STEPS, strict=True)]
+    return c0.astype(np.uint32), c1.astype(np.uint32), c2.astype(np.uint32), c3.astype(np.uint32)
+
+
+def distinct(seed: int, count: int, total: int, number: int, purpose: int) -> tuple[int, ...]:
+    """Return `count` distinct numbers of 0 … total − 1 in random order; every order is equally likely.
+
+    A shuffle of Fisher and Yates stopped after `count` steps. Step i takes the first word w of place (i, 0) and draws
+    i + ⌊w (total − i) / 2³²⌋.
+    """
+    drawn = [int(word) for word in words(seed, np.arange(count), 0, number, purpose)[0]]
+    moved: dict[int, int] = {}
+    chosen: list[int] = []
+    for i, word in enumerate(drawn):
+        j = i + (word * (total - i) >> 32)
+        chosen.append(moved.get(j, j))
+        moved[j] = moved.get(i, i)
+    return tuple(chosen)

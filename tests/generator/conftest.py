@@ -1,0 +1,73 @@
+"""A small table with known statistics, and pictures to go with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from acquisition.illuminations import Illumination
+from calibration.lut import Lut, LutWriter, Provenance, Unfit, open_lut
+from drivers.presenter import Colour
+
+SAMPLES = 25
+MakeLut = Callable[..., Lut]
+
+
+def expected_means(bits: int, light: int) -> npt.NDArray[np.float64]:
+    """Return the (8**bits, 3) means that the samples of `make_lut` are drawn around."""
+    index = np.arange(8**bits)
+    mask = (1 << bits) - 1
+    code = np.stack([index >> 2 * bits & mask, index >> bits & mask, index & mask], axis=-1) / mask
+    return 200 + 3000 * code * np.array([1 + 0.2 * light, 1.0, 1.4 - 0.2 * light])
+
+
+@pytest.fixture
+def make_lut(tmp_path: Path) -> MakeLut:
+    """Return a maker of tables with Poisson samples, in a folder of their own."""
+
+    def make(bits: int = 2, lights: int = 4, unfit: tuple[int, ...] = (), name: str = "lut") -> Lut:
+        folder = tmp_path / name
+        folder.mkdir()
+        rng = np.random.default_rng(20190601)
+        writer = LutWriter(folder, lights, 8**bits, SAMPLES)
+        plan: list[Illumination] = []
+        white: list[npt.NDArray[np.float64]] = []
+        for light in range(lights):
+            means = expected_means(bits, light)
+            writer.put(light, rng.poisson(means[:, None, :].repeat(SAMPLES, axis=1)).astype(np.uint16))
+            is_body = light % 2 == 1
+            plan.append(
+                Illumination(
+                    light,
+                    "blackbody" if is_body else "uniform",
+                    3000.0 + light if is_body else None,
+                    Colour(9, 8, light),
+                )
+            )
+            white.append(means[-1])
+        writer.finish(
+            plan,
+            np.array(white),
+            Provenance(
+                camera="Test camera",
+                bits=bits,
+                white_level=8000,
+                session_sha256="1" * 64,
+                chart_sha256="2" * 64,
+                software="test 1",
+                unfit=[Unfit(colour=colour, cause="a test") for colour in unfit],
+            ),
+        )
+        return open_lut(folder)
+
+    return make
+
+
+@pytest.fixture
+def picture() -> npt.NDArray[np.uint8]:
+    """Return a picture of random codes, of a size that is no multiple of anything."""
+    return np.random.default_rng(5).integers(0, 256, (37, 1053, 3)).astype(np.uint8)
