@@ -11,7 +11,7 @@ Laws that hold here:
 - Every slot left is an achromatic reference. References are spread evenly but without a lattice, because a lattice
   leaves streaks in the field fitted through them.
 
-The same bits, page and seed give the same chart. Sizes are those of `facts`: 221 × 155 slots on A0 hold 32 768
+The same bits, page and seed give the same chart. On A0 221 × 155 slots hold 32 768
 colours, 35 tags and 927 references. Knows nothing of printing or of cameras.
 """
 
