@@ -220,6 +220,22 @@ class World:
         _in_blocks(body.sensor[0], block)
         return frame
 
+    def signal(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float32]:
+        """Return what a frame would be without noise, black and clipping.
+
+        Parameters
+        ----------
+        colour, settings, lamp
+            As for `expose`.
+
+        Returns
+        -------
+        ndarray
+            (rows, columns) float32, DN above black, of the body's visible photosites, their response included.
+        """
+        drive = np.asarray(self._drive(colour, settings, lamp), dtype=np.float32)
+        return np.tensordot(drive, self._render(), 1)
+
     def project(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the half-size pixels where points of the print are seen: (..., 2) mm to (..., 2) px, x then y."""
         return self.view.project(np.asarray(points_mm, dtype=np.float64))

@@ -1,0 +1,49 @@
+"""Small prints and the worlds that hold them; rendering a world takes part of a second, so tests share them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim.bodies import BODIES
+from sim.world import Print, Room, World
+
+PAGE_MM = (180.0, 125.0)
+
+
+def squares() -> Print:
+    """Twelve black squares of 12.3 mm with wide white between them, off any lattice."""
+    x, y = np.meshgrid([25.37, 66.11, 107.83, 151.29], [24.71, 61.05, 99.43])
+    centres = np.stack([x.ravel(), y.ravel()], axis=-1)
+    boxes = np.concatenate([centres - 6.15, centres + 6.15], axis=1)
+    return Print(PAGE_MM, boxes, np.zeros((len(boxes), 3), dtype=np.uint8))
+
+
+def patches() -> Print:
+    """Thirty-five patches of 24 mm, side by side: seven by five colours of all kinds."""
+    x, y = (grid.ravel() for grid in np.meshgrid(6 + 24.0 * np.arange(7), 2.5 + 24.0 * np.arange(5)))
+    rgb = np.random.default_rng(5).integers(0, 32, (35, 3)) * 8
+    rgb[:3] = [[0, 0, 0], [255, 255, 255], [128, 128, 128]]
+    return Print(PAGE_MM, np.stack([x, y, x + 24, y + 24], axis=-1).astype(np.float64), rgb.astype(np.uint8))
+
+
+@pytest.fixture(scope="session")
+def world() -> World:
+    """Return patches in a room with every default, the test body before them."""
+    return World(patches(), BODIES["Test"], Room())
+
+
+@pytest.fixture(scope="session")
+def plain_world() -> World:
+    """Return patches in a room where only paint and light matter: no leak, all photosites alike."""
+    return World(patches(), BODIES["Test"], Room(black_leak=0, response_spread=0))
+
+
+@pytest.fixture(scope="session")
+def square_world() -> World:
+    """Return black squares in even light, a wavy page well turned, a lens that distorts and blurs much."""
+    room = Room(
+        tilt_deg=4, pan_deg=-6, roll_deg=1.5, k1=-0.15, waviness_mm=4, fill=0.9, focal_diagonals=1.1, blur_px=0.8,
+        vignetting=0, projector_falloff=0, response_spread=0, black_leak=0,
+    )  # fmt: skip
+    return World(squares(), BODIES["Test"], room)

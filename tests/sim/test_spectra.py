@@ -1,0 +1,140 @@
+"""The spectra are those of real lamps, inks and sensors, as far as measurements at hand tell."""
+
+from __future__ import annotations
+
+import csv
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sim.spectra import (
+    SURFACE_REFLECTANCE,
+    WAVELENGTHS_NM,
+    Lamp,
+    ink_coverage,
+    paper_white,
+    print_reflectance,
+    projector_primaries,
+    sensitivities,
+)
+
+SHARED = Path(__file__).parents[2].parent / "shared" / "data"
+CAMERAS = ("Canon_EOS_600D", "Canon_EOS_200D")
+LAMPS: tuple[Lamp, ...] = ("uhp", "led")
+ALL_CODES = np.array(list(product(range(0, 256, 8), repeat=3)), dtype=np.uint8)
+
+
+def measured(path: Path) -> dict[str, NDArray[np.float64]]:
+    if not path.exists():
+        pytest.skip(f"{path.name} is not at hand; it has no licence and is never copied")
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    values = np.array(rows, dtype=np.float64)
+    return {name: values[:, i] for i, name in enumerate(header)}
+
+
+def interpolated(
+    at: NDArray[np.float64], where: NDArray[np.float64], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    return np.asarray(np.interp(at, where, values), dtype=np.float64)
+
+
+def seen(camera: str, lamp: Lamp, codes: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return (N, 3) camera RGB of printed codes under the projector's white, 1 for bare paper."""
+    light = projector_primaries(lamp).sum(axis=0)[:, None] * sensitivities(camera)
+    return (print_reflectance(codes) @ light) / (paper_white() @ light)
+
+
+@pytest.mark.parametrize("lamp", LAMPS)
+def test_the_projectors_white_is_near_d65(lamp: Lamp) -> None:
+    # CIE 1931 2° observer, x̄ ȳ z̄ of CIE 018:2019 every 20 nm from 380; D65 is x 0.3127, y 0.3290.
+    observer = np.array(
+        [
+            [0.0014, 0.0000, 0.0065], [0.0143, 0.0004, 0.0679], [0.1344, 0.0040, 0.6456], [0.3483, 0.0230, 1.7471],
+            [0.2908, 0.0600, 1.6692], [0.0956, 0.1390, 0.8130], [0.0049, 0.3230, 0.2720], [0.0633, 0.7100, 0.0782],
+            [0.2904, 0.9540, 0.0203], [0.5945, 0.9950, 0.0039], [0.9163, 0.8700, 0.0017], [1.0622, 0.6310, 0.0008],
+            [0.8544, 0.3810, 0.0002], [0.4479, 0.1750, 0.0000], [0.1649, 0.0610, 0.0000], [0.0468, 0.0170, 0.0000],
+            [0.0114, 0.0041, 0.0000], [0.0029, 0.0010, 0.0000], [0.0007, 0.0002, 0.0000], [0.0002, 0.0001, 0.0000],
+            [0.0000, 0.0000, 0.0000],
+        ]
+    )  # fmt: skip
+    fine = np.stack([interpolated(WAVELENGTHS_NM, np.arange(380.0, 781, 20), column) for column in observer.T], axis=1)
+    white = projector_primaries(lamp).sum(axis=0) @ fine
+    np.testing.assert_allclose((white / white.sum())[:2], [0.3127, 0.3290], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("lamp_index", "name"), [(0, "r255g0b0o0"), (1, "r0g255b0o0"), (2, "r0g0b255o0")], ids=["red", "green", "blue"]
+)
+def test_led_primaries_resemble_a_measured_led_projector(lamp_index: int, name: str) -> None:
+    table = measured(SHARED / "projector" / f"{name}_median.csv")
+    wavelength, power = table["wavelength_nm"], table["power (median of 7 scans)"]
+    ours = interpolated(wavelength, WAVELENGTHS_NM, projector_primaries("led")[lamp_index])
+    assert abs(wavelength[power.argmax()] - wavelength[ours.argmax()]) <= 4
+    overlap = float(ours @ power / np.sqrt((ours @ ours) * (power @ power)))
+    assert overlap > 0.98
+
+
+@pytest.mark.parametrize("lamp", LAMPS)
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_each_primary_is_seen_most_by_its_own_channel(lamp: Lamp, camera: str) -> None:
+    response = projector_primaries(lamp) @ sensitivities(camera)
+    assert response.argmax(axis=1).tolist() == [0, 1, 2]
+    # Canon raws under daylight white: R between a third and 0.7 of G, B between 0.5 and 0.9.
+    red, green, blue = response.sum(axis=0)
+    assert 0.33 < red / green < 0.7
+    assert 0.5 < blue / green < 0.9
+
+
+def test_sensitivities_are_the_measured_ones() -> None:
+    curves = sensitivities("Canon_EOS_600D")
+    assert curves.shape == (81, 3)
+    assert curves[0].tolist() == [0.0002001080709661019, 0.0002540350492889405, 0.0004426951151709159]
+    assert curves[:, 1].max() == 1
+    assert not curves.flags.writeable
+
+
+def test_paper_and_inks_resemble_measured_photo_paper() -> None:
+    table = measured(SHARED / "print" / "photo_paper_reflectance.csv")
+    at = table["wavelength_nm"]
+
+    def ours(code: list[int]) -> NDArray[np.float64]:
+        return interpolated(at, WAVELENGTHS_NM, print_reflectance([code])[0])
+
+    assert np.abs(ours([255, 255, 255]) - table["white"]).max() < 0.05
+    assert np.abs(ours([255, 255, 0]) - table["yellow_4/4"]).mean() < 0.05
+    assert np.abs(ours([255, 0, 255]) - table["m_4/4"]).mean() < 0.06
+
+
+def test_bare_paper_is_white_and_black_is_as_black_as_matte_paper_gets() -> None:
+    reflectance = print_reflectance([[255, 255, 255], [0, 0, 0]])
+    np.testing.assert_allclose(reflectance[0], paper_white(), rtol=1e-12)
+    assert reflectance[1].min() >= SURFACE_REFLECTANCE
+    assert reflectance[1, (WAVELENGTHS_NM >= 400) & (WAVELENGTHS_NM <= 700)].max() < 0.042
+
+
+def test_ink_never_covers_less_than_nothing_or_more_than_all() -> None:
+    coverage = ink_coverage(ALL_CODES)
+    assert coverage.min() >= 0
+    assert coverage.max() <= 1
+    assert coverage[-1].max() < 0.06
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_all_colours_are_distinct_and_each_channel_grows_with_its_code(camera: str) -> None:
+    colours = seen(camera, "uhp", ALL_CODES)
+    cube = colours.reshape(32, 32, 32, 3)
+    for channel in range(3):
+        assert np.diff(cube[..., channel], axis=channel).min() > 0
+    assert len(np.unique(np.round(colours, 4), axis=0)) == len(colours)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_greys_rise_and_stay_grey(camera: str) -> None:
+    grey = np.repeat(np.arange(0, 256, 8, dtype=np.uint8)[:, None], 3, axis=1)
+    rising = seen(camera, "uhp", grey)
+    assert np.diff(rising, axis=0).min() > 0
+    assert (rising.min(axis=1) / rising.max(axis=1)).min() > 0.6
