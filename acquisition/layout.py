@@ -3,7 +3,8 @@
 Laws that hold here:
 
 - The sheet is a grid of square slots of 125 pixels at 600 dpi (5.292 mm) whose origin is a whole pixel, so that every
-  edge printed, of cells and of tag modules, is a whole pixel at 600 dpi (and at every multiple of 24 dpi).
+  edge printed, of cells and of tag modules, falls between two pixels; at any other multiple of 24 dpi their sizes are
+  still whole.
 - Each colour stands once, in random order: random order registers four times better than a smooth one and makes a
   slip by one cell visible.
 - Tags stand on an even grid that reaches the field's edges: 4 × 4 slots each, which are the 10 modules of an AprilTag
@@ -11,8 +12,8 @@ Laws that hold here:
 - Every slot left is an achromatic reference. References are spread evenly but without a lattice, because a lattice
   leaves streaks in the field fitted through them.
 
-The same bits, page and seed give the same chart. On A0 221 × 155 slots hold 32 768
-colours, 35 tags and 927 references. Knows nothing of printing or of cameras.
+The same bits, page and seed give the same chart. On A0 221 × 155 slots hold 32 768 colours, 35 tags and 927
+references. Knows nothing of printing or of cameras.
 """
 
 from __future__ import annotations
