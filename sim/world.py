@@ -112,6 +112,12 @@ class Room:
         Share of its light that the lamp loses in an hour; the room has no time, so whoever does applies it as `lamp`.
     response_spread
         Standard deviation of the photosites' response (PRNU).
+    wheel_hz
+        Turns of the projector's colour wheel per second, each a third red, green and blue; 0 for steady light. With a
+        wheel, an exposure that is no whole number of turns, or starts and ends unsteadily, gets more of one primary
+        than of another, and frames differ from `signal` and `white` by that.
+    shutter_jitter_s
+        Standard deviation of the exposure time; matters with a wheel only.
     """
 
     seed: int = 0
@@ -136,6 +142,8 @@ class Room:
     white_level_share: float = 0.70
     lamp_drift_per_hour: float = 0.004
     response_spread: float = 0.003
+    wheel_hz: float = 0.0
+    shutter_jitter_s: float = 0.0005
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -146,7 +154,9 @@ class Room:
         for name in ("vignetting", "projector_falloff", "black_leak", "ambient"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 … below 1 is expected")
-        for name in ("waviness_mm", "blur_px", "response_spread", "primary_difference"):
+        for name in (
+            "waviness_mm", "blur_px", "response_spread", "primary_difference", "wheel_hz", "shutter_jitter_s"
+        ):  # fmt: skip
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is expected")
 
@@ -202,7 +212,7 @@ class World:
         from sim.render import counts
 
         light = self._render()
-        weights = np.asarray(self._drive(colour, settings, lamp), dtype=np.float32)
+        weights = np.asarray(self._drive(colour, settings, lamp * self._turned(settings, key)), dtype=np.float32)
         body, visible = self.body, self.body.visible
         black, noise_dn, gain_e = float(body.black), body.noise_dn(settings.iso), body.gain_e(settings.iso)
         frame = np.empty(body.sensor, dtype=np.uint16)
@@ -299,7 +309,21 @@ class World:
         spots = page / 2 + half_diagonal * aside
         return lens, np.column_stack([spots, lost / (1 - lost) / half_diagonal**2])
 
-    def _drive(self, colour: Colour, settings: ExposureSettings, lamp: float) -> NDArray[np.float64]:
+    def _turned(self, settings: ExposureSettings, key: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return (3,) the light of each primary that the wheel lets through, over that of steady light."""
+        if self.room.wheel_hz == 0:
+            return np.ones(3)
+        random = self._random(4, *key)
+        start = random.uniform()
+        time = max(settings.shutter_s + self.room.shutter_jitter_s * random.standard_normal(), 0)
+        turns = np.array([start, start + time * self.room.wheel_hz])[:, None]
+        segment = np.arange(3) / 3
+        shone = np.floor(turns) / 3 + np.clip(turns - np.floor(turns) - segment, 0, 1 / 3)
+        return 3 * (shone[1] - shone[0]) / (settings.shutter_s * self.room.wheel_hz)
+
+    def _drive(
+        self, colour: Colour, settings: ExposureSettings, lamp: float | NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Return (3,) how much of each primary's reference light a frame collects, gain included."""
         codes = np.array([colour.red, colour.green, colour.blue]) / 255
         if self.room.transfer == "srgb":

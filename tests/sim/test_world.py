@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
-from sim.bodies import BODIES, Body
+from sim.bodies import BODIES, Body, Rectangle
 from sim.world import REFERENCE_EXPOSURE, Print, Room, World
 
 SIX_SIGMA = 5.0
@@ -262,6 +262,33 @@ def test_the_lamps_light_scales_the_picture_but_not_the_rooms_own() -> None:
     world = World(sheet, BODIES["Test"], Room(ambient=0.001))
     full = world.signal(WHITE, REFERENCE_EXPOSURE)
     np.testing.assert_allclose(world.signal(WHITE, REFERENCE_EXPOSURE, lamp=0), full * (0.001 / 1.001), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("shutter_s", "percent"), [(1 / 60, 7), (1 / 8, 8.7), (0.25, 0.47), (0.5, 0.24), (1.0, 0.11)])
+def test_a_colour_wheel_shakes_the_colour_of_short_exposures(shutter_s: float, percent: float) -> None:
+    """Against an independent simulation of R/G with 0.5 ms of jitter and one turn in 1/60 s."""
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    body = replace(BODIES["Test"], sensor=(4, 16), visible=Rectangle(0, 8, 4, 8), masked=(), electrons_per_dn=1e9)
+    flat = Room(wheel_hz=60, response_spread=0, white_level_share=0.5, black_leak=0)
+    world = World(sheet, replace(body, read_noise_dn=1e-3, sensor_noise_e=0), flat)
+    settings = replace(REFERENCE_EXPOSURE, shutter_s=shutter_s, aperture=8 * math.sqrt(2 * shutter_s))
+    ratios: list[float] = []
+    for n in range(400):
+        # The camera's channels overlap, so each primary is shown by itself; the key makes it the same exposure.
+        red, green = (
+            visible(world.expose(PRIMARIES[i], settings, key=(n,)), body).mean() - body.black for i in range(2)
+        )
+        ratios.append(float(red / green))
+    found = 100 * np.std(ratios) / np.mean(ratios)
+    assert found == pytest.approx(percent, rel=0.2)
+
+
+def test_whole_turns_of_the_wheel_give_steady_light() -> None:
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    steady = World(sheet, BODIES["Test"], Room())
+    turning = World(sheet, BODIES["Test"], Room(wheel_hz=120, shutter_jitter_s=0))
+    frames = [world.expose(WHITE, REFERENCE_EXPOSURE, key=(9,)).astype(int) for world in (steady, turning)]
+    assert np.abs(frames[0] - frames[1]).max() <= 1
 
 
 def test_later_rectangles_cover_earlier_ones_and_paper_shows_between() -> None:
