@@ -48,6 +48,43 @@ def _cubic(t: float, weights: NDArray[np.float64]) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=False)
+def _reached(lines: NDArray[np.float64], centre: float, reach: float, near: int) -> tuple[int, int]:
+    """Return the first and the last interval between lines that `centre` ± `reach` touches, searching from `near`."""
+    first = near
+    while first > 0 and lines[first - 1] > centre - reach:
+        first -= 1
+    while first < len(lines) and lines[first] <= centre - reach:
+        first += 1
+    last = first
+    while last < len(lines) and lines[last] < centre + reach:
+        last += 1
+    return first, last
+
+
+@njit(cache=True, nogil=True, fastmath=False)
+def _alike(labels: NDArray[np.int32], i: int, i1: int, j: int, j1: int) -> bool:
+    """Return whether all labels of rows j … j1 and columns i … i1 are the same."""
+    for b in range(j, j1 + 1):
+        for a in range(i, i1 + 1):
+            if labels[b, a] != labels[j, i]:
+                return False
+    return True
+
+
+@njit(cache=True, nogil=True, fastmath=False)
+def _shares(
+    lines: NDArray[np.float64], centre: float, sigma: float, first: int, last: int, out: NDArray[np.float64]
+) -> None:
+    """Write the share of a normal distribution that falls into each interval from first to last; they add up to 1."""
+    before = 0.0
+    for k in range(first, last):
+        below = _phi((lines[k] - centre) / sigma)
+        out[k] = below - before
+        before = below
+    out[last] = 1.0 - before
+
+
+@njit(cache=True, nogil=True, fastmath=False)
 def light(
     first_row: int,
     nodes: NDArray[np.float64],
@@ -105,7 +142,6 @@ def light(
     v_down = np.empty(node_columns)
     u_share = np.empty(labels.shape[1])
     v_share = np.empty(labels.shape[0])
-    last_x, last_y = len(x_lines), len(y_lines)
     for row in range(rows):
         y = first_row + row
         node_y = y // GRID_PX
@@ -132,51 +168,18 @@ def light(
             v_across = (v_row[c + 1] - v_row[c]) / GRID_PX
             u_sigma = sigma_px * math.sqrt(u_across * u_across + u_down[c] * u_down[c])
             v_sigma = sigma_px * math.sqrt(v_across * v_across + v_down[c] * v_down[c])
-            u_reach, v_reach = REACH * u_sigma, REACH * v_sigma
             for x in range(start, min(start + GRID_PX, columns)):
                 w = across[x - start]
                 u = w[0] * u_row[c - 1] + w[1] * u_row[c] + w[2] * u_row[c + 1] + w[3] * u_row[c + 2]
                 v = w[0] * v_row[c - 1] + w[1] * v_row[c] + w[2] * v_row[c + 1] + w[3] * v_row[c + 2]
-                # i and j: first interval that the blur reaches; i1 and j1: last.
-                while i > 0 and x_lines[i - 1] > u - u_reach:
-                    i -= 1
-                while i < last_x and x_lines[i] <= u - u_reach:
-                    i += 1
-                while j > 0 and y_lines[j - 1] > v - v_reach:
-                    j -= 1
-                while j < last_y and y_lines[j] <= v - v_reach:
-                    j += 1
-                i1, j1 = i, j
-                while i1 < last_x and x_lines[i1] < u + u_reach:
-                    i1 += 1
-                while j1 < last_y and y_lines[j1] < v + v_reach:
-                    j1 += 1
-                label = labels[j, i]
-                plain = True
-                for b in range(j, j1 + 1):
-                    for a in range(i, i1 + 1):
-                        if labels[b, a] != label:
-                            plain = False
+                i, i1 = _reached(x_lines, u, REACH * u_sigma, i)
+                j, j1 = _reached(y_lines, v, REACH * v_sigma, j)
                 channel = channels[y & 1, x & 1]
-                if plain:
-                    red, green, blue = (
-                        signals[label, channel, 0],
-                        signals[label, channel, 1],
-                        signals[label, channel, 2],
-                    )
-                else:
-                    before = 0.0
-                    for a in range(i, i1):
-                        below = _phi((x_lines[a] - u) / u_sigma)
-                        u_share[a] = below - before
-                        before = below
-                    u_share[i1] = 1.0 - before
-                    before = 0.0
-                    for b in range(j, j1):
-                        below = _phi((y_lines[b] - v) / v_sigma)
-                        v_share[b] = below - before
-                        before = below
-                    v_share[j1] = 1.0 - before
+                label = labels[j, i]
+                red, green, blue = signals[label, channel, 0], signals[label, channel, 1], signals[label, channel, 2]
+                if not _alike(labels, i, i1, j, j1):
+                    _shares(x_lines, u, u_sigma, i, i1, u_share)
+                    _shares(y_lines, v, v_sigma, j, j1, v_share)
                     red, green, blue = np.float32(0), np.float32(0), np.float32(0)
                     for b in range(j, j1 + 1):
                         for a in range(i, i1 + 1):
