@@ -127,8 +127,9 @@ def run(
     from acquisition.taking import run_session
     from drivers.console import progress
 
+    settings = load_lab(lab)
     with progress("frames") as advance:
-        outcome = run_session(load_lab(lab), session, advance)
+        outcome = run_session(settings, session, advance)
     if not outcome.complete:
         raise QualityError(
             f"{outcome.left} of {outcome.total} frames are without an accepted frame; " + "; ".join(outcome.refused)

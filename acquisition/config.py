@@ -129,10 +129,12 @@ def load_lab(path: Path) -> LabSettings:
     """
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise ConfigurationError(
-            f"cannot read settings {path}: {error}; see examples/ for a file to begin with"
+            f"cannot read settings {path}: {error.strerror}; examples/ has a file to begin with"
         ) from error
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"{path} is no text in UTF-8: {error}; save it as such") from error
     settings = parse_lab(text, str(path))
     if settings.rig == "replay" and settings.replay is None:
         raise ConfigurationError(f"{path}: rig = 'replay' needs [replay] with session = 'FOLDER' of the recording")

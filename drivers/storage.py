@@ -39,6 +39,15 @@ def storage_error(path: Path, error: OSError) -> StorageError:
     )
 
 
+def _make_folder(folder: Path, path: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"cannot write {path}: a part of that path is a file, not a folder; name another") from error
+    except OSError as error:
+        raise storage_error(path, error) from error
+
+
 def sync_folder(folder: Path) -> None:
     """Make the names in `folder` durable; does nothing where the system cannot."""
     try:
@@ -73,8 +82,8 @@ def whole_file(path: Path, final: Callable[[], Path] | None = None) -> Generator
         The disk is full, read-only or gone. Nothing is left behind.
     """
     partial = partial_path(path)
+    _make_folder(path.parent, path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("w+b") as stream:
             yield stream
             stream.flush()
@@ -105,7 +114,7 @@ def require_free(path: Path, what: str) -> None:
     if path.is_dir() and not any(path.iterdir()):
         return
     if path.exists() or path.is_symlink():
-        raise InputError(f"{path} already exists; name a new folder for {what}, or remove it first")
+        raise InputError(f"{path} already exists; name another place for {what}, or remove what is there")
 
 
 @contextmanager
@@ -133,10 +142,11 @@ def whole_folder(path: Path, what: str) -> Generator[Path]:
     """
     require_free(path, what)
     partial = partial_path(path)
+    _make_folder(path.parent, path)
     try:
         if partial.exists():
             shutil.rmtree(partial)
-        partial.mkdir(parents=True)
+        partial.mkdir()
         yield partial
         require_free(path, what)
         partial.replace(path)
