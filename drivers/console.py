@@ -26,6 +26,20 @@ def say_error(message: str) -> None:
 
 def run(command: Callable[[], object]) -> int:
     """Call `command` and return the exit code; a foreseeable fault is one line on stderr, no traceback."""
+    code = _outcome(command)
+    try:
+        # What is still to be printed fails here, where it can be judged, and not while the interpreter ends.
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _abandon_stdout()
+    except OSError as error:
+        say_error(f"cannot print: {error.strerror}; give the output another place and run again")
+        _abandon_stdout()
+        return code or StorageError.exit_code
+    return code
+
+
+def _outcome(command: Callable[[], object]) -> int:
     try:
         command()
     except CropError as error:
@@ -34,8 +48,7 @@ def run(command: Callable[[], object]) -> int:
     except KeyboardInterrupt:
         return _interrupted()
     except BrokenPipeError:
-        # The reader of our output left (head, a closed pager): not a fault, but nothing more can be printed.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _abandon_stdout()
         return 0
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EROFS, errno.EDQUOT):
@@ -47,6 +60,11 @@ def run(command: Callable[[], object]) -> int:
             return _interrupted()
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     return 0
+
+
+def _abandon_stdout() -> None:
+    """Print into nothing from now on: the reader of our output left (head, a closed pager), which is no fault."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _interrupted() -> int:

@@ -7,6 +7,7 @@ that the caller did not mean to replace.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import shutil
@@ -14,6 +15,7 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from io import BufferedRandom
 from pathlib import Path
+from typing import TypeGuard
 
 from drivers.errors import InputError, StorageError
 
@@ -37,6 +39,17 @@ def storage_error(path: Path, error: OSError) -> StorageError:
     return StorageError(
         f"cannot write {path}: {reason}; free space or choose another disk, then run the same command again"
     )
+
+
+def _is_ours(error: BaseException, path: Path) -> TypeGuard[OSError]:
+    """Return whether `error` is about writing `path`, rather than about something that the caller read meanwhile."""
+    if not isinstance(error, OSError):
+        return False
+    if not isinstance(error.filename, str | bytes):
+        # A write to an open file does not say which one; these numbers are no fault of anything but a disk.
+        return error.errno in _DISK_FAULTS
+    about, partial = Path(os.fsdecode(error.filename)), partial_path(path)
+    return about in (path, partial, *path.parents) or partial in about.parents
 
 
 def _make_folder(folder: Path, path: Path) -> None:
@@ -91,8 +104,9 @@ def whole_file(path: Path, final: Callable[[], Path] | None = None) -> Generator
         partial.replace(final() if final else path)
         sync_folder(path.parent)
     except BaseException as error:
-        partial.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno in _DISK_FAULTS:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        if _is_ours(error, path):
             raise storage_error(path, error) from error
         raise
 
@@ -153,6 +167,6 @@ def whole_folder(path: Path, what: str) -> Generator[Path]:
         sync_folder(path.parent)
     except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
-        if isinstance(error, OSError) and error.errno in _DISK_FAULTS:
+        if _is_ours(error, path):
             raise storage_error(path, error) from error
         raise

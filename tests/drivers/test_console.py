@@ -1,0 +1,130 @@
+"""Commands end with one line and a code, whatever happens."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from drivers import errors
+from drivers.console import EXIT_CODES, run
+
+
+def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(lambda: None) == 0
+    assert run(lambda: 7) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+# The tree in the docstring of drivers.errors.
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (errors.InputError, 2),
+        (errors.ConfigurationError, 2),
+        (errors.FormatError, 2),
+        (errors.DeviceError, 3),
+        (errors.LinkError, 3),
+        (errors.LinkTimeout, 3),
+        (errors.LinkClosed, 3),
+        (errors.ProtocolError, 3),
+        (errors.DeviceRefused, 3),
+        (errors.DeviceFault, 3),
+        (errors.QualityError, 4),
+        (errors.RegistrationError, 4),
+        (errors.StorageError, 5),
+    ],
+)
+def test_every_error_has_its_code(error: type[errors.CropError], code: int, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail() -> None:
+        raise error("lab.toml: shutter_s is -1, more than 0 was expected; correct it")
+
+    assert run(fail) == code
+    assert capsys.readouterr() == ("", "error: lab.toml: shutter_s is -1, more than 0 was expected; correct it\n")
+
+
+def test_interruption_is_130(capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    assert run(interrupt) == 130
+    assert capsys.readouterr().err == "error: interrupted; run the same command again to go on\n"
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])
+def test_a_disk_fault_that_nobody_translated_is_5(number: int, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail() -> None:
+        raise OSError(number, "No space left on device", "/disk/samples.npy")
+
+    assert run(fail) == 5
+    assert capsys.readouterr().err == (
+        "error: cannot write /disk/samples.npy: No space left on device; free space and run again\n"
+    )
+
+
+@pytest.mark.parametrize("error", [OSError(errno.EINVAL, "odd"), ValueError("our mistake"), AssertionError()])
+def test_our_own_mistakes_are_not_hidden(error: Exception) -> None:
+    def fail() -> None:
+        raise error
+
+    with pytest.raises(type(error)):
+        run(fail)
+
+
+@pytest.mark.parametrize(("given", "code"), [(0, 0), (2, 2), (None, 0), ("words", 1)])
+def test_exits_keep_their_code(given: int | str | None, code: int) -> None:
+    assert run(lambda: sys.exit(given)) == code
+
+
+def test_the_help_names_every_code() -> None:
+    for code in (0, 2, 3, 4, 5, 130):
+        assert f"{code} " in EXIT_CODES
+
+
+def ended(program: str, output: int) -> tuple[int, str]:
+    """Return code and stderr of a program that prints to `output`."""
+    # Buffered, as a user has it, whatever the surroundings of this test.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    text = f"from drivers.console import run\nimport sys\n{program}"
+    done = subprocess.run(
+        [sys.executable, "-c", text],
+        stdout=output,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        timeout=60,
+        env=environment,
+    )
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        "raise SystemExit(run(lambda: [print('x' * 99) for _ in range(10_000)]))",
+        "raise SystemExit(run(lambda: print('one line, still in the buffer when the command is done')))",
+        "raise SystemExit(run(lambda: (print('as typer does'), sys.exit(0))))",
+    ],
+)
+def test_a_reader_that_left_is_no_fault(program: str) -> None:
+    pipe = subprocess.Popen([sys.executable, "-c", ""], stdin=subprocess.PIPE)
+    with pipe:
+        assert pipe.stdin is not None
+        pipe.wait()
+        assert ended(program, pipe.stdin.fileno()) == (0, "")
+
+
+@pytest.mark.parametrize("lines", [1, 10_000])
+def test_a_full_device_under_stdout_is_5(lines: int) -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("this system has no /dev/full")
+    with full.open("wb") as stream:
+        code, error = ended(f"raise SystemExit(run(lambda: [print('x') for _ in range({lines})]))", stream.fileno())
+    assert code == 5
+    assert error.startswith("error: cannot ")
+    assert "No space left" in error
