@@ -14,6 +14,7 @@ Millimetres on the print; half-size pixels unless said; DN are raw counts above 
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Callable
@@ -36,6 +37,7 @@ REFERENCE_EXPOSURE = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 """The exposure at which `Room.white_level_share` holds."""
 
 _PAPER = (255, 255, 255)
+_A0_DIAGONAL_MM = math.hypot(1189, 841)
 _BACKDROP_REFLECTANCE = 0.04
 _BLOCK_ROWS = 64
 _FINEST_MM = 1e-3
@@ -88,7 +90,8 @@ class Room:
     k1, k2, p1, p2
         Brown's distortion in normalised coordinates, as OpenCV has it.
     waviness_mm
-        Peak-to-valley height of the paper's surface.
+        Peak-to-valley height of the paper's surface on an A0 sheet; on another in proportion to its diagonal, so that
+        small charts look like large ones.
     blur_px
         Standard deviation of the lens's blur, half-size pixels; the photosite's aperture is added to it.
     vignetting
@@ -173,7 +176,7 @@ class World:
         self.room = room
         rows, columns = body.half_size
         self.view = View.framed(
-            Waviness.random(room.seed, room.waviness_mm, sheet.page_mm),
+            Waviness.random(room.seed, room.waviness_mm * math.hypot(*sheet.page_mm) / _A0_DIAGONAL_MM, sheet.page_mm),
             (columns, rows),
             fill=room.fill,
             focal_diagonals=room.focal_diagonals,

@@ -41,9 +41,9 @@ def plain_world() -> World:
 
 @pytest.fixture(scope="session")
 def square_world() -> World:
-    """Return black squares in even light, a wavy page well turned, a lens that distorts and blurs much."""
+    """Return black squares in even light, a very wavy page well turned, a lens that distorts and blurs much."""
     room = Room(
-        tilt_deg=4, pan_deg=-6, roll_deg=1.5, k1=-0.15, waviness_mm=4, fill=0.9, focal_diagonals=1.1, blur_px=0.8,
+        tilt_deg=4, pan_deg=-6, roll_deg=1.5, k1=-0.15, waviness_mm=27, fill=0.9, focal_diagonals=1.1, blur_px=0.8,
         vignetting=0, projector_falloff=0, response_spread=0, black_leak=0,
     )  # fmt: skip
     return World(squares(), BODIES["Test"], room)

@@ -321,6 +321,15 @@ def test_a_drawing_off_every_lattice_is_still_drawn(square_world: World, monkeyp
     assert 0 < change.max() < 0.1 * 0.25 * square_world.white(WHITE, REFERENCE_EXPOSURE).max()
 
 
+@pytest.mark.parametrize("page_mm", [(1189.0, 841.0), (105.0, 74.0), (148.0, 210.0)])
+def test_small_sheets_wave_like_large_ones(page_mm: tuple[float, float]) -> None:
+    sheet = Print(page_mm, np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    world = World(sheet, BODIES["Test"], Room(waviness_mm=3))
+    x, y = np.meshgrid(np.linspace(0, page_mm[0], 90), np.linspace(0, page_mm[1], 90))
+    height = np.ptp(world.view.surface.height(np.stack([x, y], axis=-1)))
+    assert height / math.hypot(*page_mm) == pytest.approx(3 / math.hypot(1189, 841), rel=0.03)
+
+
 def test_the_camera_may_stand_upside_down() -> None:
     sheet = Print((180, 125), np.array([[30.0, 20, 60, 50]]), np.zeros((1, 3), dtype=np.uint8))
     world = World(sheet, BODIES["Test"], Room(roll_deg=180, response_spread=0))
