@@ -469,7 +469,8 @@ def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
         if rank < 4 or solution[0] <= 0:
             return None
         step = solution[2:] / solution[0]
-        shift += np.clip(step, -1, 1)
+        # The crop read at x + shift shows the tag as it was at x + shift − movement.
+        shift -= np.clip(step, -1, 1)
         if np.abs(shift).max() > MAX_SHIFT_PX + 1:
             return None
         if np.abs(step).max() < 1e-3:

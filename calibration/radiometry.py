@@ -1,0 +1,281 @@
+"""Counts become light: black, saturation, the field's shape, and the ground truth read from bare paper.
+
+Laws that hold inside:
+
+- Black is each frame's own, one value for each position of the 2×2 block. Raw counts are never scaled in time: the
+  lamp's drift is recorded, and the ground truth of a light comes from the very frame of its samples.
+- The field (how evenly projector and lens light the print) is a smooth shape for each frame and channel, fitted to the
+  white references and divided out of samples and ground truth alike. Its mean over the centres of the chart's cells is
+  1, so that dividing it out leaves the table's mean level as it was. Its parameters are kept, so it can be undone.
+- A frame too dark to tell its own shape is given the shape of a brighter one: the order of its own polynomial sinks to
+  0 by itself (Bayesian information criterion; G. Schwarz, Annals of Statistics 1978).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.errors import QualityError
+from drivers.rawfile import Mosaic
+
+CLIPPED = 0.98
+"""Share of saturation from which a count is taken for clipped."""
+
+MAX_BLACK_DRIFT = 1.0
+"""Counts that the black level may drift over a session before it is said aloud."""
+
+ORDERS = (0, 1, 2, 3, 4, 5, 6)
+MIN_REFERENCES = 6
+_PLATEAU = 64
+_ROUNDS = 4
+
+_Array = npt.NDArray[np.float64]
+
+
+def saturation(mosaic: Mosaic) -> int:
+    """Return the count at which the sensor saturates, as far as this frame tells.
+
+    What the metadata state, or what the frame shows if that is lower: a plateau of at least 64 photosites at the
+    frame's highest count. LibRaw's tables state 15 831 for an EOS 550D that saturates at 13 584 (ISO 100), so a
+    session without one clipped photosite keeps the stated value and its clipping limit lies too high; it does no harm
+    there, as nothing came near.
+    """
+    counts = mosaic.counts
+    top = int(counts.max())
+    if top < mosaic.white_level and int(np.count_nonzero(counts == top)) >= _PLATEAU:
+        return top
+    return mosaic.white_level
+
+
+def terms(order: int) -> list[tuple[int, int]]:
+    """Return the degrees (i, j) of a polynomial of total order `order`, lower totals first."""
+    return [(total - j, j) for total in range(order + 1) for j in range(total + 1)]
+
+
+def polynomial(points_mm: npt.ArrayLike, page_mm: tuple[float, float], order: int) -> _Array:
+    """Return the basis (N, terms) at points: products P_i(x) P_j(y) of Legendre polynomials, x, y −1 … 1 on the page.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 2) on the print.
+    page_mm
+        Width and height of the page.
+    order
+        Total order, i + j ≤ order.
+    """
+    unit = 2 * np.asarray(points_mm, dtype=np.float64) / np.asarray(page_mm, dtype=np.float64) - 1
+    x, y = (np.polynomial.legendre.legvander(unit[:, axis], order) for axis in (0, 1))
+    return np.stack([x[:, i] * y[:, j] for i, j in terms(order)], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """The shape of the light over the print, mean 1 over the cells' centres.
+
+    Attributes
+    ----------
+    page_mm
+        Width and height of the page.
+    coefficients
+        For each channel, the factors whose product the shape is: each (terms,) float64, of some total order.
+    """
+
+    page_mm: tuple[float, float]
+    coefficients: tuple[tuple[_Array, ...], tuple[_Array, ...], tuple[_Array, ...]]
+
+    def at(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return the field (N, 3) at points (N, 2) mm, > 0."""
+        points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
+        shape = np.ones((len(points), 3))
+        for channel, factors in enumerate(self.coefficients):
+            for factor in factors:
+                shape[:, channel] *= polynomial(points, self.page_mm, order_of(len(factor))) @ factor
+        return np.maximum(shape, 0.05)
+
+    def orders(self) -> tuple[int, ...]:
+        """Return the total order of each channel's last factor: what the frame itself could tell."""
+        return tuple(order_of(len(factors[-1])) if factors else 0 for factors in self.coefficients)
+
+    def parameters(self) -> list[list[list[float]]]:
+        """Return the coefficients for `lut.json`: [channel][factor][term], seven significant digits."""
+        return [
+            [[float(f"{value:.7g}") for value in factor.tolist()] for factor in factors]
+            for factors in self.coefficients
+        ]
+
+
+def order_of(count: int) -> int:
+    """Return the total order of a polynomial of `count` terms."""
+    return round((np.sqrt(8 * count + 1) - 3) / 2)
+
+
+def even_field(page_mm: tuple[float, float]) -> Field:
+    """Return the field that is 1 everywhere."""
+    return Field(page_mm, ((), (), ()))
+
+
+@dataclass(frozen=True, eq=False)
+class Paper:
+    """What the white references of a frame say.
+
+    Attributes
+    ----------
+    field
+        The frame's field.
+    white
+        (3,) float64, counts above black of bare paper after the field is divided out: the ground truth.
+    error
+        (3,) float64, standard error of `white`.
+    references
+        White references used.
+    spread
+        (3,) float64, robust standard deviation of the references about the field, relative to `white`.
+    """
+
+    field: Field
+    white: _Array
+    error: _Array
+    references: int
+    spread: _Array
+
+
+def read_paper(
+    places_mm: _Array,
+    seen: _Array,
+    centres_mm: _Array,
+    page_mm: tuple[float, float],
+    base: Field | None = None,
+    what: str = "the frame",
+) -> Paper:
+    """Return the field and the white of a frame.
+
+    Parameters
+    ----------
+    places_mm
+        (N, 2) white references on the print.
+    seen
+        (N, 3) their mean counts above black; NaN where one cannot be used.
+    centres_mm
+        (C, 2) the chart's cells, over which the field's mean is 1.
+    page_mm
+        Width and height of the page.
+    base
+        The shape of a brighter frame, to which this frame adds what it can tell; none for the brightest itself.
+    what
+        The frame's name for messages.
+
+    Raises
+    ------
+    QualityError
+        Fewer than six references can be used.
+    """
+    there = np.isfinite(seen).all(axis=1)
+    if there.sum() < MIN_REFERENCES:
+        raise QualityError(
+            f"{what}: {int(there.sum())} white references can be used, at least {MIN_REFERENCES} expected; uncover the "
+            "chart, bring all of it into the picture, and expose so that bare paper stays below saturation"
+        )
+    places, values = places_mm[there], seen[there]
+    base = even_field(page_mm) if base is None else base
+    shape = base.at(places)
+    factors: list[tuple[_Array, ...]] = []
+    white, error, spread = np.zeros(3), np.zeros(3), np.zeros(3)
+    for channel in range(3):
+        known = shape[:, channel]
+        best: tuple[float, _Array, _Array] | None = None
+        for order in ORDERS:
+            basis = polynomial(places, page_mm, order)
+            if 3 * basis.shape[1] > len(places):
+                break
+            solution, weights, residual = _robust_fit(basis * known[:, None], values[:, channel])
+            variance = float((weights * residual**2).sum() / weights.sum())
+            criterion = len(places) * np.log(max(variance, 1e-12)) + basis.shape[1] * np.log(len(places))
+            if best is None or criterion < best[0]:
+                best = (criterion, solution, weights)
+        assert best is not None
+        _, solution, weights = best
+        local = polynomial(centres_mm, page_mm, order_of(len(solution))) @ solution
+        level = float((local * base.at(centres_mm)[:, channel]).mean())
+        # Light too weak to have a shape of its own, or none at all.
+        own = solution / level if level > 0 and local.min() > 0.05 * level else np.ones(1)
+        factors.append((*base.coefficients[channel], own) if len(own) > 1 else base.coefficients[channel])
+        flat = values[:, channel] / (known * (polynomial(places, page_mm, order_of(len(own))) @ own))
+        white[channel] = float((weights * flat).sum() / weights.sum())
+        residual = flat - white[channel]
+        scatter = float(np.sqrt((weights * residual**2).sum() / weights.sum()))
+        error[channel] = scatter / np.sqrt(float(weights.sum()))
+        spread[channel] = scatter / max(abs(white[channel]), 1e-9)
+    return Paper(Field(page_mm, (factors[0], factors[1], factors[2])), white, error, int(there.sum()), spread)
+
+
+def _robust_fit(design: _Array, values: _Array) -> tuple[_Array, _Array, _Array]:
+    """Return solution, weights and residuals of a least-squares fit without what lies far off (Tukey's biweight)."""
+    weights = np.ones(len(values))
+    solution, residual = np.zeros(design.shape[1]), values
+    for _ in range(_ROUNDS):
+        root = np.sqrt(weights)
+        solution = np.asarray(np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0], dtype=np.float64)
+        residual = values - design @ solution
+        scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-9
+        weights = np.maximum(1 - (residual / (6 * scale)) ** 2, 0) ** 2
+    return solution, weights, residual
+
+
+def black_drift(blacks: Sequence[_Array]) -> float:
+    """Return how far the black level of any position of the block drifted over frames (each (2, 2)), counts."""
+    if not blacks:
+        return 0.0
+    return float(np.ptp(np.stack(blacks), axis=0).max())
+
+
+def corrections(
+    page_mm: tuple[float, float], black: _Array, saturation_counts: int, fields: Sequence[Field]
+) -> list[dict[str, Any]]:
+    """Return what was done to the counts, in order, for `lut.json`.
+
+    Parameters
+    ----------
+    page_mm
+        Width and height of the page.
+    black
+        (L, 2, 2) black level of each light's frame.
+    saturation_counts
+        Raw count of saturation.
+    fields
+        The field divided out of each light.
+    """
+    return [
+        {
+            "name": "black",
+            "how": "subtracted: mean of the frame's masked border for each position of the 2x2 block, "
+            "or the metadata's where no border is masked",
+            "unit": "counts",
+            "per_light": np.round(black, 3).tolist(),
+        },
+        {
+            "name": "half size",
+            "how": "R, mean of both G, B of each 2x2 block; nothing interpolated",
+        },
+        {
+            "name": "saturation",
+            "how": f"cells with a count of {CLIPPED:g} of it or more are unfit",
+            "unit": "raw counts",
+            "value": saturation_counts,
+        },
+        {
+            "name": "field",
+            "how": "samples and ground truth divided by F(x, y), the value at the cell's centre for its 25 samples; "
+            "F is the product of its factors, each sum c[k] P_i(u) P_j(v) over total orders 0, 1, 2 ..., "
+            "(i, j) = (n, 0), (n-1, 1) ... (0, n) within an order n, P Legendre, u = 2x/w - 1, v = 2y/h - 1, "
+            "x, y millimetres on a page of w x h; mean of F over the cells' centres = 1; multiply to undo",
+            "page_mm": list(page_mm),
+            "per_light": [field.parameters() for field in fields],
+        },
+        {"name": "rounding", "how": "to the nearest integer, negative values to 0"},
+    ]
