@@ -359,7 +359,7 @@ def generate_dataset(
         write_whole(partial / "gt.txt", truths)
         write_whole(partial / "SHA256SUMS", sums)
         write_whole(partial / "dataset.json", description.model_dump_json(indent=2) + "\n")
-    return Dataset(folder, description, entries)
+    return open_dataset(folder)
 
 
 _LIBRARIES = ("numpy", "OpenImageIO", "opencv-contrib-python-headless")

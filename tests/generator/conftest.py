@@ -19,7 +19,7 @@ MakeLut = Callable[..., Lut]
 
 def expected_means(bits: int, light: int) -> npt.NDArray[np.float64]:
     """Return the (8**bits, 3) means that the samples of `make_lut` are drawn around."""
-    index = np.arange(8**bits)
+    index: npt.NDArray[np.int64] = np.arange(8**bits, dtype=np.int64)
     mask = (1 << bits) - 1
     code = np.stack([index >> 2 * bits & mask, index >> bits & mask, index & mask], axis=-1) / mask
     return 200 + 3000 * code * np.array([1 + 0.2 * light, 1.0, 1.4 - 0.2 * light])

@@ -1,0 +1,100 @@
+"""The command `evaluate`: methods on datasets, in the format of the paper's tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from drivers.console import EXIT_CODES, run
+
+if TYPE_CHECKING:
+    from evaluation.methods import Method
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+_HELP = f"""Estimate the light of every image of a dataset and sum up the errors.
+
+Reads the folder DATASET (made by generate). Prints a table in the paper's order: mean, median, trimean, best 25 %,
+worst 25 % and Avg., their geometric mean, all in degrees. Writes nothing unless asked with --csv or --images.
+
+{EXIT_CODES}
+"""
+
+
+@app.command(help=_HELP)
+def evaluate(
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder of the dataset.", show_default=False)],
+    methods: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST",
+            help="Methods between commas, or all: white-patch, gray-world, shades-of-gray, general-gray-world, "
+            "gray-edge-1, gray-edge-2, pca.",
+        ),
+    ] = "all",
+    error: Annotated[
+        Literal["reproduction", "recovery"], typer.Option(help="Angular error to sum up.")
+    ] = "reproduction",
+    csv: Annotated[
+        Path | None, typer.Option(metavar="OUT.csv", help="Write the table to this file too.", show_default=False)
+    ] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.csv", help="Write each image's estimates and errors.", show_default=False),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Threads. [default: one a processor]", min=1, show_default=False),
+    ] = None,
+) -> None:
+    """Evaluate methods."""
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+
+    from drivers.storage import write_whole
+    from evaluation import experiments
+    from evaluation.datasets import open_scenes
+    from generator.dataset import default_workers
+
+    chosen = _choose(methods)
+    scenes = open_scenes(dataset)
+    with Progress(console=Console(stderr=True)) as progress:
+        task = progress.add_task("images", total=len(scenes))
+        results = experiments.evaluate(scenes, chosen, workers or default_workers(), lambda: progress.advance(task))
+    table = Table(title=f"{dataset.name}: {error} angular error of {len(scenes)} images, degrees")
+    table.add_column("Algorithm")
+    for column in ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg."):
+        table.add_column(column, justify="right")
+    for result in results:
+        table.add_row(result.method, *(f"{number:.2f}" for number in result.summary(error).as_tuple()))
+    Console().print(table)
+    if csv is not None:
+        write_whole(csv, experiments.table_csv(results, error))
+    if images is not None:
+        write_whole(images, experiments.images_csv(scenes, results))
+
+
+def _choose(text: str) -> list[Method]:
+    from drivers.errors import InputError
+    from evaluation.methods import standard_methods
+
+    known = standard_methods()
+    if text.strip().lower() == "all":
+        return list(known.values())
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in known:
+            raise InputError(f"{name!r} is no method; the methods are {', '.join(known)}, or all")
+    return [known[name] for name in dict.fromkeys(names)]
+
+
+def main() -> int:
+    """Run the command; see `drivers.console.EXIT_CODES` for what is returned."""
+    return run(lambda: app(prog_name="evaluate"))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,114 @@
+"""Methods over datasets: the numbers of the paper's tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.errors import InputError
+from evaluation.datasets import Scene
+from evaluation.methods import Method
+from evaluation.metrics import ErrorKind, Summary, recovery_error, reproduction_error, summarise
+
+COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg")
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What one method did on one dataset.
+
+    Attributes
+    ----------
+    method
+        The method's name.
+    estimates
+        (N, 3) float64 of unit length, in the order of the scenes.
+    errors
+        Kind of error to (N,) float64, degrees.
+    """
+
+    method: str
+    estimates: npt.NDArray[np.float64]
+    errors: Mapping[ErrorKind, npt.NDArray[np.float64]]
+
+    def summary(self, kind: ErrorKind) -> Summary:
+        """Return the six numbers for one kind of error."""
+        return summarise(self.errors[kind])
+
+
+def evaluate(
+    scenes: Sequence[Scene],
+    methods: Sequence[Method],
+    workers: int = 1,
+    on_scene: Callable[[], None] | None = None,
+) -> tuple[Result, ...]:
+    """Run every method on every scene; each image is read once.
+
+    Parameters
+    ----------
+    scenes, methods
+        At least one of each.
+    workers
+        Threads, one image each; no number depends on it.
+    on_scene
+        Called after each scene, from the calling thread.
+
+    Raises
+    ------
+    InputError
+        There is no scene or no method.
+    FormatError
+        An image cannot be read.
+    """
+    if not scenes or not methods:
+        raise InputError(f"{len(methods)} methods on {len(scenes)} images: name at least one of each")
+
+    def estimate(scene: Scene) -> npt.NDArray[np.float64]:
+        image, mask = scene.read()
+        return np.stack([method.estimate(image, scene.saturation, mask) for method in methods])
+
+    estimates: list[npt.NDArray[np.float64]] = []
+    with ThreadPoolExecutor(max(1, workers)) as pool:
+        for answer in pool.map(estimate, scenes):
+            estimates.append(answer)
+            if on_scene:
+                on_scene()
+    lights = np.stack(estimates, axis=1)
+    truths = np.stack([scene.truth for scene in scenes])
+    return tuple(
+        Result(
+            method.name,
+            given,
+            {"recovery": recovery_error(given, truths), "reproduction": reproduction_error(given, truths)},
+        )
+        for method, given in zip(methods, lights, strict=True)
+    )
+
+
+def table_csv(results: Sequence[Result], kind: ErrorKind) -> str:
+    """Return the table of one dataset as CSV text: `method,mean,median,trimean,best25,worst25,avg`, degrees."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for result in results:
+        writer.writerow([result.method, *(f"{number:.6f}" for number in result.summary(kind).as_tuple())])
+    return text.getvalue()
+
+
+def images_csv(scenes: Sequence[Scene], results: Sequence[Result]) -> str:
+    """Return every estimate and error as CSV text: `image,method,r,g,b,recovery,reproduction`."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("image", "method", "r", "g", "b", "recovery", "reproduction"))
+    for place, scene in enumerate(scenes):
+        for result in results:
+            light = result.estimates[place] / result.estimates[place].sum()
+            errors = (result.errors["recovery"][place], result.errors["reproduction"][place])
+            writer.writerow([scene.name, result.method, *(f"{part:.6f}" for part in (*light, *errors))])
+    return text.getvalue()

@@ -1,0 +1,213 @@
+"""A dataset's folder: what is in it, that it can be made again, and what happens when something is wrong."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from drivers.errors import FormatError, InputError
+from generator import dataset as dataset_module
+from generator.contact import contact_sheet
+from generator.dataset import generate_dataset, open_dataset
+from generator.illuminant import RandomLights
+from generator.kernel import render
+from generator.scene import find_pictures, random_scenes, read_picture
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from calibration.lut import Lut
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """Return a folder of five pictures, the third of them broken."""
+    folder = tmp_path / "pictures"
+    (folder / "more").mkdir(parents=True)
+    rng = np.random.default_rng(2)
+    for name, shape in (("a.png", (20, 30)), ("b, c.png", (31, 17)), ("more/d.png", (8, 600)), ("more/e.png", (9, 9))):
+        coarse = rng.integers(0, 256, (shape[0], shape[1], 3)).astype(np.uint8)
+        (folder / name).write_bytes(cv2.imencode(".png", coarse)[1].tobytes())
+    (folder / "broken.jpg").write_bytes(b"no picture")
+    return folder
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Return the hash of every file below `folder`."""
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_what_is_in_the_folder(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
+    lut = make_lut()
+    skipped: list[tuple[str, str]] = []
+    images: list[int] = []
+    made = generate_dataset(
+        lut,
+        tmp_path / "out",
+        find_pictures([pictures]),
+        [2, 1],
+        seed=77,
+        workers=2,
+        on_image=lambda: images.append(1),
+        on_skip=lambda source, reason: skipped.append((source.name, reason)),
+    )
+    assert len(images) == 8
+    assert [name for name, _ in skipped] == ["broken.jpg"]
+    assert "not a JPEG file" in skipped[0][1]
+    with (tmp_path / "out" / "ground_truth.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert list(rows[0]) == ["image", "source", "illumination", "r", "g", "b"]
+    assert [row["image"] for row in rows] == [f"{number:06d}.png" for number in range(8)]
+    assert [row["source"] for row in rows] == [
+        name for name in ("a.png", "b, c.png", "more/d.png", "more/e.png") for _ in range(2)
+    ]
+    assert [int(row["illumination"]) for row in rows] == [2, 1] * 4
+    truths = [[float(row[channel]) for channel in "rgb"] for row in rows]
+    np.testing.assert_allclose(truths, lut.ground_truth[[2, 1] * 4], atol=1e-9)
+    np.testing.assert_allclose(np.sum(truths, axis=1), 1, atol=2e-9)
+    np.testing.assert_array_equal(np.loadtxt(tmp_path / "out" / "gt.txt"), truths)
+    described = json.loads((tmp_path / "out" / "dataset.json").read_text())
+    assert (described["format"], described["version"], described["seed"]) == ("crop.dataset", 1, 77)
+    assert described["table"]["sha256"] == lut.sha256
+    assert described["table"]["white_level"] == 8000
+    assert described["skipped"] == [{"position": 2, "name": "broken.jpg"}]
+    file = pictures / "b, c.png"
+    assert described["sources"][1]["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert str(tmp_path) not in (tmp_path / "out" / "dataset.json").read_text()
+    for line in (tmp_path / "out" / "SHA256SUMS").read_text().splitlines():
+        digest, name = line.split("  ")
+        assert contents(tmp_path / "out")[name] == digest
+    # Every image is the one that its number, source and light say, by the reader and by OpenCV alone.
+    again = open_dataset(tmp_path / "out")
+    assert again == made
+    for number, entry in enumerate(again.entries):
+        expected = render(lut, read_picture(pictures / entry.source), entry.illumination, seed=77, image=number)
+        np.testing.assert_array_equal(again.read_image(entry), expected)
+        path = tmp_path / "out" / "images" / entry.image
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert stored is not None
+        np.testing.assert_array_equal(stored[..., ::-1], expected)
+        preview = cv2.imread(str(again.preview_path(entry)))
+        assert preview is not None
+        assert max(preview.shape[:2]) == min(512, max(expected.shape[:2]))
+
+
+def test_workers_change_no_byte(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
+    lut = make_lut(unfit=(3,))
+    sources = (*find_pictures([pictures]), *random_scenes(3, 40, 30, 5))
+    for workers in (1, 2, 7):
+        choice = RandomLights(3, 4, 5)
+        generate_dataset(lut, tmp_path / f"out{workers}", sources, choice, seed=5, workers=workers)
+    assert contents(tmp_path / "out1") == contents(tmp_path / "out2") == contents(tmp_path / "out7")
+    generate_dataset(lut, tmp_path / "other", sources, RandomLights(3, 4, 5), seed=6)
+    one, other = contents(tmp_path / "out1"), contents(tmp_path / "other")
+    assert all(one[name] != other[name] for name in one if name.startswith("images/"))
+
+
+def test_replaced_pixels_are_counted(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
+    lut = make_lut(unfit=(0, 21))
+    (source,) = find_pictures([pictures / "a.png"])
+    made = generate_dataset(lut, tmp_path / "out", [source], [0], previews=False)
+    top = source.read() >> 6
+    count = int(((top == 0).all(axis=2) | (top == 1).all(axis=2)).sum())  # colour 21 is (1, 1, 1)
+    assert count > 0
+    assert made.description.sources[0].replaced_pixels == count
+    assert not (tmp_path / "out" / "previews").exists()
+
+
+def test_nothing_is_left_of_a_dataset_that_fails(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
+    lut = make_lut()
+    sources = find_pictures([pictures])
+    before = contents(tmp_path)
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        generate_dataset(lut, tmp_path / "out", sources, [0, 1], workers=3, on_image=interrupt)
+    with pytest.raises(InputError, match="there is no light 9"):
+        generate_dataset(lut, tmp_path / "out", sources, [0, 9], workers=2)
+    with pytest.raises(FormatError, match="none of the 1 pictures can be read"):
+        generate_dataset(lut, tmp_path / "out", find_pictures([pictures / "broken.jpg"]), [0])
+    assert contents(tmp_path) == before
+    assert threading.active_count() == 1
+
+
+def test_a_taken_folder_and_empty_wishes_are_refused(
+    make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path
+) -> None:
+    lut = make_lut()
+    with pytest.raises(InputError, match="already exists"):
+        generate_dataset(lut, pictures, find_pictures([pictures]), [0])
+    with pytest.raises(InputError, match="0 pictures under 1 lights make no image"):
+        generate_dataset(lut, tmp_path / "out", [], [0])
+    with pytest.raises(InputError, match="under 0 lights make no image"):
+        generate_dataset(lut, tmp_path / "out", find_pictures([pictures]), [])
+    with pytest.raises(InputError, match="0 workers were asked for"):
+        generate_dataset(lut, tmp_path / "out", find_pictures([pictures]), [0], workers=0)
+
+
+@pytest.fixture
+def small(make_lut: Callable[..., Lut], tmp_path: Path) -> Path:
+    """Return a dataset of two random scenes under one light, without previews."""
+    generate_dataset(make_lut(), tmp_path / "small", random_scenes(2, 24, 16), [1], form="tiff", previews=False)
+    return tmp_path / "small"
+
+
+def test_a_damaged_dataset_is_named(small: Path, tmp_path: Path) -> None:
+    opened = open_dataset(small)
+    (small / "images" / opened.entries[0].image).write_bytes(b"II*")
+    with pytest.raises(FormatError, match=r"000000\.tiff is no 16-bit RGB image"):
+        opened.read_image(opened.entries[0])
+    (small / "images" / opened.entries[1].image).unlink()
+    with pytest.raises(FormatError, match=r"cannot read .*000001\.tiff: No such file"):
+        opened.read_image(opened.entries[1])
+    table = small / "ground_truth.csv"
+    text = table.read_text()
+    table.write_text("\n".join(text.splitlines()[:-1]))
+    with pytest.raises(FormatError, match="has 1 rows, expected one for each of the 2 images"):
+        open_dataset(small)
+    table.write_text(text.replace(",1,", ",one,"))
+    with pytest.raises(FormatError, match=r"ground_truth\.csv, line 2: expected image,source"):
+        open_dataset(small)
+    path = small / "dataset.json"
+    path.write_text(path.read_text().replace('"version": 1', '"version": 2'))
+    with pytest.raises(FormatError, match=r"version: .*reads crop\.dataset of version 1"):
+        open_dataset(small)
+    with pytest.raises(FormatError, match=r"is no dataset: cannot read .*; make one with generate"):
+        open_dataset(tmp_path / "nowhere")
+
+
+def test_a_contact_sheet_shows_rows_of_sources(
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[str] = []
+    load = dataset_module.Dataset.read_image
+
+    def read(self: dataset_module.Dataset, entry: dataset_module.Entry) -> npt.NDArray[np.uint16]:
+        shown.append(entry.image)
+        return load(self, entry)
+
+    monkeypatch.setattr(dataset_module.Dataset, "read_image", read)
+    made = generate_dataset(make_lut(), tmp_path / "out", random_scenes(5, 24, 16), [0, 1, 2, 3], previews=False)
+    whole = contact_sheet(made)
+    assert len(shown) == 20
+    assert whole.dtype == np.uint8
+    shown.clear()
+    part = contact_sheet(made, max_rows=3, max_columns=2)
+    assert shown == ["000000.png", "000003.png", "000008.png", "000011.png", "000016.png", "000019.png"]
+    assert part.shape[0] < whole.shape[0]
+    assert part.shape[1] < whole.shape[1]

@@ -1,0 +1,186 @@
+"""Pictures of every kind become the sRGB codes that the head of `scene.py` promises."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import OpenImageIO as oiio  # noqa: N813
+import pytest
+import tifffile
+
+from drivers.errors import FormatError, InputError
+from generator.scene import RandomScene, find_pictures, random_scenes, read_picture
+
+
+def write(path: Path, pixels: npt.NDArray[np.generic], form: str, **attributes: object) -> Path:
+    """Write `pixels` (H, W, C) with OpenImageIO as `form` ("uint8", "half", ...)."""
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], form)
+    for name, value in attributes.items():
+        spec.attribute(name.replace("__", ":"), value)
+    out: Any = oiio.ImageOutput.create(str(path))
+    assert out is not None
+    assert out.open(str(path), spec)
+    assert out.write_image(pixels)
+    out.close()
+    return path
+
+
+@pytest.fixture
+def colours() -> npt.NDArray[np.uint8]:
+    return np.random.default_rng(1).integers(0, 256, (5, 7, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "bmp", "ppm", "tga", "webp"])
+def test_codes_of_lossless_files_are_kept(tmp_path: Path, colours: npt.NDArray[np.uint8], suffix: str) -> None:
+    path = tmp_path / f"picture.{suffix}"
+    options = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == "webp" else []
+    if suffix == "tga":
+        write(path, colours, "uint8")
+    else:
+        path.write_bytes(cv2.imencode(f".{suffix}", colours[..., ::-1], options)[1].tobytes())
+    np.testing.assert_array_equal(read_picture(path), colours)
+
+
+def test_sixteen_bits_become_the_nearest_eight(tmp_path: Path) -> None:
+    values = np.array([[0, 128, 129, 257, 385, 386, 32767, 32768, 65406, 65407, 65535]], np.uint16)
+    path = write(tmp_path / "deep.png", values[..., None].repeat(3, axis=2), "uint16")
+    nearest = np.rint(values.astype(np.float64) * 255 / 65535)
+    np.testing.assert_array_equal(read_picture(path)[..., 1], nearest)
+
+
+def test_grey_becomes_three_equal_codes(tmp_path: Path, colours: npt.NDArray[np.uint8]) -> None:
+    path = write(tmp_path / "grey.png", colours[..., :1], "uint8")
+    np.testing.assert_array_equal(read_picture(path), colours[..., :1].repeat(3, axis=2))
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "tga"])
+def test_white_shows_through(tmp_path: Path, suffix: str) -> None:
+    alpha = np.array([[0, 64, 128, 255]], np.float64)
+    rgba = np.stack([alpha * 0 + 200, alpha * 0 + 10, alpha * 0, alpha], axis=-1).astype(np.uint8)
+    path = tmp_path / f"clear.{suffix}"
+    if suffix == "tif":
+        tifffile.imwrite(path, rgba, photometric="rgb", extrasamples=["unassalpha"])
+    elif suffix == "png":
+        path.write_bytes(cv2.imencode(".png", rgba[..., [2, 1, 0, 3]])[1].tobytes())
+    else:
+        write(path, rgba, "uint8", oiio__UnassociatedAlpha=1)
+    share = alpha[..., None] / 255
+    expected = rgba[..., :3] * share + 255 * (1 - share)
+    assert np.abs(read_picture(path) - expected).max() <= 1
+
+
+def test_grey_with_transparency(tmp_path: Path) -> None:
+    path = write(tmp_path / "clear.png", np.array([[[100, 255], [100, 0]]], np.uint8), "uint8")
+    np.testing.assert_array_equal(read_picture(path), [[[100] * 3, [255] * 3]])
+
+
+def test_floating_point_is_linear_light(tmp_path: Path) -> None:
+    # IEC 61966-2-1: 0.5 is code 188, 0.18 code 118, 0.002 code 7 (the straight part); beyond the range is clipped.
+    row = np.array([[0.5, 0.18, 0.002, 1.0, 7.0, -1.0, np.nan]], np.float32)
+    path = write(tmp_path / "light.exr", row[..., None].repeat(3, axis=2), "float")
+    np.testing.assert_array_equal(read_picture(path)[0, :, 0], [188, 118, 7, 255, 255, 0, 0])
+    hdr = write(tmp_path / "light.hdr", np.full((4, 16, 3), 0.5, np.float32), "float")
+    assert set(read_picture(hdr).ravel().tolist()) == {188}
+
+
+def test_transparent_light_is_mixed_with_white_as_light(tmp_path: Path) -> None:
+    half = np.array([[[0.25, 0.0, 0.0, 0.5]]], np.float32)  # associated: red 0.5 at half coverage
+    picture = read_picture(write(tmp_path / "clear.exr", half, "float"))
+    np.testing.assert_array_equal(picture[0, 0], [225, 188, 188])  # codes of 0.75, 0.5, 0.5
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pictures_stand_upright(tmp_path: Path, colours: npt.NDArray[np.uint8], orientation: int) -> None:
+    path = write(tmp_path / "turned.tif", colours, "uint8", Orientation=orientation)
+    # TIFF 6.0, tag 274: where the stored row 0 and column 0 are to be seen.
+    row0, column0 = {
+        1: ("top", "left"),
+        2: ("top", "right"),
+        3: ("bottom", "right"),
+        4: ("bottom", "left"),
+        5: ("left", "top"),
+        6: ("right", "top"),
+        7: ("right", "bottom"),
+        8: ("left", "bottom"),
+    }[orientation]
+    seen = read_picture(path)
+    sides = {"top": seen[0], "bottom": seen[-1], "left": seen[:, 0], "right": seen[:, -1]}
+
+    def same(side: npt.NDArray[np.uint8], stored: npt.NDArray[np.uint8]) -> bool:
+        return side.tolist() in (stored.tolist(), stored[::-1].tolist())
+
+    assert same(sides[row0], colours[0])
+    assert same(sides[column0], colours[:, 0])
+
+
+def test_only_larger_pictures_are_made_smaller(tmp_path: Path) -> None:
+    halves = np.zeros((40, 80, 3), np.uint8)
+    halves[:, ::2] = 200
+    path = write(tmp_path / "large.png", halves, "uint8")
+    assert read_picture(path, 80).shape == (40, 80, 3)
+    small = read_picture(path, 40)
+    assert small.shape == (20, 40, 3)
+    assert set(small.ravel().tolist()) == {100}
+
+
+DAMAGED = {
+    "text.jpg": b"this is no picture",
+    "empty.png": b"",
+    "half.png": cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, (99, 99, 3)))[1].tobytes()[:9000],
+    "half.jpg": cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (99, 99, 3)))[1].tobytes()[:3000],
+    "unknown.xyz": b"\x00\x01\x02",
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_what_is_no_picture_is_named_with_the_reason(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(DAMAGED[name])
+    with pytest.raises(FormatError, match=rf"cannot read .*{name}: .+; .*another"):
+        read_picture(path)
+
+
+def test_a_missing_picture_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"none\.png: there is no such file"):
+        read_picture(tmp_path / "none.png")
+
+
+def test_folders_are_searched_in_order_of_names(tmp_path: Path) -> None:
+    for name in ("b.png", "a/z.JPG", "a.tif", "B.png", "notes.txt", ".hidden.png", ".cache/c.png", "a/b/c.exr"):
+        (tmp_path / "in" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "in" / name).touch()
+    (tmp_path / "alone.dat").touch()
+    found = find_pictures([tmp_path / "alone.dat", tmp_path / "in"], 99)
+    assert [source.name for source in found] == ["alone.dat", "B.png", "a.tif", "a/b/c.exr", "a/z.JPG", "b.png"]
+    assert {source.max_side for source in found} == {99}
+
+
+def test_places_without_pictures_are_named(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="empty holds no picture"):
+        find_pictures([tmp_path / "empty"])
+    with pytest.raises(InputError, match=r"there is no .*nowhere"):
+        find_pictures([tmp_path / "nowhere"])
+
+
+def test_random_scenes_are_uniform_and_their_own() -> None:
+    first, second = (scene.read() for scene in random_scenes(2, 1001, 800, seed=9))
+    assert first.shape == (800, 1001, 3)
+    # Chi-square with 255 degrees of freedom exceeds 370 once in a million; the seed is fixed.
+    for channel in range(3):
+        counts = np.bincount(first[..., channel].ravel(), minlength=256)
+        expected = first[..., channel].size / 256
+        assert ((counts - expected) ** 2 / expected).sum() < 370
+    assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.005
+    assert abs(np.corrcoef(first[..., 0].ravel(), first[..., 1].ravel())[0, 1]) < 0.007
+    np.testing.assert_array_equal(RandomScene(1, 500, 30, 9).read(), second[:30, :500])
+
+
+@pytest.mark.parametrize(("count", "width", "height"), [(0, 5, 5), (1, 0, 5), (1, 5, 65536)])
+def test_impossible_random_scenes_are_refused(count: int, width: int, height: int) -> None:
+    with pytest.raises(InputError, match="asked for, expected"):
+        random_scenes(count, width, height)

@@ -1,0 +1,59 @@
+"""The Flash operator by hand, and back again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from drivers.errors import InputError
+from generator.tonemap import fit_flash, flash
+
+
+def test_two_pixels_by_hand() -> None:
+    # V = 0.1 and 0.4, geometric mean 0.2, k = 5 * 0.2 = 1; y = x / (V + 1); brightest 0.4 / 1.4 becomes 255.
+    image = np.array([[[0.1, 0.05, 0.0], [0.2, 0.4, 0.1]]])
+    operator = fit_flash(image, gamma=1)
+    assert operator.k == pytest.approx(1)
+    expected = np.array([[[0.1 / 1.1, 0.05 / 1.1, 0], [0.2 / 1.4, 0.4 / 1.4, 0.1 / 1.4]]]) / (0.4 / 1.4) * 255
+    np.testing.assert_allclose(operator.apply(image), expected)
+    display = fit_flash(image).apply(image)
+    np.testing.assert_allclose(display, 255 * (expected / 255) ** (1 / 2.2))
+    np.testing.assert_array_equal(flash(image), np.rint(display))
+
+
+@given(
+    hnp.arrays(np.float64, (3, 4, 3), elements=st.floats(1e-4, 1)),
+    st.floats(0.5, 20),
+    st.sampled_from([1.0, 2.2]),
+)
+def test_the_inverse_gives_back_the_image(image: np.ndarray, a: float, gamma: float) -> None:
+    operator = fit_flash(image, a, gamma)
+    np.testing.assert_allclose(operator.invert(operator.apply(image)), image, rtol=1e-6)
+
+
+def test_the_scale_of_the_values_does_not_matter() -> None:
+    image = np.random.default_rng(0).uniform(0.01, 1, (9, 9, 3))
+    np.testing.assert_allclose(fit_flash(image).apply(image), fit_flash(image / 50).apply(image / 50))
+
+
+def test_codes_of_eight_bits_lose_little() -> None:
+    image = np.random.default_rng(0).uniform(0.02, 1, (50, 50, 3))
+    operator = fit_flash(image)
+    back = operator.invert(np.rint(operator.apply(image)))
+    assert np.median(np.abs(back / image - 1)) < 0.02
+
+
+def test_black_stays_black() -> None:
+    image = np.zeros((2, 2, 3))
+    assert not flash(image).any()
+    image[0, 0] = 0.5
+    assert flash(image)[1, 1].tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(("a", "gamma"), [(0, 2.2), (5, 0)])
+def test_impossible_parameters_are_refused(a: float, gamma: float) -> None:
+    with pytest.raises(InputError, match="parameters above 0"):
+        fit_flash(np.ones((1, 1, 3)), a, gamma)
