@@ -107,6 +107,9 @@ class ProjectorContract:
         bench.switched_on()
         bench.wait(10 * 3600)
         assert bench.projector.lamps() == (Lamp(before.hours + 10, lit=True),)
+        bench.projector.switch_off()
+        bench.wait(bench.cool_down_s)
+        assert bench.projector.lamps() == (Lamp(before.hours + 10, lit=False),)
 
     def test_survives_idleness(self, bench: Bench) -> None:
         assert bench.projector.power() is Power.STANDBY
