@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from acquisition.chart import Chart
 from acquisition.config import LabSettings, unknown_key
@@ -113,22 +114,16 @@ def simulated_room(settings: LabSettings) -> Room:
     ConfigurationError
         A parameter is unknown or of the wrong type.
     """
-    room = Room(seed=settings.simulated.seed)
-    changes: dict[str, Any] = {}
-    for key, value in settings.simulated.room.items():
-        known = [field.name for field in fields(Room) if field.name != "seed"]
+    known = [field.name for field in fields(Room) if field.name != "seed"]
+    for key in settings.simulated.room:
         if key not in known:
             raise unknown_key(f"simulated.room.{key}", known, "LAB.toml")
-        default = getattr(room, key)
-        if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if not isinstance(value, type(default)):
-            raise ConfigurationError(f"simulated.room.{key} = {value!r}: expected a value like {default!r}")
-        changes[key] = value
     try:
-        return replace(room, **changes)
-    except ValueError as error:
-        raise ConfigurationError(f"simulated.room: {error}") from error
+        return TypeAdapter(Room).validate_python({"seed": settings.simulated.seed, **settings.simulated.room})
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(["simulated.room", *(str(part) for part in first["loc"][:1])])
+        raise ConfigurationError(f"LAB.toml: {key}: {first['msg']}, got {first['input']!r}") from error
 
 
 def _exposed(session: Session | None) -> Counter[Colour]:

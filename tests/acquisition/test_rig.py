@@ -1,0 +1,52 @@
+"""The simulated lab is built from LAB.toml; what it does not know is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from acquisition.config import LabSettings, parse_lab
+from acquisition.layout import design_chart
+from acquisition.rig import open_rig, simulated_body, simulated_room
+from drivers.errors import ConfigurationError
+
+HEAD = 'rig = "simulated"\nchart = "c.json"\nilluminations = "l.csv"\n'
+
+
+def settings(text: str) -> LabSettings:
+    return parse_lab(HEAD + text, "LAB.toml")
+
+
+def test_the_room_takes_what_the_file_says() -> None:
+    room = simulated_room(settings("[simulated]\nseed = 5\n[simulated.room]\nwaviness_mm = 6\ntransfer = 2.2\n"))
+    assert (room.seed, room.waviness_mm, room.transfer) == (5, 6.0, 2.2)
+    assert simulated_room(settings("[simulated.room]\ntransfer = 'srgb'\n")).transfer == "srgb"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("wavines_mm = 3", "did you mean 'waviness_mm'?"),
+        ("blur_px = -1", "blur_px"),
+        ("vignetting = 1.5", "vignetting"),
+        ("waviness_mm = 'much'", "simulated.room.waviness_mm"),
+        ("transfer = 'log'", "simulated.room.transfer"),
+        ("seed = 3", "unknown key 'simulated.room.seed'"),
+    ],
+)
+def test_a_wrong_parameter_is_named(text: str, expected: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        simulated_room(settings(f"[simulated.room]\n{text}\n"))
+    assert expected in str(caught.value)
+
+
+def test_an_unknown_body_is_named_with_the_known_ones() -> None:
+    with pytest.raises(ConfigurationError, match="EOS 550D, EOS 6D Mark II"):
+        simulated_body(settings('[simulated]\nbody = "EOS 7D"\n'))
+
+
+def test_an_imported_session_cannot_be_taken() -> None:
+    imported = LabSettings(rig="imported", chart=Path("c"), illuminations=Path("l"))
+    with pytest.raises(ConfigurationError, match="other means"), open_rig(imported, design_chart(bits=1)):
+        pass
