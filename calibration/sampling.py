@@ -167,9 +167,9 @@ def noise_of(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     noise = np.empty_like(level)
     for channel in range(3):
         order = np.argsort(level[:, channel])
-        bins = np.array_split(order, max(1, min(_NOISE_BINS, len(order) // 16)))
+        bins: list[npt.NDArray[np.int64]] = np.array_split(order, max(1, min(_NOISE_BINS, len(order) // 16)))
         at = np.array([float(np.median(level[part, channel])) for part in bins])
         # The median of a variance of nine normal values is 0.918 of its mean (chi-square, 8 degrees of freedom).
         usual = np.array([float(np.median(variance[part, channel])) for part in bins]) / 0.918
-        noise[:, channel] = np.sqrt(np.interp(level[:, channel], at, usual))
+        noise[:, channel] = np.interp(level[:, channel], at, np.sqrt(usual))
     return noise

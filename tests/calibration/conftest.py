@@ -36,7 +36,9 @@ class Lab:
     chart: Chart
     world: World
 
-    def dng(self, colour: Colour = WHITE, key: int = 1, settings: ExposureSettings = SETTINGS, lamp: float = 1) -> bytes:
+    def dng(
+        self, colour: Colour = WHITE, key: int = 1, settings: ExposureSettings = SETTINGS, lamp: float = 1
+    ) -> bytes:
         stream = BytesIO()
         counts = self.world.expose(colour, settings, key=(key,), lamp=lamp)
         write_dng(stream, counts, self.world.body, settings=settings, taken_at=TAKEN_AT)
@@ -67,7 +69,12 @@ class Lab:
 
 
 def hang(
-    bits: int = 3, page: str = "A5", body: str = "Test", seed: int = 1, room: Room | None = None, chart: Chart | None = None
+    bits: int = 3,
+    page: str = "A5",
+    body: str = "Test",
+    seed: int = 1,
+    room: Room | None = None,
+    chart: Chart | None = None,
 ) -> Lab:
     """Return a lab; the paper of a small page waves less than the room's default."""
     chart = design_chart(bits, A_SERIES_MM[page], seed) if chart is None else chart

@@ -1,0 +1,432 @@
+"""The table's report: one page that shows by eye what the figures claim.
+
+`report.html` holds everything: its figures are embedded, so it can be mailed. What it shows: the registered grid over
+the frame, what the tags and cells still ask for, the shape of the light, the lights as planned and as the camera saw
+them (the paper's three figures of chromaticities), the course of the session, and the worst cells as pictures.
+
+Matplotlib is imported where figures are made, and through its objects only: no window, no state left behind.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Callable, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.chart import Chart
+from acquisition.illuminations import decode_srgb
+from acquisition.session import Session
+from calibration.build import BuildResult
+from calibration.mosaic import half_size
+from calibration.radiometry import MAX_BLACK_DRIFT
+from calibration.registration import Registration
+from calibration.sampling import WINDOW, noise_of
+from drivers.rawfile import read_raw
+from drivers.storage import write_whole
+
+NAME = "report.html"
+_WORST = 20
+_DPI = 110
+_INK, _FAINT, _MARK = "#22262b", "#8a929c", "#e8502a"
+_CHANNEL_INK = ("#c8382e", "#2f8f46", "#2f62c8")
+
+_Image = npt.NDArray[np.float32]
+_Array = npt.NDArray[np.float64]
+
+
+def write_report(result: BuildResult, session: Session, folder: Path) -> None:
+    """Write `report.html` into a table's folder; costs some seconds.
+
+    Parameters
+    ----------
+    result
+        What the build found.
+    session
+        The session; the frame that was registered is read again for its pictures.
+    folder
+        Where the page is written.
+    """
+    chart = session.chart
+    picture = half_size(read_raw(session.folder / result.registered_file))
+    lights = np.array([[light.colour.red, light.colour.green, light.colour.blue] for light in session.illuminations])
+    black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
+    seen = f"seen by the {result.camera}"
+    figures = [
+        ("The chart as registered", _grid_caption(result), _drawn(_grid, picture, chart, result.registration)),
+        (
+            "What the registration leaves",
+            "Left: how far the cells moved the map from what the tags and the lens alone say, which is the paper's "
+            "waviness. Right: what each block of cells would still ask for, magnified; a healthy registration shows "
+            "short arrows without order.",
+            _drawn(_residuals, chart, result.registration),
+        ),
+        (
+            "The light on the print",
+            "Shape of the light under the frame that was registered, from its white references; it is divided out of "
+            "samples and ground truth. Each contour is 2 %.",
+            _drawn(_field, chart, result),
+        ),
+        (
+            "The lights",
+            "rb-chromaticities of the lights as projected, as the camera sees them on bare paper (the ground truth), "
+            "and the latter in their colours. Rings are black bodies.",
+            _drawn(_chromaticities, lights, black_body, result.white, seen),
+        ),
+        (
+            "The course of the session",
+            "Black level, movement of the chart and bare paper under white, frame by frame.",
+            _drawn(_course, result),
+        ),
+        (
+            "The worst cells",
+            f"The {_WORST} cells whose rim and middle differ most under white, in standard deviations, each between "
+            "its neighbours; the frame is the 25 samples.",
+            _drawn(_worst, picture, chart, result.registration),
+        ),
+    ]
+    write_whole(folder / NAME, _page(result, figures))
+
+
+def _page(result: BuildResult, figures: Sequence[tuple[str, str, bytes]]) -> str:
+    title = f"Table of {result.lights} lights, {result.camera}"
+    rows = "".join(
+        f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td><td class='note'>{html.escape(note)}</td></tr>"
+        for name, value, note in summary(result)
+    )
+    unfit = "".join(f"<tr><td>{cell.colour}</td><td>{html.escape(cell.cause)}</td></tr>" for cell in result.unfit[:200])
+    more = f"<p>and {len(result.unfit) - 200} more in lut.json</p>" if len(result.unfit) > 200 else ""
+    cells = (
+        f"<h2>Cells unfit for use</h2><table><tr><th>colour</th><th>cause</th></tr>{unfit}</table>{more}"
+        if result.unfit
+        else "<h2>Cells unfit for use</h2><p>None.</p>"
+    )
+    pictures = "".join(
+        f"<figure><h2>{html.escape(heading)}</h2><img alt='{html.escape(heading)}' "
+        f"src='data:image/png;base64,{base64.b64encode(png).decode()}'><figcaption>{html.escape(caption)}"
+        "</figcaption></figure>"
+        for heading, caption, png in figures
+    )
+    return f"""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{html.escape(title)}</title><style>
+body {{ font: 16px/1.5 system-ui, sans-serif; color: {_INK}; max-width: 1100px; margin: 2rem auto; padding: 0 1rem }}
+h1 {{ font-size: 1.6rem; margin-bottom: .2rem }} h2 {{ font-size: 1.15rem; margin: 2.2rem 0 .6rem }}
+table {{ border-collapse: collapse; font-size: .95rem }} th {{ text-align: left; font-weight: 600 }}
+td, th {{ padding: .25rem 1.2rem .25rem 0; border-bottom: 1px solid #e3e6ea; vertical-align: top }}
+td {{ font-variant-numeric: tabular-nums }} .note, figcaption {{ color: #5b636d; font-size: .9rem }}
+figure {{ margin: 0 }} img {{ max-width: 100%; height: auto }}
+</style></head><body>
+<h1>{html.escape(title)}</h1><p class="note">Session {html.escape(result.session.name)}</p>
+<table>{rows}</table>{pictures}{cells}</body></html>
+"""
+
+
+def summary(result: BuildResult) -> list[tuple[str, str, str]]:
+    """Return the figures that say how good a table is: name, value, what is usual."""
+    registration = result.registration
+    tags = len(registration.framing.tags)
+    share = result.white_error / np.maximum(result.white, 1e-9)
+    brightest = result.white.max(axis=1) if len(result.white) else np.zeros(1)
+    black = np.mean([figures.black for figures in result.frames], axis=0)
+    moved = sum(figures.registered for figures in result.frames)
+    return [
+        ("Lights", str(result.lights), "every one with an accepted frame"),
+        ("Frame registered", result.registered_file, ""),
+        ("Tags found", f"{tags} of {tags + len(registration.framing.missing)}", ""),
+        ("Cell", f"{registration.cell_px:.1f} px", "at least 8 for 25 pixels inside it"),
+        ("Blur", f"σ {registration.blur_px:.2f} px", "about 0.6 is sharp"),
+        ("Tags' corners", f"{registration.tag_rms_px:.3f} px RMS", "0.09 is the detector's own error"),
+        ("Waviness", f"{registration.lens_residual_px:.2f} px RMS", "of the tags against a plane seen through a lens"),
+        ("Blocks of cells", f"{registration.block_rms_px:.3f} px RMS", "movement they still ask for"),
+        ("Colours agree", f"{registration.agreement:.4f}", "correlation of cells and chart; another chart has about 0"),
+        ("Chart moved", f"{result.largest_shift_px:.3f} px at most", f"{moved} frames registered anew"),
+        ("Black level", f"{black.mean():.2f} counts", f"drift {result.black_drift:.2f}, {MAX_BLACK_DRIFT:g} is usual"),
+        ("White drift", f"{result.white_drift:.2%}", "between white frames; at most 1 % is usual"),
+        ("Saturation", f"{result.white_level} in the table", f"bare paper reaches {brightest.max():.0f}"),
+        ("Darkest light", f"{brightest.min():.0f}", "its strongest channel on bare paper"),
+        ("Ground truth", f"± {np.median(share):.2%} a channel, median", "standard error of the mean of the references"),
+        (
+            "Noise of a sample",
+            " / ".join(f"{value:.2%}" for value in result.noise.tolist()),
+            "R, G, B, of paper under white",
+        ),
+        ("Cells unfit", str(len(result.unfit)), "listed in lut.json, never filled"),
+    ]
+
+
+def _grid_caption(result: BuildResult) -> str:
+    return (
+        f"{result.registered_file}, contrast stretched, with the tags as found; below, magnified: the outline of "
+        "every cell and the pixels of its 25 samples, in the corners and in the middle."
+    )
+
+
+def _drawn(draw: Callable[..., Any], *arguments: Any) -> bytes:
+    """Return the PNG of a figure that `draw(figure, …)` fills."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    # Matplotlib's own types leave the keyword arguments of every method unknown.
+    style: Any = {
+        "font.size": 9,
+        "axes.edgecolor": _FAINT,
+        "axes.labelcolor": _INK,
+        "xtick.color": _INK,
+        "ytick.color": _INK,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.titlesize": 10,
+    }
+    library: Any = matplotlib
+    with library.rc_context(style):
+        figure: Any = Figure(layout="constrained", dpi=_DPI)
+        FigureCanvasAgg(figure)
+        draw(figure, *arguments)
+        stream = BytesIO()
+        figure.savefig(stream, format="png")
+    return stream.getvalue()
+
+
+def _stretched(picture: _Image) -> _Image:
+    """Return an image for the eye, 0 … 1: each channel to its paper white, sRGB's curve roughly."""
+    white = np.maximum(np.percentile(picture[::4, ::4].reshape(-1, 3), 99.5, axis=0), 1)
+    return np.clip(picture / white, 0, 1).astype(np.float32) ** np.float32(1 / 2.2)
+
+
+def _grid(figure: Any, picture: _Image, chart: Chart, registration: Registration) -> None:
+    height, width = picture.shape[:2]
+    figure.set_size_inches(10, 10 * height / width + 2.4)
+    whole, crops = figure.subfigures(2, 1, height_ratios=(10 * height / width, 2.4))
+    shown = _stretched(picture)
+    step = max(1, width // 1400)
+    axes = whole.subplots()
+    axes.imshow(shown[::step, ::step], extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="antialiased")
+    for tag in registration.framing.tags:
+        outline = np.vstack([tag.corners_px, tag.corners_px[:1]])
+        axes.plot(outline[:, 0], outline[:, 1], color=_MARK, linewidth=1.4)
+    page_w, page_h = chart.page_mm
+    for line in _page_lines(chart):
+        places = registration.to_pixels(line)
+        axes.plot(places[:, 0], places[:, 1], color="white", linewidth=0.5, alpha=0.75)
+    edge = registration.lens.to_pixels([(0, 0), (page_w, 0), (page_w, page_h), (0, page_h), (0, 0)])
+    axes.plot(edge[:, 0], edge[:, 1], color=_MARK, linewidth=0.8, linestyle=(0, (4, 3)))
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+    low, high = chart.centres_mm.min(axis=0), chart.centres_mm.max(axis=0)
+    spots = [
+        ("top left", low),
+        ("top right", (high[0], low[1])),
+        ("middle", (low + high) / 2),
+        ("bottom left", (low[0], high[1])),
+        ("bottom right", high),
+    ]
+    reach = 3.6 * registration.cell_px
+    places = registration.to_pixels(chart.centres_mm)
+    for axes, (name, spot) in zip(crops.subplots(1, len(spots)), spots, strict=True):
+        nearest = int(((chart.centres_mm - np.asarray(spot)) ** 2).sum(axis=1).argmin())
+        middle = places[nearest]
+        _magnified(axes, shown, middle, reach, chart, registration, places)
+        axes.set_title(name)
+
+
+def _page_lines(chart: Chart) -> list[_Array]:
+    """Return lines over the cells, every tenth cell or so, as points in mm."""
+    low, high = chart.centres_mm.min(axis=0), chart.centres_mm.max(axis=0)
+    cell = np.array(chart.cell_mm)
+    lines: list[_Array] = []
+    along = np.linspace(0, 1, 60)[:, None]
+    for axis in (0, 1):
+        count = round(float((high[axis] - low[axis]) / cell[axis])) + 1
+        for number in range(0, count + 1, 10):
+            start, end = low - cell / 2, high + cell / 2
+            start[axis] = end[axis] = start[axis] + number * cell[axis]
+            lines.append(start + along * (end - start))
+    return lines
+
+
+def _magnified(
+    axes: Any,
+    shown: _Image,
+    middle: _Array,
+    reach: float,
+    chart: Chart,
+    registration: Registration,
+    places: _Array,
+) -> None:
+    """Draw part of the frame with the outlines of cells and of their samples."""
+    height, width = shown.shape[:2]
+    axes.imshow(shown, extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
+    near = np.flatnonzero((np.abs(places - middle) < reach + registration.cell_px).all(axis=1))
+    corner = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * np.array(chart.cell_mm) / 2
+    for cell in near:
+        outline = registration.to_pixels(chart.centres_mm[cell] + corner)
+        axes.plot(outline[:, 0], outline[:, 1], color="white", linewidth=0.6)
+        x, y = np.rint(places[cell])
+        half = WINDOW / 2
+        axes.plot(
+            x + half * np.array([-1, 1, 1, -1, -1]), y + half * np.array([-1, -1, 1, 1, -1]), color=_MARK, linewidth=0.8
+        )
+    axes.set(
+        xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] + reach, middle[1] - reach), xticks=[], yticks=[]
+    )
+
+
+def _residuals(figure: Any, chart: Chart, registration: Registration) -> None:
+    figure.set_size_inches(10, 3.9)
+    left, right = figure.subplots(1, 2)
+    page_w, page_h = chart.page_mm
+    # The map is measured where cells and tags are; the sheet's bare margin is extrapolation and not worth a look.
+    half = np.array(chart.cell_mm) / 2
+    left_mm, top_mm = (float(value) for value in chart.centres_mm.min(axis=0) - half)
+    right_mm, bottom_mm = (float(value) for value in chart.centres_mm.max(axis=0) + half)
+    x, y = np.meshgrid(np.linspace(left_mm, right_mm, 120), np.linspace(top_mm, bottom_mm, 80))
+    moved = registration.displacement.at(np.column_stack([x.ravel(), y.ravel()]))
+    length = np.linalg.norm(moved, axis=1).reshape(x.shape)
+    image = left.imshow(
+        length, extent=(left_mm, right_mm, bottom_mm, top_mm), cmap="magma", interpolation="bilinear", vmin=0
+    )
+    figure.colorbar(image, ax=left, label="px", shrink=0.75)
+    every = np.s_[4::8, 4::8]
+    arrows = moved.reshape(*x.shape, 2)[every]
+    left.quiver(x[every], y[every], arrows[..., 0], -arrows[..., 1], color="white", alpha=0.85, width=0.0028)
+    left.set(title="displacement beyond the lens", xlabel="mm", ylabel="mm", xlim=(0, page_w), ylim=(page_h, 0))
+    blocks = registration.blocks
+    good = blocks.good
+    residual = blocks.residual_px[good]
+    largest = float(np.linalg.norm(residual, axis=1).max(initial=1e-3))
+    arrows = right.quiver(
+        blocks.centres_mm[good, 0],
+        blocks.centres_mm[good, 1],
+        residual[:, 0],
+        -residual[:, 1],
+        color=_INK,
+        angles="uv",
+        scale=20 * largest,
+        width=0.0028,
+    )
+    right.quiverkey(arrows, 0.9, 1.04, largest, f"{largest:.3f} px", labelpos="W")
+    right.plot(*blocks.centres_mm[~good].T, "x", color=_MARK, label="does not look like the chart")
+    if (~good).any():
+        right.legend(frameon=False, fontsize=8)
+    right.set_title("blocks of cells, left over", loc="left")
+    right.set(xlabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal")
+
+
+def _field(figure: Any, chart: Chart, result: BuildResult) -> None:
+    figure.set_size_inches(10, 2.9)
+    named = [figures for figures in result.frames if figures.record.file == result.registered_file]
+    shape = (named or list(result.frames))[0].paper.field
+    page_w, page_h = chart.page_mm
+    x, y = np.meshgrid(np.linspace(0, page_w, 120), np.linspace(0, page_h, 80))
+    field = shape.at(np.column_stack([x.ravel(), y.ravel()])).reshape(*x.shape, 3)
+    low, high = float(field.min()), float(field.max())
+    grid = figure.subplots(1, 3, sharey=True)
+    image: Any = None
+    for channel, axes in enumerate(grid):
+        image = axes.imshow(
+            field[..., channel],
+            extent=(0, page_w, page_h, 0),
+            cmap="cividis",
+            vmin=low,
+            vmax=high,
+            interpolation="bilinear",
+        )
+        levels = np.arange(np.floor(low * 50) / 50, high + 0.02, 0.02)
+        axes.contour(x, y, field[..., channel], levels=levels, colors="white", linewidths=0.5, alpha=0.7)
+        axes.set(title="RGB"[channel], xlabel="mm")
+    grid[0].set_ylabel("mm")
+    figure.colorbar(image, ax=list(grid), label="light, mean 1", shrink=0.85)
+
+
+def _chromaticities(figure: Any, codes: _Array, black_body: npt.NDArray[np.bool_], white: _Array, seen: str) -> None:
+    figure.set_size_inches(10, 3.7)
+    planned = decode_srgb(codes / 255)
+    panels = figure.subplots(1, 3)
+    for axes, linear, title, coloured in (
+        (panels[0], planned, "as projected", False),
+        (panels[1], white, seen, False),
+        (panels[2], white, f"{seen}, in colour", True),
+    ):
+        lit = linear.sum(axis=1) > 0
+        r, _, b = (linear[lit] / linear[lit].sum(axis=1, keepdims=True)).T
+        body = black_body[lit]
+        colour = linear[lit] / linear[lit].max(axis=1, keepdims=True)
+        colour = np.clip(colour, 0, 1) ** (1 / 2.2)
+        size = 14 if lit.sum() > 200 else 30
+        plain: Any = colour if coloured else _INK
+        axes.plot([0, 1, 0, 0], [0, 0, 1, 0], color="0.8", linewidth=0.8, zorder=1)
+        axes.scatter(r[~body], b[~body], s=size, c=plain[~body] if coloured else plain, linewidths=0, zorder=2)
+        axes.scatter(
+            r[body],
+            b[body],
+            s=size,
+            facecolors=colour[body] if coloured else "white",
+            edgecolors=_MARK,
+            linewidths=1.1,
+            zorder=3,
+        )
+        axes.set(title=title, xlabel="r", aspect="equal", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
+    panels[0].set_ylabel("b")
+
+
+def _course(figure: Any, result: BuildResult) -> None:
+    figure.set_size_inches(10, 2.8)
+    black, shift, white = figure.subplots(1, 3)
+    count = np.arange(len(result.frames))
+    level = np.array([figures.black.mean() for figures in result.frames])
+    black.plot(count, level, ".", color=_INK, markersize=3)
+    black.set(title="black level", ylabel="counts", xlabel="frame")
+    middle = float(np.median(level)) if len(level) else 0.0
+    black.set_ylim(middle - max(1.0, float(np.ptp(level))), middle + max(1.0, float(np.ptp(level))))
+    moved = [figures.shift.length_px for figures in result.frames]
+    shift.plot(count, moved, ".", color=_INK, markersize=3)
+    shift.axhline(0.1, color=_MARK, linewidth=0.8, linestyle=(0, (4, 3)))
+    shift.set(
+        title="movement of the chart", ylabel="px", xlabel="frame", ylim=(0, max(0.12, 1.1 * max(moved, default=0)))
+    )
+    at = [number for number, figures in enumerate(result.frames) if figures.record.kind == "white"]
+    whites = np.array([result.frames[number].paper.white for number in at]).reshape(-1, 3)
+    if len(whites):
+        for channel in range(3):
+            white.plot(
+                at,
+                100 * (whites[:, channel] / whites[0, channel] - 1),
+                ".-",
+                color=_CHANNEL_INK[channel],
+                label="RGB"[channel],
+                linewidth=0.9,
+            )
+        white.legend(frameon=False, fontsize=8)
+    white.axhline(0, color="0.8", linewidth=0.8, zorder=0)
+    white.set(title="bare paper under white", ylabel="% of the first", xlabel="frame")
+
+
+def _worst(figure: Any, picture: _Image, chart: Chart, registration: Registration) -> None:
+    figure.set_size_inches(10, 3.1)
+    height, width = picture.shape[:2]
+    places = registration.to_pixels(chart.centres_mm)
+    reach = WINDOW // 2
+    columns, rows = np.rint(places).astype(int).T
+    inside = (columns >= reach) & (rows >= reach) & (columns < width - reach) & (rows < height - reach)
+    offsets = np.arange(-reach, reach + 1)
+    at = np.flatnonzero(inside)
+    samples = picture[rows[at, None, None] + offsets[:, None], columns[at, None, None] + offsets]
+    samples = samples.reshape(len(at), WINDOW * WINDOW, 3)
+    inner = np.zeros((WINDOW, WINDOW), dtype=bool)
+    inner[1:-1, 1:-1] = True
+    difference = np.abs(samples[:, inner.ravel()].mean(axis=1) - samples[:, ~inner.ravel()].mean(axis=1))
+    sigma = noise_of(samples) * np.sqrt(1 / 9 + 1 / 16)
+    score = (difference / np.maximum(sigma, 1e-6)).max(axis=1)
+    shown = _stretched(picture)
+    order = np.argsort(-score)[:_WORST]
+    for axes, index in zip(figure.subplots(2, _WORST // 2).ravel(), order, strict=False):
+        cell = int(at[index])
+        _magnified(axes, shown, places[cell], 0.95 * registration.cell_px, chart, registration, places)
+        red, green, blue = chart.rgb[cell]
+        axes.set_title(f"{red} {green} {blue}\n{score[index]:.1f} σ", fontsize=8)
