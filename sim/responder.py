@@ -1,0 +1,44 @@
+"""The other end of PTP: what a simulated device asks to be, whatever cable serves it.
+
+`sim.eos` is one; `sim.usb`, `sim.ptpip_server` and `sim.usbip` put it on a cable. A responder knows operations and
+state; it knows neither containers nor packets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from drivers.ptp.messages import Event, Request, Response
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A response, and the data phase before it; None where there is none (an empty one is b"")."""
+
+    response: Response
+    data: bytes | None = None
+
+
+class Responder(Protocol):
+    """A device that answers one request at a time."""
+
+    def takes_data(self, request: Request) -> bool:
+        """Return whether the initiator sends a data phase with this operation."""
+        ...
+
+    def answer(self, request: Request, data: bytes | None) -> Answer:
+        """Carry out a request; `data` is the initiator's data phase."""
+        ...
+
+    def events(self) -> tuple[Event, ...]:
+        """Return the events that have come up since the last call."""
+        ...
+
+    def cancelled(self, transaction: int) -> None:
+        """Note that the initiator gave up a transaction."""
+        ...
+
+    def unplugged(self) -> None:
+        """Note that the cable was pulled or reset: the session is over."""
+        ...
