@@ -19,6 +19,7 @@ import hashlib
 import importlib.metadata
 import io
 import os
+import zlib
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -338,7 +339,7 @@ def generate_dataset(
         used = sorted({image.entry.illumination for image in written})
         description = Description(
             software=software(),
-            libraries={name: importlib.metadata.version(name) for name in _LIBRARIES},
+            libraries=libraries(),
             table=_table_of(lut),
             seed=seed,
             options={"format": form, "max_side": max_side, "lights": choice.describe(), "previews": previews},
@@ -362,7 +363,12 @@ def generate_dataset(
     return open_dataset(folder)
 
 
-_LIBRARIES = ("numpy", "OpenImageIO", "opencv-contrib-python-headless")
+def libraries() -> dict[str, str]:
+    """Return the versions of what decodes sources and encodes images: other versions may give other bytes."""
+    versions = {
+        name: importlib.metadata.version(name) for name in ("numpy", "OpenImageIO", "opencv-contrib-python-headless")
+    }
+    return {**versions, "zlib": zlib.ZLIB_RUNTIME_VERSION}
 
 
 def software() -> str:

@@ -193,7 +193,11 @@ def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
         opaque = alpha[..., None]
         white = (1.0 - opaque) * (1.0 if linear else 255.0)
         values = (values if associated else values * opaque) + white
-    codes = _encode(values) if linear else np.rint(np.clip(values, 0, 255)).astype(np.uint8)
+    if linear:
+        codes = _encode(values)
+    else:
+        # Rounding takes seconds on a large picture, and codes of 8 bits have nothing to round.
+        codes = (values if values.dtype == np.uint8 else np.rint(np.clip(values, 0, 255))).astype(np.uint8, copy=False)
     return _shrink(_turn(codes, orientation), max_side)
 
 
@@ -234,8 +238,10 @@ def _read(path: Path) -> tuple[npt.NDArray[Any], npt.NDArray[np.float64] | None,
         if alpha.min() == 1.0:
             alpha = None
     colours = [channel for channel in range(spec.nchannels) if channel != alpha_channel]
-    chosen = colours[:3] if len(colours) >= 3 else [colours[0]] * 3 if colours else [0, 0, 0]
-    values = pixels[..., chosen]
+    if colours[:3] == [0, 1, 2]:
+        values = pixels[..., :3]
+    else:
+        values = pixels[..., colours[:3] if len(colours) >= 3 else [colours[0] if colours else 0] * 3]
     if values.dtype == np.uint16:
         values = ((values.astype(np.uint32) + 128) // 257).astype(np.uint8)
     elif floating:

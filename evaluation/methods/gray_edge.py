@@ -54,14 +54,21 @@ class GrayEdge:
         """Return the light (3,) float64 of unit length; grey where no pixel may be used. See `Method.estimate`."""
         border = math.floor(self.sigma) + 1 if self.border is None else self.border
         used = usable(image, saturation, mask, border)
-        values = differentiate(image.astype(np.float32), self.order, self.sigma)[used].astype(np.float64)
-        if not values.size:
-            return unit(np.zeros(3))
-        peak = values.max(axis=0)
-        if math.isinf(self.p) or not peak.max():
-            return unit(peak)
-        # Scaled by the peak so that no power over- or underflows.
-        return unit(((values / peak.max()) ** self.p).sum(axis=0) ** (1 / self.p))
+        response = differentiate(image.astype(np.float32), self.order, self.sigma)
+        channels = [response[..., channel][used] for channel in range(3)]
+        peaks = np.array([channel.max(initial=0.0) for channel in channels], dtype=np.float64)
+        if math.isinf(self.p) or not peaks.max():
+            return unit(peaks)
+        return unit([_minkowski(channel, self.p, float(peaks.max())) for channel in channels])
+
+
+def _minkowski(values: npt.NDArray[np.float32], p: float, scale: float) -> float:
+    """Return the p-norm of values (N,) ≥ 0 over `scale`, which keeps powers from over- and underflowing."""
+    if p == 1:
+        return float(values.sum(dtype=np.float64)) / scale
+    scaled = values / np.float32(scale)
+    powers = scaled * scaled if p == 2 else scaled**p
+    return float(powers.sum(dtype=np.float64)) ** (1 / p)
 
 
 def differentiate(image: npt.NDArray[np.float32], order: int, sigma: float) -> npt.NDArray[np.float32]:
@@ -74,7 +81,8 @@ def differentiate(image: npt.NDArray[np.float32], order: int, sigma: float) -> n
     if order == 0:
         return np.abs(_filter(image, sigma, 0, 0))
     if order == 1:
-        return np.hypot(_filter(image, sigma, 1, 0), _filter(image, sigma, 0, 1))
+        along_x, along_y = _filter(image, sigma, 1, 0), _filter(image, sigma, 0, 1)
+        return np.sqrt(along_x**2 + along_y**2)
     xx, xy, yy = (_filter(image, sigma, *orders) for orders in ((2, 0), (1, 1), (0, 2)))
     return np.sqrt(xx**2 + 4 * xy**2 + yy**2)
 

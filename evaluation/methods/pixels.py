@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -10,7 +12,10 @@ GREY = np.full(3, 3**-0.5)
 
 
 def usable(
-    image: npt.NDArray[np.generic], saturation: float | None, mask: npt.NDArray[np.bool_] | None, border: int
+    image: npt.NDArray[np.integer[Any]] | npt.NDArray[np.floating[Any]],
+    saturation: float | None,
+    mask: npt.NDArray[np.bool_] | None,
+    border: int,
 ) -> npt.NDArray[np.bool_]:
     """Return (H, W) bool, True where a pixel may be used.
 
@@ -23,7 +28,9 @@ def usable(
     if saturation is None:
         free = np.ones((height, width), dtype=bool)
     else:
-        clipped = (image.max(axis=2) >= saturation).astype(np.uint8)
+        clipped = (
+            (image[..., 0] >= saturation) | (image[..., 1] >= saturation) | (image[..., 2] >= saturation)
+        ).astype(np.uint8)
         free = cv2.dilate(clipped, np.ones((3, 3), np.uint8)) == 0
     if mask is not None:
         free = free & ~mask

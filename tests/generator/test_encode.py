@@ -55,3 +55,15 @@ def test_other_arrays_are_refused() -> None:
         encode_image(np.zeros((4, 4), np.uint16))
     with pytest.raises(InputError, match=r"the image is uint16 \(0, 4, 3\)"):
         encode_image(np.zeros((0, 4, 3), np.uint16))
+
+
+def test_large_data_are_cut_into_chunks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 65536, (20, 30, 3)).astype(np.uint16)
+    monkeypatch.setattr("generator.encode.LARGEST_CHUNK", 1000)
+    data = encode_image(image)
+    assert data.count(b"IDAT") == 4
+    path = tmp_path / "image.png"
+    path.write_bytes(data)
+    stream = oiio.ImageInput.open(str(path))
+    assert stream is not None
+    np.testing.assert_array_equal(stream.read_image("uint16"), image)
