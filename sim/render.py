@@ -124,7 +124,7 @@ def light(
     vignetting
         (3,) float64: x, y and c; the lens passes 1 / (1 + c r²)² at r photosites from there.
     falloff
-        (3, 3) float64, for each primary x, y and c: the projector gives 1 / (1 + c d²) at d mm from there.
+        (3, 4) float64, for each primary x, y, c and g: the projector gives g / (1 + c d²) at d mm from there.
     response
         (rows, columns) float32, response of each photosite, about 1.
     out
@@ -192,11 +192,11 @@ def light(
                 passed = 1 / (1 + vignetting[2] * (off_x * off_x + off_y * off_y))
                 passed *= passed * response[row, x]
                 du, dv = u - falloff[0, 0], v - falloff[0, 1]
-                out[0, row, x] = red * passed / (1 + falloff[0, 2] * (du * du + dv * dv))
+                out[0, row, x] = red * passed * falloff[0, 3] / (1 + falloff[0, 2] * (du * du + dv * dv))
                 du, dv = u - falloff[1, 0], v - falloff[1, 1]
-                out[1, row, x] = green * passed / (1 + falloff[1, 2] * (du * du + dv * dv))
+                out[1, row, x] = green * passed * falloff[1, 3] / (1 + falloff[1, 2] * (du * du + dv * dv))
                 du, dv = u - falloff[2, 0], v - falloff[2, 1]
-                out[2, row, x] = blue * passed / (1 + falloff[2, 2] * (du * du + dv * dv))
+                out[2, row, x] = blue * passed * falloff[2, 3] / (1 + falloff[2, 2] * (du * du + dv * dv))
 
 
 @njit(cache=True, nogil=True, fastmath=False)

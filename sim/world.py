@@ -188,6 +188,7 @@ class World:
         paper = np.einsum("pl,l,lc->c", self._primaries, print_reflectance([_PAPER])[0], self._sensitivities)
         self._dn = room.white_level_share * (body.saturation - body.black) / float(paper.max())
         self._lens, self._falloff = self._shading()
+        self._falloff[:, 3] = self._balance()
         self._lock = threading.Lock()
         self._light: NDArray[np.float32] | None = None
 
@@ -287,16 +288,17 @@ class World:
         Returns
         -------
         ndarray
-            (..., 3) float64, for each primary of the projector (red, green, blue), at most 1: the lens is 1 on its
-            axis and a primary 1 at its brightest point. A camera channel sees the mean of the three weighted by what
-            it receives of each.
+            (..., 3) float64, for each primary of the projector (red, green, blue). The lens is 1 on its axis and green
+            1 at its brightest point; red and blue are balanced so that the three have one mean over the sheet. So
+            `white` has the chromaticity of the light that the sheet receives on the whole. A camera channel sees the
+            mean of the three weighted by what it receives of each.
         """
         points = np.asarray(points_mm, dtype=np.float64)
         photosites = 2 * self.project(points) + 0.5
         from_axis = ((photosites - self._lens[:2]) ** 2).sum(axis=-1)
         passed = 1 / (1 + self._lens[2] * from_axis) ** 2
         from_spot = ((points[..., None, :] - self._falloff[:, :2]) ** 2).sum(axis=-1)
-        return passed[..., None] / (1 + self._falloff[:, 2] * from_spot)
+        return passed[..., None] * self._falloff[:, 3] / (1 + self._falloff[:, 2] * from_spot)
 
     def _shading(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the constants of the lens's and the projector's falloff, as `sim.render.light` takes them."""
@@ -310,7 +312,14 @@ class World:
         lost = room.projector_falloff * (1 + room.primary_difference * np.array([-1.0, 0.0, 1.0]))
         aside = np.array([0.05, -0.1]) + room.primary_difference * random.uniform(-0.5, 0.5, (3, 2))
         spots = page / 2 + half_diagonal * aside
-        return lens, np.column_stack([spots, lost / (1 - lost) / half_diagonal**2])
+        return lens, np.column_stack([spots, lost / (1 - lost) / half_diagonal**2, np.ones(3)])
+
+    def _balance(self) -> NDArray[np.float64]:
+        """Return (3,) the gains of the primaries that give all three green's mean over the sheet."""
+        width, height = self.sheet.page_mm
+        x, y = np.meshgrid((np.arange(60) + 0.5) * width / 60, (np.arange(40) + 0.5) * height / 40)
+        means = self.field(np.stack([x, y], axis=-1)).mean(axis=(0, 1))
+        return means[1] / means
 
     def _turned(self, settings: ExposureSettings, key: tuple[int, ...]) -> NDArray[np.float64]:
         """Return (3,) the light of each primary that the wheel lets through, over that of steady light."""

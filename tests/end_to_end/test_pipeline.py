@@ -1,0 +1,216 @@
+"""The whole way once, through the commands: chart, lights, session, table, images, evaluation."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from acquisition.config import load_lab
+from acquisition.rig import sheet, simulated_body, simulated_room
+from acquisition.session import Session
+from calibration.lut import Lut, open_lut
+from drivers.errors import FormatError
+from sim.world import World
+
+Run = Callable[..., int]
+
+LAB = """
+rig = "simulated"
+chart = "chart/chart.json"
+illuminations = "illuminations.csv"
+[simulated]
+body = "Test"
+seed = 11
+"""
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    """Return a function that runs a command as the shell would and returns its exit code."""
+
+    def call(module: str, *arguments: object) -> int:
+        before = sys.argv
+        sys.argv = [module, *map(str, arguments)]
+        try:
+            return importlib.import_module(module).main()
+        finally:
+            sys.argv = before
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory, run: Run) -> Path:
+    """Return a folder with a chart of 512 colours, a session of seven lights, and its table."""
+    folder = tmp_path_factory.mktemp("lab")
+    assert run("acquisition.cli", "chart", folder / "chart", "--bits", 3, "--no-tiff") == 0
+    lights = folder / "illuminations.csv"
+    assert run("acquisition.cli", "illuminations", lights, "--grid", 1, "--blackbodies", "2500:10000:2500") == 0
+    (folder / "LAB.toml").write_text(LAB)
+    assert run("acquisition.cli", "check", folder / "LAB.toml") == 0
+    assert run("acquisition.cli", "run", folder / "LAB.toml", folder / "session") == 0
+    assert run("calibration.cli", folder / "session", folder / "lut") == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def lut(built: Path) -> Lut:
+    return open_lut(built / "lut")
+
+
+@pytest.fixture(scope="module")
+def pictures(built: Path) -> Path:
+    """Return a folder with two pictures: one plain, one with an edge; and one file that is no picture."""
+    folder = built / "pictures"
+    folder.mkdir()
+    plain = np.full((80, 120, 3), (200, 90, 40), dtype=np.uint8)
+    halves = plain.copy()
+    halves[:, 60:] = (30, 220, 130)
+    cv2.imwrite(str(folder / "a_plain.png"), plain[..., ::-1])
+    cv2.imwrite(str(folder / "b_halves.png"), halves[..., ::-1])
+    (folder / "c_broken.png").write_bytes(b"\x89PNG\r\n\x1a\nnothing")
+    return folder
+
+
+def test_the_table_has_the_promised_form(lut: Lut, built: Path) -> None:
+    assert lut.samples.shape == (7, 512, 25, 3)
+    assert lut.samples.dtype == np.dtype("<u2")
+    assert lut.samples.flags.c_contiguous
+    header = (built / "lut" / "illuminations.csv").read_text().splitlines()[0]
+    assert header == "index,kind,cct_k,red,green,blue,white_r,white_g,white_b"
+    assert (built / "lut" / "report.html").is_file()
+    assert lut.provenance.bits == 3
+
+
+def test_the_ground_truth_is_the_rooms_white(lut: Lut, built: Path) -> None:
+    settings = load_lab(built / "LAB.toml")
+    with Session.open(built / "session") as session:
+        world = World(sheet(session.chart), simulated_body(settings), simulated_room(settings))
+    truth = np.array([world.white(light.colour, settings.camera.exposure) for light in lut.illuminations])
+    cosine = (truth * lut.white).sum(1) / np.linalg.norm(truth, axis=1) / np.linalg.norm(lut.white, axis=1)
+    degrees = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    assert np.median(degrees) <= 0.2
+    assert degrees.max() <= 0.5
+
+
+def test_a_generated_patch_has_the_tables_mean(lut: Lut, built: Path, pictures: Path, run: Run) -> None:
+    out = built / "dataset"
+    assert run("generator.cli", built / "lut", out, "--sources", pictures, "--illuminations", "3,5", "--seed", 4) == 0
+    with (out / "ground_truth.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 4, "two pictures under two lights; the broken one is left out"
+    colour = (200 >> 5) << 6 | (90 >> 5) << 3 | 40 >> 5
+    for row in rows:
+        image = cv2.imread(str(next((out / "images").glob(f"{row['image'].split('.')[0]}*"))), cv2.IMREAD_UNCHANGED)
+        assert image is not None
+        assert image.dtype == np.uint16
+        patch = image[:, :60, ::-1].reshape(-1, 3).astype(np.float64)
+        samples = lut.samples[int(row["illumination"]), colour].astype(np.float64)
+        error = samples.std(axis=0) / np.sqrt(len(patch))
+        # Six standard errors: each of the 12 comparisons fails by chance once in 5·10⁸.
+        assert (np.abs(patch.mean(axis=0) - samples.mean(axis=0)) <= 6 * error + 1e-9).all()
+        truth = lut.ground_truth[int(row["illumination"])]
+        assert [float(row[c]) for c in "rgb"] == pytest.approx(truth.tolist(), abs=1e-6)
+    assert len((out / "gt.txt").read_text().splitlines()) == 4
+    assert "seed" in json.loads((out / "dataset.json").read_text())["options"] or "seed" in json.loads(
+        (out / "dataset.json").read_text()
+    )
+
+
+def test_the_same_seed_gives_the_same_bytes(built: Path, pictures: Path, run: Run) -> None:
+    hashes: list[dict[str, str]] = []
+    for name, workers in (("once", 1), ("again", 3)):
+        out = built / name
+        arguments = ("--sources", pictures, "--random", 2, "--seed", 9, "--workers", workers)
+        assert run("generator.cli", built / "lut", out, *arguments) == 0
+        files = [path for path in sorted(out.rglob("*")) if path.is_file() and path.name != "dataset.json"]
+        hashes.append({str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files})
+    assert hashes[0] == hashes[1]
+    other = built / "other"
+    assert run("generator.cli", built / "lut", other, "--sources", pictures, "--random", 2, "--seed", 10) == 0
+    images = [hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted((other / "images").iterdir())]
+    assert not set(images) & set(hashes[0].values())
+
+
+def test_the_dataset_can_be_evaluated(built: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("evaluation.cli", built / "dataset") == 0
+    assert "Gray-world" in capsys.readouterr().out
+
+
+def test_an_interrupted_session_gives_the_same_table(built: Path, run: Run, lut: Lut) -> None:
+    from acquisition.taking import run_session
+
+    settings = load_lab(built / "LAB.toml")
+    session = built / "interrupted"
+
+    def interrupt(done: int, total: int) -> None:
+        if done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_session(settings, session, interrupt)
+    assert run("acquisition.cli", "run", built / "LAB.toml", session) == 0
+    assert run("calibration.cli", session, built / "lut2") == 0
+    for name in ("samples.npy", "illuminations.csv", "lut.json"):
+        assert (built / "lut2" / name).read_bytes() == (built / "lut" / name).read_bytes(), name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("calibration.cli", "empty", "out"), "no session"),
+        (("calibration.cli", "session", "lut"), "already exists"),
+        (("generator.cli", "session", "out", "--sources", "pictures"), "no table"),
+        (("generator.cli", "lut", "pictures", "--sources", "pictures"), "already exists"),
+        (("generator.cli", "lut", "out", "--sources", "empty"), ""),
+        (("generator.cli", "lut", "out", "--sources", "nowhere"), "nowhere"),
+        (("generator.cli", "lut", "out", "--sources", "pictures", "--illuminations", "99"), "99"),
+        (("evaluation.cli", "session"), ""),
+    ],
+)
+def test_what_cannot_be_used_is_one_sentence(
+    built: Path,
+    pictures: Path,
+    run: Run,
+    arguments: tuple[str, ...],
+    expected: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (built / "empty").mkdir(exist_ok=True)
+    before = sorted(built.iterdir())
+    monkeypatch.chdir(built)
+    assert run(*arguments) == 2
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert message.startswith("error: ")
+    assert expected in message
+    assert sorted(built.iterdir()) == before, "nothing new, nothing lost"
+
+
+def test_a_table_of_another_version_is_named(built: Path, lut: Lut, tmp_path: Path) -> None:
+    head = json.loads((built / "lut" / "lut.json").read_text())
+    head["version"] = 2
+    for name in ("illuminations.csv", "samples.npy"):
+        (tmp_path / name).write_bytes((built / "lut" / name).read_bytes())
+    (tmp_path / "lut.json").write_text(json.dumps(head))
+    with pytest.raises(FormatError, match="version 2, this software reads version 1"):
+        open_lut(tmp_path)
+
+
+def test_a_session_without_frames_is_said(built: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    from acquisition.taking import open_session
+
+    settings = load_lab(built / "LAB.toml")
+    open_session(settings, built / "bare").close()
+    assert run("calibration.cli", built / "bare", built / "never") in (2, 4)
+    assert "frame" in capsys.readouterr().err
+    assert not (built / "never").exists()
