@@ -1,0 +1,1 @@
+"""PTP, the picture transfer protocol of cameras: its wires, its transports and the cameras that speak it."""

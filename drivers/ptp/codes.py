@@ -1,0 +1,416 @@
+"""The numbers of PTP and their names: the standard's, and Canon's for its EOS bodies.
+
+Messages carry plain integers, for a device may use codes that no one has named; `describe` turns one into words.
+Canon's meanings hold for EOS bodies alone: other makers use the same numbers for other things.
+
+Sources: ISO 15740:2013, tables of clauses 10 to 13; Canon's extensions have no public standard, their numbers were
+found on the wire and are those that libgphoto2 names.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Operation(IntEnum):
+    """What an initiator can ask for; from 0x9000 Canon's."""
+
+    GET_DEVICE_INFO = 0x1001
+    OPEN_SESSION = 0x1002
+    CLOSE_SESSION = 0x1003
+    GET_STORAGE_IDS = 0x1004
+    GET_STORAGE_INFO = 0x1005
+    GET_NUM_OBJECTS = 0x1006
+    GET_OBJECT_HANDLES = 0x1007
+    GET_OBJECT_INFO = 0x1008
+    GET_OBJECT = 0x1009
+    GET_THUMB = 0x100A
+    DELETE_OBJECT = 0x100B
+    SEND_OBJECT_INFO = 0x100C
+    SEND_OBJECT = 0x100D
+    INITIATE_CAPTURE = 0x100E
+    FORMAT_STORE = 0x100F
+    RESET_DEVICE = 0x1010
+    SELF_TEST = 0x1011
+    SET_OBJECT_PROTECTION = 0x1012
+    POWER_DOWN = 0x1013
+    GET_DEVICE_PROP_DESC = 0x1014
+    GET_DEVICE_PROP_VALUE = 0x1015
+    SET_DEVICE_PROP_VALUE = 0x1016
+    RESET_DEVICE_PROP_VALUE = 0x1017
+    TERMINATE_OPEN_CAPTURE = 0x1018
+    MOVE_OBJECT = 0x1019
+    COPY_OBJECT = 0x101A
+    GET_PARTIAL_OBJECT = 0x101B
+    INITIATE_OPEN_CAPTURE = 0x101C
+
+    EOS_GET_STORAGE_IDS = 0x9101
+    EOS_GET_STORAGE_INFO = 0x9102
+    EOS_GET_OBJECT_INFO = 0x9103
+    EOS_GET_OBJECT = 0x9104
+    EOS_DELETE_OBJECT = 0x9105
+    EOS_FORMAT_STORE = 0x9106
+    EOS_GET_PARTIAL_OBJECT = 0x9107
+    EOS_GET_DEVICE_INFO_EX = 0x9108
+    EOS_GET_OBJECT_INFO_EX = 0x9109
+    EOS_GET_THUMB_EX = 0x910A
+    EOS_REMOTE_RELEASE = 0x910F
+    EOS_SET_DEVICE_PROP_VALUE_EX = 0x9110
+    EOS_GET_REMOTE_MODE = 0x9113
+    EOS_SET_REMOTE_MODE = 0x9114
+    EOS_SET_EVENT_MODE = 0x9115
+    EOS_GET_EVENT = 0x9116
+    EOS_TRANSFER_COMPLETE = 0x9117
+    EOS_CANCEL_TRANSFER = 0x9118
+    EOS_RESET_TRANSFER = 0x9119
+    EOS_PC_HDD_CAPACITY = 0x911A
+    EOS_SET_UI_LOCK = 0x911B
+    EOS_RESET_UI_LOCK = 0x911C
+    EOS_KEEP_DEVICE_ON = 0x911D
+    EOS_SET_NULL_PACKET_MODE = 0x911E
+    EOS_BULB_START = 0x9125
+    EOS_BULB_END = 0x9126
+    EOS_REQUEST_DEVICE_PROP_VALUE = 0x9127
+    EOS_REMOTE_RELEASE_ON = 0x9128
+    EOS_REMOTE_RELEASE_OFF = 0x9129
+    EOS_RESET_MIRROR_LOCKUP_STATE = 0x9130
+    EOS_SET_REQUEST_OLC_INFO_GROUP = 0x913D
+    EOS_INITIATE_VIEWFINDER = 0x9151
+    EOS_TERMINATE_VIEWFINDER = 0x9152
+    EOS_GET_VIEWFINDER_DATA = 0x9153
+    EOS_DO_AF = 0x9154
+    EOS_DRIVE_LENS = 0x9155
+    EOS_AF_CANCEL = 0x9160
+    EOS_GET_OBJECT_INFO_64 = 0x9170
+    EOS_GET_OBJECT_64 = 0x9171
+    EOS_GET_PARTIAL_OBJECT_64 = 0x9172
+    EOS_GET_OBJECT_INFO_EX_64 = 0x9173
+    EOS_GET_PARTIAL_OBJECT_EX_64 = 0x9174
+
+
+class ResponseCode(IntEnum):
+    """How an operation ended; from 0xa000 Canon's."""
+
+    UNDEFINED = 0x2000
+    OK = 0x2001
+    GENERAL_ERROR = 0x2002
+    SESSION_NOT_OPEN = 0x2003
+    INVALID_TRANSACTION_ID = 0x2004
+    OPERATION_NOT_SUPPORTED = 0x2005
+    PARAMETER_NOT_SUPPORTED = 0x2006
+    INCOMPLETE_TRANSFER = 0x2007
+    INVALID_STORAGE_ID = 0x2008
+    INVALID_OBJECT_HANDLE = 0x2009
+    DEVICE_PROP_NOT_SUPPORTED = 0x200A
+    INVALID_OBJECT_FORMAT_CODE = 0x200B
+    STORE_FULL = 0x200C
+    OBJECT_WRITE_PROTECTED = 0x200D
+    STORE_READ_ONLY = 0x200E
+    ACCESS_DENIED = 0x200F
+    NO_THUMBNAIL_PRESENT = 0x2010
+    SELF_TEST_FAILED = 0x2011
+    PARTIAL_DELETION = 0x2012
+    STORE_NOT_AVAILABLE = 0x2013
+    SPECIFICATION_BY_FORMAT_UNSUPPORTED = 0x2014
+    NO_VALID_OBJECT_INFO = 0x2015
+    INVALID_CODE_FORMAT = 0x2016
+    UNKNOWN_VENDOR_CODE = 0x2017
+    CAPTURE_ALREADY_TERMINATED = 0x2018
+    DEVICE_BUSY = 0x2019
+    INVALID_PARENT_OBJECT = 0x201A
+    INVALID_DEVICE_PROP_FORMAT = 0x201B
+    INVALID_DEVICE_PROP_VALUE = 0x201C
+    INVALID_PARAMETER = 0x201D
+    SESSION_ALREADY_OPEN = 0x201E
+    TRANSACTION_CANCELLED = 0x201F
+    SPECIFICATION_OF_DESTINATION_UNSUPPORTED = 0x2020
+
+    EOS_UNKNOWN_COMMAND = 0xA001
+    EOS_OPERATION_REFUSED = 0xA005
+    EOS_LENS_COVER_CLOSED = 0xA006
+    EOS_LOW_BATTERY = 0xA101
+    EOS_OBJECT_NOT_READY = 0xA102
+    EOS_CANNOT_MAKE_OBJECT = 0xA104
+    EOS_MEMORY_STATUS_NOT_READY = 0xA106
+
+
+class EventCode(IntEnum):
+    """What a device tells on its event channel; from 0xc000 Canon's."""
+
+    UNDEFINED = 0x4000
+    CANCEL_TRANSACTION = 0x4001
+    OBJECT_ADDED = 0x4002
+    OBJECT_REMOVED = 0x4003
+    STORE_ADDED = 0x4004
+    STORE_REMOVED = 0x4005
+    DEVICE_PROP_CHANGED = 0x4006
+    OBJECT_INFO_CHANGED = 0x4007
+    DEVICE_INFO_CHANGED = 0x4008
+    REQUEST_OBJECT_TRANSFER = 0x4009
+    STORE_FULL = 0x400A
+    DEVICE_RESET = 0x400B
+    STORAGE_INFO_CHANGED = 0x400C
+    CAPTURE_COMPLETE = 0x400D
+    UNREPORTED_STATUS = 0x400E
+
+    EOS_REQUEST_GET_EVENT = 0xC101
+
+
+class EosEvent(IntEnum):
+    """The kinds of records in what GetEvent answers."""
+
+    END = 0
+    OBJECT_ADDED = 0xC181
+    OBJECT_REMOVED = 0xC182
+    REQUEST_GET_OBJECT_INFO = 0xC183
+    STORAGE_STATUS_CHANGED = 0xC184
+    STORAGE_INFO_CHANGED = 0xC185
+    REQUEST_OBJECT_TRANSFER = 0xC186
+    OBJECT_INFO_CHANGED = 0xC187
+    OBJECT_CONTENT_CHANGED = 0xC188
+    PROPERTY_CHANGED = 0xC189
+    AVAILABLE_LIST_CHANGED = 0xC18A
+    CAMERA_STATUS_CHANGED = 0xC18B
+    WILL_SOON_SHUT_DOWN = 0xC18D
+    SHUTDOWN_TIMER_UPDATED = 0xC18E
+    REQUEST_CANCEL_TRANSFER = 0xC18F
+    REQUEST_OBJECT_TRANSFER_DT = 0xC190
+    REQUEST_CANCEL_TRANSFER_DT = 0xC191
+    STORE_ADDED = 0xC192
+    STORE_REMOVED = 0xC193
+    BULB_EXPOSURE_TIME = 0xC194
+    RECORDING_TIME = 0xC195
+    AF_RESULT = 0xC1A3
+    CTG_INFO_CHECK_COMPLETE = 0xC1A4
+    OLC_INFO_CHANGED = 0xC1A5
+    OBJECT_ADDED_64 = 0xC1A7
+    OBJECT_INFO_CHANGED_64 = 0xC1A8
+    REQUEST_OBJECT_TRANSFER_64 = 0xC1A9
+    OBJECT_ADDED_64_LFN = 0xC1B6
+    OBJECT_INFO_CHANGED_64_LFN = 0xC1B7
+    REQUEST_OBJECT_TRANSFER_64_LFN = 0xC1B8
+
+
+class ObjectFormat(IntEnum):
+    """What an object is; from 0xb100 Canon's."""
+
+    UNDEFINED = 0x3000
+    ASSOCIATION = 0x3001
+    SCRIPT = 0x3002
+    TEXT = 0x3004
+    DPOF = 0x3006
+    WAV = 0x3008
+    AVI = 0x300A
+    MPEG = 0x300B
+    EXIF_JPEG = 0x3801
+    TIFF_EP = 0x3802
+    JFIF = 0x3808
+    PNG = 0x380B
+    TIFF = 0x380D
+    DNG = 0x3811
+    CRW = 0xB101
+    CR2 = 0xB103
+    MOV = 0xB104
+    MOV2 = 0xB105
+    CR3 = 0xB108
+
+
+class Property(IntEnum):
+    """Settings and states of a device; from 0xd100 Canon's."""
+
+    BATTERY_LEVEL = 0x5001
+    FUNCTIONAL_MODE = 0x5002
+    IMAGE_SIZE = 0x5003
+    COMPRESSION_SETTING = 0x5004
+    WHITE_BALANCE = 0x5005
+    F_NUMBER = 0x5007
+    FOCAL_LENGTH = 0x5008
+    FOCUS_MODE = 0x500A
+    EXPOSURE_TIME = 0x500D
+    EXPOSURE_PROGRAM_MODE = 0x500E
+    EXPOSURE_INDEX = 0x500F
+    EXPOSURE_BIAS_COMPENSATION = 0x5010
+    DATE_TIME = 0x5011
+
+    USE_DEVICE_STAGE = 0xD303
+    DEVICE_FRIENDLY_NAME = 0xD402
+    SESSION_INITIATOR = 0xD406
+    PERCEIVED_DEVICE_TYPE = 0xD407
+
+    EOS_APERTURE = 0xD101
+    EOS_SHUTTER_SPEED = 0xD102
+    EOS_ISO_SPEED = 0xD103
+    EOS_EXPOSURE_COMPENSATION = 0xD104
+    EOS_AE_MODE = 0xD105
+    EOS_DRIVE_MODE = 0xD106
+    EOS_METERING_MODE = 0xD107
+    EOS_FOCUS_MODE = 0xD108
+    EOS_WHITE_BALANCE = 0xD109
+    EOS_COLOUR_TEMPERATURE = 0xD10A
+    EOS_COLOUR_SPACE = 0xD10F
+    EOS_PICTURE_STYLE = 0xD110
+    EOS_BATTERY_POWER = 0xD111
+    EOS_BATTERY_SELECT = 0xD112
+    EOS_CAMERA_TIME = 0xD113
+    EOS_AUTO_POWER_OFF = 0xD114
+    EOS_OWNER = 0xD115
+    EOS_MODEL_ID = 0xD116
+    EOS_PTP_EXTENSION_VERSION = 0xD119
+    EOS_AVAILABLE_SHOTS = 0xD11B
+    EOS_CAPTURE_DESTINATION = 0xD11C
+    EOS_BRACKET_MODE = 0xD11D
+    EOS_CURRENT_STORAGE = 0xD11E
+    EOS_CURRENT_FOLDER = 0xD11F
+    EOS_IMAGE_FORMAT = 0xD120
+    EOS_IMAGE_FORMAT_CF = 0xD121
+    EOS_IMAGE_FORMAT_SD = 0xD122
+    EOS_IMAGE_FORMAT_EXT_HD = 0xD123
+    EOS_MIRROR_UP_SETTING = 0xD13A
+    EOS_HIGHLIGHT_TONE_PRIORITY = 0xD13B
+    EOS_HDR_SETTING = 0xD13D
+    EOS_HIGH_ISO_NOISE_REDUCTION = 0xD178
+    EOS_MULTI_ASPECT = 0xD194
+    EOS_OLC_INFO_VERSION = 0xD199
+    EOS_CUSTOM_FUNCTIONS = 0xD1A0
+    EOS_BATTERY_INFO = 0xD1A6
+    EOS_LENS_STATUS = 0xD1A8
+    EOS_QUICK_REVIEW_TIME = 0xD1A9
+    EOS_TEMPERATURE_STATUS = 0xD1AB
+    EOS_SHUTTER_COUNTER = 0xD1AC
+    EOS_SERIAL_NUMBER = 0xD1AF
+    EOS_EVF_OUTPUT_DEVICE = 0xD1B0
+    EOS_EVF_MODE = 0xD1B1
+    EOS_MIRROR_DOWN_STATUS = 0xD1BD
+    EOS_MIRROR_LOCKUP_STATE = 0xD1BF
+    EOS_FLASH_CHARGING_STATE = 0xD1C0
+    EOS_AUTO_LIGHTING_OPTIMIZER = 0xD1C1
+    EOS_ARTIST = 0xD1D0
+    EOS_COPYRIGHT = 0xD1D1
+    EOS_FOCUS_INFO = 0xD1D3
+    EOS_LENS_NAME = 0xD1D8
+    EOS_AEB = 0xD1D9
+
+
+class DataType(IntEnum):
+    """The type of a property's value; an array's is 0x4000 more."""
+
+    INT8 = 0x0001
+    UINT8 = 0x0002
+    INT16 = 0x0003
+    UINT16 = 0x0004
+    INT32 = 0x0005
+    UINT32 = 0x0006
+    INT64 = 0x0007
+    UINT64 = 0x0008
+    INT128 = 0x0009
+    UINT128 = 0x000A
+    STRING = 0xFFFF
+
+
+class StorageType(IntEnum):
+    """What a store is made of."""
+
+    UNDEFINED = 0
+    FIXED_ROM = 1
+    REMOVABLE_ROM = 2
+    FIXED_RAM = 3
+    REMOVABLE_RAM = 4
+
+
+class FilesystemType(IntEnum):
+    """How a store is ordered."""
+
+    UNDEFINED = 0
+    GENERIC_FLAT = 1
+    GENERIC_HIERARCHICAL = 2
+    DCF = 3
+
+
+class AeMode(IntEnum):
+    """Where the mode dial of an EOS stands (property 0xd105); read-only on bodies with a dial."""
+
+    PROGRAM = 0
+    SHUTTER_PRIORITY = 1
+    APERTURE_PRIORITY = 2
+    MANUAL = 3
+    BULB = 4
+    CUSTOM = 7
+    FULL_AUTO = 9
+
+
+class FocusMode(IntEnum):
+    """How an EOS focuses (property 0xd108)."""
+
+    ONE_SHOT = 0
+    AI_SERVO = 1
+    AI_FOCUS = 2
+    MANUAL = 3
+
+
+class DriveMode(IntEnum):
+    """What a pressed release does (property 0xd106)."""
+
+    SINGLE = 0x00
+    CONTINUOUS = 0x01
+    CONTINUOUS_HIGH = 0x04
+    CONTINUOUS_LOW = 0x05
+    TIMER_CONTINUOUS = 0x07
+    TIMER_10_S = 0x10
+    TIMER_2_S = 0x11
+    SINGLE_SILENT = 0x13
+    CONTINUOUS_SILENT = 0x14
+
+
+class WhiteBalance(IntEnum):
+    """The white balance of an EOS (property 0xd109); raw files carry it as a note only."""
+
+    AUTO = 0x00
+    DAYLIGHT = 0x01
+    CLOUDY = 0x02
+    TUNGSTEN = 0x03
+    FLUORESCENT = 0x04
+    FLASH = 0x05
+    MANUAL = 0x06
+    SHADE = 0x08
+    KELVIN = 0x09
+    PC_1 = 0x0A
+    PC_2 = 0x0B
+    PC_3 = 0x0C
+    AUTO_WHITE = 0x17
+
+
+class CaptureDestination(IntEnum):
+    """Where an EOS puts a frame (property 0xd11c); a body offers some of these, its list decides."""
+
+    CARD = 2
+    HOST = 4
+    CARD_AND_HOST = 6
+
+
+class CameraStatus(IntEnum):
+    """Whether an EOS takes commands (record 0xc18b)."""
+
+    IDLE = 0
+    BUSY = 1
+
+
+class ReleaseButton(IntEnum):
+    """How far the release of an EOS is pressed or let go (RemoteReleaseOn and Off, first parameter)."""
+
+    HALF = 1
+    FULL = 2
+    HALF_AND_FULL = 3
+
+
+VENDOR_CANON_USB = 0x04A9
+"""Canon's USB vendor id."""
+EOS_MODEL_IDS = {0x80000270: "Canon EOS 550D", 0x80000287: "Canon EOS 60D", 0x80000406: "Canon EOS 6D Mark II"}
+"""Property 0xd116 of the bodies that we know."""
+
+
+def describe(kind: type[IntEnum], code: int) -> str:
+    """Return a code for people: ``DEVICE_BUSY (0x2019)``, or ``0x2fff`` where no name is known."""
+    try:
+        return f"{kind(code).name} (0x{code:04x})"
+    except ValueError:
+        return f"0x{code:04x}"

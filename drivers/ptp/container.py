@@ -1,0 +1,280 @@
+"""PTP over USB as bytes: containers on the bulk and interrupt pipes, and the class's control requests.
+
+A container is its length (32 bits, header included), its type (16), a code (16), the transaction (32), then up to
+five parameters of 32 bits, or a payload.
+
+Laws that hold inside:
+
+- `ContainerReader` takes a stream in any pieces and keeps nothing but an unfinished header: the payload of a data
+  phase is handed on as it comes, so that no object ever lies here in full.
+- Lengths are checked before they are believed; whatever arrives, the only error is `ProtocolError`. The stream has
+  then lost its place: every further `feed` raises too, until a new reader is taken.
+- The one thing a stream alone cannot tell is where a data phase of unknown length ends. Only there a piece must be
+  what one read of the pipe returned, for a short packet ends it.
+
+Sources: USB Still Image Capture Device Definition 1.0, clauses 5 (control requests) and 7 (containers);
+ISO 15740:2013, annex D.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+from drivers.errors import ProtocolError
+from drivers.ptp.cursor import Cursor
+from drivers.ptp.datasets import encode_integer
+from drivers.ptp.messages import MAX_PARAMETERS, Event, Request, Response
+
+INTERFACE_CLASS = (6, 1, 1)
+"""USB class, subclass and protocol of a still image device."""
+HEADER_LENGTH = 12
+UNKNOWN_LENGTH = 0xFFFFFFFF
+"""A container's length where the payload goes on until a short packet: more than 4 GiB, or not known."""
+HIGH_SPEED_PACKET = 512
+"""wMaxPacketSize of a bulk pipe at high speed; 64 at full speed, 1024 at super speed."""
+
+
+class ContainerType(IntEnum):
+    """What a container holds."""
+
+    COMMAND = 1
+    DATA = 2
+    RESPONSE = 3
+    EVENT = 4
+
+
+@dataclass(frozen=True)
+class DataStart:
+    """A data phase begins; `length` counts the payload's bytes, None where only a short packet will tell."""
+
+    code: int
+    transaction: int
+    length: int | None
+
+
+@dataclass(frozen=True)
+class DataPiece:
+    """The next bytes of the payload, perhaps none; the piece with `last` closes the data phase."""
+
+    data: bytes
+    last: bool = False
+
+
+Message = Request | Response | Event | DataStart | DataPiece
+
+
+class ContainerReader:
+    """Cuts what comes out of a pipe into messages, however it was split on its way.
+
+    One for each pipe. `packet_size` is the pipe's wMaxPacketSize; it matters only to data phases of unknown length.
+    """
+
+    def __init__(self, packet_size: int = HIGH_SPEED_PACKET) -> None:
+        self._packet_size = packet_size
+        self._rest = bytearray()
+        self._payload_left: int | None = 0
+        self._in_data = False
+
+    @property
+    def at_boundary(self) -> bool:
+        """Whether the stream stands between two containers."""
+        return not self._rest and not self._in_data
+
+    def feed(self, piece: bytes) -> list[Message]:
+        """Take the next bytes, an empty piece for a zero-length packet, and return what they complete.
+
+        Raises
+        ------
+        ProtocolError
+            A header is none. Messages before it are returned first, and the next call raises.
+        """
+        if self._in_data and self._payload_left is None:
+            return self._feed_until_short(piece)
+        messages: list[Message] = []
+        self._rest += piece
+        try:
+            while self._next(messages, piece):
+                pass
+        except ProtocolError:
+            if not messages:
+                raise
+        return messages
+
+    def _feed_until_short(self, piece: bytes) -> list[Message]:
+        last = len(piece) % self._packet_size != 0 or not piece
+        self._in_data = not last
+        return [DataPiece(bytes(piece), last)] if piece or last else []
+
+    def _next(self, messages: list[Message], piece: bytes) -> bool:
+        """Move one message, or a piece of one, from what is left to `messages`; return whether more may follow."""
+        if self._in_data:
+            return self._next_payload(messages)
+        if len(self._rest) < HEADER_LENGTH:
+            return False
+        cursor = Cursor(bytes(self._rest[:HEADER_LENGTH]), "a USB container")
+        length, kind = cursor.u32("length"), cursor.u16("type")
+        code, transaction = cursor.u16("code"), cursor.u32("transaction")
+        if kind == ContainerType.DATA:
+            if length < HEADER_LENGTH:
+                raise _unusable(f"a data container of {length} bytes; its header alone has {HEADER_LENGTH}")
+            self._start_data(messages, code, transaction, length, piece)
+            return bool(self._in_data or self._rest)
+        parameters = _parameter_count(kind, length)
+        if len(self._rest) < length:
+            return False
+        body = Cursor(bytes(self._rest[HEADER_LENGTH:length]), "a USB container")
+        del self._rest[:length]
+        values = body.integers(parameters, 4, "parameters")
+        match kind:
+            case ContainerType.COMMAND:
+                messages.append(Request(code, transaction, values))
+            case ContainerType.RESPONSE:
+                messages.append(Response(code, transaction, values))
+            case _:
+                messages.append(Event(code, transaction, values))
+        return bool(self._rest)
+
+    def _start_data(self, messages: list[Message], code: int, transaction: int, length: int, piece: bytes) -> None:
+        del self._rest[:HEADER_LENGTH]
+        self._in_data = True
+        if length != UNKNOWN_LENGTH:
+            self._payload_left = length - HEADER_LENGTH
+            messages.append(DataStart(code, transaction, self._payload_left))
+            return
+        self._payload_left = None
+        messages.append(DataStart(code, transaction, None))
+        payload = bytes(self._rest)
+        self._rest.clear()
+        # A header that travels alone is a short packet too, but it opens the phase and does not end it.
+        last = bool(payload) and len(piece) % self._packet_size != 0
+        if payload:
+            messages.append(DataPiece(payload, last))
+        self._in_data = not last
+
+    def _next_payload(self, messages: list[Message]) -> bool:
+        left = self._payload_left
+        if left is None:
+            return False
+        payload = bytes(self._rest[:left])
+        del self._rest[: len(payload)]
+        self._payload_left = left - len(payload)
+        self._in_data = self._payload_left > 0
+        if payload or not self._in_data:
+            messages.append(DataPiece(payload, last=not self._in_data))
+        return bool(self._rest)
+
+
+def encode(message: Request | Response | Event) -> bytes:
+    """Return the container of a message.
+
+    Raises
+    ------
+    ValueError
+        It has more than five parameters, or a number that does not fit.
+    """
+    if len(message.parameters) > MAX_PARAMETERS:
+        raise ValueError(f"{message} has {len(message.parameters)} parameters; at most {MAX_PARAMETERS} are possible")
+    match message:
+        case Request():
+            kind = ContainerType.COMMAND
+        case Response():
+            kind = ContainerType.RESPONSE
+        case Event():
+            kind = ContainerType.EVENT
+    length = HEADER_LENGTH + 4 * len(message.parameters)
+    return _header(length, kind, message.code, message.transaction) + b"".join(
+        encode_integer(parameter, 4) for parameter in message.parameters
+    )
+
+
+def encode_data_header(code: int, transaction: int, length: int | None) -> bytes:
+    """Return what stands before a payload of `length` bytes; None, or too many for 32 bits, until a short packet."""
+    total = UNKNOWN_LENGTH if length is None else min(HEADER_LENGTH + length, UNKNOWN_LENGTH)
+    return _header(total, ContainerType.DATA, code, transaction)
+
+
+def encode_data(code: int, transaction: int, payload: bytes) -> bytes:
+    """Return a whole data phase in one container."""
+    return encode_data_header(code, transaction, len(payload)) + payload
+
+
+def ends_with_empty_packet(total: int, packet_size: int) -> bool:
+    """Return whether a transfer of `total` bytes, header included, must be closed by a zero-length packet.
+
+    A receiver knows the end of a transfer by a packet that is not full; where all are full, an empty one is due.
+    """
+    return total % packet_size == 0
+
+
+def _header(length: int, kind: ContainerType, code: int, transaction: int) -> bytes:
+    return (
+        encode_integer(length, 4) + encode_integer(kind, 2) + encode_integer(code, 2) + encode_integer(transaction, 4)
+    )
+
+
+def _parameter_count(kind: int, length: int) -> int:
+    if kind not in (ContainerType.COMMAND, ContainerType.RESPONSE, ContainerType.EVENT):
+        raise _unusable(f"a container of type {kind}; 1 command, 2 data, 3 response or 4 event was expected")
+    count, odd = divmod(length - HEADER_LENGTH, 4)
+    if odd or not 0 <= count <= MAX_PARAMETERS:
+        raise _unusable(
+            f"a {ContainerType(kind).name.lower()} container of {length} bytes; "
+            f"12 and 4 for each of 0 to {MAX_PARAMETERS} parameters were expected"
+        )
+    return count
+
+
+def _unusable(what: str) -> ProtocolError:
+    return ProtocolError(f"the USB pipe gives {what}; reset the device")
+
+
+class ControlRequest(IntEnum):
+    """Requests of the still image class on the control pipe (clause 5.2)."""
+
+    CANCEL = 0x64
+    GET_EXTENDED_EVENT_DATA = 0x65
+    RESET_DEVICE = 0x66
+    GET_DEVICE_STATUS = 0x67
+
+
+_CANCELLATION = 0x4001
+MAX_DEVICE_STATUS = 0x14
+"""Bytes that GET_DEVICE_STATUS is asked for: a header of 4, and parameters that name stalled pipes."""
+
+
+def encode_cancel(transaction: int) -> bytes:
+    """Return the data of a CANCEL request."""
+    return encode_integer(_CANCELLATION, 2) + encode_integer(transaction, 4)
+
+
+def decode_cancel(data: bytes) -> int:
+    """Return the transaction that a CANCEL request ends."""
+    cursor = Cursor(data, "a cancel request", 6)
+    code = cursor.u16("code")
+    if code != _CANCELLATION:
+        raise cursor.fault("code", f"0x{_CANCELLATION:04x}", f"0x{code:04x}")
+    return cursor.u32("transaction")
+
+
+@dataclass(frozen=True)
+class DeviceStatus:
+    """What GET_DEVICE_STATUS answers: a response code, and the addresses of stalled endpoints."""
+
+    code: int
+    parameters: tuple[int, ...] = ()
+
+    @classmethod
+    def decode(cls, data: bytes) -> DeviceStatus:
+        """Return the status in an answer."""
+        cursor = Cursor(data, "the device status", 0xFFFF)
+        length = cursor.u16("length")
+        count, odd = divmod(length - 4, 4)
+        if odd or count < 0 or count > MAX_PARAMETERS:
+            raise cursor.fault("length", f"4 and 4 for each of 0 to {MAX_PARAMETERS} parameters", length)
+        return cls(cursor.u16("code"), cursor.integers(count, 4, "parameters"))
+
+    def encode(self) -> bytes:
+        """Return the answer."""
+        parameters = b"".join(encode_integer(parameter, 4) for parameter in self.parameters)
+        return encode_integer(4 + len(parameters), 2) + encode_integer(self.code, 2) + parameters

@@ -1,0 +1,417 @@
+"""The datasets of PTP as bytes and as values: device, object, storage, property.
+
+Laws that hold inside:
+
+- ``decode`` and ``encode`` undo each other on well-formed bytes, so that both ends of the cable share one type.
+- A device's counts and lengths are not trusted: malformed bytes raise `ProtocolError`, and a dataset of more than
+  `MAX_DATASET` bytes is refused unread. Bytes behind a dataset's last field are no fault, for later
+  editions append.
+- ``encode`` raises ValueError for what the wire cannot hold; that is our own mistake, never a device's.
+
+Everything is little-endian, as USB and TCP carry it. A string is a count of UTF-16 units with the closing NUL, then
+the units; an empty string is the count 0 alone. An array is a count of 32 bits, then the items.
+
+Source: ISO 15740:2013, clauses 5 (types and datasets) and 13 (properties).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+from drivers.ptp.codes import DataType
+from drivers.ptp.cursor import Cursor
+
+MAX_DATASET = 1 << 20
+"""Bytes of the largest dataset that is read; real ones stay below 10 kB, long lists of handles included."""
+MAX_STRING_UNITS = 254
+"""UTF-16 units of the longest string, its closing NUL not counted."""
+
+Value = int | str | tuple[int, ...]
+"""A property's value: an integer, a string, or an array of integers."""
+
+_ARRAY = 0x4000
+_INTEGERS: dict[int, tuple[int, bool]] = {
+    DataType.INT8: (1, True),
+    DataType.UINT8: (1, False),
+    DataType.INT16: (2, True),
+    DataType.UINT16: (2, False),
+    DataType.INT32: (4, True),
+    DataType.UINT32: (4, False),
+    DataType.INT64: (8, True),
+    DataType.UINT64: (8, False),
+    DataType.INT128: (16, True),
+    DataType.UINT128: (16, False),
+}
+"""Bytes and sign of each integer type."""
+
+
+def read_string(cursor: Cursor, field: str) -> str:
+    """Return the next string, up to its first NUL; what is no UTF-16 becomes U+FFFD."""
+    count = cursor.u8(f"the length of {field}")
+    octets = cursor.take(2 * count, field)
+    return octets.decode("utf-16-le", "replace").partition("\0")[0]
+
+
+def encode_string(text: str) -> bytes:
+    """Return `text` as a string of PTP.
+
+    Raises
+    ------
+    ValueError
+        It is longer than 254 UTF-16 units, or holds a NUL or half a surrogate pair.
+    """
+    if not text:
+        return b"\0"
+    octets = text.encode("utf-16-le")
+    units = len(octets) // 2
+    if units > MAX_STRING_UNITS or "\0" in text:
+        raise ValueError(f"{text[:40]!r} of {units} UTF-16 units is no PTP string; at most {MAX_STRING_UNITS}, no NUL")
+    return bytes([units + 1]) + octets + b"\0\0"
+
+
+def encode_integer(value: int, size: int, signed: bool = False) -> bytes:
+    """Return `value` in `size` bytes; ValueError where it does not fit."""
+    try:
+        return value.to_bytes(size, "little", signed=signed)
+    except OverflowError as error:
+        raise ValueError(f"{value} does not fit in {size} bytes") from error
+
+
+def encode_array(values: Iterable[int], size: int, signed: bool = False) -> bytes:
+    """Return `values` as an array of integers of `size` bytes."""
+    items = tuple(values)
+    return encode_integer(len(items), 4) + b"".join(encode_integer(item, size, signed) for item in items)
+
+
+def decode_u32_array(data: bytes, what: str = "the list") -> tuple[int, ...]:
+    """Return the items of an array of 32-bit integers: storage ids, object handles."""
+    return Cursor(data, what, MAX_DATASET).array(4, "items")
+
+
+def encode_u32_array(values: Iterable[int]) -> bytes:
+    """Return `values` as an array of 32-bit integers."""
+    return encode_array(values, 4)
+
+
+def read_value(cursor: Cursor, data_type: int, field: str) -> Value:
+    """Return the next value of a property of type `data_type`, one of `DataType` or an array of it."""
+    if data_type == DataType.STRING:
+        return read_string(cursor, field)
+    if data_type & _ARRAY and data_type - _ARRAY in _INTEGERS:
+        size, signed = _INTEGERS[data_type - _ARRAY]
+        return cursor.array(size, field, signed)
+    if data_type in _INTEGERS:
+        size, signed = _INTEGERS[data_type]
+        return cursor.integer(size, field, signed)
+    raise cursor.fault(f"the type of {field}", "a type of ISO 15740, 5.3", f"0x{data_type:04x}")
+
+
+def decode_value(data_type: int, data: bytes) -> Value:
+    """Return a property's value, as GetDevicePropValue answers it."""
+    return read_value(Cursor(data, "the property's value", MAX_DATASET), data_type, "value")
+
+
+def encode_value(data_type: int, value: Value) -> bytes:
+    """Return a property's value as bytes; ValueError where it is not of the type."""
+    if data_type == DataType.STRING and isinstance(value, str):
+        return encode_string(value)
+    if data_type & _ARRAY and data_type - _ARRAY in _INTEGERS and isinstance(value, tuple):
+        size, signed = _INTEGERS[data_type - _ARRAY]
+        return encode_array(value, size, signed)
+    if data_type in _INTEGERS and isinstance(value, int):
+        size, signed = _INTEGERS[data_type]
+        return encode_integer(value, size, signed)
+    raise ValueError(f"{value!r} is not of type 0x{data_type:04x}")
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """What a device is and can do (GetDeviceInfo, 5.5.1); version 100 is 1.00."""
+
+    standard_version: int = 100
+    vendor_extension_id: int = 0
+    vendor_extension_version: int = 0
+    vendor_extension: str = ""
+    functional_mode: int = 0
+    operations: tuple[int, ...] = ()
+    events: tuple[int, ...] = ()
+    properties: tuple[int, ...] = ()
+    capture_formats: tuple[int, ...] = ()
+    image_formats: tuple[int, ...] = ()
+    manufacturer: str = ""
+    model: str = ""
+    device_version: str = ""
+    serial_number: str = ""
+
+    @classmethod
+    def decode(cls, data: bytes) -> DeviceInfo:
+        """Return the device in a dataset."""
+        cursor = Cursor(data, "DeviceInfo", MAX_DATASET)
+        return cls(
+            standard_version=cursor.u16("standard version"),
+            vendor_extension_id=cursor.u32("vendor extension id"),
+            vendor_extension_version=cursor.u16("vendor extension version"),
+            vendor_extension=read_string(cursor, "vendor extension"),
+            functional_mode=cursor.u16("functional mode"),
+            operations=cursor.array(2, "operations"),
+            events=cursor.array(2, "events"),
+            properties=cursor.array(2, "properties"),
+            capture_formats=cursor.array(2, "capture formats"),
+            image_formats=cursor.array(2, "image formats"),
+            manufacturer=read_string(cursor, "manufacturer"),
+            model=read_string(cursor, "model"),
+            device_version=read_string(cursor, "device version"),
+            serial_number=read_string(cursor, "serial number"),
+        )
+
+    def encode(self) -> bytes:
+        """Return the dataset."""
+        return b"".join(
+            (
+                encode_integer(self.standard_version, 2),
+                encode_integer(self.vendor_extension_id, 4),
+                encode_integer(self.vendor_extension_version, 2),
+                encode_string(self.vendor_extension),
+                encode_integer(self.functional_mode, 2),
+                encode_array(self.operations, 2),
+                encode_array(self.events, 2),
+                encode_array(self.properties, 2),
+                encode_array(self.capture_formats, 2),
+                encode_array(self.image_formats, 2),
+                encode_string(self.manufacturer),
+                encode_string(self.model),
+                encode_string(self.device_version),
+                encode_string(self.serial_number),
+            )
+        )
+
+
+@dataclass(frozen=True)
+class ObjectInfo:
+    """An object in a store (GetObjectInfo, 5.5.3): bytes, pixels, dates as ``YYYYMMDDThhmmss``."""
+
+    storage: int = 0
+    format: int = 0
+    protection: int = 0
+    size: int = 0
+    thumb_format: int = 0
+    thumb_size: int = 0
+    thumb_width: int = 0
+    thumb_height: int = 0
+    image_width: int = 0
+    image_height: int = 0
+    bit_depth: int = 0
+    parent: int = 0
+    association_type: int = 0
+    association_description: int = 0
+    sequence_number: int = 0
+    filename: str = ""
+    captured_at: str = ""
+    modified_at: str = ""
+    keywords: str = ""
+
+    @classmethod
+    def decode(cls, data: bytes) -> ObjectInfo:
+        """Return the object in a dataset."""
+        cursor = Cursor(data, "ObjectInfo", MAX_DATASET)
+        return cls(
+            storage=cursor.u32("storage"),
+            format=cursor.u16("format"),
+            protection=cursor.u16("protection"),
+            size=cursor.u32("size"),
+            thumb_format=cursor.u16("thumb format"),
+            thumb_size=cursor.u32("thumb size"),
+            thumb_width=cursor.u32("thumb width"),
+            thumb_height=cursor.u32("thumb height"),
+            image_width=cursor.u32("image width"),
+            image_height=cursor.u32("image height"),
+            bit_depth=cursor.u32("bit depth"),
+            parent=cursor.u32("parent"),
+            association_type=cursor.u16("association type"),
+            association_description=cursor.u32("association description"),
+            sequence_number=cursor.u32("sequence number"),
+            filename=read_string(cursor, "filename"),
+            captured_at=read_string(cursor, "capture date"),
+            modified_at=read_string(cursor, "modification date"),
+            keywords=read_string(cursor, "keywords"),
+        )
+
+    def encode(self) -> bytes:
+        """Return the dataset."""
+        return b"".join(
+            (
+                encode_integer(self.storage, 4),
+                encode_integer(self.format, 2),
+                encode_integer(self.protection, 2),
+                encode_integer(self.size, 4),
+                encode_integer(self.thumb_format, 2),
+                encode_integer(self.thumb_size, 4),
+                encode_integer(self.thumb_width, 4),
+                encode_integer(self.thumb_height, 4),
+                encode_integer(self.image_width, 4),
+                encode_integer(self.image_height, 4),
+                encode_integer(self.bit_depth, 4),
+                encode_integer(self.parent, 4),
+                encode_integer(self.association_type, 2),
+                encode_integer(self.association_description, 4),
+                encode_integer(self.sequence_number, 4),
+                encode_string(self.filename),
+                encode_string(self.captured_at),
+                encode_string(self.modified_at),
+                encode_string(self.keywords),
+            )
+        )
+
+
+@dataclass(frozen=True)
+class StorageInfo:
+    """A store (GetStorageInfo, 5.5.2): capacities in bytes; 0xffffffff free images where the device does not know.
+
+    `padding` is what a device sends behind the dataset: two NULs on the EOS 60D.
+    """
+
+    storage_type: int = 0
+    filesystem_type: int = 0
+    access: int = 0
+    capacity: int = 0
+    free: int = 0
+    free_images: int = 0xFFFFFFFF
+    description: str = ""
+    label: str = ""
+    padding: bytes = field(default=b"", repr=False)
+
+    @classmethod
+    def decode(cls, data: bytes) -> StorageInfo:
+        """Return the store in a dataset."""
+        cursor = Cursor(data, "StorageInfo", MAX_DATASET)
+        return cls(
+            storage_type=cursor.u16("storage type"),
+            filesystem_type=cursor.u16("filesystem type"),
+            access=cursor.u16("access"),
+            capacity=cursor.u64("capacity"),
+            free=cursor.u64("free bytes"),
+            free_images=cursor.u32("free images"),
+            description=read_string(cursor, "description"),
+            label=read_string(cursor, "label"),
+            padding=cursor.rest(),
+        )
+
+    def encode(self) -> bytes:
+        """Return the dataset."""
+        return b"".join(
+            (
+                encode_integer(self.storage_type, 2),
+                encode_integer(self.filesystem_type, 2),
+                encode_integer(self.access, 2),
+                encode_integer(self.capacity, 8),
+                encode_integer(self.free, 8),
+                encode_integer(self.free_images, 4),
+                encode_string(self.description),
+                encode_string(self.label),
+                self.padding,
+            )
+        )
+
+
+class Form(IntEnum):
+    """How a property's values are told (13.3.3)."""
+
+    NONE = 0
+    RANGE = 1
+    ENUMERATION = 2
+
+
+@dataclass(frozen=True)
+class RangeForm:
+    """A property's values lie between two, in steps."""
+
+    minimum: Value
+    maximum: Value
+    step: Value
+
+
+@dataclass(frozen=True)
+class EnumerationForm:
+    """A property takes the values of a list.
+
+    `widened` says that a device sends values of one byte as two, as the EOS 60D does for the battery's level
+    (0x5001: 100, 75, 50, 25, 0); the standard does not allow it, but it can be told by the bytes that are left.
+    """
+
+    values: tuple[Value, ...]
+    widened: bool = False
+
+
+@dataclass(frozen=True)
+class DevicePropDesc:
+    """A property of a device (GetDevicePropDesc, 13.3.3): its type, whether it can be set, its values."""
+
+    code: int
+    data_type: int
+    writable: bool
+    default: Value
+    current: Value
+    form: RangeForm | EnumerationForm | None = None
+
+    @classmethod
+    def decode(cls, data: bytes) -> DevicePropDesc:
+        """Return the property in a dataset."""
+        cursor = Cursor(data, "DevicePropDesc", MAX_DATASET)
+        code = cursor.u16("property")
+        cursor.what = f"DevicePropDesc of 0x{code:04x}"
+        data_type = cursor.u16("type")
+        writable = cursor.u8("get/set") != 0
+        default = read_value(cursor, data_type, "default value")
+        current = read_value(cursor, data_type, "current value")
+        form = _read_form(cursor, data_type)
+        return cls(code, data_type, writable, default, current, form)
+
+    def encode(self) -> bytes:
+        """Return the dataset."""
+        match self.form:
+            case None:
+                form = bytes([Form.NONE])
+            case RangeForm(minimum, maximum, step):
+                values = (minimum, maximum, step)
+                form = bytes([Form.RANGE]) + b"".join(encode_value(self.data_type, value) for value in values)
+            case EnumerationForm(values, widened):
+                count = bytes([Form.ENUMERATION]) + encode_integer(len(values), 2)
+                gap = b"\0" if widened else b""
+                form = count + b"".join(encode_value(self.data_type, value) + gap for value in values)
+        return b"".join(
+            (
+                encode_integer(self.code, 2),
+                encode_integer(self.data_type, 2),
+                bytes([self.writable]),
+                encode_value(self.data_type, self.default),
+                encode_value(self.data_type, self.current),
+                form,
+            )
+        )
+
+
+def _read_form(cursor: Cursor, data_type: int) -> RangeForm | EnumerationForm | None:
+    flag = cursor.u8("form")
+    match flag:
+        case Form.NONE:
+            return None
+        case Form.RANGE:
+            return RangeForm(
+                read_value(cursor, data_type, "minimum"),
+                read_value(cursor, data_type, "maximum"),
+                read_value(cursor, data_type, "step"),
+            )
+        case Form.ENUMERATION:
+            # Each value takes at least one byte, so that the bytes left bound the loop whatever the count says.
+            count = cursor.u16("the count of values")
+            if data_type == DataType.UINT8 and count and cursor.left == 2 * count:
+                start = cursor.at
+                wide = cursor.integers(count, 2, "values")
+                if max(wide) <= 0xFF:
+                    return EnumerationForm(wide, widened=True)
+                cursor.at = start
+            return EnumerationForm(tuple(read_value(cursor, data_type, "a value") for _ in range(count)))
+        case _:
+            raise cursor.fault("form", "0, 1 or 2", flag)

@@ -1,0 +1,410 @@
+"""PTP over TCP as bytes: every packet of both channels, and a cutter for the stream.
+
+A packet is its length (32 bits, these included), its type (32), then what the type says. The initiator opens the
+command channel and sends `InitCommandRequest`, the responder answers `InitCommandAck` with a number; the initiator
+opens the event channel and sends that number in `InitEventRequest`, the responder answers `InitEventAck`. `InitFail`
+may stand for either answer. Transactions run on the command channel; events, `Ping` and `Pong` on the other.
+
+Laws that hold inside:
+
+- `PacketCutter` takes a stream in any pieces. Data packets may be of any length, whatever comes of them is handed on
+  as `Data` at once and only their last bytes as `EndData`, which says the same; every other packet is at most
+  `MAX_PACKET` bytes.
+- Whatever arrives, the only error is `ProtocolError`; after it the stream has lost its place and every further
+  `feed` raises too.
+
+Source: CIPA DC-005-2005, PTP-IP, clause 2.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+
+from drivers.errors import ProtocolError
+from drivers.ptp.cursor import Cursor
+from drivers.ptp.datasets import encode_integer
+from drivers.ptp.messages import MAX_PARAMETERS, Event, Request, Response
+
+PORT = 15740
+VERSION = 0x00010000
+"""PTP/IP 1.0."""
+HEADER_LENGTH = 8
+MAX_PACKET = 4096
+"""Bytes of the longest packet that is no data; the longest real one carries a name of 40 characters."""
+UNKNOWN_TOTAL = 0xFFFFFFFFFFFFFFFF
+GUID_LENGTH = 16
+
+
+class PacketType(IntEnum):
+    """What a packet is."""
+
+    INIT_COMMAND_REQUEST = 1
+    INIT_COMMAND_ACK = 2
+    INIT_EVENT_REQUEST = 3
+    INIT_EVENT_ACK = 4
+    INIT_FAIL = 5
+    OPERATION_REQUEST = 6
+    OPERATION_RESPONSE = 7
+    EVENT = 8
+    START_DATA = 9
+    DATA = 10
+    CANCEL = 11
+    END_DATA = 12
+    PING = 13
+    PONG = 14
+
+
+class FailReason(IntEnum):
+    """Why a responder refuses a connection."""
+
+    REJECTED = 1
+    BUSY = 2
+    UNSPECIFIED = 3
+
+
+@dataclass(frozen=True)
+class InitCommandRequest:
+    """The initiator names itself: a GUID of 16 bytes, which a camera may have been paired with, and a name."""
+
+    guid: bytes
+    name: str
+    version: int = VERSION
+
+
+@dataclass(frozen=True)
+class InitCommandAck:
+    """The responder accepts, numbers the connection and names itself."""
+
+    connection: int
+    guid: bytes
+    name: str
+    version: int = VERSION
+
+
+@dataclass(frozen=True)
+class InitEventRequest:
+    """The initiator says which connection the event channel belongs to."""
+
+    connection: int
+
+
+@dataclass(frozen=True)
+class InitEventAck:
+    """The event channel stands."""
+
+
+@dataclass(frozen=True)
+class InitFail:
+    """The responder refuses; see `FailReason`."""
+
+    reason: int
+
+
+@dataclass(frozen=True)
+class OperationRequest:
+    """A request, and whether the initiator will send the data phase."""
+
+    request: Request
+    sends_data: bool = False
+
+
+@dataclass(frozen=True)
+class StartData:
+    """A data phase begins; `total` counts its bytes, None where the sender does not know."""
+
+    transaction: int
+    total: int | None
+
+
+@dataclass(frozen=True)
+class Data:
+    """The next bytes of a data phase."""
+
+    transaction: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class EndData:
+    """The last bytes of a data phase, all or none of it."""
+
+    transaction: int
+    data: bytes = b""
+
+
+@dataclass(frozen=True)
+class Cancel:
+    """The data phase is called off."""
+
+    transaction: int
+
+
+@dataclass(frozen=True)
+class Ping:
+    """Asks whether the other side is there."""
+
+
+@dataclass(frozen=True)
+class Pong:
+    """Answers `Ping`."""
+
+
+Packet = (
+    InitCommandRequest
+    | InitCommandAck
+    | InitEventRequest
+    | InitEventAck
+    | InitFail
+    | OperationRequest
+    | Response
+    | Event
+    | StartData
+    | Data
+    | EndData
+    | Cancel
+    | Ping
+    | Pong
+)
+
+_DATA_TYPES = (PacketType.DATA, PacketType.END_DATA)
+_NO_DATA_OR_IN = 1
+_DATA_OUT = 2
+
+
+def encode(packet: Packet) -> bytes:
+    """Return a packet's bytes.
+
+    Raises
+    ------
+    ValueError
+        A number does not fit, a GUID is not 16 bytes, a name is too long, or there are more than five parameters.
+    """
+    match packet:
+        case InitCommandRequest(guid, name, version):
+            kind, body = PacketType.INIT_COMMAND_REQUEST, _guid(guid) + _name(name) + encode_integer(version, 4)
+        case InitCommandAck(connection, guid, name, version):
+            kind = PacketType.INIT_COMMAND_ACK
+            body = encode_integer(connection, 4) + _guid(guid) + _name(name) + encode_integer(version, 4)
+        case InitEventRequest(connection):
+            kind, body = PacketType.INIT_EVENT_REQUEST, encode_integer(connection, 4)
+        case InitEventAck():
+            kind, body = PacketType.INIT_EVENT_ACK, b""
+        case InitFail(reason):
+            kind, body = PacketType.INIT_FAIL, encode_integer(reason, 4)
+        case OperationRequest(request, sends_data):
+            kind = PacketType.OPERATION_REQUEST
+            body = encode_integer(_DATA_OUT if sends_data else _NO_DATA_OR_IN, 4) + _message(request)
+        case Response():
+            kind, body = PacketType.OPERATION_RESPONSE, _message(packet)
+        case Event():
+            kind, body = PacketType.EVENT, _message(packet)
+        case StartData(transaction, total):
+            kind = PacketType.START_DATA
+            body = encode_integer(transaction, 4) + encode_integer(UNKNOWN_TOTAL if total is None else total, 8)
+        case Data(transaction, data):
+            kind, body = PacketType.DATA, encode_integer(transaction, 4) + data
+        case EndData(transaction, data):
+            kind, body = PacketType.END_DATA, encode_integer(transaction, 4) + data
+        case Cancel(transaction):
+            kind, body = PacketType.CANCEL, encode_integer(transaction, 4)
+        case Ping():
+            kind, body = PacketType.PING, b""
+        case Pong():
+            kind, body = PacketType.PONG, b""
+    return encode_integer(HEADER_LENGTH + len(body), 4) + encode_integer(kind, 4) + body
+
+
+def decode(data: bytes) -> Packet:
+    """Return the packet that `data` is, from its first byte to its last."""
+    cursor = Cursor(data, "a PTP/IP packet")
+    length, kind = cursor.u32("length"), cursor.u32("type")
+    if length != len(data):
+        raise cursor.fault("length", f"{len(data)}, the bytes there are", length)
+    _checked(kind, length)
+    packet = _BODIES[kind](cursor)
+    if cursor.left:
+        raise cursor.fault("the end", "no more bytes", f"followed by {cursor.left} bytes")
+    return packet
+
+
+class PacketCutter:
+    """Cuts a channel's stream into packets, however it was split on its way. One for each channel."""
+
+    def __init__(self) -> None:
+        self._rest = bytearray()
+        self._data_left = 0
+        self._data_kind = 0
+        self._transaction = 0
+
+    @property
+    def at_boundary(self) -> bool:
+        """Whether the stream stands between two packets."""
+        return not self._rest and not self._data_kind
+
+    def feed(self, piece: bytes) -> list[Packet]:
+        """Take the next bytes and return what they complete.
+
+        Raises
+        ------
+        ProtocolError
+            A packet is none. Packets before it are returned first, and the next call raises.
+        """
+        packets: list[Packet] = []
+        self._rest += piece
+        try:
+            while self._next(packets):
+                pass
+        except ProtocolError:
+            if not packets:
+                raise
+        return packets
+
+    def _next(self, packets: list[Packet]) -> bool:
+        """Move one packet, or a piece of one, from what is left to `packets`; return whether more may follow."""
+        if self._data_kind:
+            return self._next_data(packets)
+        if len(self._rest) < HEADER_LENGTH:
+            return False
+        cursor = Cursor(bytes(self._rest[: HEADER_LENGTH + 4]), "a PTP/IP packet")
+        length, kind = cursor.u32("length"), cursor.u32("type")
+        _checked(kind, length)
+        if kind in _DATA_TYPES:
+            if cursor.left < 4:
+                return False
+            self._transaction = cursor.u32("transaction")
+            self._data_kind = kind
+            self._data_left = length - cursor.at
+            del self._rest[: cursor.at]
+            return True
+        if len(self._rest) < length:
+            return False
+        packet = decode(bytes(self._rest[:length]))
+        del self._rest[:length]
+        packets.append(packet)
+        return bool(self._rest)
+
+    def _next_data(self, packets: list[Packet]) -> bool:
+        data = bytes(self._rest[: self._data_left])
+        del self._rest[: len(data)]
+        self._data_left -= len(data)
+        if not self._data_left and self._data_kind == PacketType.END_DATA:
+            packets.append(EndData(self._transaction, data))
+        elif data:
+            packets.append(Data(self._transaction, data))
+        if not self._data_left:
+            self._data_kind = 0
+        return bool(self._rest)
+
+
+def _checked(kind: int, length: int) -> None:
+    """Raise ProtocolError unless a packet of this type can be of this length."""
+    if kind not in _SHORTEST:
+        raise _unusable(f"a packet of type {kind} and {length} bytes; a type of 1 to 14 was expected")
+    least = _SHORTEST[kind]
+    most = 0xFFFFFFFF if kind in _DATA_TYPES else MAX_PACKET
+    if not least <= length <= most:
+        raise _unusable(f"a {PacketType(kind).name} packet of {length} bytes; {least} to {most} were expected")
+
+
+def _unusable(what: str) -> ProtocolError:
+    return ProtocolError(f"the PTP/IP connection gives {what}; check that a camera answers at this port, and reconnect")
+
+
+def _guid(guid: bytes) -> bytes:
+    if len(guid) != GUID_LENGTH:
+        raise ValueError(f"a GUID of {len(guid)} bytes; {GUID_LENGTH} are right")
+    return guid
+
+
+def _name(name: str) -> bytes:
+    octets = name.encode("utf-16-le") + b"\0\0"
+    if "\0" in name or len(octets) > MAX_PACKET // 2:
+        raise ValueError(f"{name[:40]!r} is no PTP/IP name")
+    return octets
+
+
+def _read_name(cursor: Cursor) -> str:
+    octets = bytearray()
+    while (unit := cursor.take(2, "name, or its closing NUL,")) != b"\0\0":
+        octets += unit
+    return octets.decode("utf-16-le", "replace")
+
+
+def _read_version(cursor: Cursor) -> int:
+    # Some responders end with the name.
+    return cursor.u32("version") if cursor.left else VERSION
+
+
+def _message(message: Request | Response | Event) -> bytes:
+    if len(message.parameters) > MAX_PARAMETERS:
+        raise ValueError(f"{message} has {len(message.parameters)} parameters; at most {MAX_PARAMETERS} are possible")
+    return (
+        encode_integer(message.code, 2)
+        + encode_integer(message.transaction, 4)
+        + b"".join(encode_integer(parameter, 4) for parameter in message.parameters)
+    )
+
+
+def _read_message(cursor: Cursor) -> tuple[int, int, tuple[int, ...]]:
+    code, transaction = cursor.u16("code"), cursor.u32("transaction")
+    count, odd = divmod(cursor.left, 4)
+    if odd or count > MAX_PARAMETERS:
+        raise cursor.fault("the list of parameters", f"0 to {MAX_PARAMETERS} of 4 bytes", f"{cursor.left} bytes")
+    return code, transaction, cursor.integers(count, 4, "parameters")
+
+
+def _read_operation(cursor: Cursor) -> OperationRequest:
+    phase = cursor.u32("data phase")
+    if phase > _DATA_OUT:
+        raise cursor.fault("data phase", "1 none or in, 2 out", phase)
+    return OperationRequest(Request(*_read_message(cursor)), phase == _DATA_OUT)
+
+
+def _read_start(cursor: Cursor) -> StartData:
+    transaction, total = cursor.u32("transaction"), cursor.u64("total")
+    return StartData(transaction, None if total == UNKNOWN_TOTAL else total)
+
+
+def _read_command_request(cursor: Cursor) -> InitCommandRequest:
+    return InitCommandRequest(cursor.take(GUID_LENGTH, "GUID"), _read_name(cursor), _read_version(cursor))
+
+
+def _read_command_ack(cursor: Cursor) -> InitCommandAck:
+    connection = cursor.u32("connection number")
+    return InitCommandAck(connection, cursor.take(GUID_LENGTH, "GUID"), _read_name(cursor), _read_version(cursor))
+
+
+_BODIES: dict[int, Callable[[Cursor], Packet]] = {
+    PacketType.INIT_COMMAND_REQUEST: _read_command_request,
+    PacketType.INIT_COMMAND_ACK: _read_command_ack,
+    PacketType.INIT_EVENT_REQUEST: lambda cursor: InitEventRequest(cursor.u32("connection number")),
+    PacketType.INIT_EVENT_ACK: lambda cursor: InitEventAck(),
+    PacketType.INIT_FAIL: lambda cursor: InitFail(cursor.u32("reason")),
+    PacketType.OPERATION_REQUEST: _read_operation,
+    PacketType.OPERATION_RESPONSE: lambda cursor: Response(*_read_message(cursor)),
+    PacketType.EVENT: lambda cursor: Event(*_read_message(cursor)),
+    PacketType.START_DATA: _read_start,
+    PacketType.DATA: lambda cursor: Data(cursor.u32("transaction"), cursor.rest()),
+    PacketType.CANCEL: lambda cursor: Cancel(cursor.u32("transaction")),
+    PacketType.END_DATA: lambda cursor: EndData(cursor.u32("transaction"), cursor.rest()),
+    PacketType.PING: lambda cursor: Ping(),
+    PacketType.PONG: lambda cursor: Pong(),
+}
+_SHORTEST: dict[int, int] = {
+    PacketType.INIT_COMMAND_REQUEST: HEADER_LENGTH + GUID_LENGTH + 2,
+    PacketType.INIT_COMMAND_ACK: HEADER_LENGTH + 4 + GUID_LENGTH + 2,
+    PacketType.INIT_EVENT_REQUEST: HEADER_LENGTH + 4,
+    PacketType.INIT_EVENT_ACK: HEADER_LENGTH,
+    PacketType.INIT_FAIL: HEADER_LENGTH + 4,
+    PacketType.OPERATION_REQUEST: HEADER_LENGTH + 10,
+    PacketType.OPERATION_RESPONSE: HEADER_LENGTH + 6,
+    PacketType.EVENT: HEADER_LENGTH + 6,
+    PacketType.START_DATA: HEADER_LENGTH + 12,
+    PacketType.DATA: HEADER_LENGTH + 4,
+    PacketType.CANCEL: HEADER_LENGTH + 4,
+    PacketType.END_DATA: HEADER_LENGTH + 4,
+    PacketType.PING: HEADER_LENGTH,
+    PacketType.PONG: HEADER_LENGTH,
+}
