@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from acquisition.framing import CHANNELS, Channel, Plane, Shift, frame_black, plane_of, shift_between, strongest_plane
 from acquisition.session import FrameRecord, Session, file_sha256
@@ -394,14 +395,8 @@ class _Measurement:
     def _covered_cells(self, registration: Registration) -> npt.NDArray[np.bool_]:
         """Return the cells whose neighbourhood does not look like the chart's."""
         blocks = registration.blocks
-        covered = np.zeros(len(self._cells_mm), dtype=bool)
-        if not len(blocks.score):
-            return covered
-        for first in range(0, len(covered), 1024):
-            part = self._cells_mm[first : first + 1024]
-            nearest = ((part[:, None] - blocks.centres_mm[None]) ** 2).sum(axis=-1).argmin(axis=1)
-            covered[first : first + 1024] = blocks.score[nearest] < MIN_BLOCK_SCORE
-        return covered
+        nearest = np.asarray(cKDTree(blocks.centres_mm).query(self._cells_mm)[1])
+        return blocks.score[nearest] < MIN_BLOCK_SCORE
 
     def measure(self, decoded: _Decoded) -> tuple[FrameFigures, npt.NDArray[np.uint16]]:
         """Return a frame's figures and its samples (colours, 25, 3) uint16 in the order of colour indices."""

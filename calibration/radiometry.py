@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration.fitting import least_squares
 from drivers.errors import QualityError
 from drivers.rawfile import Mosaic
 
@@ -219,8 +220,7 @@ def _robust_fit(design: _Array, values: _Array) -> tuple[_Array, _Array, _Array]
     weights = np.ones(len(values))
     solution, residual = np.zeros(design.shape[1]), values
     for _ in range(_ROUNDS):
-        root = np.sqrt(weights)
-        solution = np.asarray(np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0], dtype=np.float64)
+        solution = least_squares(design, values, weights)
         residual = values - design @ solution
         scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-9
         weights = np.maximum(1 - (residual / (6 * scale)) ** 2, 0) ** 2

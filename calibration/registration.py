@@ -37,6 +37,7 @@ from acquisition.framing import (
     project,
     rms,
 )
+from calibration.fitting import least_squares
 from drivers.errors import RegistrationError
 from drivers.rawfile import Mosaic
 
@@ -60,6 +61,7 @@ _COARSE_CELLS = 10
 _BLOCK_CELLS = 8
 _KNOT_CELLS = 5
 _COARSE_PER_CELL = 5
+_COLOUR_PATCHES = 5000
 _GAUSS_NEWTON_STEPS = 5
 _TAG_SIGMA_PX = 0.15
 _LEAST_INFORMATION = 4.0
@@ -303,23 +305,15 @@ def fit_colours(rgb: _Array, points_mm: _Array, seen: _Array, page_mm: tuple[flo
         value = seen[:, channel]
         model = np.zeros(terms.shape[1])
         for _ in range(6):
-            model = _least_squares(terms * (page @ field)[:, None], value, weights)
+            model = least_squares(terms * (page @ field)[:, None], value, weights)
             flat = terms @ model
-            field = _least_squares(page * flat[:, None], value, weights)
+            field = least_squares(page * flat[:, None], value, weights)
             residual = np.abs(value - flat * (page @ field))
             spread = max(1.4826 * float(np.median(residual)), 1e-9)
             weights = np.minimum(1, 2 * spread / np.maximum(residual, 1e-12))
         level = float((page @ field).mean())
         coefficients[:, channel], light[:, channel] = model * level, field / level
     return ColourModel(degree, coefficients, light, page_mm)
-
-
-def _least_squares(design: _Array, value: _Array, weights: _Array) -> _Array:
-    """Return the weighted least-squares solution by the normal equations, which a hair of ridge keeps solvable."""
-    weighted = design * weights[:, None]
-    gram = weighted.T @ design
-    gram[np.diag_indices_from(gram)] *= 1 + 1e-9
-    return np.asarray(np.linalg.solve(gram, weighted.T @ value), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -528,7 +522,9 @@ class _Matcher:
 
     def _fit_colours(self) -> ColourModel:
         seen = self._seen()
-        there = np.isfinite(seen).all(axis=1)
+        there = np.flatnonzero(np.isfinite(seen).all(axis=1))
+        # Some thousand patches tell a polynomial all they can.
+        there = there[:: max(1, len(there) // _COLOUR_PATCHES)]
         return fit_colours(self._rgb[there], self._centres[there], seen[there], self._chart.page_mm)
 
     def _template(self, raster: _Raster, cover: sparse.csr_array, blur_px: float) -> _Float:

@@ -261,7 +261,13 @@ def _magnified(
 ) -> None:
     """Draw part of the frame with the outlines of cells and of their samples."""
     height, width = shown.shape[:2]
-    axes.imshow(shown, extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
+    left, top = (max(0, int(value - reach)) for value in middle)
+    right, bottom = (min(size, int(value + reach) + 2) for value, size in zip(middle, (width, height), strict=True))
+    axes.imshow(
+        shown[top:bottom, left:right],
+        extent=(left - 0.5, right - 0.5, bottom - 0.5, top - 0.5),
+        interpolation="nearest",
+    )
     near = np.flatnonzero((np.abs(places - middle) < reach + registration.cell_px).all(axis=1))
     corner = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * np.array(chart.cell_mm) / 2
     for cell in near:
