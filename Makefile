@@ -27,7 +27,7 @@ demo: $(READY)
 	$(BIN)/acquire run $(DEMO)/LAB.toml $(DEMO)/session
 	$(BIN)/build-lut $(DEMO)/session $(DEMO)/lut
 	$(BIN)/python examples/photographs.py $(DEMO)/photographs
-	$(BIN)/generate $(DEMO)/lut $(DEMO)/dataset --sources $(DEMO)/photographs --contact-sheet $(DEMO)/contact_sheet.png
+	$(BIN)/generate $(DEMO)/lut $(DEMO)/dataset --sources $(DEMO)/photographs --illuminations 0-11 --contact-sheet $(DEMO)/contact_sheet.png
 	$(BIN)/evaluate $(DEMO)/dataset
 	@echo
 	@echo "Raw linear images with their ground truth:  $(CURDIR)/$(DEMO)/dataset"
