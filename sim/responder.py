@@ -20,6 +20,10 @@ class Answer:
     data: bytes | None = None
 
 
+class NoAnswer(Exception):
+    """Raised instead of answering: the device says nothing, and the initiator waits in vain."""
+
+
 class Responder(Protocol):
     """A device that answers one request at a time."""
 
@@ -28,7 +32,13 @@ class Responder(Protocol):
         ...
 
     def answer(self, request: Request, data: bytes | None) -> Answer:
-        """Carry out a request; `data` is the initiator's data phase."""
+        """Carry out a request; `data` is the initiator's data phase.
+
+        Raises
+        ------
+        NoAnswer
+            The device has hung itself up.
+        """
         ...
 
     def events(self) -> tuple[Event, ...]:

@@ -1,0 +1,234 @@
+"""What every PTP cable keeps to, written once: a suite names its cable by the fixture `bench`."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from drivers.errors import LinkClosed, LinkTimeout, ProtocolError
+from drivers.ptp.codes import ResponseCode
+from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.transport import MAX_COLLECTED, Transport
+from sim.responder import Answer, NoAnswer
+
+PATIENCE_S = 10.0
+"""For what must come; nothing waits this long unless it fails."""
+GIVE_UP_S = 0.05
+"""For what never comes."""
+
+ECHO = 0x9F01
+"""Answers with the parameters it was given."""
+GIVE = 0x9F02
+"""Gives as many bytes of data as its parameter says."""
+TAKE = 0x9F03
+"""Takes data, and answers with their length and CRC-32."""
+REFUSE = 0x9F04
+"""Answers busy, although asked for data."""
+BREAK_OFF = 0x9F05
+"""Gives data, then reports that they are incomplete."""
+RAISE = 0x9F06
+"""Raises as many events as its parameter says."""
+HANG = 0x9F07
+"""Never answers."""
+MIX_UP = 0x9F08
+"""Answers in the name of another transaction."""
+
+EDGES = (
+    0,
+    1,
+    499,
+    500,
+    501,
+    512,
+    1012,
+    1024,
+    65524,
+    65535,
+    65536,
+    65537,
+    131072,
+    262132,
+    262144,
+    524276,
+    524288,
+    786432,
+)
+"""Payloads at which packets, pieces or reads are just full; 500 and 12 bytes of header make a packet of 512."""
+
+
+def payload(size: int) -> bytes:
+    """Return `size` bytes, hardly any two of 251 alike."""
+    return (bytes(range(251)) * (size // 251 + 1))[:size]
+
+
+@dataclass
+class Echo:
+    """A `sim.responder.Responder` that does what it is told."""
+
+    raised: list[Event] = field(default_factory=list[Event])
+    cancellations: list[int] = field(default_factory=list[int])
+    unplugs: int = 0
+
+    def takes_data(self, request: Request) -> bool:
+        return request.code == TAKE
+
+    def answer(self, request: Request, data: bytes | None) -> Answer:
+        transaction = request.transaction
+        ok = Response(ResponseCode.OK, transaction)
+        match request.code:
+            case 0x9F01:
+                return Answer(Response(ResponseCode.OK, transaction, request.parameters))
+            case 0x9F02:
+                return Answer(ok, payload(request.parameters[0]))
+            case 0x9F03:
+                taken = data or b""
+                return Answer(Response(ResponseCode.OK, transaction, (len(taken), zlib.crc32(taken))))
+            case 0x9F05:
+                return Answer(Response(ResponseCode.INCOMPLETE_TRANSFER, transaction), payload(1000))
+            case 0x9F06:
+                self.raised += [Event(0xC101, parameters=(number,)) for number in range(request.parameters[0])]
+                return Answer(ok)
+            case 0x9F07:
+                raise NoAnswer
+            case 0x9F08:
+                return Answer(Response(ResponseCode.OK, transaction + 1))
+            case _:
+                return Answer(Response(ResponseCode.DEVICE_BUSY, transaction))
+
+    def events(self) -> tuple[Event, ...]:
+        events = tuple(self.raised)
+        self.raised.clear()
+        return events
+
+    def cancelled(self, transaction: int) -> None:
+        self.cancellations.append(transaction)
+
+    def unplugged(self) -> None:
+        self.unplugs += 1
+
+
+@dataclass
+class Bench:
+    """A cable under test, the device at its far end, and a hand that pulls it out."""
+
+    transport: Transport
+    device: Echo
+    pull: Callable[[], None]
+
+
+class TransportContract:
+    """Subclass as ``TestX`` and supply the fixture `bench`."""
+
+    def test_carries_a_transaction_without_data(self, bench: Bench) -> None:
+        for count in range(6):
+            parameters = tuple(0xFFFFFFFF - number for number in range(count))
+            request = Request(ECHO, 7 + count, parameters)
+            done = bench.transport.transact(request, timeout=PATIENCE_S)
+            assert done.response == Response(ResponseCode.OK, 7 + count, parameters)
+            assert done.data == b""
+
+    @pytest.mark.parametrize("size", EDGES)
+    def test_full_packets_lose_nothing_either_way(self, bench: Bench, size: int) -> None:
+        _give(bench, size)
+        _take(bench, size)
+        _give(bench, 3)
+
+    @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(size=st.integers(0, 5000) | st.integers(1, 200).map(lambda packets: 512 * packets - 12))
+    def test_any_size_goes_through_either_way(self, bench: Bench, size: int) -> None:
+        _give(bench, size)
+        _take(bench, size)
+
+    def test_pieces_add_up_to_the_data(self, bench: Bench) -> None:
+        pieces: list[bytes] = []
+        request = Request(GIVE, 1, (5_000_000,))
+        done = bench.transport.transact(request, receive=pieces.append, timeout=PATIENCE_S)
+        assert done.response.ok
+        assert done.data == b""
+        assert b"".join(pieces) == payload(5_000_000)
+        assert len(pieces) > 4, "an object must not lie in memory in full"
+
+    def test_more_data_than_can_be_collected_is_refused(self, bench: Bench) -> None:
+        _give(bench, MAX_COLLECTED)
+        with pytest.raises(ProtocolError, match="at most"):
+            bench.transport.transact(Request(GIVE, 1, (MAX_COLLECTED + 1,)), timeout=PATIENCE_S)
+
+    def test_an_error_instead_of_data_is_the_response(self, bench: Bench) -> None:
+        done = bench.transport.transact(Request(REFUSE, 3), timeout=PATIENCE_S)
+        assert done.response == Response(ResponseCode.DEVICE_BUSY, 3)
+        _give(bench, 100)
+
+    def test_an_error_after_data_is_the_response(self, bench: Bench) -> None:
+        done = bench.transport.transact(Request(BREAK_OFF, 3), timeout=PATIENCE_S)
+        assert done.response.code == ResponseCode.INCOMPLETE_TRANSFER
+        _give(bench, 100)
+
+    def test_events_come_once_and_in_order(self, bench: Bench) -> None:
+        assert bench.transport.events() == ()
+        bench.transport.transact(Request(RAISE, 1, (20,)), timeout=PATIENCE_S)
+        assert [event.parameters for event in bench.transport.events()] == [(number,) for number in range(20)]
+        assert bench.transport.events() == ()
+
+    def test_a_device_that_falls_silent_can_be_reset(self, bench: Bench) -> None:
+        with pytest.raises(LinkTimeout):
+            bench.transport.transact(Request(HANG, 1), timeout=GIVE_UP_S)
+        with pytest.raises(ProtocolError, match="reset"):
+            bench.transport.transact(Request(ECHO, 2), timeout=PATIENCE_S)
+        bench.transport.reset()
+        assert bench.device.unplugs == 1
+        _give(bench, 100)
+
+    def test_another_transactions_response_is_refused(self, bench: Bench) -> None:
+        with pytest.raises(ProtocolError, match="transaction 6"):
+            bench.transport.transact(Request(MIX_UP, 5), timeout=PATIENCE_S)
+        bench.transport.reset()
+        _give(bench, 100)
+
+    def test_a_caller_who_cannot_take_the_data_may_go_on(self, bench: Bench) -> None:
+        with pytest.raises(_DiskFullError):
+            bench.transport.transact(Request(GIVE, 4, (3_000_000,)), receive=_full, timeout=PATIENCE_S)
+        _give(bench, 100)
+        assert bench.device.unplugs == 0
+
+    def test_unplugged_is_closed(self, bench: Bench) -> None:
+        _give(bench, 100)
+        bench.pull()
+        for _ in range(2):
+            with pytest.raises(LinkClosed):
+                bench.transport.transact(Request(GIVE, 2, (100,)), timeout=PATIENCE_S)
+
+    def test_closed_is_closed(self, bench: Bench) -> None:
+        bench.transport.close()
+        bench.transport.close()
+        with pytest.raises(LinkClosed):
+            bench.transport.transact(Request(ECHO, 1), timeout=PATIENCE_S)
+
+    def test_messages_name_the_device(self, bench: Bench) -> None:
+        assert bench.transport.label
+        with pytest.raises(LinkTimeout, match=r".+"):
+            bench.transport.transact(Request(HANG, 1), timeout=GIVE_UP_S)
+
+
+class _DiskFullError(Exception):
+    pass
+
+
+def _full(piece: bytes) -> None:
+    raise _DiskFullError
+
+
+def _give(bench: Bench, size: int) -> None:
+    done = bench.transport.transact(Request(GIVE, 1, (size,)), timeout=PATIENCE_S)
+    assert done.response == Response(ResponseCode.OK, 1)
+    assert done.data == payload(size)
+
+
+def _take(bench: Bench, size: int) -> None:
+    data = payload(size)
+    done = bench.transport.transact(Request(TAKE, 2), send=data, timeout=PATIENCE_S)
+    assert done.response.parameters == (size, zlib.crc32(data))
