@@ -393,10 +393,11 @@ class _Measurement:
         self._planes = {channel: plane_of(decoded.mosaic, channel, decoded.black) for channel in CHANNELS}
 
     def _covered_cells(self, registration: Registration) -> npt.NDArray[np.bool_]:
-        """Return the cells whose neighbourhood does not look like the chart's."""
+        """Return the cells that do not look like the chart's, alone or with their neighbourhood."""
         blocks = registration.blocks
         nearest = np.asarray(cKDTree(blocks.centres_mm).query(self._cells_mm)[1])
-        return blocks.score[nearest] < MIN_BLOCK_SCORE
+        strangers = registration.strangers[self._chart.cell_of_colour]
+        return strangers | np.asarray(blocks.score[nearest] < MIN_BLOCK_SCORE)
 
     def measure(self, decoded: _Decoded) -> tuple[FrameFigures, npt.NDArray[np.uint16]]:
         """Return a frame's figures and its samples (colours, 25, 3) uint16 in the order of colour indices."""
@@ -475,7 +476,7 @@ class _Measurement:
                 under = f"light {light}" if light >= 0 else "white"
                 cause = f"clipped: {int(self._highest[colour])} counts under {under}, below {allowed:.0f} allowed"
             elif self._covered[colour]:
-                cause = "covered: its neighbourhood does not look like the chart's"
+                cause = "covered: it does not look like the chart's (covered, damaged, or printed otherwise)"
             elif unevenness[colour] > 0:
                 cause = f"uneven: rim and middle differ by {unevenness[colour]:.1%} under white"
             if cause:

@@ -67,6 +67,10 @@ _TAG_SIGMA_PX = 0.15
 _LEAST_INFORMATION = 4.0
 """px⁻²: a block that knows its place no better than half a pixel says nothing."""
 
+_STRANGE_SIGMA = 10.0
+_STRANGE_SHARE = 0.08
+"""Of paper white: the model's own errors at the gamut's corners stay below."""
+
 _ROUGHNESS_PX = 0.1
 """Second difference of the displacement between knots that is thought usual: a wave of 2 px every 30 knots."""
 
@@ -358,6 +362,8 @@ class Registration:
         Fit of the cells.
     colours
         The colour model of the frame.
+    strangers
+        (N,) bool, cells in the chart's order whose colour is not nearly the model's: covered, damaged, misprinted.
     agreement
         Correlation of the cells' colours with the model's, the mean of the channels that carry light.
     blur_px
@@ -375,6 +381,7 @@ class Registration:
     lens_residual_px: float
     blocks: Blocks
     colours: ColourModel
+    strangers: _Mask
     agreement: float
     blur_px: float
     cell_px: float
@@ -691,7 +698,8 @@ class _Matcher:
         self.colours = self._fit_colours()
         seen = self._seen()
         there = np.isfinite(seen).all(axis=1)
-        wanted = self.colours.seen(self._rgb[there], self._centres[there])
+        wanted = self.colours.seen(self._rgb, self._centres)
+        paper = self.colours.flat(np.array([[255, 255, 255]]))[0]
         tags = {tag.id: tag for tag in self._chart.tags}
         residual = np.stack([tag.corners_px - self.to_pixels(tags[tag.id].corners_mm) for tag in self._framing.tags])
         return Registration(
@@ -702,10 +710,18 @@ class _Matcher:
             lens_residual_px=lens_rms,
             blocks=self._fit,
             colours=self.colours,
-            agreement=_agreement(seen[there], wanted),
+            strangers=_strangers(seen, wanted, paper)[: self._chart.colour_count],
+            agreement=_agreement(seen[there], wanted[there]),
             blur_px=self._blur,
             cell_px=self._cell_px,
         )
+
+
+def _strangers(seen: _Array, wanted: _Array, paper: _Array) -> _Mask:
+    """Return which patches (N,) differ from their model far more than is usual, and by a visible share of white."""
+    residual = np.abs(seen - wanted)
+    usual = 1.4826 * np.nanmedian(residual, axis=0)
+    return np.asarray(((residual > _STRANGE_SIGMA * usual) & (residual > _STRANGE_SHARE * paper)).any(axis=1))
 
 
 def _agreement(seen: _Array, wanted: _Array) -> float:

@@ -1,0 +1,123 @@
+"""A lab for these tests: a chart hung before a simulated body, and sessions taken in it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.chart import Chart
+from acquisition.illuminations import Illumination, plan_illuminations
+from acquisition.layout import A_SERIES_MM, design_chart
+from acquisition.printing import drawing
+from acquisition.session import ACCEPTED, Session, Step, plan_steps
+from drivers.camera import ExposureSettings
+from drivers.presenter import WHITE, Colour
+from drivers.rawfile import Mosaic, read_raw
+from sim.bodies import BODIES
+from sim.dng import write_dng
+from sim.world import Print, Room, World
+
+SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
+Paint = Callable[[npt.NDArray[np.uint16]], None]
+TAKEN_AT = datetime(2024, 3, 1, 9, 0, tzinfo=UTC)
+
+
+@dataclass(frozen=True, eq=False)
+class Lab:
+    """A chart hung in a simulated room."""
+
+    chart: Chart
+    world: World
+
+    def dng(
+        self,
+        colour: Colour = WHITE,
+        key: int = 1,
+        settings: ExposureSettings = SETTINGS,
+        paint: Paint | None = None,
+    ) -> bytes:
+        """Return a frame's file; `paint` may alter the whole sensor's counts before it is written."""
+        counts = self.world.expose(colour, settings, key=(key,))
+        if paint is not None:
+            paint(counts)
+        stream = BytesIO()
+        write_dng(stream, counts, self.world.body, settings=settings, taken_at=TAKEN_AT)
+        return stream.getvalue()
+
+    def mosaic(
+        self,
+        folder: Path,
+        colour: Colour = WHITE,
+        key: int = 1,
+        settings: ExposureSettings = SETTINGS,
+        paint: Paint | None = None,
+    ) -> Mosaic:
+        """Return a frame as read from its file."""
+        path = folder / f"{key}.dng"
+        path.write_bytes(self.dng(colour, key, settings, paint))
+        return read_raw(path)
+
+    def truth_px(self, points_mm: npt.NDArray[np.float64], mosaic: Mosaic) -> npt.NDArray[np.float64]:
+        """Return where points are seen, in the half-size pixels of a mosaic as read."""
+        visible = self.world.body.visible
+        aside = np.array([mosaic.visible.left - visible.left, mosaic.visible.top - visible.top]) / 2
+        return self.world.project(points_mm) - aside
+
+
+def hang(
+    bits: int = 3,
+    page: str = "A5",
+    body: str = "Test",
+    seed: int = 1,
+    room: Room | None = None,
+    chart: Chart | None = None,
+) -> Lab:
+    """Return a lab; the paper of a small page waves less than the room's default."""
+    chart = design_chart(bits, A_SERIES_MM[page], seed) if chart is None else chart
+    picture = drawing(chart)
+    sheet = Print(picture.page_mm, picture.rectangles_mm, picture.rgb)
+    return Lab(chart, World(sheet, BODIES[body], Room(waviness_mm=0.5) if room is None else room))
+
+
+def take(
+    lab: Lab,
+    folder: Path,
+    lights: Sequence[Illumination],
+    every: int = 25,
+    frame: Callable[[Step], bytes] | None = None,
+    verdict: Callable[[Step], str] | None = None,
+) -> Session:
+    """Return an open session with an accepted frame for every step of the plan."""
+    session = Session.create(folder, "rig = 'simulated'\n", lab.chart, lights)
+    for step in plan_steps(lights, every):
+        data = lab.dng(step.colour, step.number) if frame is None else frame(step)
+        file = f"frames/{step.stem}.dng"
+        at = TAKEN_AT + timedelta(seconds=4 * step.number)
+        attempt = session.begin(step, file, at)
+        (folder / file).write_bytes(data)
+        session.commit(
+            attempt,
+            file=file,
+            size=len(data),
+            sha256=hashlib.sha256(data).hexdigest(),
+            taken_at=at,
+            exposure_s=SETTINGS.shutter_s,
+            ended_at=at,
+            verdict=ACCEPTED if verdict is None else verdict(step),
+        )
+    return session
+
+
+def renumbered(lights: Sequence[Illumination]) -> tuple[Illumination, ...]:
+    """Return lights as a plan of their own, numbered from 0."""
+    return tuple(replace(light, index=index) for index, light in enumerate(lights))
+
+
+LIGHTS = plan_illuminations(3, (2500, 4500, 6500))

@@ -1,0 +1,326 @@
+"""From a session to a table, against the light that the simulated room really had."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from acquisition.chart import Chart
+from acquisition.session import Session, Step
+from calibration.build import BuildResult, build, check, session_sha256
+from calibration.cli import main
+from calibration.lut import Lut, open_lut
+from calibration.report import summary, write_report
+from drivers.camera import ExposureSettings
+from drivers.errors import FormatError, InputError, QualityError, RegistrationError
+from drivers.presenter import WHITE
+from sim.world import Room
+from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
+
+
+def angle_deg(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> float:
+    cosine = one @ other / np.linalg.norm(one) / np.linalg.norm(other)
+    return float(np.degrees(np.arccos(min(1.0, float(cosine)))))
+
+
+def codes(chart: Chart) -> npt.NDArray[np.uint8]:
+    """Return the printed codes in the order of colour indices."""
+    return chart.rgb[chart.cell_of_colour]
+
+
+@pytest.fixture(scope="module")
+def built(session: Session, tmp_path_factory: pytest.TempPathFactory) -> BuildResult:
+    return build(session, tmp_path_factory.mktemp("table") / "lut", report=write_report)
+
+
+@pytest.fixture(scope="module")
+def table(built: BuildResult) -> Lut:
+    assert built.lut is not None
+    return open_lut(built.lut)
+
+
+def test_the_table_has_a_place_for_every_light_colour_and_sample(table: Lut, lab: Lab) -> None:
+    assert table.samples.shape == (len(LIGHTS), 512, 25, 3)
+    assert table.illuminations == LIGHTS
+    assert table.provenance.bits == 3
+    assert table.provenance.camera == "Canon CroP Test"
+    assert table.provenance.chart_sha256 == lab.chart.sha256
+    assert table.provenance.software.startswith("croplab ")
+    assert table.provenance.white_level == pytest.approx(lab.world.body.saturation - lab.world.body.black, abs=1)
+
+
+def test_the_ground_truth_is_the_light(table: Lut, lab: Lab) -> None:
+    errors = [
+        angle_deg(table.white[light.index], lab.world.white(light.colour, SETTINGS)) for light in table.illuminations
+    ]
+    assert np.median(errors) <= 0.2
+    assert max(errors) <= 0.5
+
+
+def test_every_colour_is_the_paper_s_under_every_light(table: Lut, lab: Lab) -> None:
+    for light in table.illuminations:
+        white = lab.world.white(light.colour, SETTINGS)
+        true = lab.world.reflected(codes(lab.chart), light.colour, SETTINGS) / white
+        mean = table.samples[light.index].mean(axis=1) / table.white[light.index]
+        error = mean - true
+        # Noise of the mean of 25 samples, on top of the field's half percent.
+        signal = true * white
+        noise = np.sqrt(signal / lab.world.body.electrons_per_dn + lab.world.body.read_noise_dn**2) / 5 / white
+        assert (np.abs(error) < 5 * noise + 0.01 * true + 0.002).all()
+        assert np.abs(error.mean(axis=0)).max() < 0.003
+
+
+def test_samples_have_the_noise_of_the_sensor(table: Lut, lab: Lab) -> None:
+    """Interpolated samples would have less."""
+    light = next(light for light in LIGHTS if light.colour == WHITE)
+    samples = table.samples[light.index].astype(np.float64)
+    signal = samples.mean(axis=1)
+    body = lab.world.body
+    for channel, photosites in ((0, 1), (1, 2), (2, 1)):
+        spread = samples[..., channel].var(axis=1, ddof=1)
+        response = (lab.world.room.response_spread * signal[:, channel]) ** 2
+        expected = (signal[:, channel] / body.electrons_per_dn + body.read_noise_dn**2 + response) / photosites
+        assert np.median(spread / expected) == pytest.approx(1, abs=0.12)
+
+
+def test_nothing_is_unfit_in_a_healthy_session(built: BuildResult) -> None:
+    assert len(built.unfit) <= 2
+    assert built.black_drift < 1
+    assert built.largest_shift_px < 0.02
+    assert not any(figures.registered for figures in built.frames)
+
+
+def test_the_field_can_be_undone(table: Lut, built: BuildResult, session: Session, lab: Lab) -> None:
+    """Multiplied by the field of `lut.json`, the table gives the counts of the frame again."""
+    told = {correction["name"]: correction for correction in table.provenance.corrections}
+    assert list(told) == ["black", "half size", "saturation", "field", "rounding"]
+    assert len(told["field"]["per_light"]) == len(told["black"]["per_light"]) == len(LIGHTS)
+    figures = next(f for f in built.frames if f.record.illumination == 5)
+    field = figures.paper.field.at(lab.chart.centres_mm[lab.chart.cell_of_colour])
+    assert field.mean(axis=0) == pytest.approx(1, abs=1e-6)
+    assert field.std() > 0.03
+    white = lab.world.reflected(codes(lab.chart), LIGHTS[5].colour, SETTINGS)
+    raw = table.samples[5].mean(axis=1) * field
+    assert (
+        np.corrcoef(raw[:, 1], white[:, 1])[0, 1] < np.corrcoef(table.samples[5].mean(axis=1)[:, 1], white[:, 1])[0, 1]
+    )
+
+
+def test_the_report_stands_alone(built: BuildResult) -> None:
+    assert built.lut is not None
+    page = (built.lut / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 6
+    assert re.search(r"(src|href)='?http", page) is None
+    for name, _, _ in summary(built):
+        assert html.escape(name) in page
+
+
+def test_the_same_session_gives_the_same_table(session: Session, built: BuildResult, tmp_path: Path) -> None:
+    assert built.lut is not None
+    build(session, tmp_path / "again")
+    for name in ("samples.npy", "illuminations.csv", "lut.json"):
+        assert (tmp_path / "again" / name).read_bytes() == (built.lut / name).read_bytes()
+
+
+def test_check_writes_nothing(session: Session) -> None:
+    before = sorted(session.folder.rglob("*"))
+    result = check(session)
+    assert result.lut is None
+    assert result.registered_file == "frames/0000_white.dng"
+    assert result.registration.agreement > 0.99
+    assert sorted(session.folder.rglob("*")) == before
+
+
+def test_the_session_s_hash_changes_with_any_frame(session: Session) -> None:
+    records = [record for record in session.frames() if record.accepted]
+    assert session_sha256(records) == session_sha256(list(records))
+    assert session_sha256(records) != session_sha256(records[:-1])
+
+
+def small(lab: Lab, folder: Path, count: int = 2) -> Session:
+    return take(lab, folder, LIGHTS[:count])
+
+
+def test_a_light_without_an_accepted_frame_is_named(lab: Lab, tmp_path: Path) -> None:
+    session = take(
+        lab,
+        tmp_path / "session",
+        LIGHTS[:3],
+        verdict=lambda step: "refused" if step.illumination == 1 else "accepted",
+    )
+    with session, pytest.raises(FormatError, match=r"1 of 3 lights have no accepted frame: 1; finish the session"):
+        build(session, tmp_path / "lut")
+    assert not (tmp_path / "lut").exists()
+    assert list(tmp_path.iterdir()) == [tmp_path / "session"]
+
+
+def test_a_missing_file_is_named(lab: Lab, tmp_path: Path) -> None:
+    with small(lab, tmp_path / "session") as session:
+        (session.folder / "frames/0002_light_000.dng").unlink()
+        with pytest.raises(FormatError, match=r"0002_light_000\.dng is missing"):
+            build(session, tmp_path / "lut")
+
+
+def test_a_changed_file_is_named(lab: Lab, tmp_path: Path) -> None:
+    with small(lab, tmp_path / "session") as session:
+        path = session.folder / "frames/0003_light_001.dng"
+        data = bytearray(path.read_bytes())
+        data[-1000] ^= 1
+        path.write_bytes(data)
+        with pytest.raises(FormatError, match=r"0003_light_001\.dng is not the file that was taken"):
+            build(session, tmp_path / "lut")
+
+
+def test_a_chart_of_another_order_builds_no_table(lab: Lab, tmp_path: Path) -> None:
+    with small(lab, tmp_path / "session") as session:
+        pass
+    other = hang(seed=2)
+    other.chart.save(tmp_path / "session" / "chart.json")
+    with Session.open(tmp_path / "session") as session, pytest.raises(RegistrationError, match="colours are not those"):
+        build(session, tmp_path / "lut")
+    assert not (tmp_path / "lut").exists()
+
+
+def test_a_bump_in_the_night_is_followed(lab: Lab, tmp_path: Path) -> None:
+    bumped = hang(chart=lab.chart, room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
+    lights = renumbered(LIGHTS[4:8])
+
+    def frame(step: Step) -> bytes:
+        return (bumped if step.number >= 4 else lab).dng(step.colour, step.number)
+
+    with take(lab, tmp_path / "session", lights, frame=frame) as session:
+        result = build(session, tmp_path / "lut")
+    anew = [figures.record.illumination for figures in result.frames if figures.registered]
+    assert anew == [2]
+    table = open_lut(tmp_path / "lut")
+    for light in lights:
+        white = lab.world.white(light.colour, SETTINGS)
+        true = lab.world.reflected(codes(lab.chart), light.colour, SETTINGS) / white
+        mean = table.samples[light.index].mean(axis=1) / table.white[light.index]
+        # A grid that had stayed behind would read neighbours here and there.
+        assert np.abs(mean - true)[:, 1].max() < 0.05
+
+
+def test_a_small_movement_is_followed_without_registering_anew(lab: Lab, tmp_path: Path) -> None:
+    lights = renumbered(LIGHTS[4:6])
+
+    def frame(step: Step) -> bytes:
+        def move(counts: npt.NDArray[np.uint16]) -> None:
+            if step.kind == "light":
+                # A picture mixed with itself one half-size pixel to the right lies a share of a pixel to the right.
+                counts[:] = (0.8 * counts + 0.2 * np.roll(counts, 2, axis=1)).astype(np.uint16)
+
+        return lab.dng(step.colour, step.number, paint=move)
+
+    with take(lab, tmp_path / "session", lights, frame=frame) as session:
+        result = build(session, tmp_path / "lut")
+    moved = [figures.shift.dx for figures in result.frames if figures.record.kind == "light"]
+    assert moved == pytest.approx([0.17, 0.17], abs=0.05)
+    assert not any(figures.registered for figures in result.frames)
+
+
+def test_a_table_s_folder_that_is_taken_is_left_alone(session: Session, tmp_path: Path) -> None:
+    (tmp_path / "lut").mkdir()
+    (tmp_path / "lut" / "precious").write_text("x")
+    with pytest.raises(InputError, match="already exists"):
+        build(session, tmp_path / "lut")
+    assert (tmp_path / "lut" / "precious").read_text() == "x"
+
+
+def test_an_overexposed_session_builds_no_table(lab: Lab, tmp_path: Path) -> None:
+    bright = ExposureSettings(100, 8.0, 1.2)
+    session = take(lab, tmp_path / "session", LIGHTS[:2], frame=lambda step: lab.dng(step.colour, step.number, bright))
+    with session, pytest.raises(QualityError):
+        build(session, tmp_path / "lut")
+
+
+def test_cells_that_cannot_be_used_are_listed_with_their_cause(lab: Lab, tmp_path: Path) -> None:
+    lights = renumbered(LIGHTS[5:6])
+    visible, chart = lab.world.body.visible, lab.chart
+    clipped, dusty = int(chart.cell_of_colour[100]), int(chart.cell_of_colour[300])
+
+    def frame(step: Step) -> bytes:
+        def paint(counts: npt.NDArray[np.uint16]) -> None:
+            places = np.rint(lab.world.project(chart.centres_mm[[clipped, dusty]])).astype(int)
+            rows, columns = visible.top + 2 * places[:, 1], visible.left + 2 * places[:, 0]
+            if step.kind == "light":
+                counts[rows[0], columns[0]] = lab.world.body.saturation
+            else:
+                counts[rows[1] - 4 : rows[1] - 2, columns[1] - 4 : columns[1] + 5] += 2500
+
+        return lab.dng(step.colour, step.number, paint=paint)
+
+    with take(lab, tmp_path / "session", lights, frame=frame) as session:
+        build(session, tmp_path / "lut")
+    unfit = {cell.colour: cell.cause for cell in open_lut(tmp_path / "lut").provenance.unfit}
+    assert unfit[100].startswith("clipped: 13584 counts under light 0")
+    assert unfit[300].startswith("uneven: rim and middle differ by")
+    assert len(unfit) <= 3
+
+
+def test_cells_under_a_cover_are_listed(lab: Lab, tmp_path: Path) -> None:
+    visible = lab.world.body.visible
+    corner = np.array([220, 130])
+
+    def frame(step: Step) -> bytes:
+        def cover(counts: npt.NDArray[np.uint16]) -> None:
+            top, left = visible.top + 2 * int(corner[1]), visible.left + 2 * int(corner[0])
+            counts[top : top + 110, left : left + 110] = 2300
+
+        return lab.dng(step.colour, step.number, paint=cover)
+
+    with take(lab, tmp_path / "session", renumbered(LIGHTS[5:6]), frame=frame) as session:
+        result = check(session)
+    covered = [cell.colour for cell in result.unfit if cell.cause.startswith("covered")]
+    under = lab.world.project(lab.chart.centres_mm)[lab.chart.cell_of_colour[covered]] - corner
+    assert 15 <= len(covered) <= 100
+    assert ((under > -45) & (under < 100)).all()
+
+
+def test_the_command_builds_and_tells(
+    session: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["build-lut", str(session.folder), str(tmp_path / "lut")])
+    assert main() == 0
+    told = capsys.readouterr().out
+    assert "Colours agree" in told
+    assert f"{len(LIGHTS)} lights, Canon CroP Test" in told
+    assert json.loads((tmp_path / "lut" / "lut.json").read_text())["format"] == "crop.lut"
+    assert (tmp_path / "lut" / "report.html").exists()
+
+
+def test_the_command_checks(
+    session: Session, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["build-lut", "--check", str(session.folder)])
+    assert main() == 0
+    assert "a table can be built" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nowhere", "lut"], "is no session"),
+        (["--check", "nowhere", "lut"], "--check writes nothing"),
+        (["nowhere"], "a folder for the table is expected"),
+    ],
+)
+def test_the_command_says_what_is_wrong_in_a_line(
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["build-lut", *arguments])
+    assert main() == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.strip().splitlines()) == 1

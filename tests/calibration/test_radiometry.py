@@ -1,0 +1,135 @@
+"""Black, saturation, the field and the ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration.radiometry import (
+    Field,
+    black_drift,
+    corrections,
+    even_field,
+    order_of,
+    polynomial,
+    read_paper,
+    saturation,
+    terms,
+)
+from drivers.camera import ExposureSettings
+from drivers.errors import QualityError
+from drivers.presenter import WHITE
+from tests.calibration.lab import Lab
+
+PAGE = (400.0, 300.0)
+RANDOM = np.random.default_rng(3)
+PLACES = RANDOM.random((400, 2)) * PAGE
+CENTRES = RANDOM.random((1000, 2)) * PAGE
+
+
+def falloff(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    x, y = (2 * points / PAGE - 1).T
+    return np.stack([1 / (1 + 0.2 * (x * x + y * y)), 1 / (1 + 0.25 * ((x - 0.1) ** 2 + y * y)), 1 - 0.1 * x], axis=-1)
+
+
+@pytest.mark.parametrize("order", range(8))
+def test_terms_and_orders_agree(order: int) -> None:
+    assert len(terms(order)) == (order + 1) * (order + 2) // 2
+    assert order_of(len(terms(order))) == order
+    assert polynomial(PLACES, PAGE, order).shape == (len(PLACES), len(terms(order)))
+
+
+def test_the_field_is_found_and_its_mean_over_the_cells_is_one() -> None:
+    level = np.array([3000.0, 8000.0, 5000.0])
+    paper = read_paper(PLACES, falloff(PLACES) * level, CENTRES, PAGE)
+    assert paper.field.at(CENTRES).mean(axis=0) == pytest.approx(1, abs=1e-6)
+    expected = falloff(CENTRES) / falloff(CENTRES).mean(axis=0)
+    # Corners that no reference reaches are extrapolated.
+    assert paper.field.at(CENTRES) == pytest.approx(expected, rel=0.01)
+    assert np.sqrt(((paper.field.at(CENTRES) / expected - 1) ** 2).mean()) < 3e-4
+    assert paper.white == pytest.approx(level * falloff(CENTRES).mean(axis=0), rel=1e-3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([20.0, 300.0, 9000.0]))
+def test_noise_is_not_taken_for_shape(seed: int, level: float) -> None:
+    random = np.random.default_rng(seed)
+    noise = np.sqrt(level / 1.8 + 36) / 5
+    seen = level * falloff(PLACES) + random.normal(0, noise, (len(PLACES), 3))
+    base = read_paper(PLACES, 9000 * falloff(PLACES), CENTRES, PAGE).field
+    paper = read_paper(PLACES, seen, CENTRES, PAGE, base)
+    true = level * falloff(CENTRES).mean(axis=0)
+    assert (np.abs(paper.white - true) < 6 * paper.error + 1e-3 * true).all()
+    assert paper.error == pytest.approx(np.full(3, noise / 20), rel=0.35)
+    expected = falloff(CENTRES) / falloff(CENTRES).mean(axis=0)
+    assert np.sqrt(((paper.field.at(CENTRES) / expected - 1) ** 2).mean()) < 0.002 + 0.25 * noise / level
+
+
+def test_references_that_are_covered_or_dirty_do_not_count() -> None:
+    seen = 5000 * falloff(PLACES)
+    seen[:30] *= 0.5
+    seen[30:40] = np.nan
+    paper = read_paper(PLACES, seen, CENTRES, PAGE)
+    assert paper.references == 390
+    assert paper.white == pytest.approx(5000 * falloff(CENTRES).mean(axis=0), rel=0.002)
+
+
+def test_a_channel_without_light_has_the_shape_of_a_brighter_frame() -> None:
+    base = read_paper(PLACES, 9000 * falloff(PLACES), CENTRES, PAGE).field
+    seen = np.random.default_rng(0).normal(0, 1, (len(PLACES), 3))
+    field = read_paper(PLACES, seen, CENTRES, PAGE, base).field
+    assert field.at(CENTRES) == pytest.approx(base.at(CENTRES), rel=0.02)
+    assert (field.at(CENTRES) > 0).all()
+
+
+def test_too_few_references_are_refused() -> None:
+    with pytest.raises(QualityError, match="5 white references can be used, at least 6 expected"):
+        read_paper(PLACES[:5], np.ones((5, 3)), CENTRES, PAGE)
+
+
+def test_the_table_says_enough_to_undo_the_field() -> None:
+    """Evaluated by the words of `lut.json`, with NumPy's Legendre series and nothing of ours."""
+    base = read_paper(PLACES, 9000 * falloff(PLACES), CENTRES, PAGE).field
+    tilted = falloff(PLACES) * (1 + 0.05 * (2 * PLACES[:, :1] / PAGE[0] - 1))
+    field = read_paper(PLACES, 9000 * tilted, CENTRES, PAGE, base).field
+    told = next(c for c in corrections(PAGE, np.zeros((1, 2, 2)), 13584, [field]) if c["name"] == "field")
+    u, v = (2 * CENTRES / PAGE - 1).T
+    for channel in range(3):
+        product = np.ones(len(CENTRES))
+        for factor in told["per_light"][0][channel]:
+            weights, order, rest = np.zeros((7, 7)), 0, list(factor)
+            while rest:
+                for j in range(order + 1):
+                    weights[order - j, j] = rest.pop(0)
+                order += 1
+            product *= np.asarray(np.polynomial.legendre.legval2d(u, v, weights), dtype=np.float64)
+        assert product == pytest.approx(field.at(CENTRES)[:, channel], rel=1e-5)
+
+
+def test_an_even_field_is_one() -> None:
+    assert even_field(PAGE).at(CENTRES) == pytest.approx(1)
+    assert isinstance(even_field(PAGE), Field)
+
+
+def test_saturation_is_what_the_frame_shows(lab: Lab, tmp_path: Path) -> None:
+    normal = lab.mosaic(tmp_path)
+    assert saturation(normal) == normal.white_level == lab.world.body.saturation
+    # A sensor that saturates below what its file states, as LibRaw's tables have it for the EOS 550D.
+    plateau = 12_800
+
+    def saturate(counts: npt.NDArray[np.uint16]) -> None:
+        np.minimum(counts, plateau, out=counts)
+
+    bright = lab.mosaic(tmp_path, WHITE, settings=ExposureSettings(100, 8.0, 2.0), paint=saturate)
+    assert bright.white_level > plateau
+    assert saturation(bright) == plateau
+
+
+def test_black_drift_is_the_worst_position() -> None:
+    assert black_drift([]) == 0
+    assert black_drift([np.zeros((2, 2)), np.array([[0, 0.2], [-0.3, 0.1]])]) == pytest.approx(0.3)

@@ -1,0 +1,168 @@
+"""The chart's place in a frame, against the place from which the simulated frame was rendered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from acquisition.layout import A_SERIES_MM, design_chart
+from calibration.registration import Displacement, fit_lens, register
+from drivers.errors import RegistrationError
+from drivers.presenter import WHITE, Colour
+from drivers.rawfile import Mosaic, read_raw
+from sim.world import Room
+from tests.calibration.lab import Lab, hang
+
+RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw"
+
+
+def miss(lab: Lab, mosaic: Mosaic) -> npt.NDArray[np.float64]:
+    """Return how far the registered cells lie from the truth, px."""
+    registration = register(mosaic, lab.chart)
+    places = registration.to_pixels(lab.chart.centres_mm)
+    return np.linalg.norm(places - lab.truth_px(lab.chart.centres_mm, mosaic), axis=1)
+
+
+def test_whole_chart_in_the_default_room(tmp_path: Path) -> None:
+    lab = hang(5, "A0", "EOS 550D", room=Room())
+    mosaic = lab.mosaic(tmp_path)
+    error = miss(lab, mosaic)
+    assert np.sqrt(np.mean(error**2)) < 0.05
+    assert error.max() < 0.3
+
+
+@pytest.mark.parametrize("colour", [WHITE, Colour(255, 0, 0), Colour(0, 0, 255), Colour(90, 60, 20)])
+def test_every_light_registers(lab: Lab, tmp_path: Path, colour: Colour) -> None:
+    error = miss(lab, lab.mosaic(tmp_path, colour))
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert error.max() < 0.6
+
+
+@pytest.mark.parametrize(("bits", "page"), [(1, "A7"), (2, "A6"), (3, "A5")])
+@pytest.mark.parametrize("roll", [0.5, 180.0])
+def test_small_charts_upright_and_upside_down(tmp_path: Path, bits: int, page: str, roll: float) -> None:
+    lab = hang(bits, page, room=Room(waviness_mm=0.5, roll_deg=roll))
+    error = miss(lab, lab.mosaic(tmp_path))
+    assert np.sqrt(np.mean(error**2)) < 0.15
+    assert error.max() < 0.6
+
+
+def test_waves_that_tags_cannot_see(tmp_path: Path) -> None:
+    lab = hang(room=Room(waviness_mm=3.0, seed=5))
+    mosaic = lab.mosaic(tmp_path)
+    registration = register(mosaic, lab.chart)
+    truth = lab.truth_px(lab.chart.centres_mm, mosaic)
+    by_tags = np.linalg.norm(registration.lens.to_pixels(lab.chart.centres_mm) - truth, axis=1)
+    by_cells = np.linalg.norm(registration.to_pixels(lab.chart.centres_mm) - truth, axis=1)
+    assert (by_cells**2).mean() < 0.25 * (by_tags**2).mean()
+    assert by_cells.max() < 0.6
+
+
+def test_the_estimate_of_its_own_error_is_honest(lab: Lab, tmp_path: Path) -> None:
+    mosaic = lab.mosaic(tmp_path)
+    registration = register(mosaic, lab.chart)
+    assert registration.agreement > 0.99
+    assert registration.block_rms_px < 0.03
+    assert registration.blocks.good.all()
+    assert registration.cell_px == pytest.approx(9, abs=1)
+
+
+def test_shifted_moves_every_point(lab: Lab, tmp_path: Path) -> None:
+    registration = register(lab.mosaic(tmp_path), lab.chart)
+    moved = registration.shifted(0.25, -0.5).to_pixels(lab.chart.centres_mm)
+    assert moved - registration.to_pixels(lab.chart.centres_mm) == pytest.approx(np.tile([0.25, -0.5], (len(moved), 1)))
+
+
+def test_another_order_of_colours_is_refused(lab: Lab, tmp_path: Path) -> None:
+    other = design_chart(3, A_SERIES_MM["A5"], 2)
+    assert [tag.id for tag in other.tags] == [tag.id for tag in lab.chart.tags]
+    with pytest.raises(RegistrationError, match=r"colours are not those of the chart: .* name the chart\.json"):
+        register(lab.mosaic(tmp_path), other)
+
+
+def test_a_slip_by_one_cell_is_refused_or_mended(lab: Lab, tmp_path: Path) -> None:
+    """A chart file whose cells stand one cell beside the print must not give a table one cell off."""
+    slipped = replace(lab.chart, centres_mm=lab.chart.centres_mm + np.array([lab.chart.cell_mm[0], 0]))
+    mosaic = lab.mosaic(tmp_path)
+    try:
+        places = register(mosaic, slipped).to_pixels(slipped.centres_mm)
+    except RegistrationError:
+        return
+    assert np.abs(places - lab.truth_px(lab.chart.centres_mm, mosaic)).max() < 1
+
+
+def test_a_covered_half_is_refused(lab: Lab, tmp_path: Path) -> None:
+    top, left, height, width = lab.world.body.visible
+
+    def cover(counts: npt.NDArray[np.uint16]) -> None:
+        counts[top + height // 4 : top + 3 * height // 4, left + width // 6 : left + 5 * width // 6] = 2600
+
+    with pytest.raises(RegistrationError, match="uncover"):
+        register(lab.mosaic(tmp_path, paint=cover), lab.chart)
+
+
+def test_a_covered_corner_does_not_pull_its_neighbours(tmp_path: Path) -> None:
+    lab = hang(4, "A2", "EOS 550D", room=Room())
+    top, left, height, width = lab.world.body.visible
+    rows, columns = slice(top + height // 2, top + height // 2 + 400), slice(left + width // 2, left + width // 2 + 400)
+
+    def cover(counts: npt.NDArray[np.uint16]) -> None:
+        counts[rows, columns] = 3000
+
+    mosaic = lab.mosaic(tmp_path, paint=cover)
+    registration = register(mosaic, lab.chart)
+    truth = lab.truth_px(lab.chart.centres_mm, mosaic)
+    middle = np.array([width / 4 + 100, height / 4 + 100])
+    free = (np.abs(truth - middle) > 130).any(axis=1)
+    error = np.linalg.norm(registration.to_pixels(lab.chart.centres_mm) - truth, axis=1)
+    assert error[free].max() < 0.6
+
+
+def test_out_of_focus_is_refused(tmp_path: Path) -> None:
+    lab = hang(room=Room(waviness_mm=0.5, blur_px=1.6))
+    with pytest.raises(RegistrationError, match=r"out of focus|not fit|looked for"):
+        register(lab.mosaic(tmp_path), lab.chart)
+
+
+def test_too_far_away_is_refused(tmp_path: Path) -> None:
+    lab = hang(room=Room(waviness_mm=0.5, fill=0.78))
+    with pytest.raises(RegistrationError, match="nearer"):
+        register(lab.mosaic(tmp_path), lab.chart)
+
+
+def test_a_real_photograph_without_the_chart_is_refused(lab: Lab) -> None:
+    path = RAW / "canon_eos_550d_colorchart.dng"
+    if not path.exists():
+        pytest.skip("the photograph is not at hand")
+    with pytest.raises(RegistrationError, match="looked for, none found") as caught:
+        register(read_raw(path), lab.chart, path.name)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_lens_is_found_exactly_without_noise() -> None:
+    points = np.stack(np.meshgrid(np.linspace(0, 1189, 8), np.linspace(0, 841, 6)), axis=-1).reshape(-1, 2)
+    x, y = ((points - (594, 420)) / 1500 * 2).T
+    r2 = x * x + y * y
+    radial = 1 - 0.04 * r2 + 0.02 * r2**2
+    bent = np.stack([x * radial + 3e-4 * x * y, y * radial + 1.5e-4 * (r2 + 2 * y * y)], axis=-1)
+    places = bent * 1500 + (1300, 866)
+    lens, residual = fit_lens(points, places, (2601, 1733))
+    assert np.abs(residual).max() < 0.02
+    assert lens.to_pixels(points) == pytest.approx(places, abs=0.02)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(-3, 3), st.floats(-0.05, 0.05), st.floats(-0.05, 0.05))
+def test_a_displacement_without_bend_is_followed_exactly(level: float, slope_x: float, slope_y: float) -> None:
+    low, high = np.array([10.0, 20.0]), np.array([110.0, 90.0])
+    points = low + np.random.default_rng(1).random((300, 2)) * (high - low)
+    moved = np.stack([level + slope_x * points[:, 0], level + slope_y * points[:, 1]], axis=-1)
+    information = np.broadcast_to(np.eye(2) * 1e4, (300, 2, 2))
+    found = Displacement.over(low, high, 12.0).fitted(points, information, 1e4 * moved)
+    assert found.at(points) == pytest.approx(moved, abs=1e-3)

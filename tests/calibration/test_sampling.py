@@ -1,0 +1,86 @@
+"""Samples are the sensor's own counts at the right places, and patches that are not of one colour are found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibration.mosaic import half_size
+from calibration.sampling import gather, noise_of, sites_at, table_values, uneven
+from tests.calibration.lab import Lab
+
+
+def test_samples_are_pixels_of_the_half_size_picture(lab: Lab, tmp_path: Path) -> None:
+    mosaic = lab.mosaic(tmp_path)
+    black = np.array([[2048.25, 2047.5], [2049.0, 2048.0]])
+    picture = half_size(mosaic, black)
+    height, width = picture.shape[:2]
+    places = np.random.default_rng(1).random((200, 2)) * (width - 1, height - 1)
+    sites = sites_at(places, (height, width))
+    samples, highest = gather(mosaic, black, sites)
+    for patch, (x, y) in enumerate(places):
+        column, row = round(float(x)), round(float(y))
+        if not (2 <= column < width - 2 and 2 <= row < height - 2):
+            assert not sites.inside[patch]
+            assert not samples[patch].any()
+            continue
+        window = picture[row - 2 : row + 3, column - 2 : column + 3].reshape(25, 3)
+        assert samples[patch] == pytest.approx(window, abs=2e-3)
+        raw = mosaic.counts[2 * (row - 2) : 2 * (row + 3), 2 * (column - 2) : 2 * (column + 3)]
+        assert highest[patch] == raw.max()
+
+
+@given(st.floats(-10, 60), st.floats(-10, 60))
+def test_a_patch_is_inside_when_all_its_pixels_are(x: float, y: float) -> None:
+    sites = sites_at(np.array([[x, y]]), (40, 50))
+    column, row = int(np.rint(x)), int(np.rint(y))
+    assert bool(sites.inside[0]) == (column - 2 >= 0 and row - 2 >= 0 and column + 2 <= 49 and row + 2 <= 39)
+
+
+def test_the_table_rounds_and_clips_at_zero() -> None:
+    samples = np.array([[[-3.0, 0.4, 0.6]] * 25, [[100.0, 200.0, 300.0]] * 25], dtype=np.float32)
+    values = table_values(samples, np.array([[1.0, 1.0, 1.0], [0.8, 1.0, 1.25]]))
+    assert values.dtype == np.uint16
+    assert values[0, 0].tolist() == [0, 0, 1]
+    assert values[1, 0].tolist() == [125, 200, 240]
+
+
+def patches(level: float, sigma: float, count: int = 3000) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    return np.random.default_rng(2).normal(level, sigma, (count, 25, 3))
+
+
+def test_noise_alone_is_even() -> None:
+    samples = patches(800, 30)
+    assert not uneven(samples, np.full((len(samples), 3), 30.0)).any()
+
+
+def test_a_rim_of_another_colour_is_found() -> None:
+    samples = patches(8000, 60)
+    rim = np.ones((5, 5), dtype=bool)
+    rim[1:-1, 1:-1] = False
+    samples[7, rim.ravel(), 1] += 400
+    found = uneven(samples, np.full((len(samples), 3), 60.0))
+    assert np.flatnonzero(found).tolist() == [7]
+    assert found[7] == pytest.approx(400 / (8000 + 400 * 16 / 25), rel=0.15)
+
+
+def test_less_than_a_percent_is_let_be() -> None:
+    samples = patches(8000, 1)
+    rim = np.ones((5, 5), dtype=bool)
+    rim[1:-1, 1:-1] = False
+    samples[:, rim.ravel()] += 70
+    assert not uneven(samples, np.full((len(samples), 3), 1.0)).any()
+
+
+def test_noise_is_known_as_a_function_of_the_level() -> None:
+    random = np.random.default_rng(5)
+    level = random.uniform(50, 8000, 4000)
+    sigma = np.sqrt(36 + level / 1.8)
+    samples = level[:, None, None] + sigma[:, None, None] * random.standard_normal((4000, 25, 3))
+    ratio = noise_of(samples) / sigma[:, None]
+    assert np.median(ratio) == pytest.approx(1, abs=0.02)
+    assert np.abs(ratio[level > 500] - 1).max() < 0.15
