@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import threading
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from drivers import console
 from drivers.console import EXIT_CODES
+
+if TYPE_CHECKING:
+    from sim.world import Print
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -50,6 +53,58 @@ def projector(
         host, port = server.address
         print(f"PJLink projector at {host}:{port}", flush=True)
         _until_interrupted()
+
+
+@app.command()
+def camera(
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port for PTP/IP; 0 picks a free one.")],
+    model: Annotated[str, typer.Option(help="EOS 550D, EOS 6D Mark II, or Test: a small frame.")] = "EOS 550D",
+) -> None:
+    """Serve a simulated Canon EOS as a PTP/IP camera: it photographs a print of grey squares under white light.
+
+    Reads and writes no file. Prints the address it listens on, then serves until interrupted (Ctrl-C), which is its
+    proper end: exit code 0. Exit code 2 when there is no such model, 3 when the port is taken. Any software that
+    speaks PTP/IP can use it, for instance (both connections go to the same port, here 15740):
+
+    gphoto2 --camera "PTP/IP Camera" --port ptpip:127.0.0.1:15740:15740 --capture-image-and-download
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    from drivers.clock import SystemClock
+    from drivers.errors import ConfigurationError
+    from drivers.presenter import WHITE
+    from sim.bodies import BODIES
+    from sim.camera import WorldFilm
+    from sim.eos import SimulatedEos
+    from sim.eos_bodies import EOS_BODIES
+    from sim.presenter import Screen
+    from sim.ptpip_server import serve_ptpip
+    from sim.world import Room, World
+
+    if model not in EOS_BODIES:
+        raise ConfigurationError(f"--model {model!r}: known are {', '.join(sorted(EOS_BODIES))}")
+    # A lamp that ages would be dark by now: its drift counts from the day when the simulated lab opened.
+    world = World(_grey_squares(), BODIES[model], Room(lamp_drift_per_hour=0))
+    film = WorldFilm(world, Screen(WHITE), lambda: 1.0, "0000000001", {})
+    with ThreadPoolExecutor(1, "darkroom") as darkroom:
+        eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, darkroom=darkroom)
+        with serve_ptpip(eos, port, name=eos.body.model) as server:
+            host, port = server.address
+            print(f"PTP/IP camera {eos.body.model} at {host}:{port}", flush=True)
+            _until_interrupted()
+
+
+def _grey_squares() -> Print:
+    """Return an A4 sheet with five by three squares from black to paper white."""
+    import numpy as np
+
+    from sim.world import Print
+
+    column, row = (grid.ravel() for grid in np.meshgrid(np.arange(5), np.arange(3)))
+    left, top = 18 + 54.0 * column, 21 + 60.0 * row
+    boxes = np.stack([left, top, left + 45, top + 45], axis=-1).astype(np.float64)
+    grey = np.linspace(0, 248, len(left)).round().astype(np.uint8)
+    return Print((297, 210), boxes, np.stack([grey] * 3, axis=-1))
 
 
 def _until_interrupted() -> None:
