@@ -1,10 +1,12 @@
-"""Whether a raw frame is well exposed: neither clipped nor dark, and dark where it should be.
+"""Whether a raw frame is well exposed: as asked for, neither clipped nor dark, and dark where it should be.
 
-Counts only; where the chart lies in the picture is the business of `acquisition.framing`.
+Counts and what the file says of its exposure; where the chart lies in the picture is the business of
+`acquisition.framing`.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,11 +16,16 @@ from acquisition.session import FrameKind
 
 if TYPE_CHECKING:
     from acquisition.config import LimitSettings
+    from drivers.camera import ExposureSettings
     from drivers.rawfile import Mosaic
 
 CLIPPING_SHARE = 0.98
 """Counts above this share of saturation are treated as clipped (judgement: the knee of the response lies above)."""
 BRIGHTEST_PERCENTILE = 99.9
+EXPOSURE_TOLERANCE_STOPS = 0.25
+"""How far a file's exposure may lie from the one asked for. Nominal values are rounded, and files state either: 0.3 s
+stands for 0.354 s on a dial of half stops, which is 0.24 stops. A dial turned by one third differs by 0.2 to 0.5 stops
+in what the file states, so that most such turns are seen, and every one of more."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,25 @@ def measure_exposure(mosaic: Mosaic) -> Exposure:
     planes = mosaic.block_planes()[:, :, ::2, ::2].reshape(2, 2, -1)
     brightest = np.percentile(planes, BRIGHTEST_PERCENTILE, axis=2) - black
     return Exposure(float(clipped), float(brightest.max()), float(mosaic.white_level - black.mean()))
+
+
+def disagreement(mosaic: Mosaic, asked: ExposureSettings) -> str | None:
+    """Return how the exposure that a raw file states differs from the one asked for, or None where it does not.
+
+    What the file does not state cannot differ, nor what it states as 0: the aperture of a lens without contacts.
+    """
+    differing = [
+        f"{name} {stated:g} instead of {wanted:g}"
+        for name, stated, wanted, stops in (
+            ("ISO speed", mosaic.iso, asked.iso, 1),
+            ("aperture", mosaic.aperture, asked.aperture, 2),
+            ("shutter time in s", mosaic.shutter_s, asked.shutter_s, 1),
+        )
+        if stated and abs(stops * math.log2(stated / wanted)) >= EXPOSURE_TOLERANCE_STOPS
+    ]
+    if not differing:
+        return None
+    return f"the file states {', '.join(differing)}; was a dial of the camera turned?"
 
 
 def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str | None:

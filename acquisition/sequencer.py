@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from acquisition.config import LabSettings, SequenceSettings
-from acquisition.exposure import measure_exposure, refusal
+from acquisition.exposure import disagreement, measure_exposure, refusal
 from acquisition.session import ACCEPTED, REFUSED, FrameKind, Session, Step
 from drivers.camera import Camera
 from drivers.clock import Clock
@@ -159,7 +159,9 @@ def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None
         mosaic = read_raw(path)
     except FormatError as error:
         return str(error)
-    return refusal(measure_exposure(mosaic), kind, settings.limits)
+    # Of frames taken by other means nobody here knows what was asked for.
+    differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
+    return differs or refusal(measure_exposure(mosaic), kind, settings.limits)
 
 
 def _take_step(session: Session, step: Step, devices: Devices, settings: LabSettings) -> str | None:

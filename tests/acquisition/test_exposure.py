@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from acquisition.config import LimitSettings
-from acquisition.exposure import Exposure, measure_exposure, refusal
+from acquisition.exposure import Exposure, disagreement, measure_exposure, refusal
 from drivers.camera import ExposureSettings
 from drivers.rawfile import Mosaic, read_raw
 from sim.bodies import BODIES
@@ -66,3 +67,46 @@ def test_a_refusal_says_value_and_limit(clipped: float, brightest: float, kind: 
     else:
         assert reason is not None
         assert expected in reason
+
+
+ASKED = ExposureSettings(iso=100, aperture=8, shutter_s=0.5)
+
+
+def test_a_file_that_states_what_was_asked_agrees(tmp_path: Path) -> None:
+    assert disagreement(mosaic_of(tmp_path, 4000), ASKED) is None
+
+
+@pytest.mark.parametrize(
+    ("asked", "stated"),
+    [  # nominal value on the dial, exact value in the file: 2^(n/8) s, 2^(n/16), 100 · 2^(n/8)
+        ({"shutter_s": 30.0}, {"shutter_s": 32.0}),
+        ({"shutter_s": 1 / 60}, {"shutter_s": 1 / 64}),
+        ({"shutter_s": 0.6}, {"shutter_s": 2**-0.625}),
+        ({"shutter_s": 0.3}, {"shutter_s": 2**-1.5}),
+        ({"aperture": 3.5}, {"aperture": 2 ** (29 / 16)}),
+        ({"aperture": 1.8}, {"aperture": 2 ** (12 / 16)}),
+        ({"iso": 1250}, {"iso": 1270}),
+        ({}, {"iso": None, "aperture": None, "shutter_s": None}),
+        ({}, {"aperture": 0.0}),
+    ],
+)
+def test_a_nominal_value_agrees_with_the_exact_one_behind_it(
+    tmp_path: Path, asked: dict[str, float], stated: dict[str, float | None]
+) -> None:
+    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyright: ignore[reportArgumentType] - names from the table
+    assert disagreement(mosaic, replace(ASKED, **asked)) is None  # pyright: ignore[reportArgumentType] - likewise
+
+
+@pytest.mark.parametrize(
+    ("stated", "expected"),
+    [
+        ({"shutter_s": 0.4}, "the file states shutter time in s 0.4 instead of 0.5; was a dial of the camera turned?"),
+        ({"shutter_s": 0.6}, "shutter time in s 0.6 instead of 0.5"),
+        ({"aperture": 9.0}, "aperture 9 instead of 8"),
+        ({"iso": 125}, "ISO speed 125 instead of 100"),
+        ({"iso": 200, "shutter_s": 0.25}, "ISO speed 200 instead of 100, shutter time in s 0.25 instead of 0.5"),
+    ],
+)
+def test_a_dial_turned_by_one_third_of_a_stop_is_seen(tmp_path: Path, stated: dict[str, float], expected: str) -> None:
+    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyright: ignore[reportArgumentType] - names from the table
+    assert expected in (disagreement(mosaic, ASKED) or "")

@@ -34,17 +34,18 @@ LIGHTS = (
 SETTINGS = LabSettings(rig="simulated", chart=Path("chart.json"), illuminations=Path("lights.csv"))
 
 
-def raw(level: int) -> bytes:
-    """Return a raw file whose every photosite has `level` counts above black."""
+def raw(level: int, exposure: ExposureSettings = EXPOSURE) -> bytes:
+    """Return a raw file whose every photosite has `level` counts above black, and which states `exposure`."""
     stream = io.BytesIO()
     counts = np.full(BODY.sensor, BODY.black + level, dtype=np.uint16)
     for area in BODY.masked:
         counts[area.top : area.top + area.height, area.left : area.left + area.width] = BODY.black
-    write_dng(stream, counts, BODY, settings=EXPOSURE, taken_at=datetime(2026, 1, 1, tzinfo=UTC))
+    write_dng(stream, counts, BODY, settings=exposure, taken_at=datetime(2026, 1, 1, tzinfo=UTC))
     return stream.getvalue()
 
 
 WELL, NIGHT, GLARE = raw(6000), raw(0), raw(BODY.saturation - BODY.black)
+TURNED = raw(6000, ExposureSettings(100, 8.0, 0.4))
 
 
 @dataclass
@@ -159,7 +160,14 @@ def test_a_cut_transfer_is_noticed(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("bad", "reason"), [(NIGHT, "is the projector on"), (GLARE, "clipped"), (WELL[:-5000], ""), (b"garbage", "raw")]
+    ("bad", "reason"),
+    [
+        (NIGHT, "is the projector on"),
+        (GLARE, "clipped"),
+        (TURNED, "0.4 instead of 0.5"),
+        (WELL[:-5000], ""),
+        (b"garbage", "raw"),
+    ],
 )
 def test_a_bad_frame_is_kept_refused_and_taken_again(folder: Path, bad: bytes, reason: str) -> None:
     lab = Lab(folder, {2: bad})
