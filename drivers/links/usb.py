@@ -1,0 +1,338 @@
+"""USB cables: finding still image devices on the bus and opening their pipes. The only file here that imports pyusb.
+
+Laws that hold inside:
+
+- Devices are told apart by vendor, product and serial number, or by the port they are plugged into: the address
+  changes whenever a device restarts.
+- The system's errors are translated here and nowhere else, and say what helps: ETIMEDOUT is `LinkTimeout`; ENODEV, EIO
+  and whatever else ends the transfer is `LinkClosed`; EPIPE is `PipeStalled`; EBUSY and EACCES are `DeviceRefused`.
+- pyusb opens anew what was closed as soon as it is used; here, closed is closed.
+
+Sources: USB 2.0, clauses 5.8 (bulk), 5.7 (interrupt) and 9.6 (descriptors); libusb 1.0's error codes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import math
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import usb.core
+import usb.util
+
+from drivers.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
+from drivers.pipes import Pipe, PipeStalled
+from drivers.ptp.container import INTERFACE_CLASS
+
+if TYPE_CHECKING:
+    from usb.backend import IBackend
+
+UDEV_RULE = "70-crop-cameras.rules"
+"""The file in `drivers/data` that lets users of a Linux machine open cameras."""
+
+_CLASS_OUT = 0x21
+_CLASS_IN = 0xA1
+_BULK = 2
+_INTERRUPT = 3
+_MAX_POLLING_S = 0.05
+
+
+@dataclass(frozen=True)
+class UsbDevice:
+    """A still image device on the bus.
+
+    `serial` is None where the device has no number, or does not let us read it. `port` is the bus and the ports on the
+    way, such as ``1-2.4``; it stays when the device restarts, unlike `address`.
+    """
+
+    vendor: int
+    product: int
+    serial: str | None
+    name: str
+    port: str
+    address: int
+
+    def __str__(self) -> str:
+        number = f", serial number {self.serial}" if self.serial else ""
+        return f"{self.name or 'camera'} ({self.vendor:04x}:{self.product:04x}{number}) at USB port {self.port}"
+
+
+def list_devices(*, backend: IBackend | None = None) -> tuple[UsbDevice, ...]:
+    """Return the still image devices on the bus; `backend` stands for another bus than the machine's own.
+
+    Raises
+    ------
+    LinkClosed
+        libusb is not installed.
+    """
+    return tuple(description for _, description, _ in _found(backend))
+
+
+def open_usb(
+    *,
+    vendor: int | None = None,
+    product: int | None = None,
+    serial: str | None = None,
+    port: str | None = None,
+    backend: IBackend | None = None,
+) -> OpenUsbDevice:
+    """Open the one still image device that has all the marks given, and claim its interface.
+
+    Raises
+    ------
+    LinkClosed
+        There is none, or libusb is not installed.
+    InputError
+        There are several.
+    DeviceRefused
+        It may not be opened, or another program holds it.
+    """
+    matching: list[tuple[usb.core.Device, UsbDevice]] = []
+    others: list[UsbDevice] = []
+    hidden: DeviceRefused | None = None
+    for device, description, refusal in _found(backend):
+        marks = ((vendor, description.vendor), (product, description.product), (port, description.port))
+        alike = all(wanted is None or wanted == is_ for wanted, is_ in marks)
+        if alike and (serial is None or serial == description.serial):
+            matching.append((device, description))
+        else:
+            others.append(description)
+            if alike and refusal is not None:
+                hidden = refusal
+    if not matching:
+        if hidden is not None:
+            raise hidden
+        raise LinkClosed(_absent(vendor, product, serial, port, others))
+    if len(matching) > 1:
+        choice = "; ".join(str(description) for _, description in matching)
+        raise InputError(f"{len(matching)} cameras on USB fit: {choice}; name one by serial number or port")
+    return OpenUsbDevice(*matching[0])
+
+
+class OpenUsbDevice:
+    """The `drivers.pipes.UsbPipes` of a device that `open_usb` found."""
+
+    def __init__(self, device: usb.core.Device, description: UsbDevice) -> None:
+        self._device = device
+        self._label = str(description)
+        self._open = True
+        self._detached = False
+        try:
+            self._claim()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def label(self) -> str:
+        """The device's name, numbers and port."""
+        return self._label
+
+    @property
+    def packet_size(self) -> int:
+        """Bytes of a full packet on the bulk pipes."""
+        return self._packet_size
+
+    @property
+    def polling_s(self) -> float:
+        """Seconds between two looks at the interrupt pipe."""
+        return self._polling_s
+
+    def bulk_write(self, data: bytes, timeout: float) -> None:
+        """Send all of `data`; none is a zero-length packet."""
+        with self._transfer(f"takes no data for {timeout:g} s"):
+            sent = self._device.write(self._addresses[Pipe.BULK_OUT], data, _milliseconds(timeout))
+        if sent != len(data):
+            raise LinkTimeout(f"{self._label} took {sent} of {len(data)} bytes within {timeout:g} s; reset it")
+
+    def bulk_read(self, limit: int, timeout: float) -> bytes:
+        """Return what one transfer brings, up to `limit` bytes."""
+        with self._transfer(f"sent nothing for {timeout:g} s"):
+            return self._device.read(self._addresses[Pipe.BULK_IN], limit, _milliseconds(timeout)).tobytes()
+
+    def interrupt_read(self, timeout: float) -> bytes:
+        """Return the next packet of the interrupt pipe."""
+        with self._transfer(f"has no event for {timeout:g} s"):
+            address = self._addresses[Pipe.INTERRUPT_IN]
+            return self._device.read(address, self._interrupt_size, _milliseconds(timeout)).tobytes()
+
+    def control_out(self, request: int, data: bytes, timeout: float) -> None:
+        """Send a request of the interface's class on the control pipe."""
+        with self._transfer(f"takes no control request for {timeout:g} s"):
+            self._device.ctrl_transfer(_CLASS_OUT, request, 0, self._interface, data, _milliseconds(timeout))
+
+    def control_in(self, request: int, limit: int, timeout: float) -> bytes:
+        """Return the answer to a request of the interface's class."""
+        with self._transfer(f"answers no control request for {timeout:g} s"):
+            answer = self._device.ctrl_transfer(_CLASS_IN, request, 0, self._interface, limit, _milliseconds(timeout))
+        return bytes(answer)
+
+    def clear_halt(self, pipe: Pipe) -> None:
+        """Let a stalled pipe transfer again."""
+        with self._transfer("does not end a stall"):
+            self._device.clear_halt(self._addresses[pipe])
+
+    def reset_port(self) -> None:
+        """Have the bus reset the device, and claim it again."""
+        with self._transfer("does not come back from a reset"):
+            self._device.reset()
+        self._claim()
+
+    def close(self) -> None:
+        """Release the interface and give it back to the kernel's driver, if there was one."""
+        if not self._open:
+            return
+        self._open = False
+        # A device that was unplugged cannot be released, and need not be.
+        with contextlib.suppress(usb.core.USBError, NotImplementedError):
+            if self._detached:
+                usb.util.release_interface(self._device, self._interface)
+                self._device.attach_kernel_driver(self._interface)
+        with contextlib.suppress(usb.core.USBError, NotImplementedError):
+            usb.util.dispose_resources(self._device)
+
+    def _claim(self) -> None:
+        with self._transfer("does not answer"):
+            try:
+                configuration = self._device.get_active_configuration()
+            except usb.core.USBError as error:
+                if error.errno is not None:
+                    raise
+                # None is active: a device fresh from the bus on systems that leave this to us.
+                self._device.set_configuration()
+                configuration = self._device.get_active_configuration()
+            interface = next(found for found in configuration if _is_still_image(found))
+            self._interface = interface.bInterfaceNumber
+            self._addresses: dict[Pipe, int] = {}
+            for endpoint in interface:
+                self._note(endpoint)
+            missing = [pipe.value for pipe in Pipe if pipe not in self._addresses]
+            if missing:
+                raise ProtocolError(f"{self._label} has no pipe {', '.join(missing)}; it is no PTP device")
+            with contextlib.suppress(NotImplementedError):
+                if self._device.is_kernel_driver_active(self._interface):
+                    self._device.detach_kernel_driver(self._interface)
+                    self._detached = True
+            usb.util.claim_interface(self._device, self._interface)
+
+    def _note(self, endpoint: usb.core.Endpoint) -> None:
+        kind = endpoint.bmAttributes & 3
+        inward = bool(endpoint.bEndpointAddress & 0x80)
+        # Bits 11 and 12 count extra transactions in a microframe (USB 2.0, 9.6.6).
+        size = endpoint.wMaxPacketSize & 0x7FF
+        if kind == _BULK:
+            self._addresses[Pipe.BULK_IN if inward else Pipe.BULK_OUT] = endpoint.bEndpointAddress
+            self._packet_size = size
+        elif kind == _INTERRUPT and inward:
+            self._addresses[Pipe.INTERRUPT_IN] = endpoint.bEndpointAddress
+            self._interrupt_size = size
+            # High speed counts 2^(n-1) microframes of 125 µs, full speed n frames of 1 ms; slower than needed is safe.
+            frames = 2 ** (min(endpoint.bInterval, 16) - 1) / 8 if endpoint.bInterval else 1
+            self._polling_s = min(max(frames, endpoint.bInterval) / 1000 + 0.001, _MAX_POLLING_S)
+
+    @contextlib.contextmanager
+    def _transfer(self, late: str) -> Generator[None]:
+        if not self._open:
+            raise LinkClosed(f"{self._label} was closed; open it again")
+        try:
+            yield
+        except usb.core.USBTimeoutError as error:
+            raise LinkTimeout(f"{self._label} {late}; reset it, or switch it off and on") from error
+        except usb.core.USBError as error:
+            raise _translated(error, self._label) from error
+        except NotImplementedError as error:
+            raise DeviceRefused(
+                f"{self._label} cannot be used with the driver that the system has for it; "
+                f"on Windows install WinUSB for it"
+            ) from error
+
+
+def _found(backend: IBackend | None) -> Iterator[tuple[usb.core.Device, UsbDevice, DeviceRefused | None]]:
+    """Yield the still image devices, and for each why its serial number could not be read."""
+    try:
+        devices = list(usb.core.find(find_all=True, backend=backend, custom_match=_has_still_image))
+    except usb.core.NoBackendError as error:
+        raise LinkClosed(
+            "libusb is not installed, so that no USB device can be seen; "
+            "install it (Debian and Ubuntu: libusb-1.0-0, Fedora: libusb1, macOS: brew install libusb)"
+        ) from error
+    for device in devices:
+        numbers = ".".join(str(number) for number in device.port_numbers or ())
+        port = f"{device.bus}-{numbers}" if numbers else f"{device.bus}"
+        address = device.address or 0
+        refusal: DeviceRefused | None = None
+        serial, name = None, ""
+        try:
+            serial = usb.util.get_string(device, device.iSerialNumber)
+            name = usb.util.get_string(device, device.iProduct) or ""
+        except (usb.core.USBError, ValueError, NotImplementedError):
+            # pyusb says ValueError, with no reason, when it cannot read the list of languages either.
+            refusal = DeviceRefused(_forbidden(f"the camera {device.idVendor:04x}:{device.idProduct:04x} at {port}"))
+        finally:
+            usb.util.dispose_resources(device)
+        yield device, UsbDevice(device.idVendor, device.idProduct, serial, name, port, address), refusal
+
+
+def _has_still_image(device: usb.core.Device) -> bool:
+    try:
+        return any(_is_still_image(interface) for configuration in device for interface in configuration)
+    except usb.core.USBError:
+        # It was unplugged while we looked.
+        return False
+
+
+def _is_still_image(interface: usb.core.Interface) -> bool:
+    kind = (interface.bInterfaceClass, interface.bInterfaceSubClass, interface.bInterfaceProtocol)
+    return kind == INTERFACE_CLASS
+
+
+def _translated(
+    error: usb.core.USBError, label: str
+) -> LinkTimeout | LinkClosed | PipeStalled | DeviceRefused | ProtocolError:
+    reason = error.strerror or str(error)
+    match error.errno:
+        case errno.ETIMEDOUT:
+            return LinkTimeout(f"{label} does not answer ({reason}); reset it, or switch it off and on")
+        case errno.EPIPE:
+            return PipeStalled(f"{label} stalls")
+        case errno.EBUSY:
+            return DeviceRefused(
+                f"{label} is held by another program, such as the desktop's photo monitor; "
+                f"close photo programs, and on Linux run: systemctl --user stop gvfs-gphoto2-volume-monitor.service "
+                f"(on macOS: killall ptpcamerad)"
+            )
+        case errno.EACCES | errno.EPERM:
+            return DeviceRefused(_forbidden(label))
+        case errno.EOVERFLOW:
+            return ProtocolError(f"{label} sends more than was asked for; reset it")
+        case _:
+            return LinkClosed(f"{label} is gone ({reason}); check cable and power, and open it again")
+
+
+def _forbidden(label: str) -> str:
+    return (
+        f"{label} may not be opened by this user; on Linux install the rule {UDEV_RULE}, "
+        f"as docs/devices.md shows under USB permission, and plug the camera in again"
+    )
+
+
+def _absent(
+    vendor: int | None, product: int | None, serial: str | None, port: str | None, others: list[UsbDevice]
+) -> str:
+    marks = [
+        f"vendor {vendor:04x}" if vendor is not None else "",
+        f"product {product:04x}" if product is not None else "",
+        f"serial number {serial}" if serial is not None else "",
+        f"port {port}" if port is not None else "",
+    ]
+    wanted = ", ".join(mark for mark in marks if mark) or "PTP"
+    there = "; ".join(str(other) for other in others) or "none at all"
+    return f"no camera with {wanted} on USB; found: {there}: switch the camera on, check cable and sleep timer"
+
+
+def _milliseconds(timeout: float) -> int:
+    # libusb takes 0 for ever.
+    return max(1, math.ceil(timeout * 1000))
