@@ -23,7 +23,8 @@ from dataclasses import dataclass, field
 from drivers.errors import InputError, ProtocolError
 
 TOLERANCE = 0.01
-"""How far, of one, a wanted value may lie from a nominal one; neighbouring nominal values are 4 % apart or more."""
+"""How far, of one, a wanted value may lie from a nominal one; neighbouring nominal values are 5 % apart or more."""
+_HIGHEST_CODE = 0xFF
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Scale:
 
     def exact(self, code: int) -> float:
         """Return the value that `code` stands for in stops, unrounded: 2^(−5) s where the camera shows 1/30."""
-        if code in self.specials:
+        if code in self.specials or not 0 <= code <= _HIGHEST_CODE:
             raise ProtocolError(f"{self.name} {self.label(code)} has no value")
         return self.law(code)
 
@@ -149,7 +150,7 @@ SHUTTER = _scale(
     55=1/13 58=1/15 5B=1/20 5C=1/20 5D=1/25 60=1/30 63=1/40 64=1/45 65=1/50 68=1/60 6B=1/80 6C=1/90 6D=1/100
     70=1/125 73=1/160 74=1/180 75=1/200 78=1/250 7B=1/320 7C=1/350 7D=1/400 80=1/500 83=1/640 84=1/750 85=1/800
     88=1/1000 8B=1/1250 8C=1/1500 8D=1/1600 90=1/2000 93=1/2500 94=1/3000 95=1/3200 98=1/4000 9B=1/5000 9C=1/6000
-    9D=1/6400 A0=1/8000
+    9D=1/6400 A0=1/8000 A8=1/16000
     """,
     {0x00: "auto", 0x0C: "bulb", 0x04: "bulb"},
     lambda code: 2.0 ** ((0x38 - code) / 8),
@@ -163,7 +164,7 @@ APERTURE = _scale(
     28=4 2B=4.5 2C=4.5 2D=5 30=5.6 33=6.3 34=6.7 35=7.1 38=8 3B=9 3C=9.5 3D=10 40=11 43=13 44=13 45=14 48=16 4B=18
     4C=19 4D=20 50=22 53=25 54=27 55=29 58=32 5B=36 5C=38 5D=40 60=45
     """,
-    {0x00: "auto"},
+    {0x00: "auto", 0xB0: "auto", 0xFFFF: "auto"},
     lambda code: 2.0 ** ((code - 8) / 16),
 )
 """Aperture as f-number (property 0xd101); 0 also where the lens has no contacts."""
@@ -174,8 +175,9 @@ ISO = _scale(
     40=50 43=64 45=80 48=100 4B=125 4D=160 50=200 53=250 55=320 58=400 5B=500 5D=640 60=800 63=1000 65=1250 68=1600
     6B=2000 6D=2500 70=3200 73=4000 75=5000 78=6400 7B=8000 7D=10000 80=12800 83=16000 85=20000 88=25600 8B=32000
     8D=40000 90=51200 93=64000 95=80000 98=102400
+    A0=204800 A8=409600
     """,
-    {0x00: "auto"},
+    {0x00: "auto", 0x01: "auto"},
     lambda code: 100 * 2.0 ** ((code - 0x48) / 8),
 )
 """ISO speed (property 0xd103)."""

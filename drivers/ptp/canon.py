@@ -206,6 +206,8 @@ class ObjectEntry:
         name = self.name.encode("latin-1", "replace")
         if len(name) > self.name_width or b"\0" in name:
             raise ValueError(f"{self.name!r} is no name of at most {self.name_width} characters")
+        if self.name_width < _NAME_WIDTH if self.time is not None else self.name_width >= _NAME_WIDTH + _TIME_LENGTH:
+            raise ValueError(f"a name's field of {self.name_width} bytes cannot be told from the time behind it")
         time = b"" if self.time is None else encode_integer(self.time, _TIME_LENGTH)
         return b"".join(
             (
@@ -341,7 +343,8 @@ class ObjectEvent:
 class TransferRequest:
     """An object waits in the camera's memory to be fetched, and blocks it until TransferComplete (0xc186, 0xc1a9).
 
-    On bodies that number 0xc1b8 instead, `extra` holds the parent and a number whose meaning is not known.
+    `extra` are the numbers between size and name, empty where all are 0; on bodies that send 0xc1b8 instead, the
+    parent and one whose meaning is not known.
     """
 
     handle: int
@@ -421,12 +424,12 @@ def decode_events(data: bytes) -> tuple[Record, ...]:
     cursor = Cursor(data, "GetEvent", MAX_EVENTS)
     records: list[Record] = []
     while True:
+        place = cursor.at
         size, kind = cursor.u32("the size of a record"), cursor.u32("the type of a record")
         if kind == EosEvent.END and size == _HEADER_LENGTH:
             return tuple(records)
         if size < _HEADER_LENGTH:
-            raise cursor.fault("the size of a record", f"at least {_HEADER_LENGTH}", size)
-        place = cursor.at - _HEADER_LENGTH
+            raise cursor.fault("the size of a record", f"at least {_HEADER_LENGTH}", size, at=place)
         body = cursor.take(size - _HEADER_LENGTH, f"a record of type {describe(EosEvent, kind)}")
         try:
             records.append(_decode_record(kind, body))
@@ -482,7 +485,7 @@ def _decode_transfer_request(cursor: Cursor, kind: int) -> TransferRequest:
     if len(octets) == len(name):
         raise cursor.fault("the name", "closed by NUL", repr(octets[:40]))
     padding = len(octets) - len(name) - 1
-    return TransferRequest(handle, object_format, size, name, kind, reserved, extra, padding)
+    return TransferRequest(handle, object_format, size, name, kind, reserved, extra if any(extra) else (), padding)
 
 
 def _encode_record(record: Record) -> tuple[int, bytes]:
@@ -539,18 +542,17 @@ OLC_SHUTTER, OLC_APERTURE, OLC_ISO, OLC_FOCUS = 0x0002, 0x0004, 0x0008, 0x0100
 def decode_olc_info(body: bytes, version: int) -> dict[int, bytes]:
     """Return the fields in the body of a record of type 0xc1a5, by their bit in its mask.
 
-    `version` is the body's property 0xd199; fields of an unknown version are left out, for their sizes are not known.
-    Nobody sends this record before SetRequestOLCInfoGroup asks for it.
+    `version` is the body's property 0xd199. Some versions' sizes are inferred from their neighbours: where they do not
+    add up to the record's, there are no fields, for none could be trusted. No body sends this record before
+    SetRequestOLCInfoGroup asks for it.
     """
     cursor = Cursor(body, describe(EosEvent, EosEvent.OLC_INFO_CHANGED))
     length, mask = cursor.u32("length"), cursor.u16("mask")
     if length not in (len(body), len(body) + 4):
-        raise cursor.fault("length", f"{len(body)} or {len(body) + 4}", length)
-    cursor.at = 4
-    sizes = next((sizes for first, sizes in _OLC_SIZES if version >= first), ())
-    fields: dict[int, bytes] = {}
-    return fields if not sizes else _olc_fields(cursor, mask, sizes)
-
-
-def _olc_fields(cursor: Cursor, mask: int, sizes: tuple[int, ...]) -> dict[int, bytes]:
-    return {1 << bit: cursor.take(size, f"field 0x{1 << bit:04x}") for bit, size in enumerate(sizes) if mask >> bit & 1}
+        raise cursor.fault("length", f"{len(body)} or {len(body) + 4}", length, at=0)
+    cursor.take(2, "reserved")
+    known = next((sizes for first, sizes in _OLC_SIZES if version >= first), ())
+    sizes = {1 << bit: size for bit, size in enumerate(known) if mask >> bit & 1}
+    if sum(sizes.values()) != cursor.left:
+        return {}
+    return {bit: cursor.take(size, f"field 0x{bit:04x}") for bit, size in sizes.items()}

@@ -19,18 +19,20 @@ class Cursor:
     def __init__(self, data: bytes, what: str, limit: int | None = None) -> None:
         if limit is not None and len(data) > limit:
             raise ProtocolError(f"{what} of {len(data)} bytes; at most {limit} were expected")
-        self._data = data
+        self._data = bytes(data)
         self.what = what
         self.at = 0
+        self._before = 0
 
     @property
     def left(self) -> int:
         """Bytes not yet read."""
         return len(self._data) - self.at
 
-    def fault(self, field: str, expected: str, came: object) -> ProtocolError:
-        """Return the error that says what is wrong at this place."""
-        return ProtocolError(f"{self.what}: {field} at byte {self.at} is {came}; expected {expected}")
+    def fault(self, field: str, expected: str, came: object, at: int | None = None) -> ProtocolError:
+        """Return the error that says what is wrong with the field that was read last, or with the one at `at`."""
+        place = self._before if at is None else at
+        return ProtocolError(f"{self.what}: {field} at byte {place} is {came}; expected {expected}")
 
     def take(self, count: int, field: str) -> bytes:
         """Return the next `count` bytes."""
@@ -38,9 +40,9 @@ class Cursor:
             raise ProtocolError(
                 f"{self.what}: {field} at byte {self.at} needs {count} bytes, but only {self.left} follow"
             )
-        start = self.at
+        self._before = self.at
         self.at += count
-        return self._data[start : self.at]
+        return self._data[self._before : self.at]
 
     def rest(self) -> bytes:
         """Return all bytes that are left."""

@@ -51,7 +51,7 @@ def read_string(cursor: Cursor, field: str) -> str:
     """Return the next string, up to its first NUL; what is no UTF-16 becomes U+FFFD."""
     count = cursor.u8(f"the length of {field}")
     octets = cursor.take(2 * count, field)
-    return octets.decode("utf-16-le", "replace").partition("\0")[0]
+    return octets[: 2 * MAX_STRING_UNITS].decode("utf-16-le", "replace").partition("\0")[0]
 
 
 def encode_string(text: str) -> bytes:

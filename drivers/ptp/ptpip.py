@@ -33,6 +33,8 @@ VERSION = 0x00010000
 HEADER_LENGTH = 8
 MAX_PACKET = 4096
 """Bytes of the longest packet that is no data; the longest real one carries a name of 40 characters."""
+MAX_NAME_UNITS = 255
+"""UTF-16 units of the longest name; the standard allows 39."""
 UNKNOWN_TOTAL = 0xFFFFFFFFFFFFFFFF
 GUID_LENGTH = 16
 
@@ -221,11 +223,11 @@ def decode(data: bytes) -> Packet:
     cursor = Cursor(data, "a PTP/IP packet")
     length, kind = cursor.u32("length"), cursor.u32("type")
     if length != len(data):
-        raise cursor.fault("length", f"{len(data)}, the bytes there are", length)
+        raise cursor.fault("length", f"{len(data)}, the bytes there are", length, at=0)
     _checked(kind, length)
     packet = _BODIES[kind](cursor)
     if cursor.left:
-        raise cursor.fault("the end", "no more bytes", f"followed by {cursor.left} bytes")
+        raise cursor.fault("the end", "no more bytes", f"followed by {cursor.left} bytes", at=cursor.at)
     return packet
 
 
@@ -319,16 +321,18 @@ def _guid(guid: bytes) -> bytes:
 
 
 def _name(name: str) -> bytes:
-    octets = name.encode("utf-16-le") + b"\0\0"
-    if "\0" in name or len(octets) > MAX_PACKET // 2:
-        raise ValueError(f"{name[:40]!r} is no PTP/IP name")
-    return octets
+    octets = name.encode("utf-16-le")
+    if "\0" in name or len(octets) > 2 * MAX_NAME_UNITS:
+        raise ValueError(f"{name[:40]!r} is no PTP/IP name; at most {MAX_NAME_UNITS} UTF-16 units, no NUL")
+    return octets + b"\0\0"
 
 
 def _read_name(cursor: Cursor) -> str:
     octets = bytearray()
     while (unit := cursor.take(2, "name, or its closing NUL,")) != b"\0\0":
         octets += unit
+        if len(octets) > 2 * MAX_NAME_UNITS:
+            raise cursor.fault("name", f"at most {MAX_NAME_UNITS} UTF-16 units", "longer")
     return octets.decode("utf-16-le", "replace")
 
 
@@ -351,7 +355,9 @@ def _read_message(cursor: Cursor) -> tuple[int, int, tuple[int, ...]]:
     code, transaction = cursor.u16("code"), cursor.u32("transaction")
     count, odd = divmod(cursor.left, 4)
     if odd or count > MAX_PARAMETERS:
-        raise cursor.fault("the list of parameters", f"0 to {MAX_PARAMETERS} of 4 bytes", f"{cursor.left} bytes")
+        raise cursor.fault(
+            "the list of parameters", f"0 to {MAX_PARAMETERS} of 4 bytes", f"{cursor.left} bytes", at=cursor.at
+        )
     return code, transaction, cursor.integers(count, 4, "parameters")
 
 

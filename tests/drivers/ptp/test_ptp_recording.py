@@ -1,0 +1,117 @@
+"""All that a real EOS 60D said and was told: read to the last byte, and built again."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+from drivers.ptp import canon, container
+from drivers.ptp.apex import APERTURE, ISO
+from drivers.ptp.canon import AvailableValues, DeviceInfoEx, Notice, PropertyChanged, PropertySetting
+from drivers.ptp.codes import EOS_MODEL_IDS, Operation, Property
+from drivers.ptp.container import ContainerReader, DataPiece, DataStart
+from drivers.ptp.datasets import (
+    DeviceInfo,
+    DevicePropDesc,
+    EnumerationForm,
+    StorageInfo,
+    decode_u32_array,
+    encode_u32_array,
+)
+from drivers.ptp.messages import Request, Response
+from drivers.ptp.ptpip import EndData, OperationRequest, PacketCutter, StartData, encode
+from tests.drivers.ptp.conftest import Recorded
+
+REBUILT: dict[int, Callable[[bytes], bytes]] = {
+    Operation.GET_DEVICE_INFO: lambda data: DeviceInfo.decode(data).encode(),
+    Operation.GET_DEVICE_PROP_DESC: lambda data: DevicePropDesc.decode(data).encode(),
+    Operation.EOS_GET_STORAGE_IDS: lambda data: encode_u32_array(decode_u32_array(data)),
+    Operation.EOS_GET_STORAGE_INFO: lambda data: StorageInfo.decode(data).encode(),
+    Operation.EOS_GET_DEVICE_INFO_EX: lambda data: DeviceInfoEx.decode(data).encode(),
+    Operation.EOS_SET_DEVICE_PROP_VALUE_EX: lambda data: PropertySetting.decode(data).encode(),
+    Operation.EOS_GET_EVENT: lambda data: canon.encode_events(canon.decode_events(data)),
+}
+
+
+def payload(transaction: Recorded) -> bytes:
+    return bytes.fromhex(transaction["data"] or "")
+
+
+def first(recording: list[Recorded], operation: Operation) -> bytes:
+    return next(payload(entry) for entry in recording if int(entry["code"], 16) == operation)
+
+
+def test_every_dataset_is_rebuilt_to_the_byte(recording: list[Recorded]) -> None:
+    rebuilt = 0
+    for number, entry in enumerate(recording):
+        if entry["data"] is not None:
+            data = payload(entry)
+            assert REBUILT[int(entry["code"], 16)](data) == data, number
+            rebuilt += 1
+    assert (len(recording), rebuilt) == (70, 48)
+
+
+def test_every_transaction_crosses_both_cables(recording: list[Recorded]) -> None:
+    for entry in recording:
+        code, tid, data = int(entry["code"], 16), entry["tid"], payload(entry)
+        request, response = Request(code, tid, tuple(entry["params"])), Response(int(entry["rc"], 16), tid)
+        phase = container.encode_data(code, tid, data) if entry["data"] is not None else b""
+        stream = container.encode(request) + phase + container.encode(response)
+        pieces = (stream[at : at + 64] for at in range(0, len(stream), 64))
+        reader = ContainerReader(64)
+        messages = [message for piece in pieces for message in reader.feed(piece)]
+        assert (messages[0], messages[-1]) == (request, response)
+        assert b"".join(m.data for m in messages if isinstance(m, DataPiece)) == data
+        if entry["data"] is not None:
+            assert messages[1] == DataStart(code, tid, len(data))
+        packets = [OperationRequest(request, entry["dir"] == "out"), StartData(tid, len(data)), EndData(tid, data)]
+        assert PacketCutter().feed(b"".join(map(encode, packets))) == packets
+
+
+def test_commands_are_the_bytes_that_the_host_sent(recording: list[Recorded]) -> None:
+    # The host's first four commands, container by container, written from the recording's numbers by hand.
+    written = ["10000000 0100 0210 00000000 01000000", "0c000000 0100 0110 01000000"]
+    written += ["10000000 0100 1491 02000000 01000000", "10000000 0100 1491 03000000 01000000"]
+    for entry, octets in zip(recording, written, strict=False):
+        request = Request(int(entry["code"], 16), entry["tid"], tuple(entry["params"]))
+        assert container.encode(request) == bytes.fromhex(octets)
+    settings = [payload(entry) for entry in recording if entry["dir"] == "out"]
+    destination, aperture = Property.EOS_CAPTURE_DESTINATION, Property.EOS_APERTURE
+    sent = [(destination, 4), (aperture, 0x24), (destination, 2), (destination, 4), (aperture, 0x24), (destination, 1)]
+    assert [PropertySetting(code, canon.number_value(value)).encode() for code, value in sent] == settings
+
+
+def test_what_the_body_is(recording: list[Recorded]) -> None:
+    info = DeviceInfo.decode(first(recording, Operation.GET_DEVICE_INFO))
+    assert (info.manufacturer, info.model, info.device_version) == ("Canon Inc.", "Canon EOS 60D", "3-1.1.0")
+    assert (info.vendor_extension_id, info.vendor_extension_version) == (6, 200)
+    assert Operation.EOS_REMOTE_RELEASE_ON in info.operations
+    assert Operation.EOS_BULB_START not in info.operations
+    extended = DeviceInfoEx.decode(first(recording, Operation.EOS_GET_DEVICE_INFO_EX))
+    assert (len(extended.events), len(extended.properties), extended.others) == (18, 87, (0, 1, 2, 4))
+
+
+def test_the_state_dump(recording: list[Recorded]) -> None:
+    records = canon.decode_events(first(recording, Operation.EOS_GET_EVENT))
+    # 77 values, then one notice, then 86 lists.
+    assert Counter(type(record).__name__ for record in records) == {
+        "PropertyChanged": 77,
+        "AvailableValues": 84,
+        "AvailableFormats": 2,
+        "Notice": 1,
+    }
+    assert isinstance(records[77], Notice)
+    state = {record.code: record for record in records if isinstance(record, PropertyChanged)}
+    assert EOS_MODEL_IDS[state[Property.EOS_MODEL_ID].number] == "Canon EOS 60D"
+    assert ISO.value(state[Property.EOS_ISO_SPEED].number) == 1600
+    assert APERTURE.value(state[Property.EOS_APERTURE].number) == 4
+    assert str(state[Property.EOS_IMAGE_FORMAT].image_format) == "JPEG L fine"
+    lists = {record.code: record.values for record in records if isinstance(record, AvailableValues)}
+    assert lists[Property.EOS_CAPTURE_DESTINATION] == (2, 4, 6)
+    assert APERTURE.labels(lists[Property.EOS_APERTURE]).startswith("3.5, 4, 4.5, 5, 5.6, 6.3")
+    assert lists[Property.EOS_SHUTTER_SPEED] == ()
+
+
+def test_the_battery_is_told_in_words_of_16_bits(recording: list[Recorded]) -> None:
+    described = DevicePropDesc.decode(first(recording, Operation.GET_DEVICE_PROP_DESC))
+    assert described.form == EnumerationForm((100, 75, 50, 25, 0), widened=True)
