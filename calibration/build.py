@@ -384,12 +384,13 @@ class _Measurement:
         self._even_frames = 0
         self._covered = self._covered_cells(registration)
         self._base: Field | None = None
-        samples, highest, places = self._sampled(first, registration)
-        self._base = self._paper(first, samples, highest, places).field
+        samples, highest = gather(first.mosaic, first.black, self._sites)
+        self._base = self._paper(first, samples, highest, self._sites).field
 
     def _adopt(self, decoded: _Decoded, registration: Registration) -> None:
         """Make a frame the one that others are compared with."""
         self._registration = registration
+        self._sites = self._sites_of(registration)
         self._planes = {channel: plane_of(decoded.mosaic, channel, decoded.black) for channel in CHANNELS}
 
     def _covered_cells(self, registration: Registration) -> npt.NDArray[np.bool_]:
@@ -411,23 +412,24 @@ class _Measurement:
             )
         channel = decoded.strongest.channel
         shift = shift_between(self._planes[channel], self._registration.framing, decoded.strongest)
-        registration, anew = self._registration, False
+        sites, anew = self._sites, False
         # A turn or a change of distance moves the tags differently; moving the grid along would not mend it.
         turned = shift.largest_px > shift.length_px + STILL_PX
         if shift.tags == 0 or shift.length_px > BUMP_PX or turned:
             registration, anew = register(mosaic, self._chart, file), True
             self._adopt(decoded, registration)
             self._covered |= self._covered_cells(registration)
+            sites = self._sites
         elif shift.length_px > STILL_PX:
-            registration = registration.shifted(shift.dx, shift.dy)
-        samples, highest, places = self._sampled(decoded, registration)
-        paper = self._paper(decoded, samples, highest, places)
+            sites = self._sites_of(self._registration.shifted(shift.dx, shift.dy))
+        samples, highest = gather(mosaic, decoded.black, sites)
+        paper = self._paper(decoded, samples, highest, sites)
         cells = self._chart.colour_count
         light = decoded.record.illumination
         brighter = highest[:cells] > self._highest
         self._highest[brighter] = highest[:cells][brighter]
         self._highest_at[brighter] = -1 if light is None else light
-        self._outside |= ~places.inside[:cells]
+        self._outside |= ~sites.inside[:cells]
         if decoded.record.kind == "white" or self._even_frames == 0:
             self._even_sum += samples[:cells]
             self._even_noise += noise_of(samples[:cells]) ** 2
@@ -435,14 +437,10 @@ class _Measurement:
         values = table_values(samples[:cells], paper.field.at(self._cells_mm))
         return FrameFigures(decoded.record, decoded.black, channel, shift, anew, paper), values
 
-    def _sampled(
-        self, decoded: _Decoded, registration: Registration
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint16], Sites]:
-        """Return samples, highest counts and sites of the cells, then of the white references."""
+    def _sites_of(self, registration: Registration) -> Sites:
+        """Return the sites of the cells in the order of colour indices, then of the white references."""
         places = registration.to_pixels(np.concatenate([self._cells_mm, self._reference_mm]))
-        sites = sites_at(places, (self._shape[0], self._shape[1]))
-        samples, highest = gather(decoded.mosaic, decoded.black, sites)
-        return samples, highest, sites
+        return sites_at(places, (self._shape[0], self._shape[1]))
 
     def _paper(
         self, decoded: _Decoded, samples: npt.NDArray[np.float32], highest: npt.NDArray[np.uint16], sites: Sites

@@ -185,13 +185,15 @@ def read_paper(
     places, values = places_mm[there], seen[there]
     base = even_field(page_mm) if base is None else base
     shape = base.at(places)
+    # Terms stand in rising order, so a lower order's basis is the beginning of a higher one's.
+    whole = polynomial(places, page_mm, ORDERS[-1])
     factors: list[tuple[_Array, ...]] = []
     white, error, spread = np.zeros(3), np.zeros(3), np.zeros(3)
     for channel in range(3):
         known = shape[:, channel]
         best: tuple[float, _Array, _Array] | None = None
         for order in ORDERS:
-            basis = polynomial(places, page_mm, order)
+            basis = whole[:, : len(terms(order))]
             if 3 * basis.shape[1] > len(places):
                 break
             solution, weights, residual = _robust_fit(basis * known[:, None], values[:, channel])
@@ -206,7 +208,7 @@ def read_paper(
         # Light too weak to have a shape of its own, or none at all.
         own = solution / level if level > 0 and local.min() > 0.05 * level else np.ones(1)
         factors.append((*base.coefficients[channel], own) if len(own) > 1 else base.coefficients[channel])
-        flat = values[:, channel] / (known * (polynomial(places, page_mm, order_of(len(own))) @ own))
+        flat = values[:, channel] / (known * (whole[:, : len(own)] @ own))
         white[channel] = float((weights * flat).sum() / weights.sum())
         residual = flat - white[channel]
         scatter = float(np.sqrt((weights * residual**2).sum() / weights.sum()))

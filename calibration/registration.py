@@ -507,7 +507,7 @@ class _Matcher:
         self.displacement = Displacement.over(
             low, low + self._cells_across * cell, float(cell.max()) * max(2.0, min(_KNOT_CELLS, across / 3))
         )
-        self._per_cell = int(np.clip(round(cell_px), 8, 16))
+        self._per_cell = int(np.clip(round(0.8 * cell_px), 8, 16))
         self._raster = _Raster.of(low, cell / self._per_cell, self._cells_across * self._per_cell)
         self._cover = self._raster.coverage(self._centres, self._sizes)
         self._free = self._raster.outside_tags(chart.tags)
