@@ -73,13 +73,15 @@ def camera(
     from drivers.clock import SystemClock
     from drivers.errors import ConfigurationError
     from drivers.presenter import WHITE
+    from drivers.ptp.apex import SHUTTER
+    from drivers.ptp.codes import Property
     from sim.bodies import BODIES
     from sim.camera import WorldFilm
     from sim.eos import SimulatedEos
     from sim.eos_bodies import EOS_BODIES
     from sim.presenter import Screen
     from sim.ptpip_server import serve_ptpip
-    from sim.world import Room, World
+    from sim.world import REFERENCE_EXPOSURE, Room, World
 
     if model not in EOS_BODIES:
         raise ConfigurationError(f"--model {model!r}: known are {', '.join(sorted(EOS_BODIES))}")
@@ -88,6 +90,7 @@ def camera(
     film = WorldFilm(world, Screen(WHITE), lambda: 1.0, "0000000001", {})
     with ThreadPoolExecutor(1, "darkroom") as darkroom:
         eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, darkroom=darkroom)
+        eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))
         with serve_ptpip(eos, port, name=eos.body.model) as server:
             host, port = server.address
             print(f"PTP/IP camera {eos.body.model} at {host}:{port}", flush=True)

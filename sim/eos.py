@@ -80,7 +80,7 @@ from drivers.ptp.datasets import (
 )
 from drivers.ptp.messages import Event, Request, Response
 from sim.camera import Film
-from sim.eos_bodies import FOCUS_CENTRE, FREE, LIST, EosBody, focus_points
+from sim.eos_bodies import FOCUS_CENTRE, FREE, LIST, MIRROR_LOCKUP, EosBody, custom_functions, focus_points
 from sim.responder import Answer
 
 CARD = 0x00020001
@@ -230,6 +230,9 @@ class SimulatedEos:
         Releases before this one's first.
     without
         Operations that this specimen does not know, for instance `Operation.EOS_REMOTE_RELEASE_ON`.
+    forgetful
+        Whether frames in the camera's memory are lost with the session. Assumed to be kept: users report memories
+        that stay full after a host was killed.
     darkroom
         Where the film is developed. None does it while the release is answered, and is what tests want; a camera on
         a real cable hands in an executor of one thread, so that a large frame does not hold up the answers.
@@ -247,6 +250,7 @@ class SimulatedEos:
         battery: float = 1.0,
         shutter_count: int = 5000,
         without: Iterable[int] = (),
+        forgetful: bool = False,
         darkroom: Executor | None = None,
     ) -> None:
         self.body = body
@@ -254,6 +258,7 @@ class SimulatedEos:
         self._film = film
         self._clock = clock
         self._darkroom = darkroom
+        self._forgetful = forgetful
         self._guard = threading.RLock()
         self._operations = self._handlers(frozenset(without))
         self._card = None if card_bytes is None else self._blank_card(card_bytes)
@@ -339,7 +344,7 @@ class SimulatedEos:
         """Note that the initiator gave up a transaction: each is carried out at once, so nothing is left to undo."""
 
     def unplugged(self) -> None:
-        """End the session; frames that wait in the camera's memory are lost."""
+        """End the session; frames that wait in the camera's memory go on waiting, unless it is `forgetful`."""
         with self._guard:
             self._move()
             self._end_session()
@@ -389,6 +394,8 @@ class SimulatedEos:
             self._mirror_lockup = on
             if Property.EOS_MIRROR_UP_SETTING in self._properties:
                 self._change(Property.EOS_MIRROR_UP_SETTING, number_value(int(on)))
+            else:
+                self._tell(Property.EOS_CUSTOM_FUNCTIONS)
 
     def set_menu(self, code: int, value: int | ImageFormat) -> None:
         """Set a property by the camera's own menu, which no list restricts."""
@@ -426,6 +433,7 @@ class SimulatedEos:
         idle = now - self._idle_since
         if idle >= limit:
             self._end_session()
+            self._memory.clear()
             self._asleep = True
         elif idle >= limit - min(_SHUTDOWN_WARNING_S, limit / 2) and not self._warned:
             self._warned = True
@@ -541,7 +549,8 @@ class SimulatedEos:
         self._event_mode = 0
         self._queue.clear()
         self._hints.clear()
-        self._memory.clear()
+        if self._forgetful:
+            self._memory.clear()
         self._host_bytes = 0
         self._warned = False
         self._let_go(ReleaseButton.HALF_AND_FULL)
@@ -584,11 +593,14 @@ class SimulatedEos:
     def _tell_everything(self) -> None:
         for code, known in self._properties.items():
             if known.told:
-                self._record(PropertyChanged(code, self._value(code)))
+                self._tell(code)
         if self._card is not None:
             self._record(Notice(EosEvent.CTG_INFO_CHECK_COMPLETE, CARD))
         for code in self._properties:
             self._tell_list(code)
+        # Assumed: a frame that nobody fetched is offered to the next who listens.
+        for item in self._memory.values():
+            self._offer_transfer(item)
 
     def _tell_list(self, code: int) -> None:
         known = self._properties[code]
@@ -624,6 +636,9 @@ class SimulatedEos:
     def _tell(self, *codes: int) -> None:
         for code in codes:
             self._record(PropertyChanged(code, self._value(code)))
+            if code == Property.EOS_CUSTOM_FUNCTIONS and Property.EOS_MIRROR_UP_SETTING not in self._properties:
+                # Custom functions come as one record a group.
+                self._record(PropertyChanged(code, custom_functions(3, {MIRROR_LOCKUP: int(self._mirror_lockup)})))
 
     def _change(self, code: int, value: bytes) -> None:
         self._properties[code].value = value
@@ -926,7 +941,7 @@ class SimulatedEos:
         drive = self._number_of(Property.EOS_DRIVE_MODE)
         bracketing = self._number_of(Property.EOS_AEB)
         if self._number_of(Property.EOS_SHUTTER_SPEED) == _BULB:
-            self._bulb_since = now, self._now()
+            self._bulb_since = now, self._clock.now()
             self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY))
             return None
         # A bracket comes whole, except in single drive, where each press takes one of its three.
@@ -1022,7 +1037,7 @@ class SimulatedEos:
         def open_shutter() -> None:
             late = timedelta(seconds=self._clock.monotonic() - opens_at)
             self._unfinished -= 1
-            self._expose(settings, self._now() - late, opens_at + settings.shutter_s)
+            self._expose(settings, self._clock.now() - late, opens_at + settings.shutter_s)
 
         self._at(opens_at, open_shutter)
         return opens_at + max(settings.shutter_s, 1 / self.body.frames_per_s)
@@ -1034,7 +1049,7 @@ class SimulatedEos:
         self._number = self._number % 9999 + 1
         frame = _Frame(
             self._number,
-            opened,
+            opened + self._time_offset,
             self._develop(settings, opened),
             ImageFormat.decode(self._properties[Property.EOS_IMAGE_FORMAT].value),
             self._number_of(Property.EOS_CAPTURE_DESTINATION),
@@ -1087,12 +1102,16 @@ class SimulatedEos:
             self._card.objects[handle] = item
             self._record(ObjectEvent(EosEvent.OBJECT_ADDED_64 if wide else EosEvent.OBJECT_ADDED, item.entry))
             self._record(Notice(EosEvent.STORAGE_INFO_CHANGED, CARD))
-        if frame.destination & CaptureDestination.HOST and self._session:
+        if frame.destination & CaptureDestination.HOST:
             handle = next(self._handles)
             self._memory[handle] = _Object(handle, 0, kind, name, frame.taken_at, data=data)
             self._host_bytes = max(self._host_bytes - len(data), 0)
-            request = EosEvent.REQUEST_OBJECT_TRANSFER_64 if wide else EosEvent.REQUEST_OBJECT_TRANSFER
-            self._record(TransferRequest(handle, kind, len(data), name, request))
+            self._offer_transfer(self._memory[handle])
+
+    def _offer_transfer(self, item: _Object) -> None:
+        wide = self.body.wide_objects
+        request = EosEvent.REQUEST_OBJECT_TRANSFER_64 if wide else EosEvent.REQUEST_OBJECT_TRANSFER
+        self._record(TransferRequest(item.handle, item.format, len(item.data), item.name, request))
 
 
 class _Arguments(NamedTuple):

@@ -242,6 +242,12 @@ def _structure(*numbers: int) -> bytes:
     return struct.pack(f"<{1 + len(numbers)}I", 4 + 4 * len(numbers), *numbers)
 
 
+HALF_STOPS = 0x0101
+"""Custom function: exposure is set in half stops, not thirds."""
+MIRROR_LOCKUP = 0x060F
+"""Custom function: the first press lifts the mirror, on bodies that do not have it in the menu (group 3)."""
+
+
 def custom_functions(group: int, functions: Mapping[int, int]) -> bytes:
     """Return one group of custom functions (property 0xd1a0): number of a function → its setting."""
     settings = [number for function, setting in functions.items() for number in (function, 1, setting)]
@@ -348,7 +354,7 @@ def _properties(body: _Choices) -> tuple[PropertySpec, ...]:
         *(PropertySpec(code, None, FREE) for code in range(0xD170, 0xD173)),
         listed(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.CARD, ()),
         *lockup,
-        PropertySpec(Property.EOS_CUSTOM_FUNCTIONS, custom_functions(1, {0x0101: int(body.half_stops)}), FREE),
+        PropertySpec(Property.EOS_CUSTOM_FUNCTIONS, custom_functions(1, {HALF_STOPS: int(body.half_stops)}), FREE),
         PropertySpec(0xD1A1, _structure(2, 1, 0x14, 2, 0x00030002), FREE),
         fixed(Property.EOS_LENS_STATUS, 1),
         fixed(Property.EOS_TEMPERATURE_STATUS, 0),

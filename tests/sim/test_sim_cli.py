@@ -45,16 +45,20 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return main()
 
 
-def test_a_taken_port_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("arguments", [["projector", "--pjlink"], ["camera", "--model", "Test", "--port"]])
+def test_a_taken_port_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str]
+) -> None:
     with TcpServer(lambda link: None) as server:
-        assert run(monkeypatch, "projector", "--pjlink", str(server.address[1])) == 3
+        assert run(monkeypatch, *arguments, str(server.address[1])) == 3
     error = capsys.readouterr().err
     assert error.startswith("error: cannot listen at 127.0.0.1:")
     assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
-    "arguments", [["projector"], ["projector", "--pjlink", "x"], ["projector", "--pjlink", "70000"], ["toaster"]]
+    "arguments",
+    [["projector"], ["projector", "--pjlink", "x"], ["projector", "--pjlink", "70000"], ["camera"], ["toaster"]],
 )
 def test_wrong_arguments_end_with_2(monkeypatch: pytest.MonkeyPatch, arguments: list[str]) -> None:
     assert run(monkeypatch, *arguments) == 2
@@ -65,6 +69,13 @@ def test_a_password_longer_than_the_standards_is_refused(
 ) -> None:
     assert run(monkeypatch, "projector", "--pjlink", "0", "--password", "x" * 33) == 2
     assert "at most 32" in capsys.readouterr().err
+
+
+def test_an_unknown_model_is_told_the_known_ones(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "camera", "--port", "0", "--model", "EOS R5") == 2
+    assert "EOS 550D, EOS 6D Mark II, Test" in capsys.readouterr().err
 
 
 def test_help_names_the_exit_codes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
