@@ -6,6 +6,7 @@ import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import datetime, timedelta
+from io import BytesIO
 from pathlib import Path
 from threading import Event as ThreadEvent
 from typing import BinaryIO
@@ -36,6 +37,7 @@ from drivers.ptp.canon import (
     number_value,
     text_value,
 )
+from drivers.ptp.canon_eos import CanonEos
 from drivers.ptp.codes import (
     AeMode,
     CaptureDestination,
@@ -68,6 +70,7 @@ from sim.eos_bodies import (
     TEST_BODY,
     EosBody,
 )
+from sim.ptp_memory import MemoryTransport
 from sim.responder import Answer
 
 RECORDING = Path(__file__).parents[2].parent / "shared" / "data" / "ptp" / "eos60d_transactions.json"
@@ -540,7 +543,7 @@ def test_is_busy_until_the_frame_is_written(host: Host) -> None:
         assert host.set(Property.EOS_ISO_SPEED, 0x58) == ResponseCode.DEVICE_BUSY
         assert host.press() == ResponseCode.DEVICE_BUSY
         assert host.events() == ()
-    host.clock.sleep(0.11)
+    host.clock.sleep(TEST_BODY.write_s + 0.001)
     records = host.events()
     assert len(transfers(records)) == 1
     assert statuses(records) == [0]
@@ -849,3 +852,24 @@ def test_a_frame_under_way_outlives_its_session(host: Host) -> None:
     host.ok(Operation.OPEN_SESSION, 2)
     host.ok(Operation.EOS_SET_EVENT_MODE, 1)
     assert len(transfers(host.events())) == 1
+
+
+# With our own driver.
+
+
+@pytest.mark.parametrize(
+    "body", [EOS_550D, EOS_6D_MARK_II, replace(EOS_6D_MARK_II, wide_objects=True)], ids=["550D", "6D2", "wide"]
+)
+@pytest.mark.parametrize("without", [(), (Operation.EOS_REMOTE_RELEASE_ON,)], ids=["press", "release"])
+def test_our_driver_takes_a_series(body: EosBody, without: tuple[int, ...]) -> None:
+    clock, film = SimulatedClock(), NumberedFilm()
+    eos = SimulatedEos(body, film, clock, auto_power_off_s=0, without=without)
+    camera = CanonEos(lambda: MemoryTransport(eos), clock)
+    camera.configure(ExposureSettings(100, 8.0, 0.5))
+    for number in range(2 * body.burst):
+        into = BytesIO()
+        frame = camera.capture(into)
+        assert into.getvalue() == film.frames[number]
+        assert (frame.name, frame.released_at) == (f"IMG_{number + 1:04d}.DNG", film.exposures[number][1])
+    camera.close()
+    assert {settings for settings, _ in film.exposures} == {ExposureSettings(100, 8.0, 0.5)}
