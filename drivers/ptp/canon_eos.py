@@ -164,7 +164,8 @@ class CanonEos:
                     raise
                 self._drop(error)
                 if not left:
-                    raise DeviceError(
+                    kind = DeviceRefused if isinstance(error, Declined) else DeviceError
+                    raise kind(
                         f"{error}; the connection was renewed {RECOVERIES} times without success: {_REMEDY}"
                     ) from error
         raise AssertionError
@@ -174,6 +175,7 @@ class CanonEos:
 
         def released(body: EosBody) -> _Shot:
             body.make_ready()
+            _apply(body, settings)  # says nothing on the wire unless a dial was turned
             now = self._clock.monotonic()
             exposed = now + _CERTAIN_SHARE * settings.shutter_s
             until = now + settings.shutter_s + FRAME_LIMIT_S
@@ -237,9 +239,10 @@ class CanonEos:
             try:
                 return self._connect()
             except DeviceError as error:
-                absent = self._transport is None and first
+                # While it comes back a body may be absent, or in the hands of the desktop.
+                curable = not first if self._transport is None else _curable(error)
                 self._drop(error)
-                if not _curable(error) or absent:
+                if not curable:
                     raise
                 if self._clock.monotonic() + pause > end:
                     raise DeviceError(f"no camera to work with: {error}; {_REMEDY}") from error

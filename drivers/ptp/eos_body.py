@@ -128,7 +128,8 @@ class EosBody:
 
     def poll(self) -> bool:
         """Ask once what is new; return whether anything was."""
-        self._session.events()  # hints that this would be worth while, which it is anyway
+        with contextlib.suppress(ProtocolError):
+            self._session.events()  # hints that asking would be worth while, which it is anyway
         _, data = self._session.call(Operation.EOS_GET_EVENT)
         records = decode_events(data)
         self.state.take(records)
@@ -199,8 +200,12 @@ class EosBody:
                 # What keeps a body busy here is a release still held down, or events that nobody fetched.
                 self._let_go()
                 self.drain()
-                if error.code != ResponseCode.DEVICE_BUSY or left == 0:
+                if error.code != ResponseCode.DEVICE_BUSY:
                     raise
+                if not left:
+                    raise Declined(
+                        f"{error}; look for mirror lockup, a timer or a menu on its display", error.code
+                    ) from error
                 self._clock.sleep(PASSING_LIMIT_S / RELEASE_TRIES)
         self._let_go()
 

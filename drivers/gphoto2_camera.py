@@ -1,0 +1,273 @@
+"""Any tethered camera that libgphoto2 knows, as the suite's `Camera`: the way for makers without a driver of our own.
+
+Laws that hold inside:
+
+- python-gphoto2 is an optional extra and is imported only when a camera is opened.
+- libgphoto2's errors become ours in `_speaking`. After a fault the connection is dropped, and the next call opens a
+  new one; a frame that was on its way is lost and may be retaken.
+- Settings are chosen from the lists that libgphoto2 shows for the body, and read back.
+
+libgphoto2 may focus before it releases, so that a body that does not focus by hand is refused.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, BinaryIO
+
+from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
+from drivers.clock import Clock, SystemClock
+from drivers.errors import ConfigurationError, DeviceError, DeviceRefused, LinkClosed, LinkTimeout
+
+if TYPE_CHECKING:
+    import gphoto2
+
+TOLERANCE = 0.06
+"""How far, of one, a label may lie from the value asked for: libgphoto2 says 6.3 s where the dial says 6."""
+
+_SYSTEM_CLOCK = SystemClock()
+_MANUAL = ("Manual", "M")
+_SINGLE = ("Single", "Single silent", "Single Shot")
+_RAW_FORMATS = ("RAW", "NEF (Raw)", "Raw")
+_HOST_TARGETS = ("Internal RAM", "sdram")
+_IDENTITY = {
+    "maker": ("manufacturer",),
+    "model": ("cameramodel",),
+    "serial": ("eosserialnumber", "serialnumber"),
+    "firmware": ("deviceversion",),
+}
+
+
+class Gphoto2Camera:
+    """A `drivers.camera.Camera` through libgphoto2.
+
+    Parameters
+    ----------
+    port
+        libgphoto2's name of the port, ``usb:001,005`` or ``ptpip:192.168.1.1``; None takes the first camera found.
+    model
+        libgphoto2's name of the model; None lets it find out, which works on USB. ``PTP/IP Camera`` on a network.
+    clock
+        Stamps the releases.
+    """
+
+    def __init__(self, port: str | None = None, model: str | None = None, clock: Clock = _SYSTEM_CLOCK) -> None:
+        self._port = port
+        self._model = model
+        self._clock = clock
+        self._camera: gphoto2.Camera | None = None
+        self._settings: ExposureSettings | None = None
+        self._closed = False
+        library()
+
+    def identity(self) -> CameraIdentity:
+        """Return maker, model, serial number and firmware; empty what the body does not say."""
+        with self._speaking() as camera:
+            return CameraIdentity(**{field: _text(camera, names) for field, names in _IDENTITY.items()})
+
+    def configure(self, settings: ExposureSettings) -> None:
+        """Set and verify the exposure, raw format and destination.
+
+        Raises
+        ------
+        DeviceRefused
+            The body does not offer a value, or is set up in a way that spoils a series; all of it in one message.
+        """
+        self._settings = None
+        with self._speaking() as camera:
+            self._apply(camera, settings)
+        self._settings = settings
+
+    def capture(self, into: BinaryIO) -> CapturedFrame:
+        """Release the shutter and write the raw file, whole and unchanged, to `into`.
+
+        Raises
+        ------
+        DeviceRefused
+            The body was never configured.
+        DeviceError
+            The frame did not arrive; what `into` holds is worthless and may be retaken.
+        """
+        settings = self._settings
+        if settings is None:
+            raise DeviceRefused("the camera has no exposure settings; configure it before the first capture")
+        gp = library()
+        fresh = self._camera is None
+        with self._speaking() as camera:
+            if fresh:
+                self._apply(camera, settings)
+            released_at = self._clock.now()
+            path = camera.capture(gp.GP_CAPTURE_IMAGE)
+            try:
+                # The bytes belong to `file` and go with it.
+                file = camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)
+                size = into.write(file.get_data_and_size())
+            finally:
+                # What waits in the camera's memory would fill it; where it has gone already there is nothing to delete.
+                with contextlib.suppress(gp.GPhoto2Error):
+                    camera.file_delete(path.folder, path.name)
+        return CapturedFrame(path.name, size, released_at)
+
+    def close(self) -> None:
+        """Give the camera back to its user; a second call does nothing."""
+        self._closed = True
+        self._drop()
+
+    def _drop(self) -> None:
+        # libgphoto2 takes its leave when the last reference goes; an `exit` that fails and is then repeated closes file
+        # descriptors that belong to others by then.
+        self._camera = None
+
+    @contextmanager
+    def _speaking(self) -> Generator[gphoto2.Camera]:
+        """Give the open camera; translate what libgphoto2 raises."""
+        if self._closed:
+            raise DeviceError("the camera has been closed; open the rig again")
+        gp = library()
+        try:
+            if self._camera is None:
+                self._camera = self._opened()
+            yield self._camera
+        except gp.GPhoto2Error as error:
+            self._drop()
+            raise _translated(error, self._port or "the camera") from error
+
+    def _opened(self) -> gphoto2.Camera:
+        gp = library()
+        camera = gp.Camera()
+        if self._port is not None:
+            ports = gp.PortInfoList()
+            ports.load()
+            camera.set_port_info(ports[ports.lookup_path(self._port)])
+        if self._model is not None:
+            known = gp.CameraAbilitiesList()
+            known.load()
+            camera.set_abilities(known[known.lookup_model(self._model)])
+        camera.init()
+        return camera
+
+    def _apply(self, camera: gphoto2.Camera, settings: ExposureSettings) -> None:
+        refused: list[str] = []
+        for name, allowed, remedy in (
+            ("autoexposuremode", _MANUAL, "turn the mode dial to M"),
+            ("focusmode", _MANUAL, "set the lens to MF and focus by hand"),
+            ("drivemode", _SINGLE, "set single shooting"),
+        ):
+            value = _text(camera, (name,))
+            if value and value not in allowed:
+                refused.append(f"{name} is {value}: {remedy}")
+        wanted: dict[str, str] = {}
+        for name, labels in (("capturetarget", _HOST_TARGETS), ("imageformat", _RAW_FORMATS)):
+            choices = _choices(camera, name)
+            found = next((label for label in labels if label in choices), None)
+            if found is not None:
+                wanted[name] = found
+            elif choices:
+                refused.append(f"{name} offers {', '.join(choices)}, none of {', '.join(labels)}")
+        for name, value in (
+            ("iso", float(settings.iso)),
+            ("aperture", settings.aperture),
+            ("shutterspeed", settings.shutter_s),
+        ):
+            choices = _choices(camera, name)
+            found = _nearest(choices, value)
+            if found is not None:
+                wanted[name] = found
+            else:
+                refused.append(f"{name} {value:g} is not offered; offered are {', '.join(choices) or 'none'}")
+        if refused:
+            raise DeviceRefused(f"the camera cannot take the series: {'; '.join(refused)}")
+        for name, label in wanted.items():
+            _set(camera, name, label)
+
+
+def library():
+    """Return python-gphoto2.
+
+    Raises
+    ------
+    ConfigurationError
+        It is not installed.
+    """
+    try:
+        import gphoto2
+    except ImportError as error:
+        raise ConfigurationError(
+            "python-gphoto2 is not installed; install the extra: pip install 'croplab[gphoto2]'"
+        ) from error
+    return gphoto2
+
+
+def _translated(error: gphoto2.GPhoto2Error, label: str) -> DeviceError:
+    gp = library()
+    what = f"{label}: libgphoto2 says {error.string} ({error.code})"
+    match error.code:
+        case gp.GP_ERROR_TIMEOUT:
+            return LinkTimeout(f"{what}; look whether the camera is on and awake")
+        case gp.GP_ERROR_IO_USB_CLAIM | gp.GP_ERROR_IO_LOCK:
+            return LinkClosed(f"{what}; end the other program that uses the camera, photo importers of the desktop too")
+        case gp.GP_ERROR_CAMERA_BUSY:
+            return DeviceError(f"{what}; the frame may be retaken when it is idle")
+        case gp.GP_ERROR_MODEL_NOT_FOUND | gp.GP_ERROR_UNKNOWN_PORT | gp.GP_ERROR_IO_USB_FIND:
+            return LinkClosed(f"{what}; connect the camera and switch it on")
+        case gp.GP_ERROR_IO | gp.GP_ERROR_IO_READ | gp.GP_ERROR_IO_WRITE | gp.GP_ERROR_IO_INIT:
+            return LinkClosed(f"{what}; check the cable, switch the camera off and on")
+        case _:
+            return DeviceError(f"{what}; switch the camera off and on, then run again")
+
+
+def _text(camera: gphoto2.Camera, names: Iterable[str]) -> str:
+    """Return the value of the first of some widgets that the body has, empty where it has none."""
+    gp = library()
+    for name in names:
+        try:
+            value = camera.get_single_config(name).get_value()
+        except gp.GPhoto2Error as error:
+            if error.code != gp.GP_ERROR_BAD_PARAMETERS:
+                raise
+            continue
+        if value:
+            return str(value)
+    return ""
+
+
+def _choices(camera: gphoto2.Camera, name: str) -> list[str]:
+    """Return what a widget can be set to, empty where the body has no such widget or no list for it."""
+    gp = library()
+    try:
+        widget = camera.get_single_config(name)
+    except gp.GPhoto2Error as error:
+        if error.code != gp.GP_ERROR_BAD_PARAMETERS:
+            raise
+        return []
+    if widget.get_type() not in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU):
+        return []
+    return [widget.get_choice(index) for index in range(widget.count_choices())]
+
+
+def _set(camera: gphoto2.Camera, name: str, label: str) -> None:
+    widget = camera.get_single_config(name)
+    if widget.get_value() != label:
+        widget.set_value(label)
+        camera.set_single_config(name, widget)
+        came = camera.get_single_config(name).get_value()
+        if came != label:
+            raise DeviceRefused(f"{name} was set to {label}, and the camera reports {came}; set it by hand")
+
+
+def _nearest(choices: Iterable[str], wanted: float) -> str | None:
+    """Return the label of the choice nearest to `wanted`, None where none is near enough."""
+    numbers = {label: number for label in choices if (number := _number(label)) is not None}
+    near = [label for label, number in numbers.items() if abs(number / wanted - 1) <= TOLERANCE]
+    return min(near, key=lambda label: abs(numbers[label] / wanted - 1), default=None)
+
+
+def _number(label: str) -> float | None:
+    over, _, under = label.lower().removeprefix("f/").removesuffix("s").partition("/")
+    try:
+        number = float(over) / float(under or 1)
+    except (ValueError, ZeroDivisionError):
+        return None
+    return number if number > 0 else None

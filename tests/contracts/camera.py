@@ -1,0 +1,129 @@
+"""What every camera keeps to, written once: a suite names its camera by the fixture `bench`.
+
+The camera photographs with a `SeededFilm`, so that each frame can be compared with what was exposed.
+"""
+
+from __future__ import annotations
+
+import io
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from typing import BinaryIO
+
+import pytest
+
+from drivers.camera import Camera, CameraIdentity, ExposureSettings
+from drivers.errors import DeviceError, DeviceRefused
+
+SETTINGS = ExposureSettings(iso=100, aperture=8, shutter_s=1 / 60)
+"""What every camera under test offers."""
+
+
+class SeededFilm:
+    """A `sim.camera.Film` whose pictures are noise, each another one, and remembered."""
+
+    suffix = ".cr2"
+
+    def __init__(self, size: int = 600, seed: int = 1) -> None:
+        self._chance = random.Random(seed)
+        self._size = size
+        self.frames: list[bytes] = []
+        self.settings: list[ExposureSettings] = []
+
+    def accept(self, settings: ExposureSettings) -> None:
+        if settings.iso == 110:
+            raise DeviceRefused("the film offers iso 100 … 6400, but not 110")
+
+    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
+        self.settings.append(settings)
+        # Now and then a size that fills whole packets.
+        size = self._size if len(self.frames) % 7 else 512 * (1 + self._size // 512)
+        self.frames.append(self._chance.randbytes(size))
+        return into.write(self.frames[-1])
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A camera under test, the film in it, and what is true of it.
+
+    `keeps_names` tells whether frames come under the names that the camera gave them; `develop` brings `film` up to
+    date where it is the image of one elsewhere.
+    """
+
+    camera: Camera
+    film: SeededFilm
+    identity: CameraIdentity
+    now: Callable[[], datetime]
+    keeps_names: bool = True
+    develop: Callable[[], None] = lambda: None
+
+    def frames(self) -> list[bytes]:
+        """Return what has been exposed."""
+        self.develop()
+        return self.film.frames
+
+
+class CameraContract:
+    """Subclass as ``TestX`` and supply the fixture `bench`."""
+
+    def test_names_itself(self, bench: Bench) -> None:
+        assert bench.camera.identity() == bench.identity
+        assert bench.camera.identity() == bench.identity
+
+    def test_takes_nothing_before_it_knows_how(self, bench: Bench) -> None:
+        with pytest.raises(DeviceRefused, match="configure"):
+            bench.camera.capture(io.BytesIO())
+        assert bench.frames() == []
+
+    def test_every_frame_is_the_one_that_was_exposed(self, bench: Bench) -> None:
+        bench.camera.configure(SETTINGS)
+        names: list[str] = []
+        for number in range(4):
+            into = io.BytesIO()
+            before = bench.now()
+            captured = bench.camera.capture(into)
+            assert into.getvalue() == bench.frames()[number]
+            assert captured.size == len(bench.frames()[number])
+            assert captured.released_at.utcoffset() == timedelta(0)
+            assert before <= captured.released_at.astimezone(UTC) <= bench.now()
+            names.append(captured.name)
+        assert len(bench.frames()) == 4
+        assert len(set(names)) == 4
+        assert all(name.lower().endswith(".cr2") for name in names)
+        if bench.keeps_names:
+            assert names == ["IMG_0001.CR2", "IMG_0002.CR2", "IMG_0003.CR2", "IMG_0004.CR2"]
+
+    def test_exposes_as_it_was_told(self, bench: Bench) -> None:
+        told = [SETTINGS, replace(SETTINGS, iso=200), replace(SETTINGS, aperture=11.0, shutter_s=1 / 125), SETTINGS]
+        for settings in told:
+            bench.camera.configure(settings)
+            bench.camera.capture(io.BytesIO())
+        bench.develop()
+        assert bench.film.settings == told
+
+    def test_writes_where_the_file_stands(self, bench: Bench) -> None:
+        bench.camera.configure(SETTINGS)
+        into = io.BytesIO(b"before")
+        into.seek(0, io.SEEK_END)
+        captured = bench.camera.capture(into)
+        assert into.getvalue() == b"before" + bench.frames()[0]
+        assert captured.size == len(bench.frames()[0])
+
+    def test_refuses_what_it_does_not_offer_and_stays_usable(self, bench: Bench) -> None:
+        with pytest.raises(DeviceRefused, match="100"):
+            bench.camera.configure(replace(SETTINGS, iso=110))
+        assert bench.frames() == []
+        bench.camera.configure(SETTINGS)
+        into = io.BytesIO()
+        bench.camera.capture(into)
+        assert into.getvalue() == bench.frames()[-1]
+
+    def test_a_closed_camera_is_closed(self, bench: Bench) -> None:
+        bench.camera.configure(SETTINGS)
+        bench.camera.close()
+        bench.camera.close()
+        with pytest.raises(DeviceError):
+            bench.camera.capture(io.BytesIO())
+        assert bench.frames() == []

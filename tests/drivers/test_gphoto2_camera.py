@@ -1,0 +1,104 @@
+"""The way through libgphoto2, against the simulated EOS on the loopback: another initiator than ours, in real time."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from drivers.camera import CameraIdentity, ExposureSettings
+from drivers.clock import SystemClock
+from drivers.errors import ConfigurationError, DeviceError, DeviceRefused, LinkError
+from drivers.gphoto2_camera import Gphoto2Camera
+from tests.contracts.camera import SETTINGS, Bench, CameraContract, SeededFilm
+from tests.drivers.gphoto2_server import FILM_BYTES
+
+pytest.importorskip("gphoto2", reason="the extra `gphoto2` is not installed")
+
+MODEL = "PTP/IP Camera"
+
+
+class FarFilm(SeededFilm):
+    """The film in the other process: exposed here again as that one says it was."""
+
+    def __init__(self, reports: int) -> None:
+        super().__init__(FILM_BYTES)
+        self._reports = reports
+        self._rest = b""
+        os.set_blocking(reports, False)
+
+    def catch_up(self) -> None:
+        with suppress(BlockingIOError):
+            while piece := os.read(self._reports, 4096):
+                self._rest += piece
+        *lines, self._rest = self._rest.split(b"\n")
+        for line in lines:
+            self.expose(ExposureSettings(**json.loads(line)), SystemClock().now(), io.BytesIO())
+
+
+@contextmanager
+def served(port: int = 0, mode: str = "prepared") -> Generator[tuple[str, FarFilm]]:
+    """Serve a simulated EOS; give libgphoto2's name of its port, and its film."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "tests.drivers.gphoto2_server", str(port), mode],
+        cwd=Path(__file__).parents[2],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            yield process.stdout.readline().decode().strip(), FarFilm(process.stdout.fileno())
+        finally:
+            process.stdin.close()
+            process.wait(10)
+
+
+class TestContract(CameraContract):
+    @pytest.fixture
+    def bench(self) -> Generator[Bench]:
+        with served() as (port, film):
+            camera = Gphoto2Camera(port, MODEL)
+            identity = CameraIdentity("Canon Inc.", "Canon EOS 550D", "0000000001", "3-1.0.9")
+            yield Bench(camera, film, identity, SystemClock().now, keeps_names=False, develop=film.catch_up)
+            camera.close()
+
+
+def test_a_body_that_is_not_set_up_is_refused_with_all_reasons_at_once() -> None:
+    with served(mode="unprepared") as (port, _):
+        camera = Gphoto2Camera(port, MODEL)
+        with pytest.raises(DeviceRefused, match=r"autoexposuremode is AV.*focusmode is One Shot"):
+            camera.configure(SETTINGS)
+        camera.close()
+
+
+def test_a_lost_connection_is_renewed_by_the_next_call() -> None:
+    with served() as (port, _):
+        camera = Gphoto2Camera(port, MODEL)
+        camera.configure(SETTINGS)
+    with pytest.raises(DeviceError):
+        camera.capture(io.BytesIO())
+    with served(int(port.rpartition(":")[2])) as (_, film):
+        into = io.BytesIO()
+        camera.capture(into)
+        film.catch_up()
+        assert [into.getvalue()] == film.frames
+        camera.close()
+
+
+def test_no_camera_is_said_with_what_helps() -> None:
+    with pytest.raises(LinkError, match="ptpip:127"):
+        Gphoto2Camera("ptpip:127.0.0.1:1:1", MODEL).identity()
+
+
+def test_a_missing_library_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gphoto2", None)
+    with pytest.raises(ConfigurationError, match=r"croplab\[gphoto2\]"):
+        Gphoto2Camera()
