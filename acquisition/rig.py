@@ -21,16 +21,19 @@ from acquisition.config import LabSettings, unknown_key
 from acquisition.printing import drawing
 from acquisition.sequencer import Devices
 from acquisition.session import Session
-from drivers.camera import CameraIdentity
 from drivers.errors import ConfigurationError, FormatError
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.presenter import Colour
 from drivers.projector import Power
+from drivers.ptp.canon_eos import CanonEos
 from sim.bodies import BODIES, Body
-from sim.camera import Film, SimulatedCamera, WorldFilm
+from sim.camera import Film, WorldFilm
 from sim.clock import OPENING, SimulatedClock
+from sim.eos import SimulatedEos
+from sim.eos_bodies import EOS_BODIES
 from sim.presenter import Screen, SimulatedPresenter
 from sim.projector import PjLinkPeer, SimulatedProjector, memory_link
+from sim.ptp_memory import MemoryTransport
 from sim.replay import RecordedFrame, ReplayFilm
 from sim.world import Print, Room, World
 
@@ -65,17 +68,16 @@ def open_rig(settings: LabSettings, chart: Chart, session: Session | None = None
     clock = SimulatedClock(_last_moment(session) if session is not None else OPENING)
     screen = Screen()
     beamer = SimulatedProjector(clock, power=Power.ON if exposed else Power.STANDBY)
+    name = settings.simulated.body
     if settings.rig == "simulated":
-        body = simulated_body(settings)
-        world = World(sheet(chart), body, simulated_room(settings))
+        world = World(sheet(chart), simulated_body(settings), simulated_room(settings))
         film: Film = WorldFilm(world, screen, beamer.light, SERIAL, exposed)
-        identity = CameraIdentity(body.maker, body.model.removeprefix(f"{body.maker} "), SERIAL, "simulated")
     else:
         assert settings.replay is not None
         film = ReplayFilm(_recording(settings.replay.session), screen, exposed)
-        identity = CameraIdentity("CroP", f"replay of {settings.replay.session.name}", SERIAL, "simulated")
+    eos = SimulatedEos(EOS_BODIES[name], film, clock, serial=SERIAL, auto_power_off_s=0)
     peer = PjLinkPeer(beamer)
-    camera = SimulatedCamera(identity, film, clock)
+    camera = CanonEos(lambda: MemoryTransport(eos), clock)
     presenter = SimulatedPresenter(screen, clock)
     projector = PjLinkProjector(lambda: memory_link(peer))
     try:
