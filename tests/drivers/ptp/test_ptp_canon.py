@@ -139,6 +139,19 @@ def test_a_state_dump() -> None:
     assert serial.text == "1286027086"
 
 
+def test_an_object_of_a_body_with_sizes_of_64_bits() -> None:
+    # Size at 0x1c of the record, parent at 0x24, the other handle at 0x28, name at 0x2c.
+    head = "40000000 a7c10000 21009191 01000200 08b10000 00000000 20000000 0000004001000000 00009191 20009191"
+    name = "494d475f303034322e43523300000000 00000000"
+    octets = bytes.fromhex(head + name + "08000000 00000000")
+    assert octets.index(b"IMG") == 0x2C
+    entry = ObjectEntry(
+        0x91910021, 0x00020001, ObjectFormat.CR3, 0x1_4000_0000, "IMG_0042.CR3", 0x91910000, 0x91910020, flags=0x20
+    )
+    assert canon.decode_events(octets) == (ObjectEvent(EosEvent.OBJECT_ADDED_64, entry),)
+    assert canon.encode_events([ObjectEvent(EosEvent.OBJECT_ADDED_64, entry)]) == octets
+
+
 def test_nothing_new() -> None:
     empty = bytes.fromhex("08000000 00000000")
     assert canon.encode_events() == empty
@@ -226,6 +239,15 @@ def test_any_objects_come_back(entries: tuple[ObjectEntry, ...]) -> None:
     assert canon.decode_object_entries(canon.encode_object_entries(entries)) == entries
 
 
+def test_what_no_body_could_say_is_our_own_mistake() -> None:
+    jpeg = ImageFile(1, 0, 3)
+    for files in ((), (jpeg, jpeg, jpeg)):
+        with pytest.raises(ValueError, match="a release makes 1 or 2"):
+            ImageFormat(files).encode()
+    with pytest.raises(ValueError, match="2 extra numbers"):
+        canon.encode_events([TransferRequest(1, 0xB103, 0, "A.CR2", extra=(1, 2))])
+
+
 def test_a_name_must_fit() -> None:
     with pytest.raises(ValueError, match="no name of at most 16"):
         ObjectEntry(1, 1, 0xB103, 0, "A_NAME_TOO_LONG.CR2").encode()
@@ -273,6 +295,27 @@ def test_a_device_and_what_it_reports() -> None:
     info = DeviceInfoEx((0xC181, 0xC189), (0xD101,), (4,))
     assert info.encode() == examples.DEVICE_INFO_EX
     assert DeviceInfoEx.decode(examples.DEVICE_INFO_EX) == info
+
+
+@pytest.mark.parametrize(
+    ("version", "bit", "octets"),
+    [
+        (0x07, canon.OLC_SHUTTER, "010198100060"),  # 6D and others
+        (0x07, canon.OLC_APERTURE, "01015b3030"),
+        (0x07, canon.OLC_ISO, "01010078"),
+        (0x0B, canon.OLC_FOCUS, "000000000101"),  # 5Ds
+        (0x0F, canon.OLC_SHUTTER, "01039810007000"),  # 200D
+        (0x10, canon.OLC_APERTURE, "010150202000"),
+        (0x11, canon.OLC_SHUTTER, "0101a00c000c00"),  # R
+        (0x12, canon.OLC_APERTURE, "01030058002d003000"),  # M6 Mark II
+        (0x12, canon.OLC_ISO, "0101006b6828"),
+    ],
+)
+def test_fields_have_the_sizes_that_bodies_sent(version: int, bit: int, octets: str) -> None:
+    # Fields quoted in libgphoto2's ptp-pack.c, each alone in a record.
+    value = bytes.fromhex(octets)
+    body = (8 + len(value)).to_bytes(4, "little") + bit.to_bytes(4, "little") + value
+    assert canon.decode_olc_info(body, version) == {bit: value}
 
 
 def test_groups_of_newer_bodies() -> None:

@@ -212,6 +212,7 @@ def test_transactions_are_numbered_past_the_reserved_ones() -> None:
 
 
 def test_messages_read_well() -> None:
+    assert [Response(code).ok for code in (0x2001, 0x2019)] == [True, False]
     assert str(Request(0x1002, 0, (1,))) == "OPEN_SESSION (0x1002)(0x1)"
     assert str(Response(0x2019)) == "DEVICE_BUSY (0x2019)"
     assert str(Event(0xC999)) == "0xc999"
