@@ -94,6 +94,8 @@ _MEMORY = 0xA0000000
 """Handles of objects in the camera's memory are numbered from here (assumed)."""
 _ROOT = 0xFFFFFFFF
 _ANY = 0xFFFFFFFF
+_U32 = 0xFFFFFFFF
+_MOST_SHOTS = 0x7FFFFFFF
 _BULB = 0x0C
 _TIMERS_S: dict[int, float] = {
     DriveMode.TIMER_10_S: 10.0,
@@ -179,7 +181,7 @@ class _Object:
     def entry(self) -> ObjectEntry:
         return ObjectEntry(
             self.handle, self.storage, self.format, len(self.data), self.name, self.parent, self.handle,
-            time=int(self.taken_at.timestamp()),
+            time=int(self.taken_at.timestamp()) & _U32,
         )  # fmt: skip
 
 
@@ -619,7 +621,7 @@ class SimulatedEos:
             case Property.EOS_BATTERY_POWER:
                 return number_value(self._battery_code())
             case Property.EOS_CAMERA_TIME:
-                return number_value(int(self._now().timestamp()))
+                return number_value(int(self._now().timestamp()) & _U32)
             case Property.EOS_SHUTTER_COUNTER:
                 return number_value(self._shutter_count)
             case Property.EOS_CURRENT_STORAGE:
@@ -885,7 +887,7 @@ class SimulatedEos:
             free = min(card, self._host_bytes)
         else:
             free = card
-        return max(free, 0) // self.body.frame_bytes
+        return min(max(free, 0) // self.body.frame_bytes, _MOST_SHOTS)
 
     # The release.
 

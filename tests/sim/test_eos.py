@@ -12,7 +12,7 @@ from threading import Event as ThreadEvent
 from typing import BinaryIO
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.camera import ExposureSettings
@@ -371,6 +371,8 @@ def test_a_specimen_may_lack_operations() -> None:
     assert len(transfers(host.events())) == 1
 
 
+@example(Operation.EOS_PC_HDD_CAPACITY, [0xFFFFFFFF, 0xFFFFFFFF], None)
+@example(Operation.EOS_SET_DEVICE_PROP_VALUE_EX, [], PropertySetting(Property.EOS_CAMERA_TIME, b"\xff" * 4).encode())
 @given(
     code=st.sampled_from(OPERATIONS),
     parameters=st.lists(st.integers(0, 0xFFFFFFFF) | st.sampled_from([0, 1, 2, 3, CARD, FOLDER, DCIM]), max_size=5),
@@ -381,6 +383,10 @@ def test_answers_whatever_is_asked(code: int, parameters: list[int], data: bytes
     assert host.shoot()
     answer = host.ask(code, *parameters, data=data)
     assert answer.response.ok or answer.data is None
+    host.clock.sleep(60)
+    assert host.eos.answer(Request(Operation.OPEN_SESSION, 0, (1,)), None)
+    host.transaction = 1000
+    host.events()
 
 
 def test_a_body_without_a_master_takes_no_orders() -> None:
