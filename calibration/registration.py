@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, optimize, sparse
 from scipy.sparse import linalg as sparse_linalg
+from scipy.spatial import cKDTree
 
 from acquisition.chart import Chart, Tag
 from acquisition.framing import (
@@ -68,6 +69,10 @@ _LEAST_INFORMATION = 4.0
 """px⁻²: a block that knows its place no better than half a pixel says nothing."""
 
 _STRANGE_SIGMA = 10.0
+_NEIGHBOURS = 13
+"""A cell and the twelve within two cells of it."""
+
+_STRANGE_NEIGHBOURS = 0.35
 _STRANGE_SHARE = 0.08
 """Of paper white: the model's own errors at the gamut's corners stay below."""
 
@@ -710,7 +715,9 @@ class _Matcher:
             lens_residual_px=lens_rms,
             blocks=self._fit,
             colours=self.colours,
-            strangers=_strangers(seen, wanted, paper)[: self._chart.colour_count],
+            strangers=_with_neighbours(
+                _strangers(seen, wanted, paper)[: self._chart.colour_count], self._chart.centres_mm / self._cell
+            ),
             agreement=_agreement(seen[there], wanted[there]),
             blur_px=self._blur,
             cell_px=self._cell_px,
@@ -722,6 +729,16 @@ def _strangers(seen: _Array, wanted: _Array, paper: _Array) -> _Mask:
     residual = np.abs(seen - wanted)
     usual = 1.4826 * np.nanmedian(residual, axis=0)
     return np.asarray(((residual > _STRANGE_SIGMA * usual) & (residual > _STRANGE_SHARE * paper)).any(axis=1))
+
+
+def _with_neighbours(strangers: _Mask, centres: _Array) -> _Mask:
+    """Return the strangers (N,) and the cells amid them, which a cover of their own colour would hide.
+
+    `centres` (N, 2) in cells.
+    """
+    near = cKDTree(centres).query(centres, k=min(_NEIGHBOURS, len(centres)))[1]
+    share = strangers[np.asarray(near).reshape(len(centres), -1)].mean(axis=1)
+    return np.asarray(strangers | (share > _STRANGE_NEIGHBOURS))
 
 
 def _agreement(seen: _Array, wanted: _Array) -> float:

@@ -122,6 +122,10 @@ def test_a_covered_corner_does_not_pull_its_neighbours(tmp_path: Path) -> None:
     free = (np.abs(truth - middle) > 130).any(axis=1)
     error = np.linalg.norm(registration.to_pixels(lab.chart.centres_mm) - truth, axis=1)
     assert error[free].max() < 0.6
+    hidden = (np.abs(truth - middle) < 95).all(axis=1)
+    assert hidden.sum() > 100
+    assert registration.strangers[hidden].all()
+    assert not registration.strangers[free].any()
 
 
 def test_out_of_focus_is_refused(tmp_path: Path) -> None:
