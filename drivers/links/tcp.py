@@ -25,6 +25,7 @@ class TcpLink:
     def __init__(self, connection: socket.socket, far_end: str) -> None:
         self._socket = connection
         self._far_end = far_end
+        self._timeout: float | None = None
         # Commands are short and each waits for its answer: to gather them into bigger packets only delays them.
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -60,7 +61,7 @@ class TcpLink:
     def write(self, data: bytes, timeout: float) -> None:
         """Send all of `data` within `timeout` seconds."""
         try:
-            self._socket.settimeout(timeout)
+            self._limit(timeout)
             self._socket.sendall(data)
         except OSError as error:
             raise self._translated(error, f"{self._far_end} takes no data for {timeout:g} s") from error
@@ -68,7 +69,7 @@ class TcpLink:
     def read(self, limit: int, timeout: float) -> bytes:
         """Return the next 1 … `limit` bytes, waiting at most `timeout` seconds for the first."""
         try:
-            self._socket.settimeout(timeout)
+            self._limit(timeout)
             data = self._socket.recv(limit)
         except OSError as error:
             raise self._translated(error, f"{self._far_end} sent nothing for {timeout:g} s") from error
@@ -82,6 +83,12 @@ class TcpLink:
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
+
+    def _limit(self, timeout: float) -> None:
+        # To set it is a system call, and most calls want what the last one wanted.
+        if timeout != self._timeout:
+            self._socket.settimeout(timeout)
+            self._timeout = timeout
 
     def _translated(self, error: OSError, late: str) -> LinkError:
         if isinstance(error, (TimeoutError, BlockingIOError)):

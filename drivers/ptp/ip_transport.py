@@ -49,7 +49,7 @@ DATA_PIECE = 64 * 1024
 MAX_EVENTS = 4096
 """Events kept for a caller who never asks for them."""
 
-_READ = 256 * 1024
+_READ = 128 * 1024
 _PING_EVERY_S = 1.0
 _CONNECT_S = 10.0
 _EVENT_CHANNEL_S = 2.0

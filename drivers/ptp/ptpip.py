@@ -183,6 +183,7 @@ def encode(packet: Packet) -> bytes:
     ValueError
         A number does not fit, a GUID is not 16 bytes, a name is too long, or there are more than five parameters.
     """
+    rest = b""
     match packet:
         case InitCommandRequest(guid, name, version):
             kind, body = PacketType.INIT_COMMAND_REQUEST, _guid(guid) + _name(name) + encode_integer(version, 4)
@@ -206,16 +207,17 @@ def encode(packet: Packet) -> bytes:
             kind = PacketType.START_DATA
             body = encode_integer(transaction, 4) + encode_integer(UNKNOWN_TOTAL if total is None else total, 8)
         case Data(transaction, data):
-            kind, body = PacketType.DATA, encode_integer(transaction, 4) + data
+            kind, body, rest = PacketType.DATA, encode_integer(transaction, 4), data
         case EndData(transaction, data):
-            kind, body = PacketType.END_DATA, encode_integer(transaction, 4) + data
+            kind, body, rest = PacketType.END_DATA, encode_integer(transaction, 4), data
         case Cancel(transaction):
             kind, body = PacketType.CANCEL, encode_integer(transaction, 4)
         case Ping():
             kind, body = PacketType.PING, b""
         case Pong():
             kind, body = PacketType.PONG, b""
-    return encode_integer(HEADER_LENGTH + len(body), 4) + encode_integer(kind, 4) + body
+    length = HEADER_LENGTH + len(body) + len(rest)
+    return b"".join((encode_integer(length, 4), encode_integer(kind, 4), body, rest))
 
 
 def decode(data: bytes) -> Packet:
@@ -235,15 +237,16 @@ class PacketCutter:
     """Cuts a channel's stream into packets, however it was split on its way. One for each channel."""
 
     def __init__(self) -> None:
-        self._rest = bytearray()
-        self._data_left = 0
-        self._data_kind = 0
-        self._transaction = 0
+        self._waiting: bytes = b""
+        self._at: int = 0
+        self._data_left: int = 0
+        self._data_kind: int = 0
+        self._transaction: int = 0
 
     @property
     def at_boundary(self) -> bool:
         """Whether the stream stands between two packets."""
-        return not self._rest and not self._data_kind
+        return not self._waiting and not self._data_kind
 
     def feed(self, piece: bytes) -> list[Packet]:
         """Take the next bytes and return what they complete.
@@ -254,22 +257,30 @@ class PacketCutter:
             A packet is none. Packets before it are returned first, and the next call raises.
         """
         packets: list[Packet] = []
-        self._rest += piece
+        # Data are handed on at once, so that what waits is never more than the beginning of a short packet.
+        self._waiting = self._waiting + piece if self._waiting else piece
+        self._at = 0
         try:
             while self._next(packets):
                 pass
         except ProtocolError:
             if not packets:
                 raise
+        finally:
+            self._waiting = self._waiting[self._at :]
         return packets
 
+    @property
+    def _left(self) -> int:
+        return len(self._waiting) - self._at
+
     def _next(self, packets: list[Packet]) -> bool:
-        """Move one packet, or a piece of one, from what is left to `packets`; return whether more may follow."""
+        """Move one packet, or a piece of one, from what waits to `packets`; return whether more may follow."""
         if self._data_kind:
             return self._next_data(packets)
-        if len(self._rest) < HEADER_LENGTH:
+        if self._left < HEADER_LENGTH:
             return False
-        cursor = Cursor(bytes(self._rest[: HEADER_LENGTH + 4]), "a PTP/IP packet")
+        cursor = Cursor(self._waiting[self._at : self._at + HEADER_LENGTH + 4], "a PTP/IP packet")
         length, kind = cursor.u32("length"), cursor.u32("type")
         _checked(kind, length)
         if kind in _DATA_TYPES:
@@ -278,18 +289,18 @@ class PacketCutter:
             self._transaction = cursor.u32("transaction")
             self._data_kind = kind
             self._data_left = length - cursor.at
-            del self._rest[: cursor.at]
+            self._at += cursor.at
             return True
-        if len(self._rest) < length:
+        if self._left < length:
             return False
-        packet = decode(bytes(self._rest[:length]))
-        del self._rest[:length]
+        packet = decode(self._waiting[self._at : self._at + length])
+        self._at += length
         packets.append(packet)
-        return bool(self._rest)
+        return self._left > 0
 
     def _next_data(self, packets: list[Packet]) -> bool:
-        data = bytes(self._rest[: self._data_left])
-        del self._rest[: len(data)]
+        data = self._waiting[self._at : self._at + self._data_left]
+        self._at += len(data)
         self._data_left -= len(data)
         if not self._data_left and self._data_kind == PacketType.END_DATA:
             packets.append(EndData(self._transaction, data))
@@ -297,7 +308,7 @@ class PacketCutter:
             packets.append(Data(self._transaction, data))
         if not self._data_left:
             self._data_kind = 0
-        return bool(self._rest)
+        return self._left > 0
 
 
 def _checked(kind: int, length: int) -> None:

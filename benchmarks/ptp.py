@@ -1,0 +1,147 @@
+"""How fast PTP goes through our cables: `python -m benchmarks.ptp` prints one JSON object a line.
+
+Both ends run in this process and share its processor, on loopback and on the simulated bus; the best of several runs
+counts, taken in turns with what it is compared to.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+from drivers.clock import SystemClock
+from drivers.links.tcp import LOOPBACK
+from drivers.links.usb import open_usb
+from drivers.ptp.codes import Operation, ResponseCode
+from drivers.ptp.ip_transport import IpTransport
+from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.transport import Transport
+from drivers.ptp.usb_transport import UsbTransport
+from sim.ptpip_server import serve_ptpip
+from sim.responder import Answer
+from sim.usb import SimulatedBus
+from sim.usb_device import PtpUsbDevice
+
+OBJECT = bytes(range(256)) * 117_188
+"""30 MB, a raw file."""
+RUNS = 7
+OPERATIONS = 2000
+TIMEOUT_S = 10.0
+
+
+class Store:
+    """A device that holds one object and answers everything else with success."""
+
+    def takes_data(self, request: Request) -> bool:
+        return False
+
+    def answer(self, request: Request, data: bytes | None) -> Answer:
+        given = OBJECT if request.code == Operation.GET_OBJECT else None
+        return Answer(Response(ResponseCode.OK, request.transaction), given)
+
+    def events(self) -> tuple[Event, ...]:
+        return ()
+
+    def cancelled(self, transaction: int) -> None: ...
+
+    def unplugged(self) -> None: ...
+
+
+class Plain:
+    """A socket that sends the object for each byte it is sent, or for a ``1`` that byte alone."""
+
+    def __init__(self) -> None:
+        self._listener = socket.create_server((LOOPBACK, 0))
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+        self._socket = socket.create_connection(self._listener.getsockname())
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._buffer = bytearray(256 * 1024)
+
+    def download(self) -> None:
+        self._socket.sendall(b"0")
+        left = len(OBJECT)
+        while left:
+            left -= self._socket.recv_into(self._buffer)
+
+    def exchange(self) -> None:
+        self._socket.sendall(b"1")
+        self._socket.recv(1)
+
+    def close(self) -> None:
+        self._socket.close()
+        self._thread.join()
+        self._listener.close()
+
+    def _serve(self) -> None:
+        connection, _ = self._listener.accept()
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        with connection:
+            while word := connection.recv(1):
+                connection.sendall(OBJECT if word == b"0" else word)
+
+
+def took(work: Callable[[], object]) -> float:
+    """Return how long it takes, seconds."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def best(*works: Callable[[], object]) -> list[float]:
+    """Return the least time of each over several runs in turns, seconds."""
+    return [min(times) for times in zip(*([took(work) for work in works] for _ in range(RUNS)), strict=True)]
+
+
+def download(transport: Transport) -> None:
+    taken = 0
+
+    def take(piece: bytes) -> None:
+        nonlocal taken
+        taken += len(piece)
+
+    transport.transact(Request(Operation.GET_OBJECT, 1, (1,)), receive=take, timeout=TIMEOUT_S)
+    assert taken == len(OBJECT)
+
+
+def operate(transport: Transport) -> None:
+    for number in range(OPERATIONS):
+        transport.transact(Request(Operation.EOS_KEEP_DEVICE_ON, number), timeout=TIMEOUT_S)
+
+
+def report(name: str, value: float, unit: str, against: str) -> None:
+    print(json.dumps({"name": name, "value": float(f"{value:.3g}"), "unit": unit, "against": against}), flush=True)
+
+
+def main() -> None:
+    """Measure and print."""
+    bus = SimulatedBus()
+    bus.plug(PtpUsbDevice(Store()))
+    over_usb = UsbTransport(open_usb(backend=bus), SystemClock())
+    plain = Plain()
+    with serve_ptpip(Store(), 0) as server:
+        over_ip = IpTransport.connect(*server.address, guid=bytes(16), name="CroP", clock=SystemClock())
+        by_socket, by_ip, by_usb = best(plain.download, lambda: download(over_ip), lambda: download(over_usb))
+        exchanging, operating_ip, operating_usb = best(
+            lambda: [plain.exchange() for _ in range(OPERATIONS)], lambda: operate(over_ip), lambda: operate(over_usb)
+        )
+        over_ip.close()
+    over_usb.close()
+    plain.close()
+
+    size = len(OBJECT) / 1e6
+    report("PTP/IP download of 30 MB", size / by_ip, "MB/s", "none")
+    report(
+        "PTP/IP download over a socket's", by_socket / by_ip, "1", "a plain socket copy in the same run; at least 0.5"
+    )
+    report("PTP/IP operations", OPERATIONS / operating_ip, "1/s", "none")
+    report("PTP/IP operations over a socket's", exchanging / operating_ip, "1", "one byte there and back, same run")
+    report("USB download of 30 MB, simulated bus", size / by_usb, "MB/s", "35 to 40 MB/s of high speed")
+    report("USB operations, simulated bus", OPERATIONS / operating_usb, "1/s", "none")
+
+
+if __name__ == "__main__":
+    main()
