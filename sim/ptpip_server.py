@@ -40,6 +40,7 @@ from drivers.ptp.ptpip import (
     Pong,
     StartData,
     encode,
+    encode_data,
 )
 from sim.responder import Answer, NoAnswer, Responder
 
@@ -184,7 +185,7 @@ class PtpIpService:
                     response = Response(ResponseCode.TRANSACTION_CANCELLED, request.transaction)
                     _send(initiator.command, response)
                     return
-                _send(initiator.command, packet)
+                initiator.command.write(packet, _PATIENCE_S)
         _send(initiator.command, answer.response)
 
     def _tell_events(self, initiator: _Initiator) -> None:
@@ -271,9 +272,10 @@ def _collect(packets: _Incoming) -> bytes | None:
                 pass
 
 
-def _data_packets(transaction: int, data: bytes) -> Iterator[Packet]:
-    yield StartData(transaction, len(data))
+def _data_packets(transaction: int, data: bytes) -> Iterator[bytes]:
+    yield encode(StartData(transaction, len(data)))
+    view = memoryview(data)
     last = max(0, len(data) - 1) // DATA_PIECE * DATA_PIECE
     for at in range(0, last, DATA_PIECE):
-        yield Data(transaction, data[at : at + DATA_PIECE])
-    yield EndData(transaction, data[last:])
+        yield encode_data(transaction, view[at : at + DATA_PIECE], last=False)
+    yield encode_data(transaction, view[last:], last=True)

@@ -40,6 +40,7 @@ from drivers.ptp.ptpip import (
     Pong,
     StartData,
     encode,
+    encode_data,
 )
 from drivers.ptp.reception import Reception
 from drivers.ptp.transport import Transaction
@@ -266,10 +267,11 @@ class IpTransport:
             return
         transaction = request.transaction
         self._command.write(encode(StartData(transaction, len(send))), timeout)
+        view = memoryview(send)
         last = max(0, len(send) - 1) // DATA_PIECE * DATA_PIECE
         for at in range(0, last, DATA_PIECE):
-            self._command.write(encode(Data(transaction, send[at : at + DATA_PIECE])), timeout)
-        self._command.write(encode(EndData(transaction, send[last:])), timeout)
+            self._command.write(encode_data(transaction, view[at : at + DATA_PIECE], last=False), timeout)
+        self._command.write(encode_data(transaction, view[last:], last=True), timeout)
 
     def _receive(self, reception: Reception, timeout: float) -> Transaction:
         while True:

@@ -183,7 +183,6 @@ def encode(packet: Packet) -> bytes:
     ValueError
         A number does not fit, a GUID is not 16 bytes, a name is too long, or there are more than five parameters.
     """
-    rest = b""
     match packet:
         case InitCommandRequest(guid, name, version):
             kind, body = PacketType.INIT_COMMAND_REQUEST, _guid(guid) + _name(name) + encode_integer(version, 4)
@@ -207,17 +206,23 @@ def encode(packet: Packet) -> bytes:
             kind = PacketType.START_DATA
             body = encode_integer(transaction, 4) + encode_integer(UNKNOWN_TOTAL if total is None else total, 8)
         case Data(transaction, data):
-            kind, body, rest = PacketType.DATA, encode_integer(transaction, 4), data
+            return encode_data(transaction, data, last=False)
         case EndData(transaction, data):
-            kind, body, rest = PacketType.END_DATA, encode_integer(transaction, 4), data
+            return encode_data(transaction, data, last=True)
         case Cancel(transaction):
             kind, body = PacketType.CANCEL, encode_integer(transaction, 4)
         case Ping():
             kind, body = PacketType.PING, b""
         case Pong():
             kind, body = PacketType.PONG, b""
-    length = HEADER_LENGTH + len(body) + len(rest)
-    return b"".join((encode_integer(length, 4), encode_integer(kind, 4), body, rest))
+    return encode_integer(HEADER_LENGTH + len(body), 4) + encode_integer(kind, 4) + body
+
+
+def encode_data(transaction: int, data: bytes | memoryview, *, last: bool) -> bytes:
+    """Return the packet `Data`, or `EndData` for the last one, around a part of something large: it is copied once."""
+    length = HEADER_LENGTH + 4 + len(data)
+    kind = PacketType.END_DATA if last else PacketType.DATA
+    return b"".join((encode_integer(length, 4), encode_integer(kind, 4), encode_integer(transaction, 4), data))
 
 
 def decode(data: bytes) -> Packet:
