@@ -61,7 +61,7 @@ _Result = TypeVar("_Result")
 
 @dataclass
 class _Shot:
-    """A release that has happened, or may have."""
+    """A release that has happened, or may have; objects that are `absent` cannot be its frame."""
 
     body: EosBody
     released_at: datetime
@@ -157,8 +157,9 @@ class CanonEos:
     def _carry_out(self, action: Callable[[EosBody], _Result]) -> _Result:
         """Return what `action` does with a connected body, over a new connection if this one fails."""
         for left in reversed(range(RECOVERIES + 1)):
+            body = self._connected()
             try:
-                return action(self._connected())
+                return action(body)
             except DeviceError as error:
                 if not _curable(error):
                     raise
@@ -179,7 +180,7 @@ class CanonEos:
             now = self._clock.monotonic()
             exposed = now + _CERTAIN_SHARE * settings.shutter_s
             until = now + settings.shutter_s + FRAME_LIMIT_S
-            shot = _Shot(body, self._clock.now(), exposed, until, settings.shutter_s)
+            shot = _Shot(body, self._clock.now(), exposed, until, settings.shutter_s, absent=set(body.state.waiting))
             try:
                 body.release()
             except (LinkError, ProtocolError) as error:

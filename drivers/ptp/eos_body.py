@@ -33,7 +33,7 @@ PIECE_BYTES = 1 << 20
 """Asked for at once; pieces of 5 MiB have crashed newer bodies."""
 MAX_FRAME_BYTES = 256 << 20
 """No raw file of an EOS body comes near it."""
-MAX_POLLS = 256
+MAX_POLLS = 64
 """GetEvent answers that one drain takes, at most."""
 KEEP_ALIVE_S = 10.0
 """After this long a body is told to stay awake."""
@@ -47,7 +47,10 @@ _REMOTE_ON, _REMOTE_OFF = 1, 0
 _WITHOUT_AF = 1
 _HOST_CLUSTERS, _HOST_CLUSTER_BYTES = 0x04FFFFFF, 0x1000
 _PAUSES_S = (0.05, 0.1, 0.15, 0.2)
-_PIECE_TRIES = 4
+_PIECE_TRIES = 5
+_FREE_TRIES = 3
+_LASTING = (ResponseCode.INVALID_OBJECT_HANDLE, ResponseCode.SESSION_NOT_OPEN, ResponseCode.DEVICE_BUSY)
+"""Responses to a request for a piece that asking again does not change."""
 _RELEASE_RESULTS = {
     1: "it finds no focus: set the lens to MF",
     3: "its mirror is up: switch mirror lockup off",
@@ -263,29 +266,46 @@ class EosBody:
         tries = _PIECE_TRIES
         while offset < waiting.size:
             wanted = min(PIECE_BYTES, waiting.size - offset)
-            parameters, data = self._session.call(operation, waiting.handle, offset, wanted)
-            if len(data) > wanted:
-                raise ProtocolError(f"{self.label} gives {len(data)} bytes at {offset}; {wanted} were asked for")
-            if not data or (parameters and parameters[0] != len(data)):
+            data = b""
+            try:
+                parameters, data = self._session.call(operation, waiting.handle, offset, wanted)
+            except Declined as error:
                 tries -= 1
+                if not tries or error.code in _LASTING:
+                    raise
+                parameters = ()
+            else:
+                if len(data) > wanted:
+                    raise ProtocolError(f"{self.label} gives {len(data)} bytes at {offset}; {wanted} were asked for")
+                if parameters and parameters[0] != len(data):
+                    data = b""
+                if not data:
+                    tries -= 1
                 if not tries:
                     raise DeviceError(
                         f"{self.label} announced {waiting.size} bytes for {waiting.name!r}, but gives only {offset}; "
                         "the frame is worthless and may be retaken"
                     )
+            if data:
+                into.write(data)
+                offset += len(data)
+                tries = _PIECE_TRIES
+            else:
                 self._clock.sleep(_PAUSES_S[-1])
-                continue
-            into.write(data)
-            offset += len(data)
-            tries = _PIECE_TRIES
             self._keep_awake()
 
     def free(self, waiting: WaitingObject) -> None:
-        """Let the body forget an object."""
-        self.state.waiting.pop(waiting.handle, None)
-        # Declined where the object is gone already, which is as well.
-        with contextlib.suppress(Declined):
-            self._session.call(Operation.EOS_TRANSFER_COMPLETE, waiting.handle)
+        """Let the body forget an object; where it will not, the next `make_ready` tries again."""
+        for left in reversed(range(_FREE_TRIES)):
+            try:
+                self._session.call(Operation.EOS_TRANSFER_COMPLETE, waiting.handle)
+            except Declined as error:
+                if error.code != ResponseCode.INVALID_OBJECT_HANDLE:  # else it has gone, which is as well
+                    if left:
+                        self._clock.sleep(_PAUSES_S[-1])
+                    continue
+            self.state.waiting.pop(waiting.handle, None)
+            return
 
     def free_waiting(self, spare: Callable[[WaitingObject], bool] = lambda waiting: False) -> None:
         """Let the body forget every object that waits, but those to `spare`."""

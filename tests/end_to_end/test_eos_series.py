@@ -1,0 +1,139 @@
+"""A whole series over the EOS driver, while body and cable misbehave as seldom as in a bad lab, which is often."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from drivers.camera import CapturedFrame
+from drivers.errors import DeviceError, DeviceRefused
+from drivers.pipes import UsbPipes
+from drivers.ptp.canon import OtherRecord, TransferRequest, decode_events, encode_events
+from drivers.ptp.canon_eos import CanonEos
+from drivers.ptp.codes import Operation, ResponseCode
+from drivers.ptp.messages import Request, Response
+from drivers.storage import whole_file
+from sim.eos_bodies import EOS_550D
+from sim.faults import CutOff, TroubledResponder
+from sim.responder import Answer, NoAnswer, Responder
+from tests.contracts.camera import SETTINGS
+from tests.drivers.eos_lab import Lab
+
+FRAMES = 707
+ATTEMPTS = 6
+"""Tries at a frame; the sequencer's default is three, in a better lab."""
+TROUBLE = 0.02
+"""Share of operations at which something happens."""
+KILLED_EVERY = 90
+
+
+class BadDay(TroubledResponder):
+    """A body to which something happens now and then, by chance."""
+
+    def __init__(self, good: Responder, seed: int, unplug: Callable[[], object]) -> None:
+        super().__init__(good)
+        self._chance = random.Random(seed)
+        self._unplug = unplug
+        self.happened: Counter[str] = Counter()
+
+    def answer(self, request: Request, data: bytes | None) -> Answer:
+        if self._chance.random() >= TROUBLE:
+            return super().answer(request, data)
+        trouble = self._chance.choice((self._busy, self._ill, self._silent, self._lost, self._pulled, self._wrong))
+        self.happened[trouble.__name__] += 1
+        return trouble(request, data)
+
+    def _busy(self, request: Request, data: bytes | None) -> Answer:
+        return Answer(Response(ResponseCode.DEVICE_BUSY, request.transaction))
+
+    def _ill(self, request: Request, data: bytes | None) -> Answer:
+        return Answer(Response(ResponseCode.GENERAL_ERROR, request.transaction))
+
+    def _silent(self, request: Request, data: bytes | None) -> Answer:
+        raise NoAnswer
+
+    def _lost(self, request: Request, data: bytes | None) -> Answer:
+        super().answer(request, data)
+        raise NoAnswer
+
+    def _pulled(self, request: Request, data: bytes | None) -> Answer:
+        self._unplug()
+        raise NoAnswer
+
+    def _wrong(self, request: Request, data: bytes | None) -> Answer:
+        """Send too little or too much; of events lose, double and invent some."""
+        answer = super().answer(request, data)
+        if answer.data is None:
+            return answer
+        if request.code != Operation.EOS_GET_EVENT:
+            changed = self._chance.choice((answer.data[:-1], answer.data + b"more", b""))
+            return Answer(answer.response, changed)
+        records = decode_events(answer.data)
+        frames = [record for record in records if isinstance(record, TransferRequest)]
+        others = [record for record in records if record not in frames]
+        changed = self._chance.choice((others, [*records, *frames], [*records, OtherRecord(0xC1FE, b"?")]))
+        return Answer(answer.response, encode_events(changed))
+
+
+@pytest.mark.parametrize("forgetful", [False, True], ids=["keeps frames", "forgets frames"])
+def test_a_series_on_a_bad_day_is_whole(tmp_path: Path, forgetful: bool) -> None:
+    lab = Lab(replace(EOS_550D, shots_per_charge=10_000), film_bytes=300, forgetful=forgetful)  # on mains power
+    chance = random.Random(707)
+    cables: list[_Cable] = []
+    day = BadDay(lab.eos, 1, lambda: cables[-1].pull())
+    lab.device = day
+
+    def cable(pipes: UsbPipes) -> UsbPipes:
+        cables.append(_Cable(pipes, lab, chance.randrange(40_000, 400_000)))
+        return cables[-1]
+
+    lab.pipes = cable
+    lab.camera.configure(SETTINGS)
+    taken: list[CapturedFrame] = []
+    failed = 0
+    for number in range(FRAMES):
+        if number % KILLED_EVERY == KILLED_EVERY - 1:
+            # The host dies without a word, and begins anew.
+            lab.camera = CanonEos(lab.open, lab.clock)
+            lab.camera.configure(SETTINGS)
+        for left in reversed(range(ATTEMPTS)):
+            before = len(lab.film.frames)
+            try:
+                with whole_file(tmp_path / f"{number:04d}.cr2") as stream:
+                    captured = lab.camera.capture(stream)
+            except DeviceError as error:
+                failed += 1
+                if not left or isinstance(error, DeviceRefused):
+                    raise
+                continue
+            assert len(lab.film.frames) > before, "the frame was exposed for this light"
+            taken.append(captured)
+            break
+    lab.camera.close()
+    numbers = [int(captured.name[4:8]) for captured in taken]
+    assert len(numbers) == FRAMES
+    assert numbers == sorted(set(numbers)), "each frame once, in the order of exposure"
+    for step, number in enumerate(numbers):
+        assert (tmp_path / f"{step:04d}.cr2").read_bytes() == lab.film.frames[number - 1]
+    assert len(list(tmp_path.iterdir())) == FRAMES
+    assert min(day.happened.values()) > 10, "every kind of trouble came up"
+    assert failed > 0
+    assert lab.waiting() == 0
+
+
+class _Cable(CutOff):
+    """A cable that is pulled by hand, or breaks after some bytes."""
+
+    def __init__(self, good: UsbPipes, lab: Lab, after: int) -> None:
+        super().__init__(good, after)
+        self._lab = lab
+
+    def pull(self) -> None:
+        """Pull it: the body notices, and so does who speaks over it."""
+        self._left = 0
+        self._lab.eos.unplugged()
