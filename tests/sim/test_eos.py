@@ -468,7 +468,9 @@ def test_the_cameras_time_can_be_set(host: Host) -> None:
     assert host.set(Property.EOS_CAMERA_TIME, then) == ResponseCode.OK
     host.clock.sleep(5)
     assert host.number(Property.EOS_CAMERA_TIME) == then + 5
-    host.shoot()
+    (request,) = transfers(host.shoot())
+    info = ObjectInfo.decode(host.ok(Operation.GET_OBJECT_INFO, request.handle))
+    assert info.captured_at == "20251231T080005"
     # The film lives in the lab's time, whatever the camera shows.
     assert host.film.exposures[0][1] == OPENING + timedelta(seconds=5)
 
@@ -525,6 +527,7 @@ def test_a_frame_arrives_as_the_film_made_it(host: Host) -> None:
     assert host.code(Operation.GET_THUMB, request.handle) == ResponseCode.NO_THUMBNAIL_PRESENT
 
 
+@example(offset=3000, length=10)
 @given(offset=st.integers(0, 3100), length=st.integers(0, 4000))
 def test_any_part_of_a_frame_can_be_fetched(offset: int, length: int) -> None:
     host = host_of().take_control()
@@ -581,6 +584,7 @@ def test_takes_nothing_for_a_host_that_has_not_told_its_room() -> None:
     host.ok(Operation.EOS_PC_HDD_CAPACITY, TEST_BODY.frame_bytes // 0x1000 * 3, 0x1000, 1)
     assert host.number(Property.EOS_AVAILABLE_SHOTS) == 3
     assert len(transfers(host.shoot())) == 1
+    assert host.number(Property.EOS_AVAILABLE_SHOTS) == 2
 
 
 def test_raw_and_jpeg_are_two_files_of_one_name(host: Host) -> None:
@@ -766,6 +770,12 @@ def test_timers_and_series_follow_the_drive_mode(host: Host) -> None:
     host.clock.sleep(60)
     # 3.7 frames a second: at 0, 0.27, 0.54 and 0.81 s.
     assert len(transfers(host.events())) == 4
+    host.ok(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, 1)
+    host.clock.sleep(60.0)
+    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
+    # The memory holds six, and five were in it.
+    host.clock.sleep(60)
+    assert len(transfers(host.events())) == 1
 
 
 def test_bulb_lasts_as_long_as_the_press(host: Host) -> None:
@@ -822,7 +832,9 @@ def test_a_long_exposure_is_no_idleness(host: Host) -> None:
     host.eos.set_menu(Property.EOS_AUTO_POWER_OFF, 20)
     host.set(Property.EOS_SHUTTER_SPEED, 0x10)
     assert host.press() == ResponseCode.OK
-    host.clock.sleep(30.2)
+    host.clock.sleep(25)
+    assert not host.eos.asleep
+    host.clock.sleep(5.2)
     assert len(transfers(host.events())) == 1
 
 
@@ -839,6 +851,10 @@ def test_a_frame_that_nobody_fetched_is_offered_to_the_next(host: Host) -> None:
     assert transfers(records) == [request]
     assert changes(records)[Property.EOS_CAPTURE_DESTINATION] == number_value(CaptureDestination.CARD)
     assert host.ok(Operation.GET_OBJECT, request.handle) == host.film.frames[0]
+    # The next has not told yet what room it has.
+    host.ok(Operation.EOS_SET_REMOTE_MODE, 1)
+    assert host.set(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.HOST) == ResponseCode.OK
+    assert host.number(Property.EOS_AVAILABLE_SHOTS) == 0
 
 
 def test_a_forgetful_body_loses_it() -> None:
