@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import socket
 import struct
+import threading
 from collections.abc import Iterator
 
 import pytest
@@ -126,8 +127,10 @@ class TestLent(TransportContract):
 @pytest.fixture
 def lender() -> Iterator[TcpServer]:
     devices = [PtpUsbDevice(Echo()), PtpUsbDevice(Echo(), Identity(product=0x32CA, serial="77", name="EOS 6D Mark II"))]
+    before = set(threading.enumerate())
     with serve_usbip(devices, 0) as server:
         yield server
+    assert set(threading.enumerate()) <= before
 
 
 def test_a_client_by_others_finds_the_cameras(lender: TcpServer) -> None:
