@@ -419,7 +419,7 @@ EOS_550D = EosBody(
     burst=6,
     frames_per_s=3.7,
     frame_bytes=25 << 20,
-    write_s=0.8,
+    write_s=0.783,
     shots_per_charge=440,
     borrowed=(
         "60D: vendor extension id, operations, events, third-stop apertures, white balance shifts, structures, order",
@@ -481,7 +481,7 @@ EOS_6D_MARK_II = EosBody(
     burst=21,
     frames_per_s=6.5,
     frame_bytes=35 << 20,
-    write_s=0.6,
+    write_s=0.617,
     shots_per_charge=1200,
     borrowed=(
         "60D: vendor extension id, operations, events, structures, order, nine focus points where it has 45",
@@ -497,7 +497,7 @@ TEST_BODY = replace(
     EOS_550D,
     info=replace(EOS_550D.info, model="CroP Test"),
     frame_bytes=1 << 20,
-    write_s=0.1,
+    write_s=0.113,
     borrowed=(*EOS_550D.borrowed, "everything else: the EOS 550D"),
 )
 """A 550D with the small frames of the test sensor."""
