@@ -6,9 +6,11 @@ import threading
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drivers.clock import SystemClock
-from drivers.errors import DeviceRefused, LinkClosed, ProtocolError
+from drivers.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from drivers.link import Link
 from drivers.links.memory import MemoryLink, memory_pair
 from drivers.links.tcp import TcpServer
@@ -18,6 +20,7 @@ from sim.clock import SimulatedClock
 from sim.ptpip_server import serve_ptpip
 from tests.contracts.link import read_exactly
 from tests.contracts.transport import PATIENCE_S, Bench, Echo, TransportContract
+from tests.drivers.troubled_links import Dribbling
 
 GUID = bytes(range(16))
 
@@ -241,3 +244,77 @@ def test_a_web_server_is_no_camera() -> None:
 
     with TcpServer(serve) as server, pytest.raises(ProtocolError):
         IpTransport.connect(*server.address, guid=GUID, name="CroP", clock=SystemClock())
+
+
+def answer(size: int) -> bytes:
+    start = packet(9, bytes.fromhex("05000000") + size.to_bytes(8, "little"))
+    pieces = packet(10, bytes.fromhex("05000000") + bytes(size - 10)) + packet(
+        12, bytes.fromhex("05000000") + bytes(10)
+    )
+    return start + pieces + packet(7, bytes.fromhex("0120 05000000"))
+
+
+@given(cut=st.integers(0, len(answer(100)) - 1), hangs_up=st.booleans())
+def test_a_stream_that_ends_at_any_byte_is_closed_or_late(cut: int, hangs_up: bool) -> None:
+    far = FarEnd()
+    transport = far.connect()
+    far.command.write(answer(100)[:cut], PATIENCE_S)
+    if hangs_up:
+        far.command.close()
+    with pytest.raises(LinkClosed if hangs_up else LinkTimeout):
+        transport.transact(Request(0x9116, 5), timeout=0.0 if not hangs_up else PATIENCE_S)
+    with pytest.raises(LinkClosed if hangs_up else ProtocolError):
+        transport.transact(Request(0x9116, 6), timeout=PATIENCE_S)
+
+
+@given(at=st.integers(0, len(answer(100)) - 1), value=st.integers(0, 255))
+def test_a_garbled_byte_never_ends_in_anything_but_our_errors(at: int, value: int) -> None:
+    far = FarEnd()
+    transport = far.connect()
+    stream = bytearray(answer(100))
+    stream[at] = value
+    far.command.write(bytes(stream), PATIENCE_S)
+    try:
+        done = transport.transact(Request(0x9116, 5), timeout=0.0)
+    except (ProtocolError, LinkTimeout):
+        return
+    assert done.response.transaction == 5
+    assert len(done.data) == 100 or not done.response.ok
+
+
+def test_a_reader_that_gets_byte_by_byte_gets_all() -> None:
+    far = FarEnd()
+    transport = IpTransport(
+        lambda: Dribbling(far.open_command()), far.open_event, guid=GUID, name="Cr", clock=SimulatedClock()
+    )
+    far.command.write(answer(3000), PATIENCE_S)
+    assert transport.transact(Request(0x9116, 5), timeout=PATIENCE_S).data == bytes(3000)
+
+
+def test_reset_is_a_new_connection() -> None:
+    first, second = FarEnd(), FarEnd()
+    ends = [second, first]
+    transport = IpTransport(
+        lambda: ends[-1].open_command(), lambda: ends[-1].open_event(), guid=GUID, name="Cr", clock=SimulatedClock()
+    )
+    ends.pop()
+    transport.reset()
+    with pytest.raises(LinkClosed):
+        first.command.write(b"x", PATIENCE_S)
+    second.command.write(packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
+    assert transport.transact(Request(0x9116, 5), timeout=PATIENCE_S).response.ok
+
+
+def test_reset_waits_for_a_device_that_still_holds_the_old_connection() -> None:
+    busy = [FarEnd(packet(5, (2).to_bytes(4, "little"))) for _ in range(3)]
+    ends = [FarEnd(), *busy, FarEnd()]
+    clock = SimulatedClock()
+    current: list[FarEnd] = []
+
+    def open_command() -> Link:
+        current.append(ends.pop())
+        return current[-1].open_command()
+
+    transport = IpTransport(open_command, lambda: current[-1].open_event(), guid=GUID, name="Cr", clock=clock)
+    transport.reset()
+    assert 0.2 < clock.monotonic() < 0.5
