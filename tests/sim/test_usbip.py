@@ -20,12 +20,16 @@ from drivers.links.memory import MemoryLink, memory_pair
 from drivers.links.tcp import TcpServer
 from drivers.pipes import Pipe, PipeStalled
 from drivers.ptp.container import ContainerReader, DataPiece, DataStart, encode
+from drivers.ptp.datasets import DeviceInfo
 from drivers.ptp.messages import Request, Response
 from drivers.ptp.usb_transport import UsbTransport
 from sim.clock import SimulatedClock
+from sim.eos import SimulatedEos
+from sim.eos_bodies import EOS_550D
 from sim.usb_device import BULK_IN, BULK_OUT, INTERRUPT_IN, Identity, PtpUsbDevice
 from sim.usbip import UsbIpService, serve_usbip
 from sim.usbip_wire import ImportRequest, RequestReader, Submit, Unlink
+from tests.contracts.camera import SeededFilm
 from tests.contracts.transport import GIVE, HANG, PATIENCE_S, RAISE, Bench, Echo, TransportContract, payload
 
 ADDRESSES = {Pipe.BULK_OUT: BULK_OUT, Pipe.BULK_IN: BULK_IN, Pipe.INTERRUPT_IN: INTERRUPT_IN}
@@ -153,6 +157,17 @@ def test_a_client_by_others_imports_a_camera_and_talks_to_it(lender: TcpServer) 
     assert camera.interrupt_in(INTERRUPT_IN, 8) == bytes.fromhex("10000000040001c1")
     assert camera.interrupt_in(INTERRUPT_IN, 8) == bytes.fromhex("ffffffff00000000")
     camera.close()
+
+
+def test_a_client_by_others_asks_a_simulated_eos_what_it_is() -> None:
+    eos = SimulatedEos(EOS_550D, SeededFilm(600), SimulatedClock())
+    with serve_usbip([PtpUsbDevice(eos)], 0) as server:
+        camera = usbip.open(0x04A9, 0x31EA, transport=usbip.USBIP(*server.address))
+        camera.bulk_out(BULK_OUT, encode(Request(0x1001, 0)))
+        container = camera.bulk_in(BULK_IN, 65536)
+        camera.close()
+    info = DeviceInfo.decode(container[12:])
+    assert (info.manufacturer, info.model) == ("Canon Inc.", "Canon EOS 550D")
 
 
 def test_a_stall_is_told_and_cleared(lender: TcpServer) -> None:
