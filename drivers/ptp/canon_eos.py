@@ -165,7 +165,9 @@ class CanonEos:
                     raise
                 self._drop(error)
                 if not left:
-                    kind = DeviceRefused if isinstance(error, Declined) else DeviceError
+                    # A body that is busy in every session is kept so by its own settings, not by a fault.
+                    busy = isinstance(error, Declined) and error.code == ResponseCode.DEVICE_BUSY
+                    kind = DeviceRefused if busy else DeviceError
                     raise kind(
                         f"{error}; the connection was renewed {RECOVERIES} times without success: {_REMEDY}"
                     ) from error

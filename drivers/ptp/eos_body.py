@@ -254,44 +254,12 @@ class EosBody:
         ProtocolError
             It gives more than was asked for.
         """
-        operation = (
-            Operation.EOS_GET_PARTIAL_OBJECT
-            if self._offers(Operation.EOS_GET_PARTIAL_OBJECT)
-            else Operation.GET_PARTIAL_OBJECT
-        )
         if not 0 < waiting.size <= MAX_FRAME_BYTES:
             raise DeviceError(
                 f"{self.label} announces {waiting.name!r} of {waiting.size} bytes; 1 to {MAX_FRAME_BYTES} were expected"
             )
-        tries = _PIECE_TRIES
         while offset < waiting.size:
-            wanted = min(PIECE_BYTES, waiting.size - offset)
-            data = b""
-            try:
-                parameters, data = self._session.call(operation, waiting.handle, offset, wanted)
-            except Declined as error:
-                tries -= 1
-                if not tries or error.code in _LASTING:
-                    raise
-                parameters = ()
-            else:
-                if len(data) > wanted:
-                    raise ProtocolError(f"{self.label} gives {len(data)} bytes at {offset}; {wanted} were asked for")
-                if parameters and parameters[0] != len(data):
-                    data = b""
-                if not data:
-                    tries -= 1
-                if not tries:
-                    raise DeviceError(
-                        f"{self.label} announced {waiting.size} bytes for {waiting.name!r}, but gives only {offset}; "
-                        "the frame is worthless and may be retaken"
-                    )
-            if data:
-                into.write(data)
-                offset += len(data)
-                tries = _PIECE_TRIES
-            else:
-                self._clock.sleep(_PAUSES_S[-1])
+            offset += into.write(self._piece(waiting, offset))
             self._keep_awake()
 
     def free(self, waiting: WaitingObject) -> None:
@@ -307,11 +275,35 @@ class EosBody:
             self.state.waiting.pop(waiting.handle, None)
             return
 
-    def free_waiting(self, spare: Callable[[WaitingObject], bool] = lambda waiting: False) -> None:
-        """Let the body forget every object that waits, but those to `spare`."""
+    def free_waiting(self) -> None:
+        """Let the body forget every object that waits."""
         for waiting in list(self.state.waiting.values()):
-            if not spare(waiting):
-                self.free(waiting)
+            self.free(waiting)
+
+    def _piece(self, waiting: WaitingObject, offset: int) -> bytes:
+        """Return the next bytes of an object; fewer than were asked for are good, for the rest follows."""
+        wanted = min(PIECE_BYTES, waiting.size - offset)
+        operation = Operation.EOS_GET_PARTIAL_OBJECT
+        if not self._offers(operation):
+            operation = Operation.GET_PARTIAL_OBJECT
+        for left in reversed(range(_PIECE_TRIES)):
+            try:
+                sent, data = self._session.call(operation, waiting.handle, offset, wanted)
+            except Declined as error:
+                if not left or error.code in _LASTING:
+                    raise
+            else:
+                if len(data) > wanted:
+                    raise ProtocolError(f"{self.label} gives {len(data)} bytes at {offset}; {wanted} were asked for")
+                # The standard's operation tells how many bytes were sent; what Canon's own answers is not known.
+                told = sent[0] if sent and operation == Operation.GET_PARTIAL_OBJECT else len(data)
+                if data and told == len(data):
+                    return data
+            self._clock.sleep(_PAUSES_S[-1])
+        raise DeviceError(
+            f"{self.label} announced {waiting.size} bytes for {waiting.name!r}, but gives only {offset}; "
+            "the frame is worthless and may be retaken"
+        )
 
     def _receive_frames(self) -> None:
         """Have frames sent to the host, and tell the body that there is room for them."""

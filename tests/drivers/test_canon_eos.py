@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drivers.camera import CameraIdentity, ExposureSettings
 from drivers.errors import DeviceError, DeviceRefused, LinkClosed, StorageError
@@ -20,6 +22,7 @@ from drivers.ptp.canon import (
     ImageFormat,
     Notice,
     OtherRecord,
+    PropertyChanged,
     Record,
     TransferRequest,
     decode_events,
@@ -27,6 +30,7 @@ from drivers.ptp.canon import (
 )
 from drivers.ptp.canon_eos import CanonEos
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode
+from drivers.ptp.eos_state import EosState, custom_functions, problems
 from drivers.ptp.ip_transport import IpTransport
 from drivers.ptp.messages import Event, Request, Response
 from drivers.ptp.transport import Transaction, Transport
@@ -384,9 +388,23 @@ CHANGES: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("code", [Operation.GET_DEVICE_INFO, Operation.EOS_GET_EVENT, Operation.EOS_GET_PARTIAL_OBJECT])
+@pytest.mark.parametrize("code", [Operation.GET_DEVICE_INFO, Operation.EOS_GET_EVENT])
 def test_wrong_data_once(moody_lab: Lab, code: Operation, change: str) -> None:
     moody_lab.device = faults.Falsifying(moody_lab.eos, CHANGES[change], Occasion({code}))
+    goes_on(moody_lab)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_wrong_data_in_a_piece_whose_length_the_body_tells(change: str) -> None:
+    lab = Lab(without=[Operation.EOS_GET_PARTIAL_OBJECT])
+    lab.device = faults.Falsifying(lab.eos, CHANGES[change], Occasion({Operation.GET_PARTIAL_OBJECT}))
+    goes_on(lab)
+
+
+@pytest.mark.parametrize("change", ["short", "surplus", "nothing"])  # of Canon's operation a decoder must tell garbage
+def test_wrong_data_in_a_piece(moody_lab: Lab, change: str) -> None:
+    occasion = Occasion({Operation.EOS_GET_PARTIAL_OBJECT})
+    moody_lab.device = faults.Falsifying(moody_lab.eos, CHANGES[change], occasion)
     goes_on(moody_lab)
 
 
@@ -618,3 +636,36 @@ def test_a_release_that_stays_refused_says_where_to_look(lab: Lab) -> None:
         lab.take()
     lab.device = lab.eos
     lab.take()
+
+
+# What a body tells, as values.
+
+
+def test_mirror_lockup_among_recorded_custom_functions(recording: list[dict[str, Any]]) -> None:
+    state = EosState()
+    state.take(decode_events(bytes.fromhex(recording[5]["data"])))
+    assert state.functions[0x060F] == 0
+    assert len(state.functions) == 20
+    groups = [
+        record.value
+        for record in decode_events(bytes.fromhex(recording[5]["data"]))
+        if isinstance(record, PropertyChanged) and record.code == Property.EOS_CUSTOM_FUNCTIONS
+    ]
+    number, count = (0x060F).to_bytes(4, "little"), (1).to_bytes(4, "little")
+    (group,) = (value for value in groups if number in value)
+    switched_on = group.replace(number + count + bytes(4), number + count + count)
+    state.take([PropertyChanged(Property.EOS_CUSTOM_FUNCTIONS, switched_on)])
+    assert "mirror lockup is on: switch it off" in problems(state)
+
+
+@given(st.binary(max_size=200))
+def test_custom_functions_of_any_bytes_are_none_or_some(value: bytes) -> None:
+    assert all(isinstance(number, int) for number in custom_functions(value))
+
+
+@given(st.lists(st.integers(0, 200), max_size=300))
+def test_only_so_many_announcements_are_remembered(handles: list[int]) -> None:
+    state = EosState()
+    state.take(TransferRequest(handle, 0xB103, 1, "IMG_0001.CR2") for handle in handles)
+    assert len(state.waiting) == min(len(set(handles)), 64)
+    assert not handles or handles[-1] in state.waiting
