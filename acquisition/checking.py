@@ -59,7 +59,8 @@ def check_lab(settings: LabSettings, picture: Path | None) -> CheckReport:
     faults: list[str] = []
     with open_rig(settings, chart) as devices, tempfile.TemporaryDirectory() as scratch:
         body = devices.camera.identity()
-        lines.append(f"camera      {body.maker} {body.model}, serial {body.serial}")
+        name = body.model if body.model.startswith(body.maker.split()[0]) else f"{body.maker} {body.model}"
+        lines.append(f"camera      {name}, serial {body.serial}")
         devices.camera.configure(settings.camera.exposure)
         if devices.projector is not None:
             make_ready(devices.projector, devices.clock, settings.sequence)

@@ -57,16 +57,22 @@ def projector(
 
 @app.command()
 def camera(
-    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port for PTP/IP; 0 picks a free one.")],
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port for PTP/IP; 0 picks a free one.")] = None,
+    usbip: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port for USB/IP; 3240 is the usual.")] = None,
     model: Annotated[str, typer.Option(help="EOS 550D, EOS 6D Mark II, or Test: a small frame.")] = "EOS 550D",
 ) -> None:
-    """Serve a simulated Canon EOS as a PTP/IP camera: it photographs a print of grey squares under white light.
+    """Serve a simulated Canon EOS on a network or a USB cable: it photographs grey squares under white light.
 
     Reads and writes no file. Prints the address it listens on, then serves until interrupted (Ctrl-C), which is its
-    proper end: exit code 0. Exit code 2 when there is no such model, 3 when the port is taken. Any software that
-    speaks PTP/IP can use it, for instance (both connections go to the same port, here 15740):
+    proper end: exit code 0. Exit code 2 when there is no such model or no port, 3 when the port is taken.
+
+    With --port, any software that speaks PTP/IP can use it, for instance (both connections go to one port):
 
     gphoto2 --camera "PTP/IP Camera" --port ptpip:127.0.0.1:15740:15740 --capture-image-and-download
+
+    With --usbip, a Linux machine can plug it in (as root, with the kernel's vhci-hcd) and use it as any USB camera:
+
+    modprobe vhci-hcd; usbip --tcp-port 3240 attach -r 127.0.0.1 -b 1-1
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -81,8 +87,14 @@ def camera(
     from sim.eos_bodies import EOS_BODIES
     from sim.presenter import Screen
     from sim.ptpip_server import serve_ptpip
+    from sim.usb_device import Identity, PtpUsbDevice
+    from sim.usbip import serve_usbip
     from sim.world import REFERENCE_EXPOSURE, Room, World
 
+    if port is None and usbip is None:
+        raise ConfigurationError("name a cable: --port N for PTP/IP, --usbip N for USB/IP, or both")
+    if port is not None and usbip is not None:
+        raise ConfigurationError("one camera hangs on one cable: either --port or --usbip")
     if model not in EOS_BODIES:
         raise ConfigurationError(f"--model {model!r}: known are {', '.join(sorted(EOS_BODIES))}")
     # A lamp that ages would be dark by now: its drift counts from the day when the simulated lab opened.
@@ -91,10 +103,15 @@ def camera(
     with ThreadPoolExecutor(1, "darkroom") as darkroom:
         eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, darkroom=darkroom)
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))
-        with serve_ptpip(eos, port, name=eos.body.model) as server:
-            host, port = server.address
-            print(f"PTP/IP camera {eos.body.model} at {host}:{port}", flush=True)
-            _until_interrupted()
+        if port is not None:
+            with serve_ptpip(eos, port, name=eos.body.model) as server:
+                print("PTP/IP camera {} at {}:{}".format(eos.body.model, *server.address), flush=True)
+                _until_interrupted()
+        elif usbip is not None:
+            device = PtpUsbDevice(eos, Identity(*eos.body.usb, serial=eos.serial, name=eos.body.model))
+            with serve_usbip([device], usbip) as server:
+                print("USB/IP camera {} at {}:{}, bus id 1-1".format(eos.body.model, *server.address), flush=True)
+                _until_interrupted()
 
 
 def _grey_squares() -> Print:

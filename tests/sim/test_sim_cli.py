@@ -7,6 +7,8 @@ import subprocess
 import sys
 
 import pytest
+import usbip
+import usbip.host
 
 from drivers.links.tcp import TcpLink, TcpServer
 from drivers.pjlink.projector import PjLinkProjector
@@ -45,7 +47,10 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return main()
 
 
-@pytest.mark.parametrize("arguments", [["projector", "--pjlink"], ["camera", "--model", "Test", "--port"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [["projector", "--pjlink"], ["camera", "--model", "Test", "--port"], ["camera", "--model", "Test", "--usbip"]],
+)
 def test_a_taken_port_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str]
 ) -> None:
@@ -58,7 +63,14 @@ def test_a_taken_port_is_one_line(
 
 @pytest.mark.parametrize(
     "arguments",
-    [["projector"], ["projector", "--pjlink", "x"], ["projector", "--pjlink", "70000"], ["camera"], ["toaster"]],
+    [
+        ["projector"],
+        ["projector", "--pjlink", "x"],
+        ["projector", "--pjlink", "70000"],
+        ["camera"],
+        ["toaster"],
+        ["camera", "--port", "0", "--usbip", "0"],
+    ],
 )
 def test_wrong_arguments_end_with_2(monkeypatch: pytest.MonkeyPatch, arguments: list[str]) -> None:
     assert run(monkeypatch, *arguments) == 2
@@ -81,3 +93,24 @@ def test_an_unknown_model_is_told_the_known_ones(
 def test_help_names_the_exit_codes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(monkeypatch, "--help") == 0
     assert "130" in capsys.readouterr().out
+
+
+def test_lends_a_camera_over_usb_ip_until_interrupted() -> None:
+    with subprocess.Popen(
+        [*SIM, "camera", "--usbip", "0", "--model", "EOS 6D Mark II"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line.endswith("bus id 1-1\n")
+            host, port = line.split(" at ")[1].split(",")[0].split(":")
+            found = usbip.host.list_devices(usbip.USBIP(host, int(port)))
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    assert [(entry["idVendor"], entry["idProduct"]) for entry in found] == [(0x04A9, 0x32CA)]
+    assert (process.returncode, out, err) == (0, "stopped\n", "")
