@@ -35,6 +35,7 @@ MIN_MODULE_PX = 3.0
 TAG_MODULES = 8
 """Modules along a 36h11 tag's black square."""
 
+MIN_TAGS = 2
 MIN_TAG_SHARE = 0.8
 """Share of the chart's tags that must be found."""
 
@@ -239,8 +240,14 @@ def find_chart(frame: Mosaic | Plane, chart: Chart, what: str = "the frame") -> 
     Raises
     ------
     RegistrationError
-        No tag is seen; they are mirrored, too small, not this chart's, too few, or their places do not fit it.
+        The chart has no tags; none is seen; they are mirrored, too small, not this chart's, too few, or their places
+        do not fit it.
     """
+    if len(chart.tags) < MIN_TAGS:
+        raise RegistrationError(
+            f"{what}: the chart has {len(chart.tags)} tags, and it is found by its tags, at least {MIN_TAGS}; "
+            "print a chart made by acquire chart"
+        )
     plane = strongest_plane(frame) if isinstance(frame, Mosaic) else frame
     found = find_tags(plane)
     expected = {tag.id: tag for tag in chart.tags}
@@ -248,7 +255,7 @@ def find_chart(frame: Mosaic | Plane, chart: Chart, what: str = "the frame") -> 
     looked_for = f"{len(ids)} tags 36h11 with ids {ids[0]}–{ids[-1]}"
     tags = tuple(tag for tag in found if tag.id in expected)
     missing = tuple(number for number in ids if number not in {tag.id for tag in tags})
-    if len(tags) < max(2, len(ids) // 4):
+    if len(tags) < max(MIN_TAGS, len(ids) // 4):
         raise _not_found(plane, found, tags, looked_for, what)
     chart_points = np.concatenate([expected[tag.id].corners_mm for tag in tags])
     frame_points = np.concatenate([tag.corners_px for tag in tags])
@@ -366,28 +373,28 @@ def _some(ids: Sequence[int]) -> str:
 def blur_px(framing: Framing) -> float:
     """Return how soft the picture is: σ of the Gaussian that the tags' black edges have been blurred with, px.
 
-    Median over the tags. Across a tag's edge lie its data, its black border, its white rim and what is beyond, the
-    middle two one module wide: a staircase of four unknown levels and known steps, blurred. The σ whose staircase fits
-    best is taken. Contained is what lens, focus and movement do, and the photosites' own size and spacing: 0.29 px for
-    green (two photosites half a pixel apart), 0.14 px for red and blue. Below 0.5 px it is read up to 0.1 px high, as
-    such a picture is no longer fully sampled.
+    Median over the tags' edges. Across an edge lie the tag's data, its black border, its white rim and what is beyond,
+    the middle two one module wide: a staircase of four unknown levels and known steps, blurred. The σ whose staircase
+    fits best is taken. Contained is what lens, focus and movement do, and the photosites' own size and spacing:
+    0.29 px for green (two photosites half a pixel apart), 0.14 px for red and blue. Below 0.5 px it is read up to
+    0.1 px high, as such a picture is no longer fully sampled.
     """
-    found = [sigma for tag in framing.tags if (sigma := _tag_blur(framing.plane, tag)) is not None]
-    return float(np.median(found)) if found else float("nan")
+    found = np.concatenate([_edge_blurs(framing.plane, tag) for tag in framing.tags])
+    return float(np.median(found)) if len(found) else float("nan")
 
 
 _BLURS = np.geomspace(0.15, 4, 60)
 
 
-def _tag_blur(plane: Plane, tag: FoundTag) -> float | None:
-    """Return the σ of one tag's edges, the mean profile of all four, or None where the picture ends."""
+def _edge_blurs(plane: Plane, tag: FoundTag) -> npt.NDArray[np.float64]:
+    """Return the σ of each of a tag's four edges; none where the picture ends."""
     module = tag.side_px / TAG_MODULES
     across = np.linspace(-1.6, 1.6, 65) * module
     # Clear of the corners, where another edge is near.
     along = np.linspace(0.2, 0.8, 24)
-    profile = np.zeros(len(across))
+    profiles = np.zeros((len(across), 4))
     height, width = plane.values.shape
-    for start, end in zip(tag.corners_px, np.roll(tag.corners_px, -1, axis=0), strict=True):
+    for edge, (start, end) in enumerate(zip(tag.corners_px, np.roll(tag.corners_px, -1, axis=0), strict=True)):
         tangent = (end - start) / np.linalg.norm(end - start)
         outward = np.array([tangent[1], -tangent[0]])
         if outward @ ((start + end) / 2 - tag.centre_px) < 0:
@@ -395,23 +402,21 @@ def _tag_blur(plane: Plane, tag: FoundTag) -> float | None:
         places = (start + along[:, None] * (end - start))[:, None, :] + across[None, :, None] * outward
         places = (places - plane.offset_px).astype(np.float32)
         if places.min() < 1 or places[..., 0].max() > width - 2 or places[..., 1].max() > height - 2:
-            return None
+            return np.empty(0)
         seen = cv2.remap(plane.values, places[..., 0], places[..., 1], cv2.INTER_CUBIC)
-        profile += np.asarray(seen, dtype=np.float64).mean(axis=0)
-    misfit = np.empty(len(_BLURS))
+        profiles[:, edge] = np.asarray(seen, dtype=np.float64).mean(axis=0)
+    misfit = np.empty((len(_BLURS), 4))
     for number, sigma in enumerate(_BLURS):
         steps = [_normal_cdf((across - at) / sigma) for at in (-module, 0.0, module)]
         # The slope of the middle step takes up what the corners are off.
         slope = np.exp(-0.5 * (across / sigma) ** 2)
         design = np.column_stack([np.ones_like(across), *steps, slope])
-        solution = np.linalg.lstsq(design, profile, rcond=None)[0]
-        misfit[number] = float(((profile - design @ solution) ** 2).sum())
-    best = int(misfit.argmin())
-    if not 0 < best < len(_BLURS) - 1:
-        return float(_BLURS[best])
-    left, middle, right = misfit[best - 1 : best + 2]
-    aside = 0.5 * (left - right) / (left - 2 * middle + right)
-    return float(_BLURS[best] * (_BLURS[1] / _BLURS[0]) ** aside)
+        solution = np.linalg.lstsq(design, profiles, rcond=None)[0]
+        misfit[number] = ((profiles - design @ solution) ** 2).sum(axis=0)
+    best = np.clip(misfit.argmin(axis=0), 1, len(_BLURS) - 2)
+    left, middle, right = (misfit[best + step, np.arange(4)] for step in (-1, 0, 1))
+    aside = np.clip(0.5 * (left - right) / np.maximum(left - 2 * middle + right, 1e-12), -1, 1)
+    return _BLURS[best] * (_BLURS[1] / _BLURS[0]) ** aside
 
 
 def _normal_cdf(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

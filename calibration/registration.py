@@ -515,7 +515,7 @@ class _Matcher:
         self._per_cell = int(np.clip(round(0.8 * cell_px), 8, 16))
         self._raster = _Raster.of(low, cell / self._per_cell, self._cells_across * self._per_cell)
         self._cover = self._raster.coverage(self._centres, self._sizes)
-        self._free = self._raster.outside_tags(chart.tags)
+        self._free = self._raster.outside_tags(chart.tags) & self._raster.near(self._cover, self._per_cell)
         self.colours = self._fit_colours()
         self._fit = Blocks(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2)))
 
@@ -574,6 +574,9 @@ class _Matcher:
         for _ in range(2):
             template = self._template(raster, cover, max(self._blur, 0.7))
             image, there = self._rectified(raster)
+            # What is printed in the margin is no cell's business.
+            bare = ~raster.near(cover, _COARSE_PER_CELL)
+            image[bare] = template[bare]
             # Square roots keep a bright light's gradient from deciding; noise is even after it too (Anscombe 1948).
             pair = [np.sqrt(np.maximum(picture, 0)) for picture in (template, image)]
             centres: list[_Array] = []
@@ -845,6 +848,15 @@ class _Raster:
         return sparse.csr_array(
             (value[inside], ((rows * width + columns)[inside], which)), shape=(height * width, len(centres_mm))
         )
+
+    def near(self, cover: sparse.csr_array, per_cell: int) -> _Mask:
+        """Return which elements (H, W) are covered by a patch, or lie within a fifth of a cell of one.
+
+        The margin beyond may hold anything: rulers, text, pins.
+        """
+        covered = (np.diff(cover.indptr) > 0).reshape(self.shape).astype(np.uint8)
+        reach = 2 * max(1, round(0.2 * per_cell)) + 1
+        return np.asarray(cv2.dilate(covered, np.ones((reach, reach), dtype=np.uint8))).astype(np.bool_)
 
     def outside_tags(self, tags: tuple[Tag, ...]) -> _Mask:
         """Return which elements (H, W) lie clear of every tag and its white rim."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 
@@ -40,9 +41,17 @@ RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw"
 FLAT = Room(waviness_mm=0.0, tilt_deg=0, pan_deg=0, k1=0, k2=0, p1=0, p2=0)
 
 
-def world_of(chart: Chart, room: Room, body: str = "Test") -> World:
-    picture = drawing(chart)
-    return World(Print(picture.page_mm, picture.rectangles_mm, picture.rgb), BODIES[body], room)
+CHART = design_chart(3, A_SERIES_MM["A5"], 1)
+
+
+@cache
+def sheet() -> Print:
+    picture = drawing(CHART)
+    return Print(picture.page_mm, picture.rectangles_mm, picture.rgb)
+
+
+def world_of(room: Room) -> World:
+    return World(sheet(), BODIES["Test"], room)
 
 
 def frame_of(world: World, folder: Path, colour: Colour = WHITE, key: int = 1) -> Mosaic:
@@ -67,12 +76,12 @@ def truth(world: World, mosaic: Mosaic, points_mm: npt.NDArray[np.float64]) -> n
 
 @pytest.fixture(scope="module")
 def chart() -> Chart:
-    return design_chart(3, A_SERIES_MM["A5"], 1)
+    return CHART
 
 
 @pytest.fixture(scope="module")
-def world(chart: Chart) -> World:
-    return world_of(chart, Room(waviness_mm=0.5))
+def world() -> World:
+    return world_of(Room(waviness_mm=0.5))
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +125,7 @@ def test_corners_are_true_in_every_colour(
 
 
 def test_pose_is_told(chart: Chart, tmp_path: Path) -> None:
-    mosaic = frame_of(world_of(chart, replace(FLAT, fill=0.8, roll_deg=180.0)), tmp_path)
+    mosaic = frame_of(world_of(replace(FLAT, fill=0.8, roll_deg=180.0)), tmp_path)
     framing = find_chart(mosaic, chart)
     assert framing.fill == pytest.approx(0.8, abs=0.01)
     assert abs(framing.rotation_deg) == pytest.approx(180, abs=0.5)
@@ -126,7 +135,7 @@ def test_pose_is_told(chart: Chart, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("blur", [0.4, 0.8, 1.2])
 def test_blur_is_measured(chart: Chart, tmp_path: Path, blur: float) -> None:
-    mosaic = frame_of(world_of(chart, replace(FLAT, blur_px=blur)), tmp_path)
+    mosaic = frame_of(world_of(replace(FLAT, blur_px=blur)), tmp_path)
     # A photosite is half a pixel wide (σ = 0.5/√12) and the two greens lie 0.25 px to either side.
     expected = float(np.sqrt(blur**2 + 0.25 / 12 + 0.25**2))
     assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=0.1)
@@ -189,6 +198,11 @@ def test_another_chart_is_told_by_its_tags(chart: Chart, white: Mosaic) -> None:
     places = tuple(replace(chart.tags[i], id=ids[i], corners_mm=shuffled[i][[2, 0, 3, 1]]) for i in range(len(ids)))
     with pytest.raises(RegistrationError, match="do not fit it"):
         find_chart(white, replace(chart, tags=places))
+
+
+def test_a_chart_without_tags_is_refused(chart: Chart, white: Mosaic) -> None:
+    with pytest.raises(RegistrationError, match=r"the chart has 0 tags, and it is found by its tags"):
+        find_chart(white, replace(chart, tags=()))
 
 
 def test_covered_tags_are_named(chart: Chart, white: Mosaic) -> None:

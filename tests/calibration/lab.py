@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 
@@ -71,18 +72,17 @@ class Lab:
         return self.world.project(points_mm) - aside
 
 
-def hang(
-    bits: int = 3,
-    page: str = "A5",
-    body: str = "Test",
-    seed: int = 1,
-    room: Room | None = None,
-    chart: Chart | None = None,
-) -> Lab:
-    """Return a lab; the paper of a small page waves less than the room's default."""
-    chart = design_chart(bits, A_SERIES_MM[page], seed) if chart is None else chart
+@cache
+def designed(bits: int, page: str, seed: int) -> tuple[Chart, Print]:
+    """Return a chart and its sheet, drawn once."""
+    chart = design_chart(bits, A_SERIES_MM[page], seed)
     picture = drawing(chart)
-    sheet = Print(picture.page_mm, picture.rectangles_mm, picture.rgb)
+    return chart, Print(picture.page_mm, picture.rectangles_mm, picture.rgb)
+
+
+def hang(bits: int = 3, page: str = "A5", body: str = "Test", seed: int = 1, room: Room | None = None) -> Lab:
+    """Return a lab; the paper of a small page waves less than the room's default."""
+    chart, sheet = designed(bits, page, seed)
     return Lab(chart, World(sheet, BODIES[body], Room(waviness_mm=0.5) if room is None else room))
 
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.chart import Chart
+from acquisition.layout import A_SERIES_MM, design_chart
 from acquisition.session import Session, Step
 from calibration.build import BuildResult, build, check, session_sha256
 from calibration.cli import main
@@ -180,15 +181,14 @@ def test_a_changed_file_is_named(lab: Lab, tmp_path: Path) -> None:
 def test_a_chart_of_another_order_builds_no_table(lab: Lab, tmp_path: Path) -> None:
     with small(lab, tmp_path / "session") as session:
         pass
-    other = hang(seed=2)
-    other.chart.save(tmp_path / "session" / "chart.json")
+    design_chart(3, A_SERIES_MM["A5"], 2).save(tmp_path / "session" / "chart.json")
     with Session.open(tmp_path / "session") as session, pytest.raises(RegistrationError, match="colours are not those"):
         build(session, tmp_path / "lut")
     assert not (tmp_path / "lut").exists()
 
 
 def test_a_bump_in_the_night_is_followed(lab: Lab, tmp_path: Path) -> None:
-    bumped = hang(chart=lab.chart, room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
+    bumped = hang(room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
     lights = renumbered(LIGHTS[4:8])
 
     def frame(step: Step) -> bytes:

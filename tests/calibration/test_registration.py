@@ -123,7 +123,7 @@ def test_a_covered_corner_does_not_pull_its_neighbours(tmp_path: Path) -> None:
     error = np.linalg.norm(registration.to_pixels(lab.chart.centres_mm) - truth, axis=1)
     assert error[free].max() < 0.6
     hidden = (np.abs(truth - middle) < 95).all(axis=1)
-    assert hidden.sum() > 100
+    assert hidden.sum() > 30
     assert registration.strangers[hidden].all()
     assert not registration.strangers[free].any()
 
