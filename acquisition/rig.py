@@ -27,10 +27,10 @@ from drivers.presenter import Colour
 from drivers.projector import Power
 from drivers.ptp.canon_eos import CanonEos
 from sim.bodies import BODIES, Body
-from sim.camera import Film, WorldFilm
 from sim.clock import OPENING, SimulatedClock
 from sim.eos import SimulatedEos
 from sim.eos_bodies import EOS_BODIES
+from sim.film import Film, WorldFilm
 from sim.presenter import Screen, SimulatedPresenter
 from sim.projector import PjLinkPeer, SimulatedProjector, memory_link
 from sim.ptp_memory import MemoryTransport

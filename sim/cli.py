@@ -82,9 +82,9 @@ def camera(
     from drivers.ptp.apex import SHUTTER
     from drivers.ptp.codes import Property
     from sim.bodies import BODIES
-    from sim.camera import WorldFilm
     from sim.eos import SimulatedEos
     from sim.eos_bodies import EOS_BODIES
+    from sim.film import WorldFilm
     from sim.presenter import Screen
     from sim.ptpip_server import serve_ptpip
     from sim.usb_device import Identity, PtpUsbDevice

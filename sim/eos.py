@@ -79,8 +79,8 @@ from drivers.ptp.datasets import (
     encode_value,
 )
 from drivers.ptp.messages import Event, Request, Response
-from sim.camera import Film
 from sim.eos_bodies import FOCUS_CENTRE, FREE, LIST, MIRROR_LOCKUP, EosBody, custom_functions, focus_points
+from sim.film import Film
 from sim.responder import Answer
 
 CARD = 0x00020001

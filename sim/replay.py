@@ -30,7 +30,7 @@ class RecordedFrame:
 
 
 class ReplayFilm:
-    """Pictures from a recording; see `sim.camera.Film`.
+    """Pictures from a recording; see `sim.film.Film`.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ SETTINGS = ExposureSettings(iso=100, aperture=8, shutter_s=1 / 60)
 
 
 class SeededFilm:
-    """A `sim.camera.Film` whose pictures are noise, each another one, and remembered."""
+    """A `sim.film.Film` whose pictures are noise, each another one, and remembered."""
 
     suffix = ".cr2"
 

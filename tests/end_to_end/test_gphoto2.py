@@ -30,9 +30,9 @@ from drivers.ptp.canon import RAW_ONLY, ImageFile, ImageFormat
 from drivers.ptp.codes import Property
 from drivers.rawfile import read_raw
 from sim.bodies import BODIES
-from sim.camera import Film, WorldFilm
 from sim.eos import SimulatedEos
 from sim.eos_bodies import EOS_6D_MARK_II, EOS_550D_AS_LISTED, TEST_BODY
+from sim.film import Film, WorldFilm
 from sim.presenter import Screen
 from sim.ptpip_server import serve_ptpip
 from sim.world import Print, Room, World

@@ -1,7 +1,7 @@
-"""The simulated camera: a body with a shutter whose pictures come from elsewhere.
+"""What is on a simulated camera's pictures, apart from how its body behaves.
 
-The camera knows how a body behaves (settings, file names, time); a `Film` knows what is on the picture: the `World`
-that it photographs (`WorldFilm`), or the frames of a recorded session (`sim.replay`). Nothing here draws a picture.
+`sim.eos` knows settings, names and time; a `Film` knows the picture: the `World` as it is lit now (`WorldFilm`), or
+the frames of a recorded session (`sim.replay`). Nothing here draws a picture.
 """
 
 from __future__ import annotations
@@ -11,17 +11,13 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import BinaryIO, Protocol
 
-from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused
+from drivers.camera import ExposureSettings
+from drivers.errors import DeviceRefused
 from drivers.presenter import Colour
 from sim.clock import OPENING
 from sim.dng import write_dng
 from sim.presenter import Screen
 from sim.world import World
-
-READOUT_S = 1.0
-"""Time from the end of the exposure until the file has arrived."""
 
 
 class Film(Protocol):
@@ -39,47 +35,6 @@ class Film(Protocol):
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
         """Write the raw file of a picture taken now; return its size in bytes."""
         ...
-
-
-class SimulatedCamera:
-    """A `drivers.camera.Camera` around a `Film`."""
-
-    def __init__(self, identity: CameraIdentity, film: Film, clock: Clock) -> None:
-        self._identity = identity
-        self._film = film
-        self._clock = clock
-        self._settings: ExposureSettings | None = None
-        self._released = 0
-        self._open = True
-
-    def identity(self) -> CameraIdentity:
-        """Return what the body says of itself."""
-        return self._identity
-
-    def configure(self, settings: ExposureSettings) -> None:
-        """Set the exposure."""
-        self._require_open()
-        self._film.accept(settings)
-        self._settings = settings
-
-    def capture(self, into: BinaryIO) -> CapturedFrame:
-        """Take a picture of what there is to see now."""
-        self._require_open()
-        if self._settings is None:
-            raise DeviceRefused("the simulated camera has no exposure settings; configure it before the first capture")
-        released_at = self._clock.now()
-        self._released += 1
-        size = self._film.expose(self._settings, released_at, into)
-        self._clock.sleep(self._settings.shutter_s + READOUT_S)
-        return CapturedFrame(f"IMG_{self._released % 10000:04d}{self._film.suffix.upper()}", size, released_at)
-
-    def close(self) -> None:
-        """Switch the camera off."""
-        self._open = False
-
-    def _require_open(self) -> None:
-        if not self._open:
-            raise DeviceError("the simulated camera is switched off; open the rig again")
 
 
 class WorldFilm:
