@@ -241,20 +241,26 @@ def test_the_body_is_given_back_as_it_was(lab: Lab) -> None:
     assert lab.waiting() == 0
 
 
-def test_a_large_frame_comes_in_pieces_of_a_mebibyte() -> None:
-    lab = Lab(film_bytes=2_500_000)
-    asked: list[tuple[int, ...]] = []
+def heard(lab: Lab) -> list[tuple[int, ...]]:
+    """Return the list of (offset, size) of the pieces that will be asked of the body, and answered."""
+    pieces: list[tuple[int, ...]] = []
 
     class Listening(faults.TroubledResponder):
         def answer(self, request: Request, data: bytes | None) -> Answer:
             if request.code == Operation.EOS_GET_PARTIAL_OBJECT:
-                asked.append(request.parameters[1:])
+                pieces.append(request.parameters[1:])
             return super().answer(request, data)
 
-    lab.device = Listening(lab.eos)
+    lab.device = Listening(lab.device)
+    return pieces
+
+
+def test_a_large_frame_comes_in_pieces_of_a_mebibyte() -> None:
+    lab = Lab(film_bytes=2_500_000)
+    pieces = heard(lab)
     lab.camera.configure(SETTINGS)
     size = lab.take().size
-    assert asked == [(0, 1 << 20), (1 << 20, 1 << 20), (2 << 20, size - (2 << 20))]
+    assert pieces == [(0, 1 << 20), (1 << 20, 1 << 20), (2 << 20, size - (2 << 20))]
     assert lab.waiting() == 0
 
 
@@ -463,6 +469,57 @@ def test_an_object_that_is_not_there_is_passed_over(lab: Lab) -> None:
     goes_on(lab)
     assert len(lab.film.frames) == 3
     assert lab.openings == 1
+
+
+def test_an_object_that_is_announced_for_ever_and_never_there(lab: Lab) -> None:
+    bogus = TransferRequest(0x77, 0xB103, 600, "IMG_9999.CR2")
+    lab.device = Announcing(lab.eos, lambda records: (*records, bogus))
+    goes_on(lab)
+    assert len(lab.film.frames) == 3
+
+
+def test_an_announcement_that_comes_after_the_next_release_is_not_taken_for_its_frame(lab: Lab) -> None:
+    held: list[Record] = []
+    released: list[int] = []
+
+    def hold_first(records: tuple[Record, ...]) -> tuple[Record, ...]:
+        if released:
+            late, held[:] = tuple(held), []
+            return records + late
+        held.extend(filter(is_frame, records))
+        return tuple(record for record in records if not is_frame(record))
+
+    class Listening(faults.TroubledResponder):
+        def answer(self, request: Request, data: bytes | None) -> Answer:
+            if request.code == Operation.EOS_REMOTE_RELEASE_ON:
+                released.append(1)
+            return super().answer(request, data)
+
+    lab.device = Listening(Announcing(lab.eos, hold_first))
+    lab.camera.configure(replace(SETTINGS, shutter_s=1.0))
+    lab.press()
+    lab.camera.idle()
+    assert held
+    lab.take(attempts=1)
+    assert len(lab.film.frames) == 2
+    assert lab.waiting() == 0
+
+
+def test_a_transfer_goes_on_where_it_broke_off() -> None:
+    lab = Lab(film_bytes=2_500_000)
+    pieces = heard(lab)
+    lab.device = faults.Hanging(lab.device, Occasion({Operation.EOS_GET_PARTIAL_OBJECT}, after=1))
+    lab.camera.configure(SETTINGS)
+    lab.take(attempts=1)
+    assert [offset for offset, _ in pieces] == [0, 1 << 20, 2 << 20]
+    assert lab.openings == 2
+
+
+def test_what_stood_behind_the_place_in_the_file_is_gone(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    into = io.BytesIO(b"former" * 1000)
+    lab.camera.capture(into)
+    assert into.getvalue() == lab.film.frames[-1]
 
 
 def test_records_that_nobody_knows_and_a_queue_that_never_ends(lab: Lab) -> None:
