@@ -88,7 +88,9 @@ class Chart:
     colours
         (8**bits,) int64, colour index of each cell, in the same order.
     tags, references
-        Fiducials and achromatic patches.
+        Fiducials and achromatic patches; a print without fiducials has none.
+    seed, software
+        What the chart was designed with and by, if its file tells; printed in the margin.
     """
 
     page_mm: tuple[float, float]
@@ -98,6 +100,8 @@ class Chart:
     colours: npt.NDArray[np.int64]
     tags: tuple[Tag, ...]
     references: tuple[Reference, ...]
+    seed: int | None = None
+    software: str | None = None
 
     @property
     def colour_count(self) -> int:
@@ -143,6 +147,10 @@ class Chart:
                 }
                 for reference in self.references
             ],
+        }
+        # A chart that does not know them gives the text it was read from, so that its hash stays its name.
+        document |= {
+            key: value for key, value in (("seed", self.seed), ("software", self.software)) if value is not None
         }
         return json.dumps(document, separators=(",", ":")) + "\n"
 
@@ -193,6 +201,8 @@ class _Document(_Strict):
     cells: _Cells
     tags: list[_Tag]
     references: list[_Reference]
+    seed: int | None = Field(default=None, ge=0)
+    software: str | None = None
 
 
 def load_chart(path: Path) -> Chart:
@@ -237,4 +247,6 @@ def load_chart(path: Path) -> Chart:
             Reference(reference.name, reference.rgb, reference.centre_mm, reference.size_mm)
             for reference in document.references
         ),
+        seed=document.seed,
+        software=document.software,
     )

@@ -4,7 +4,8 @@ Laws that hold here:
 
 - The sheet is a grid of square slots of 125 pixels at 600 dpi (5.292 mm) whose origin is a whole pixel, so that every
   edge printed, of cells and of tag modules, falls between two pixels; at any other multiple of 24 dpi their sizes are
-  still whole.
+  still whole. On a page too small for that a slot is the largest multiple of 5 pixels that fits: a tag module, 2/5 of
+  it, stays whole at 600 dpi.
 - Each colour stands once, in random order: random order registers four times better than a smooth one and makes a
   slip by one cell visible.
 - Tags stand on an even grid that reaches the field's edges: 4 × 4 slots each, which are the 10 modules of an AprilTag
@@ -12,7 +13,9 @@ Laws that hold here:
 - Every slot left is an achromatic reference. References are spread evenly but without a lattice, because a lattice
   leaves streaks in the field fitted through them.
 
-The same bits, page and seed give the same chart. On A0 221 × 155 slots hold 32 768 colours, 35 tags and 927
+`paper_chart` is the other arrangement: the paper's plain grid of 256 × 128 cells, for sheets printed before.
+
+The same bits, page, cell and seed give the same chart. On A0 221 × 155 slots hold 32 768 colours, 35 tags and 927
 references. Knows nothing of printing or of cameras.
 """
 
@@ -20,6 +23,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from importlib.metadata import version
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +33,12 @@ from drivers.errors import InputError
 
 DESIGN_DPI = 600
 SLOT_PX = 125
-MODULE_PX = 50
+SLOT_STEP_PX = 5
+"""Slots are multiples of it, because a tag's ten modules are four slots."""
+
+LEAST_SLOT_PX = 25
+"""A cell of 1.06 mm, a module of 0.42 mm: below, a printer's dots are too few to mix a colour."""
+
 TAG_FAMILY = "36h11"
 TAG_SLOTS = 4
 TAG_MODULES = 8
@@ -40,6 +49,10 @@ TAG_IDS = 587
 """Codes in the family 36h11."""
 
 MARGIN_MM = 8.0
+PAPER_COLUMNS, PAPER_ROWS = 256, 128
+PAPER_REFERENCE_MM = 100.0
+"""Distance between the patches of bare paper in the margin of the paper's grid."""
+
 A_SERIES_MM: dict[str, tuple[float, float]] = {
     "A0": (1189, 841),
     "A1": (841, 594),
@@ -66,19 +79,25 @@ _Slots = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class _Grid:
-    """The slot grid of a page: its size in slots, its origin in pixels of the design, its tags' first slots."""
+    """The slot grid of a page: its size in slots, a slot and its origin in pixels of the design."""
 
     columns: int
     rows: int
+    slot_px: int
     origin_px: tuple[int, int]
 
     @classmethod
-    def on(cls, page_mm: tuple[float, float]) -> _Grid:
+    def on(cls, page_mm: tuple[float, float], slot_px: int = SLOT_PX) -> _Grid:
         page_px = [math.floor(side / _PX_MM) for side in page_mm]
         margin_px = math.ceil(MARGIN_MM / _PX_MM)
-        columns, rows = (max(0, side - 2 * margin_px) // SLOT_PX for side in page_px)
-        x0, y0 = ((side - count * SLOT_PX) // 2 for side, count in zip(page_px, (columns, rows), strict=True))
-        return cls(columns, rows, (x0, y0))
+        columns, rows = (max(0, side - 2 * margin_px) // slot_px for side in page_px)
+        x0, y0 = ((side - count * slot_px) // 2 for side, count in zip(page_px, (columns, rows), strict=True))
+        return cls(columns, rows, slot_px, (x0, y0))
+
+    @property
+    def cell_mm(self) -> tuple[float, float]:
+        """Width and height of a slot."""
+        return self.slot_px * _PX_MM, self.slot_px * _PX_MM
 
     @property
     def tag_slots(self) -> list[tuple[int, int]]:
@@ -99,7 +118,7 @@ class _Grid:
     def mm(self, column: float, row: float) -> tuple[float, float]:
         """Place on the print of a point of the slot grid."""
         x0, y0 = self.origin_px
-        return (x0 + column * SLOT_PX) * _PX_MM, (y0 + row * SLOT_PX) * _PX_MM
+        return (x0 + column * self.slot_px) * _PX_MM, (y0 + row * self.slot_px) * _PX_MM
 
 
 def _tag_starts(slots: int) -> list[int]:
@@ -114,12 +133,43 @@ def _least_references(bits: int) -> int:
     return max(32, 8**bits // 40)
 
 
-def smallest_page(bits: int) -> str:
-    """Return the name of the smallest A page, landscape, that holds a chart of `bits` bits."""
-    return next(name for name in reversed(A_SERIES_MM) if _Grid.on(A_SERIES_MM[name]).holds(bits))
+def smallest_page(bits: int, slot_px: int = SLOT_PX) -> str:
+    """Return the name of the smallest A page, landscape, that holds a chart of `bits` bits.
+
+    Raises
+    ------
+    InputError
+        Not even the largest does.
+    """
+    for name in reversed(A_SERIES_MM):
+        if _Grid.on(A_SERIES_MM[name], slot_px).holds(bits):
+            return name
+    raise InputError(
+        f"no A page holds {8**bits} cells of {slot_px * _PX_MM:.2f} mm; choose smaller cells (--cell-mm) or give the "
+        "page's size in mm (--page)"
+    )
 
 
-def design_chart(bits: int = 5, page: str | tuple[float, float] | None = None, seed: int = 1) -> Chart:
+def slot_of(cell_mm: float) -> int:
+    """Return the pixels of the slot nearest to a wanted size that keeps tag modules whole.
+
+    Raises
+    ------
+    InputError
+        The size is no length, or smaller than can be printed.
+    """
+    slot = round(cell_mm / _PX_MM / SLOT_STEP_PX) * SLOT_STEP_PX if math.isfinite(cell_mm) else 0
+    if slot < LEAST_SLOT_PX:
+        raise InputError(
+            f"a cell of {cell_mm:g} mm cannot be printed evenly; {LEAST_SLOT_PX * _PX_MM:.2f} mm "
+            f"({LEAST_SLOT_PX} px at {DESIGN_DPI} dpi) is the least"
+        )
+    return slot
+
+
+def design_chart(
+    bits: int = 5, page: str | tuple[float, float] | None = None, seed: int = 1, cell_mm: float | None = None
+) -> Chart:
     """Return the chart of all 8**bits colours on a page.
 
     Parameters
@@ -130,6 +180,9 @@ def design_chart(bits: int = 5, page: str | tuple[float, float] | None = None, s
         "A0" … "A8" (landscape), or width and height in mm; the smallest A page that holds the chart when not given.
     seed
         ≥ 0, decides the order of the colours and the places of the references.
+    cell_mm
+        Side of a cell; goes to the nearest multiple of 5 pixels at 600 dpi (0.212 mm). When not given it is 5.292 mm,
+        or on a page too small for that the largest that fits.
 
     Returns
     -------
@@ -142,26 +195,13 @@ def design_chart(bits: int = 5, page: str | tuple[float, float] | None = None, s
     Raises
     ------
     InputError
-        The bits or the seed are out of range, the page is unknown or too small.
+        The bits, the seed or the cell are out of range, the page is unknown or too small for cells that can be printed.
     """
     if not 1 <= bits <= 5:
         raise InputError(f"a chart has 1 to 5 bits a channel, not {bits}")
     if seed < 0:
         raise InputError(f"the seed is {seed}; give a whole number from 0")
-    page_mm = _page_mm(smallest_page(bits) if page is None else page)
-    grid = _Grid.on(page_mm)
-    if not grid.holds(bits):
-        if len(grid.tag_slots) > TAG_IDS:
-            raise InputError(
-                f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm needs {len(grid.tag_slots)} tags and the family "
-                f"{TAG_FAMILY} has {TAG_IDS}; choose a smaller page"
-            )
-        name = smallest_page(bits)
-        width, height = A_SERIES_MM[name]
-        raise InputError(
-            f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm is too small for the {8**bits} colours of a chart of "
-            f"{bits} bits; the smallest that holds it is {name} ({width:g} × {height:g} mm)"
-        )
+    grid, page_mm = _choose_grid(bits, page, cell_mm)
     rng = np.random.default_rng(seed)
     free = np.ones((grid.rows, grid.columns), dtype=np.bool_)
     for column, row in grid.tag_slots:
@@ -171,12 +211,116 @@ def design_chart(bits: int = 5, page: str | tuple[float, float] | None = None, s
     return Chart(
         page_mm=page_mm,
         bits=bits,
-        cell_mm=(SLOT_PX * _PX_MM, SLOT_PX * _PX_MM),
+        cell_mm=grid.cell_mm,
         centres_mm=np.array([grid.mm(column + 0.5, row + 0.5) for column, row in zip(columns, rows, strict=True)]),
         colours=rng.permutation(8**bits).astype(np.int64),
         tags=tuple(_tag(grid, number, *slot) for number, slot in enumerate(grid.tag_slots)),
         references=tuple(_references(grid, referenced, rng)),
+        seed=seed,
+        software=_software(),
     )
+
+
+def _software() -> str:
+    return f"croplab {version('croplab')}"
+
+
+def _choose_grid(
+    bits: int, page: str | tuple[float, float] | None, cell_mm: float | None
+) -> tuple[_Grid, tuple[float, float]]:
+    """Return the grid and the page it stands on: as asked, or with the largest cells that fit."""
+    wanted = SLOT_PX if cell_mm is None else slot_of(cell_mm)
+    page_mm = _page_mm(smallest_page(bits, wanted) if page is None else page)
+    grid = _Grid.on(page_mm, wanted)
+    if grid.holds(bits):
+        return grid, page_mm
+    if len(grid.tag_slots) > TAG_IDS:
+        raise InputError(
+            f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm needs {len(grid.tag_slots)} tags and the family "
+            f"{TAG_FAMILY} has {TAG_IDS}; choose a smaller page"
+        )
+    smaller = (_Grid.on(page_mm, slot) for slot in range(wanted - SLOT_STEP_PX, LEAST_SLOT_PX - 1, -SLOT_STEP_PX))
+    fitting = next((grid for grid in smaller if grid.holds(bits)), None)
+    text = (
+        f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm is too small for the {8**bits} colours of a chart of {bits} bits"
+    )
+    if fitting is None:
+        name = next(name for name in reversed(A_SERIES_MM) if _Grid.on(A_SERIES_MM[name], LEAST_SLOT_PX).holds(bits))
+        width, height = A_SERIES_MM[name]
+        raise InputError(
+            f"{text} even with cells of {LEAST_SLOT_PX * _PX_MM:.2f} mm, the smallest that can be printed; the "
+            f"smallest page that holds it is {name} ({width:g} × {height:g} mm), at its best size {smallest_page(bits)}"
+        )
+    if cell_mm is not None:
+        raise InputError(
+            f"{text} in cells of {wanted * _PX_MM:.2f} mm; {fitting.cell_mm[0]:.2f} mm fit: give that, or leave the "
+            "cell's size to the program"
+        )
+    return fitting, page_mm
+
+
+def paper_chart(page: str | tuple[float, float] | None = None) -> Chart:
+    """Return the paper's plain grid: 256 × 128 cells, each of the 32 768 colours once, without tags.
+
+    The paper's figure of the pattern gives no order, so this one is a reconstruction: 8 × 4 blocks of 32 × 32 cells.
+    In a block red rises by column and green by row, one block after the other (row by row, the second row from right to
+    left, and so on) blue rises; every second column of blocks runs red backwards and every second row green, so that
+    neighbours differ by one step in one channel, but for blue between blocks above each other.
+
+    References are patches of bare paper in the margin, which the sheet is taken to have: 5 mm squares at the corners
+    and every 100 mm above and on the right of the field.
+
+    Parameters
+    ----------
+    page
+        As in `design_chart`; A0 when not given. Cells are the largest whole pixels at 600 dpi that leave a margin of
+        8 mm: 108 × 152 on A0, 4.57 × 6.43 mm.
+
+    Raises
+    ------
+    InputError
+        The page is unknown, or too small for cells that can be printed.
+    """
+    page_mm = _page_mm("A0" if page is None else page)
+    margin_px = math.ceil(MARGIN_MM / _PX_MM)
+    page_px = [math.floor(side / _PX_MM) for side in page_mm]
+    counts = (PAPER_COLUMNS, PAPER_ROWS)
+    cell_w, cell_h = ((side - 2 * margin_px) // count for side, count in zip(page_px, counts, strict=True))
+    if min(cell_w, cell_h) < LEAST_SLOT_PX:
+        raise InputError(
+            f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm is too small for {PAPER_COLUMNS} × {PAPER_ROWS} cells of "
+            f"{LEAST_SLOT_PX * _PX_MM:.2f} mm, the smallest that can be printed; choose a larger one, A0 at best"
+        )
+    x0, y0 = ((side - count * cell) // 2 for side, count, cell in zip(page_px, counts, (cell_w, cell_h), strict=True))
+    row, column = (places.ravel() for places in np.indices((PAPER_ROWS, PAPER_COLUMNS), dtype=np.int64))
+    block_column, block_row = column // 32, row // 32
+    red = np.where(block_column % 2 == 0, column % 32, 31 - column % 32)
+    green = np.where(block_row % 2 == 0, row % 32, 31 - row % 32)
+    blue = 8 * block_row + np.where(block_row % 2 == 0, block_column, 7 - block_column)
+    field = (x0, y0, x0 + PAPER_COLUMNS * cell_w, y0 + PAPER_ROWS * cell_h)
+    return Chart(
+        page_mm=page_mm,
+        bits=5,
+        cell_mm=(cell_w * _PX_MM, cell_h * _PX_MM),
+        centres_mm=_PX_MM * np.array([x0 + (column + 0.5) * cell_w, y0 + (row + 0.5) * cell_h], dtype=np.float64).T,
+        colours=(red << 10) | (green << 5) | blue,
+        tags=(),
+        references=tuple(_margin_whites(field)),
+        software=_software(),
+    )
+
+
+def _margin_whites(field_px: tuple[int, int, int, int]) -> list[Reference]:
+    """Return patches of bare paper around a field, a margin's clear 1.5 mm away from it."""
+    left, top, right, bottom = field_px
+    side, away, step = 118, 35 + 59, PAPER_REFERENCE_MM / _PX_MM
+    across, down = (math.ceil((high - low) / step) for low, high in ((left, right), (top, bottom)))
+    places = [(x, y) for y in (top - away, bottom + away) for x in (left - away, right + away)]
+    places += [(left + round(k * (right - left) / across), top - away) for k in range(1, across)]
+    places += [(right + away, top + round(k * (bottom - top) / down)) for k in range(1, down)]
+    return [
+        Reference("white", PAPER_WHITE, (x * _PX_MM, y * _PX_MM), (side * _PX_MM, side * _PX_MM)) for x, y in places
+    ]
 
 
 def _page_mm(page: str | tuple[float, float]) -> tuple[float, float]:
@@ -194,8 +338,8 @@ def _page_mm(page: str | tuple[float, float]) -> tuple[float, float]:
 
 
 def _tag(grid: _Grid, number: int, column: int, row: int) -> Tag:
-    rim = MODULE_PX / SLOT_PX
-    near, far = rim, rim + TAG_MODULES * MODULE_PX / SLOT_PX
+    rim = TAG_SLOTS / (TAG_MODULES + 2)
+    near, far = rim, rim + TAG_MODULES * rim
     corners = [(near, near), (far, near), (far, far), (near, far)]
     return Tag(TAG_FAMILY, number, np.array([grid.mm(column + x, row + y) for x, y in corners]))
 
@@ -209,13 +353,12 @@ def _references(grid: _Grid, referenced: _Slots, rng: np.random.Generator) -> li
         chosen = spread(left, int(referenced.sum()) // (2 * len(GREY_CODES)), rng)
         codes[chosen] = code
         left &= ~chosen
-    size = (SLOT_PX * _PX_MM, SLOT_PX * _PX_MM)
     return [
         Reference(
             name="white" if code == PAPER_WHITE[0] else f"grey {code}",
             rgb=(code, code, code),
             centre_mm=grid.mm(int(column) + 0.5, int(row) + 0.5),
-            size_mm=size,
+            size_mm=grid.cell_mm,
         )
         for row, column in np.argwhere(referenced)
         for code in [int(codes[row, column])]

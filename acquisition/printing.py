@@ -1,4 +1,4 @@
-"""The chart as a print: a list of rectangles, and from it a TIFF, a PDF and a preview.
+"""The chart as a print: a list of rectangles, field and marks, and from it a TIFF, a PDF and a preview.
 
 Laws that hold here:
 
@@ -8,39 +8,46 @@ Laws that hold here:
   printer's colour management must be off, so that the same code is the same ink everywhere, and the paper matte.
 - In the TIFF every cell and every tag module is the same whole number of pixels; a resolution at which they are not
   is refused (300 dpi, for one), because modules of unequal size move the corners that detectors find.
+- Cells do not only touch in the PDF: each reaches a fifth of a pixel below its right and lower neighbours, because
+  renderers leave hairlines of paper between parts that meet in one line.
 - An A0 sheet at 600 dpi has 1.7 GB of pixels; it is never held: rows that look alike are drawn once and packed strip
   by strip.
 """
 
 from __future__ import annotations
 
+import math
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart import PAPER_WHITE, Chart, Tag
+from acquisition.marks import PX_MM, Boxes, margin_marks, whole_px
 from drivers.errors import InputError
 from drivers.storage import whole_file, write_whole
+
+if TYPE_CHECKING:
+    from reportlab.pdfgen.canvas import Canvas
 
 PRINT_DPI = 600
 MM_PER_INCH = 25.4
 POINTS_PER_MM = 72 / MM_PER_INCH
 _STRIP_ROWS = 64
 _SUPERSAMPLING = 8
-_LABEL_GAP_MM = 1.5
-_LABEL_HEIGHT_MM = 2.0
+_LAP_PX, _INSET_PX = 0.2, 0.01
 TAG_MODULES = 8
 """Modules along the black square of a tag 36h11: 6 of data inside a black border of one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """The printed field, on bare paper, in painter's order: a later rectangle covers an earlier one.
+    """What is printed on bare paper, in painter's order: a later rectangle covers an earlier one.
 
     Attributes
     ----------
@@ -50,34 +57,95 @@ class Drawing:
         (N, 4) float64, left, top, right, bottom; origin at the sheet's top-left corner, x right, y down.
     rgb
         (N, 3) uint8, printed code of each rectangle; (255, 255, 255) is bare paper.
+    tiles
+        How many of the last rectangles are cells and references, side by side, row by row.
     """
 
     page_mm: tuple[float, float]
     rectangles_mm: npt.NDArray[np.float64]
     rgb: npt.NDArray[np.uint8]
+    tiles: int = 0
 
 
 def drawing(chart: Chart) -> Drawing:
-    """Return the rectangles of a chart: tags first (white rim, black square, white modules), cells, references.
+    """Return the whole sheet: the marks in its margins (`acquisition.marks`), then the field.
 
-    The line of text in the margin that the files carry (`label`) is not among them.
+    The field's rectangles are in the order tags (white rim, black square, white modules), cells and references row by
+    row.
 
     Raises
     ------
     InputError
         A tag is of a family that is not known here, or does not stand upright.
     """
+    field = field_drawing(chart)
+    marks = _marks_px(chart).astype(np.float64) * PX_MM
+    return Drawing(
+        chart.page_mm,
+        np.concatenate([marks, field.rectangles_mm]),
+        np.concatenate([np.zeros((len(marks), 3), dtype=np.uint8), field.rgb]),
+        field.tiles,
+    )
+
+
+def field_drawing(chart: Chart, within_mm: tuple[float, float, float, float] | None = None) -> Drawing:
+    """Return the rectangles of tags, cells and references.
+
+    Parameters
+    ----------
+    within_mm
+        Left, top, right and bottom of a window: only what lies wholly inside is returned, tags with their white rims.
+
+    Raises
+    ------
+    InputError
+        As `drawing`.
+    """
+    left, top, right, bottom = (-math.inf, -math.inf, math.inf, math.inf) if within_mm is None else within_mm
+    boxes = _part_boxes(chart)
+    codes = np.array([reference.rgb for reference in chart.references], dtype=np.uint8).reshape(-1, 3)
+    # A thousandth of a millimetre is nothing on paper and more than what numbers in a file are rounded by.
+    near = np.array([left, top, -right, -bottom]) - 1e-3
+    inside = np.asarray((boxes * [1, 1, -1, -1] >= near).all(axis=1))
+    rectangles, rgb = [np.empty((0, 4))], [np.empty((0, 3), dtype=np.uint8)]
+    for number, tag in enumerate(chart.tags):
+        if inside[number]:
+            parts, shades = _tag_rectangles(tag)
+            rectangles.append(parts)
+            rgb.append(shades)
+    rest = np.flatnonzero(inside[len(chart.tags) :])
+    tiles, colours = boxes[len(chart.tags) :][rest], np.concatenate([chart.rgb, codes])[rest]
+    order = np.lexsort(tiles[:, :2].round(3).T)
+    return Drawing(
+        chart.page_mm,
+        np.concatenate([*rectangles, tiles[order]]),
+        np.concatenate([*rgb, colours[order]]),
+        len(order),
+    )
+
+
+def _part_boxes(chart: Chart) -> npt.NDArray[np.float64]:
+    """(N, 4) mm: tags with their white rims, cells, references."""
+    rims = [_tag_rectangles(tag)[0][:1] for tag in chart.tags]
     half = np.array(chart.cell_mm) / 2
-    rectangles = [np.empty((0, 4)), *(_tag_rectangles(tag)[0] for tag in chart.tags)]
-    rgb = [np.empty((0, 3), dtype=np.uint8), *(_tag_rectangles(tag)[1] for tag in chart.tags)]
-    rectangles.append(np.concatenate([chart.centres_mm - half, chart.centres_mm + half], axis=1))
-    rgb.append(chart.rgb)
-    if chart.references:
-        centres = np.array([reference.centre_mm for reference in chart.references])
-        halves = np.array([reference.size_mm for reference in chart.references]) / 2
-        rectangles.append(np.concatenate([centres - halves, centres + halves], axis=1))
-        rgb.append(np.array([reference.rgb for reference in chart.references], dtype=np.uint8))
-    return Drawing(chart.page_mm, np.concatenate(rectangles), np.concatenate(rgb))
+    cells = np.concatenate([chart.centres_mm - half, chart.centres_mm + half], axis=1)
+    centres = np.array([reference.centre_mm for reference in chart.references]).reshape(-1, 2)
+    halves = np.array([reference.size_mm for reference in chart.references]).reshape(-1, 2) / 2
+    return np.concatenate([*rims, cells, np.concatenate([centres - halves, centres + halves], axis=1)])
+
+
+def field_px(chart: Chart) -> Boxes:
+    """Return (4,) int64: the box of all tags and cells, whole pixels at 600 dpi."""
+    boxes = whole_px(_part_boxes(chart)[: len(chart.tags) + len(chart.centres_mm)])
+    return np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
+
+
+def _marks_px(chart: Chart) -> Boxes:
+    field = field_px(chart)
+    references = whole_px(_part_boxes(chart)[len(chart.tags) + len(chart.centres_mm) :])
+    outside = ((references[:, :2] < field[:2]) | (references[:, 2:] > field[2:])).any(axis=1)
+    width, height = (int(side / PX_MM) for side in chart.page_mm)
+    return margin_marks(field, (width, height), references[outside], label_lines(chart))
 
 
 def tag_modules(tag: Tag) -> npt.NDArray[np.bool_]:
@@ -119,48 +187,19 @@ def _tag_rectangles(tag: Tag) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.u
     return rectangles, rgb
 
 
-def label(chart: Chart) -> str:
-    """Return the line printed in the margin, which tells a sheet from another and how to print it."""
+def label_lines(chart: Chart) -> tuple[str, str]:
+    """Return the two lines printed in the margin: what tells this sheet from another, and how to print it."""
     width, height = chart.page_mm
     bits = "1 bit" if chart.bits == 1 else f"{chart.bits} bits"
-    return (
-        f"CroP chart, {bits}, {width:g} x {height:g} mm, {chart.sha256[:16]}. "
-        "Print at actual size, colour management off, on matte paper."
-    )
+    parts = [f"CroP chart, {bits}, {width:g} x {height:g} mm", f"chart.json {chart.sha256[:16]}"]
+    parts += [] if chart.seed is None else [f"seed {chart.seed}"]
+    parts += [] if chart.software is None else [chart.software.encode("ascii", "replace").decode()]
+    return ", ".join(parts), "Print at 100 %, colour management off, on matte paper; the rulers are in millimetres."
 
 
-def _label_rectangles(chart: Chart, field_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(N, 4) mm: the label as runs of black below the field's left end; none where the margin has no room.
-
-    Rectangles rather than text, so that neither file needs a font and both print the same.
-    """
-    import cv2
-
-    left, _, right, bottom = field_mm.tolist()
-    if bottom + _LABEL_GAP_MM + _LABEL_HEIGHT_MM > chart.page_mm[1]:
-        return np.empty((0, 4))
-    text, font, scale, stroke = label(chart), cv2.FONT_HERSHEY_SIMPLEX, 1.0, 2
-    (columns, ascent), descent = cv2.getTextSize(text, font, scale, stroke)
-    bitmap = np.zeros((ascent + descent + stroke, columns), dtype=np.uint8)
-    cv2.putText(bitmap, text, (0, ascent + stroke // 2), font, scale, 255, stroke, cv2.LINE_8)
-    edges = np.diff(np.pad((bitmap > 127).astype(np.int8), ((0, 0), (1, 1))), axis=1)
-    rows, starts = np.nonzero(edges == 1)
-    ends = np.nonzero(edges == -1)[1]
-    size = min(_LABEL_HEIGHT_MM / bitmap.shape[0], (right - left) / columns)
-    runs = np.stack([starts, rows, ends, rows + 1], axis=1).astype(np.float64) * size
-    return runs + np.array([left, bottom + _LABEL_GAP_MM, left, bottom + _LABEL_GAP_MM])
-
-
-def _sheet(chart: Chart) -> Drawing:
-    """Return the drawing with its label."""
-    field = drawing(chart)
-    extent = np.concatenate([field.rectangles_mm[:, :2].min(axis=0), field.rectangles_mm[:, 2:].max(axis=0)])
-    runs = _label_rectangles(chart, extent)
-    return Drawing(
-        chart.page_mm,
-        np.concatenate([field.rectangles_mm, runs]),
-        np.concatenate([field.rgb, np.zeros((len(runs), 3), dtype=np.uint8)]),
-    )
+def label(chart: Chart) -> str:
+    """Return what the margin says (`label_lines`) as one line."""
+    return ". ".join(label_lines(chart))
 
 
 @dataclass(frozen=True)
@@ -205,8 +244,15 @@ def _require_whole_pixels(chart: Chart, dpi: int) -> None:
         if dpi < 1 or round(pixels) < 1 or abs(pixels - round(pixels)) > 1e-3:
             raise InputError(
                 f"at {dpi} dpi a part of {length:.3f} mm would be {pixels:.2f} pixels, and only whole ones print "
-                "evenly; choose 600 or 360 dpi, or print the PDF"
+                f"evenly; choose {_even_resolutions(lengths)} dpi, or print the PDF"
             )
+
+
+def _even_resolutions(lengths: list[float]) -> str:
+    """Name the usual resolutions at which all lengths are whole pixels."""
+    pixels = {dpi: [length * dpi / MM_PER_INCH for length in lengths] for dpi in (1200, 600, 360)}
+    even = [f"{dpi}" for dpi, sizes in pixels.items() if all(abs(size - round(size)) <= 1e-3 for size in sizes)]
+    return " or ".join(even) or "another number of"
 
 
 def save_tiff(chart: Chart, path: Path, dpi: int = PRINT_DPI) -> None:
@@ -230,7 +276,7 @@ def save_tiff(chart: Chart, path: Path, dpi: int = PRINT_DPI) -> None:
     import tifffile
 
     _require_whole_pixels(chart, dpi)
-    sheet = _sheet(chart)
+    sheet = drawing(chart)
     width, height = (round(side * dpi / MM_PER_INCH) for side in chart.page_mm)
     bands = _bands(sheet, dpi / MM_PER_INCH, (width, height))
     with whole_file(path) as stream, tifffile.TiffWriter(stream) as writer:
@@ -261,25 +307,48 @@ def save_pdf(chart: Chart, path: Path) -> None:
     StorageError
         The disk is full, read-only or gone.
     """
-    from reportlab.pdfgen.canvas import Canvas
+    save_drawing(drawing(chart), path, label(chart), f"chart.json has SHA-256 {chart.sha256}")
 
-    sheet = _sheet(chart)
-    width, height = (side * POINTS_PER_MM for side in chart.page_mm)
+
+def save_drawing(
+    sheet: Drawing, path: Path, title: str, subject: str, finish: Callable[[Canvas], None] | None = None
+) -> None:
+    """Write any drawing as a PDF of one page of exactly its size: filled rectangles in device RGB, no colour profile.
+
+    Parameters
+    ----------
+    finish
+        May draw more on the page, in points with y up, before it is closed.
+
+    Raises
+    ------
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    from reportlab.pdfgen.canvas import FILL_NON_ZERO, Canvas
+
+    width, height = (side * POINTS_PER_MM for side in sheet.page_mm)
     corners = sheet.rectangles_mm * POINTS_PER_MM
+    # Renderers paint every pixel that a part touches: a hair less on each side keeps rounding out of the next pixel.
+    hair, lap = _INSET_PX * PX_MM * POINTS_PER_MM, _LAP_PX * PX_MM * POINTS_PER_MM
+    corners += np.array([hair, hair, -hair, -hair])
+    corners[len(corners) - sheet.tiles :, 2:] += lap
     changes = np.flatnonzero((np.diff(sheet.rgb.astype(np.int64), axis=0) != 0).any(axis=1)) + 1
     with whole_file(path) as stream:
         canvas = Canvas(stream, pagesize=(width, height), pageCompression=1, invariant=1)
-        canvas.setTitle(label(chart))
+        canvas.setTitle(title)
         canvas.setAuthor("CroP")
         canvas.setCreator("CroP")
-        canvas.setSubject(f"chart.json has SHA-256 {chart.sha256}")
+        canvas.setSubject(subject)
         # Neighbours of one colour share a path: it keeps the painter's order and saves bytes.
         for first, last in zip([0, *changes], [*changes, len(corners)], strict=True):
             canvas.setFillColorRGB(*(int(code) / 255 for code in sheet.rgb[first]))
             path_ = canvas.beginPath()
             for left, top, right, bottom in corners[first:last].tolist():
                 path_.rect(left, height - bottom, right - left, bottom - top)
-            canvas.drawPath(path_, stroke=0, fill=1)
+            canvas.drawPath(path_, stroke=0, fill=1, fillMode=FILL_NON_ZERO)
+        if finish is not None:
+            finish(canvas)
         canvas.showPage()
         canvas.save()
 
@@ -292,12 +361,20 @@ def preview(chart: Chart, width_px: int) -> npt.NDArray[np.uint8]:
     InputError
         The width is below 1, or a tag cannot be printed.
     """
+    import cv2
+
     if width_px < 1:
         raise InputError(f"a preview of {width_px} pixels has no width; give 1 or more")
     height_px = max(1, round(width_px * chart.page_mm[1] / chart.page_mm[0]))
     fine = (width_px * _SUPERSAMPLING, height_px * _SUPERSAMPLING)
-    bands = list(_bands(_sheet(chart), fine[0] / chart.page_mm[0], fine))
-    means = np.stack([band.row.reshape(width_px, _SUPERSAMPLING, 3).mean(axis=1) for band in bands])
+    bands = list(_bands(drawing(chart), fine[0] / chart.page_mm[0], fine))
+    # A mean by whole numbers of pixels; OpenCV takes it a good deal faster than numpy.
+    means = np.stack(
+        [
+            cv2.resize(band.row[None].astype(np.float32), (width_px, 1), interpolation=cv2.INTER_AREA)[0]
+            for band in bands
+        ]
+    )
     tops = np.arange(height_px)[:, None] * _SUPERSAMPLING
     band_tops, band_bottoms = np.array([[band.top, band.bottom] for band in bands]).T
     shared = np.minimum(band_bottoms, tops + _SUPERSAMPLING) - np.maximum(band_tops, tops)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acquisition.chart import Chart, colour_of_index, load_chart
-from acquisition.layout import design_chart
+from acquisition.layout import design_chart, paper_chart
 from drivers.errors import FormatError
 
 # Written by hand from the format's description, with keys that this version does not know.
@@ -59,6 +60,31 @@ def test_what_is_saved_is_read_again(bits: int, tmp_path: Path) -> None:
         assert (one.name, one.rgb, one.size_mm) == (other.name, other.rgb, other.size_mm)
         assert one.centre_mm == pytest.approx(other.centre_mm, abs=1e-6)
     assert again.to_json() == chart.to_json()
+    assert again.sha256 == chart.sha256
+
+
+def test_seed_and_software_are_kept_and_an_old_file_keeps_its_hash(tmp_path: Path) -> None:
+    chart = design_chart(1, seed=3)
+    document = json.loads(chart.to_json())
+    assert document["seed"] == 3
+    assert document["software"] == chart.software
+    # The text of version 1 before the keys were there: those of the design, in that order, and nothing else.
+    for key in ("seed", "software"):
+        del document[key]
+    old = json.dumps(document, separators=(",", ":")) + "\n"
+    path = tmp_path / "chart.json"
+    path.write_text(old)
+    again = load_chart(path)
+    assert (again.seed, again.software) == (None, None)
+    assert again.to_json() == old
+    assert again.sha256 == hashlib.sha256(old.encode()).hexdigest()
+
+
+def test_a_chart_without_tags_is_read_again(tmp_path: Path) -> None:
+    chart = paper_chart()
+    chart.save(tmp_path / "chart.json")
+    again = load_chart(tmp_path / "chart.json")
+    assert again.tags == ()
     assert again.sha256 == chart.sha256
 
 
@@ -130,6 +156,8 @@ def drop(key: str) -> Callable[[dict[str, Any]], None]:
         (set_("tags", 0, "id", to=-1), "tags.0.id"),
         (set_("references", 1, "rgb", to=[99, 99, 256]), "references.1.rgb"),
         (set_("references", 1, "size_mm", to=[0, 1]), "references.1.size_mm"),
+        (set_("seed", to=-1), "seed"),
+        (set_("software", to=3), "software"),
     ],
 )
 def test_a_bad_chart_is_refused_in_one_sentence(

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acquisition.chart import Chart
-from acquisition.layout import A_SERIES_MM, GREY_CODES, design_chart, smallest_page, spread
-from acquisition.printing import drawing
+from acquisition.layout import A_SERIES_MM, GREY_CODES, design_chart, paper_chart, smallest_page, spread
+from acquisition.printing import field_drawing
 from drivers.errors import InputError
 
 PX_MM = 25.4 / 600
@@ -161,9 +161,14 @@ def test_a_page_can_be_larger_named_or_measured() -> None:
         (0, None, 1, "1 to 5 bits"),
         (6, None, 1, "1 to 5 bits"),
         (5, None, -1, "seed is -1"),
-        (5, "A1", 1, r"841 × 594 mm is too small for the 32768 colours .* smallest .* A0 \(1189 × 841 mm\)"),
-        (4, "A3", 1, "A2"),
-        (2, (50.0, 500.0), 1, "A7"),
+        (
+            5,
+            "A5",
+            1,
+            r"210 × 148 mm is too small for the 32768 colours .* even with cells of 1.06 mm.* A4 .* best .* A0",
+        ),
+        (4, "A8", 1, r"A7 \(105 × 74 mm\).* A2"),
+        (2, (18.0, 500.0), 1, "A8"),
         (2, (0.0, 500.0), 1, "above 0"),
         (2, (float("nan"), 500.0), 1, "above 0"),
         (2, (float("inf"), 500.0), 1, "above 0"),
@@ -194,12 +199,95 @@ def test_spread_chooses_as_many_as_asked_among_the_allowed(
 
 def test_the_drawing_covers_every_tag_cell_and_reference() -> None:
     chart = design_chart(2)
-    drawn = drawing(chart)
+    drawn = field_drawing(chart)
     assert drawn.rectangles_mm.dtype == np.float64
     assert drawn.rgb.dtype == np.uint8
     assert len(drawn.rectangles_mm) == len(drawn.rgb)
-    np.testing.assert_array_equal(drawn.rgb[-len(chart.references) :], [item.rgb for item in chart.references])
+    assert drawn.tiles == len(chart.centres_mm) + len(chart.references)
+    tiles, shades = drawn.rectangles_mm[-drawn.tiles :], drawn.rgb[-drawn.tiles :]
+    centres = {tuple(centre) for centre in ((tiles[:, :2] + tiles[:, 2:]) / 2).round(6).tolist()}
+    places = [*chart.centres_mm.tolist(), *(reference.centre_mm for reference in chart.references)]
+    assert centres == {(round(x, 6), round(y, 6)) for x, y in places}
+    codes = Counter(tuple(shade) for shade in shades.tolist())
+    assert codes == Counter([tuple(rgb) for rgb in chart.rgb.tolist()] + [item.rgb for item in chart.references])
     area = np.prod(drawn.rectangles_mm[:, 2:] - drawn.rectangles_mm[:, :2], axis=1)
     assert area[-1] == pytest.approx(chart.cell_mm[0] * chart.cell_mm[1])
     rims = (drawn.rgb == 255).all(axis=1) & (area > 15 * area[-1])
     assert rims.sum() == len(chart.tags)
+
+
+@pytest.mark.parametrize(
+    ("bits", "page", "pixels"), [(5, "A1", 85), (5, "A2", 60), (4, "A3", 120), (3, (100.0, 500.0), 125), (5, "A3", 40)]
+)
+def test_cells_shrink_to_whole_pixels_on_a_page_too_small(
+    bits: int, page: str | tuple[float, float], pixels: int
+) -> None:
+    chart = design_chart(bits, page)
+    assert chart.cell_mm == pytest.approx((pixels * PX_MM, pixels * PX_MM))
+    assert sorted(chart.colours.tolist()) == list(range(8**bits))
+    module = np.ptp(chart.tags[0].corners_mm[:, 0]) / 8 / PX_MM
+    assert module == pytest.approx(0.4 * pixels)
+    assert module == pytest.approx(round(module)), "a module is whole pixels"
+    for edges in (chart.centres_mm - np.array(chart.cell_mm) / 2, np.array([tag.corners_mm for tag in chart.tags])):
+        assert np.abs(edges / PX_MM - np.rint(edges / PX_MM)).max() < 1e-6
+    # One size larger does not fit: there is no room for as many slots within the margins.
+    larger = pixels + 5
+    room = [int((side / PX_MM - 2 * 189) // larger) for side in chart.page_mm]
+    assert pixels == 125 or room[0] * room[1] < 8**bits * 41 / 40 + 16 * len(chart.tags)
+
+
+def test_the_cell_s_size_can_be_chosen() -> None:
+    assert design_chart(2, "A4", cell_mm=7.0).cell_mm[0] == pytest.approx(165 * PX_MM)
+    assert design_chart(2, cell_mm=2.54).page_mm == A_SERIES_MM["A8"]
+    with pytest.raises(InputError, match=r"in cells of 5\.29 mm; 3\.60 mm fit"):
+        design_chart(5, "A1", cell_mm=5.3)
+    for wrong in (0.9, 0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match=r"1\.06 mm"):
+            design_chart(2, cell_mm=wrong)
+    with pytest.raises(InputError, match="no A page holds"):
+        design_chart(5, cell_mm=20.0)
+
+
+def test_the_seed_and_the_software_are_kept() -> None:
+    assert design_chart(1, seed=7).seed == 7
+    assert str(design_chart(1).software).startswith("croplab ")
+
+
+def test_the_paper_s_arrangement_is_a_plain_grid_of_every_colour_once() -> None:
+    chart = paper_chart()
+    assert chart.page_mm == (1189, 841)
+    assert chart.cell_mm == pytest.approx((4.58, 6.45), abs=0.02)
+    assert chart.tags == ()
+    assert sorted(chart.colours.tolist()) == list(range(32768))
+    corner = (chart.centres_mm - np.array(chart.cell_mm) / 2) / PX_MM
+    assert np.abs(corner - np.rint(corner)).max() < 1e-6
+    xs, ys = (np.unique(chart.centres_mm[:, axis].round(6)) for axis in (0, 1))
+    assert (len(xs), len(ys)) == (256, 128)
+    assert np.diff(xs) == pytest.approx(chart.cell_mm[0])
+    assert np.diff(ys) == pytest.approx(chart.cell_mm[1])
+    assert min(xs[0] - chart.cell_mm[0] / 2, ys[0] - chart.cell_mm[1] / 2) >= MARGIN_MM
+    # The documented order: neighbours in a row differ by one step, as do those in a column but for blue between blocks.
+    codes = chart.rgb.reshape(128, 256, 3).astype(int)
+    across, down = np.abs(np.diff(codes, axis=1)), np.abs(np.diff(codes, axis=0))
+    assert (across.sum(axis=2) == 8).all()
+    assert (np.delete(down, [31, 63, 95], axis=0).sum(axis=2) == 8).all()
+    assert (down[:, :, :2].sum(axis=2)[[31, 63, 95]] == 0).all()
+    assert codes[0, 0].tolist() == [0, 0, 0]
+    assert codes[0, 31].tolist() == [248, 0, 0]
+    assert codes[31, 0].tolist() == [0, 248, 0]
+    assert codes[0, 255].tolist() == [0, 0, 56]
+
+
+def test_the_paper_s_references_are_bare_margin() -> None:
+    chart = paper_chart()
+    places = np.array([reference.centre_mm for reference in chart.references])
+    half = np.array([reference.size_mm for reference in chart.references]) / 2
+    low, high = chart.centres_mm.min(axis=0), chart.centres_mm.max(axis=0)
+    edge = np.array(chart.cell_mm) / 2 + 1.4
+    assert all(reference.is_white for reference in chart.references)
+    assert len(places) >= 20
+    assert (((places + half <= low - edge) | (places - half >= high + edge)).any(axis=1)).all()
+    assert (places - half > 0).all()
+    assert (places + half < chart.page_mm).all()
+    with pytest.raises(InputError, match="256 × 128 cells"):
+        paper_chart("A5")
