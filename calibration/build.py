@@ -31,14 +31,14 @@ from calibration.lut import LutWriter, Provenance, Unfit
 from calibration.radiometry import CLIPPED, Field, Paper, black_drift, corrections, read_paper, saturation
 from calibration.registration import MIN_BLOCK_SCORE, Registration, register
 from calibration.sampling import SAMPLES, Sites, gather, noise_of, sites_at, table_values, uneven
+from calibration.verdict import Verdict, figures_of, judge, refusal
 from drivers.errors import FormatError, QualityError
 from drivers.rawfile import Mosaic, read_raw
-from drivers.storage import whole_folder
+from drivers.storage import whole_folder, write_whole
 
 STILL_PX = 0.1
 BUMP_PX = 0.5
-MAX_UNFIT = 0.1
-"""Share of the cells that may be unfit before no table is made."""
+REPORT_FILES = ("report.html", "report.json")
 
 _THREADS = 2
 _AHEAD = 3
@@ -104,6 +104,8 @@ class BuildResult:
         Figures of every frame read, in order.
     noise
         (3,) float64, median standard deviation of one sample under white, relative to paper white.
+    white_references
+        White references of the chart.
     """
 
     session: Path
@@ -118,6 +120,12 @@ class BuildResult:
     unfit: tuple[Unfit, ...]
     frames: tuple[FrameFigures, ...] = field(default=())
     noise: _Array = field(default_factory=lambda: np.zeros(3))
+    white_references: int = 0
+
+    @property
+    def verdict(self) -> Verdict:
+        """The figures against their limits."""
+        return judge(figures_of(self))
 
     @property
     def largest_shift_px(self) -> float:
@@ -176,6 +184,7 @@ def check(session: Session) -> BuildResult:
         unfit=work.unfit(decoded.saturation),
         frames=(figures,),
         noise=work.noise(),
+        white_references=len(session.chart.white_references),
     )
 
 
@@ -205,7 +214,8 @@ def build(
     RegistrationError
         The chart is not found, or not the one expected.
     QualityError
-        The white references cannot be used, or too many cells are unfit.
+        The white references cannot be used, or the verdict on the table is to refuse it; its report is then in
+        `refused_folder(out)`.
     InputError
         `out` is taken.
     StorageError
@@ -241,7 +251,6 @@ def build(
             told(len(frames), len(chosen), decoded.record.file)
         told(len(chosen), len(chosen), "writing the report")
         unfit = work.unfit(limit)
-        _require_fit(unfit, chart.colour_count)
         level = round(limit - float(np.mean([figures.black.mean() for figures in frames])))
         result = BuildResult(
             session=session.folder,
@@ -256,6 +265,7 @@ def build(
             unfit=unfit,
             frames=tuple(frames),
             noise=work.noise(),
+            white_references=len(chart.white_references),
         )
         writer.finish(
             lights,
@@ -273,6 +283,7 @@ def build(
         )
         if report is not None:
             report(result, session, folder)
+        _require_good(result, out, folder)
     return result
 
 
@@ -482,21 +493,19 @@ class _Measurement:
         return tuple(found)
 
 
-def _require_fit(unfit: Sequence[Unfit], colours: int) -> None:
-    if len(unfit) <= MAX_UNFIT * colours:
+def _require_good(result: BuildResult, out: Path, folder: Path) -> None:
+    """Refuse a table that is not good enough; its report is kept beside the place where the table would be."""
+    verdict = result.verdict
+    if not verdict.refused:
         return
-    causes: dict[str, int] = {}
-    for cell in unfit:
-        name = cell.cause.split(":")[0]
-        causes[name] = causes.get(name, 0) + 1
-    worst = max(causes, key=lambda name: causes[name])
-    remedy = {
-        "outside": "bring all of the chart into the picture",
-        "clipped": "expose less",
-        "covered": "uncover the chart",
-        "uneven": "focus on the print and keep the camera still",
-    }[worst]
-    raise QualityError(
-        f"{len(unfit)} of {colours} cells are unfit, at most {MAX_UNFIT:.0%} allowed; {causes[worst]} are {worst}; "
-        f"{remedy}, and take the session anew"
-    )
+    refused = refused_folder(out)
+    kept = [name for name in REPORT_FILES if (folder / name).exists()]
+    for name in kept:
+        write_whole(refused / name, (folder / name).read_bytes())
+    where = f"; see {refused / kept[0]}" if kept else ""
+    raise QualityError(f"{result.session}: no table is made. {refusal(verdict, result)}{where}")
+
+
+def refused_folder(out: Path) -> Path:
+    """Return where the report of a refused table goes: `LUT.refused` beside `LUT`."""
+    return out.with_name(f"{out.name}.refused")

@@ -37,6 +37,8 @@ def _version(asked: bool) -> None:
     "Reads SESSION (chart.json, illuminations.csv, journal.sqlite, frames/) and checks each frame's SHA-256. Finds the "
     "chart once, follows it if it moves, divides the light's unevenness out, and writes LUT: samples.npy, "
     "illuminations.csv with the ground truth, lut.json, report.html. LUT appears whole or not at all.\n\n"
+    "Every figure is held against its limit: accept, accept with remarks, or refuse. A refused table is not written; "
+    "its report is then in LUT.refused/, and the exit code 4.\n\n"
     "With --check, finds the chart in the session's best frame, judges it, and writes nothing.\n\n" + EXIT_CODES,
 )
 def build_lut(
@@ -62,6 +64,11 @@ def build_lut(
         else:
             result = _build(opened, lut)
     _tell(result)
+    if lut is None and (verdict := result.verdict).refused:
+        from calibration.verdict import refusal
+        from drivers.errors import QualityError
+
+        raise QualityError(f"{result.session}: {refusal(verdict, result)}")
 
 
 def _build(opened: Session, lut: Path) -> BuildResult:
@@ -101,6 +108,12 @@ def _tell(result: BuildResult) -> None:
     for name, value, note in summary(result):
         if name in names:
             print(f"{name + ':':17}{value}" + (f"  ({note})" if note else ""))
+    verdict = result.verdict
+    for row in verdict.remarks:
+        print(f"remark: {row.text()}; {row.threshold.remedy}")
+    print(f"{'Verdict:':17}{verdict.outcome}")
+    if verdict.refused:
+        return
     if result.lut is None:
         print(f"{result.session}: the chart is found and is the one expected; a table can be built")
     else:

@@ -1,8 +1,9 @@
-"""The table's report: one page that shows by eye what the figures claim.
+"""The table's report: one page that shows by eye what the figures claim, and the same figures for programs.
 
-`report.html` holds everything: its figures are embedded, so it can be mailed. What it shows: the registered grid over
-the frame, what the tags and cells still ask for, the shape of the light, the lights as planned and as the camera saw
-them (the paper's three figures of chromaticities), the course of the session, and the worst cells as pictures.
+`report.json` holds figures, limits and verdict. `report.html` opens with the verdict and holds everything: its figures
+are embedded, so it can be mailed. What it shows: the registered grid over the frame, what the tags and cells still ask
+for, the shape of the light, the lights as planned and as the camera saw them (the paper's three figures of
+chromaticities), the course of the session, and the worst cells as pictures.
 
 Matplotlib is imported where figures are made, and through its objects only: no window, no state left behind.
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import base64
 import html
+import json
 from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -27,10 +29,12 @@ from calibration.mosaic import half_size
 from calibration.radiometry import MAX_BLACK_DRIFT
 from calibration.registration import Registration
 from calibration.sampling import WINDOW, noise_of
+from calibration.verdict import Judged, Verdict, report_json, shown
 from drivers.rawfile import read_raw
 from drivers.storage import write_whole
 
 NAME = "report.html"
+JSON_NAME = "report.json"
 _WORST = 20
 _DPI = 110
 _INK, _FAINT, _MARK = "#22262b", "#8a929c", "#e8502a"
@@ -41,7 +45,7 @@ _Array = npt.NDArray[np.float64]
 
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
-    """Write `report.html` into a table's folder; costs some seconds.
+    """Write `report.html` and `report.json` into a table's folder; costs some seconds.
 
     Parameters
     ----------
@@ -91,6 +95,7 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
         ),
     ]
     write_whole(folder / NAME, _page(result, figures))
+    write_whole(folder / JSON_NAME, json.dumps(report_json(result), indent=2) + "\n")
 
 
 def _page(result: BuildResult, figures: Sequence[tuple[str, str, bytes]]) -> str:
@@ -120,11 +125,48 @@ h1 {{ font-size: 1.6rem; margin-bottom: .2rem }} h2 {{ font-size: 1.15rem; margi
 table {{ border-collapse: collapse; font-size: .95rem }} th {{ text-align: left; font-weight: 600 }}
 td, th {{ padding: .25rem 1.2rem .25rem 0; border-bottom: 1px solid #e3e6ea; vertical-align: top }}
 td {{ font-variant-numeric: tabular-nums }} .note, figcaption {{ color: #5b636d; font-size: .9rem }}
-figure {{ margin: 0 }} img {{ max-width: 100%; height: auto }}
+.verdict {{ font-size: 1.15rem; font-weight: 600; padding: .5rem .8rem; margin: 1rem 0; border-left: 6px solid }}
+.accept {{ border-color: #2f8f46 }} .remark {{ border-color: #d9a400 }} .refuse {{ border-color: #c8382e }}
+td.accept, td.remark, td.refuse {{ border-left: 4px solid; padding-left: .6rem; white-space: nowrap }}
+td.accept {{ border-left-color: #2f8f46 }} td.remark {{ border-left-color: #d9a400 }}
+td.refuse {{ border-left-color: #c8382e; font-weight: 600 }}
+td.number {{ white-space: nowrap }} figure {{ margin: 0 }} img {{ max-width: 100%; height: auto }}
 </style></head><body>
 <h1>{html.escape(title)}</h1><p class="note">Session {html.escape(result.session.name)}</p>
-<table>{rows}</table>{pictures}{cells}</body></html>
+{_verdict(result.verdict)}<h2>Figures</h2><table>{rows}</table>{pictures}{cells}</body></html>
 """
+
+
+_CLASSES = {"accept": "accept", "accept with remarks": "remark", "refuse": "refuse"}
+
+
+def _verdict(verdict: Verdict) -> str:
+    """Return the verdict and its table, the worst rows first."""
+    order = ("refuse", "accept with remarks", "accept")
+    rows = "".join(_judged(row) for row in sorted(verdict.rows, key=lambda row: order.index(row.outcome)))
+    said = {
+        "accept": "Accepted: every figure is within its limit.",
+        "accept with remarks": f"Accepted with remarks: {len(verdict.remarks)} of {len(verdict.rows)} figures.",
+        "refuse": f"Refused: {len(verdict.refused)} of {len(verdict.rows)} figures are beyond what can be used.",
+    }[verdict.outcome]
+    return (
+        f"<p class='verdict {_CLASSES[verdict.outcome]}'>{said}</p><table><tr><th></th><th>figure</th><th>measured</th>"
+        f"<th>limits</th><th>why</th></tr>{rows}</table>"
+    )
+
+
+def _judged(row: Judged) -> str:
+    limit, name = row.threshold, _CLASSES[row.outcome]
+    limits = f"{limit.sense} {shown(limit.accept, limit.unit)}"
+    if limit.refuse is not None:
+        limits += f"; refused beyond {shown(limit.refuse, limit.unit)}"
+    remedy = f". <b>{html.escape(limit.remedy)}</b>" if row.outcome != "accept" and limit.remedy else ""
+    return (
+        f"<tr><td class='{name}'>{name}</td><th>{html.escape(limit.title)}</th>"
+        f"<td class='number'>{html.escape(shown(row.value, limit.unit))}</td>"
+        f"<td class='note'>{html.escape(limits)}</td>"
+        f"<td class='note' title='{html.escape(limit.source, quote=True)}'>{html.escape(limit.why)}{remedy}</td></tr>"
+    )
 
 
 def summary(result: BuildResult) -> list[tuple[str, str, str]]:

@@ -1,0 +1,201 @@
+"""Accept, accept with remarks, or refuse: a table's figures held against `calibration.thresholds`.
+
+Laws that hold inside:
+
+- Judging is a pure function of figures: the same figures give the same verdict, whoever measured them.
+- A figure that could not be measured is not judged; one that is not a number is refused.
+- The verdict is its worst row.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration.thresholds import THRESHOLDS, Threshold
+
+if TYPE_CHECKING:
+    from calibration.build import BuildResult
+
+FORMAT = "crop.report"
+VERSION = 1
+
+Outcome = Literal["accept", "accept with remarks", "refuse"]
+_OUTCOMES: tuple[Outcome, Outcome, Outcome] = ("accept", "accept with remarks", "refuse")
+_REMEDIES = {
+    "outside": "bring all of the chart into the picture",
+    "clipped": "expose less",
+    "covered": "uncover the chart",
+    "uneven": "focus on the print and keep the camera still",
+}
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One figure, its limit, and what follows."""
+
+    threshold: Threshold
+    value: float
+    outcome: Outcome
+
+    def text(self) -> str:
+        """Return the figure with its limits, for a line of text."""
+        limit, unit = self.threshold, self.threshold.unit
+        refused = "" if limit.refuse is None else f", refused beyond {shown(limit.refuse, unit)}"
+        return (
+            f"{limit.title}: {shown(self.value, unit)}, {limit.sense} {shown(limit.accept, unit)} expected{refused}; "
+            f"{limit.why}"
+        )
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is thought of a table, figure by figure."""
+
+    rows: tuple[Judged, ...]
+
+    @property
+    def outcome(self) -> Outcome:
+        """The worst of the rows."""
+        return _OUTCOMES[max((_OUTCOMES.index(row.outcome) for row in self.rows), default=0)]
+
+    @property
+    def refused(self) -> tuple[Judged, ...]:
+        """The rows for which no table is made."""
+        return tuple(row for row in self.rows if row.outcome == "refuse")
+
+    @property
+    def remarks(self) -> tuple[Judged, ...]:
+        """The rows to know of."""
+        return tuple(row for row in self.rows if row.outcome == "accept with remarks")
+
+
+def shown(value: float, unit: str) -> str:
+    """Return a figure for people: shares as per cent, three significant digits."""
+    if unit == "share":
+        return f"{100 * value:.3g} %"
+    return f"{value:.3g} {unit}".strip() if abs(value) < 1000 else f"{value:.0f} {unit}".strip()
+
+
+def judge(figures: Mapping[str, float], thresholds: Sequence[Threshold] = THRESHOLDS) -> Verdict:
+    """Return the verdict on figures by name; a limit whose figure is missing is passed over."""
+    return Verdict(
+        tuple(
+            Judged(limit, figures[limit.name], _outcome(figures[limit.name], limit))
+            for limit in thresholds
+            if limit.name in figures
+        )
+    )
+
+
+def _outcome(value: float, limit: Threshold) -> Outcome:
+    if math.isnan(value):
+        return "refuse" if limit.refuse is not None else "accept with remarks"
+    sign = 1 if limit.sense == "at most" else -1
+    if limit.refuse is not None and sign * value > sign * limit.refuse:
+        return "refuse"
+    return "accept with remarks" if sign * value > sign * limit.accept else "accept"
+
+
+def figures_of(result: BuildResult) -> dict[str, float]:
+    """Return the figures of a build or a check that are judged, by name."""
+    registration = result.registration
+    tags = len(registration.framing.tags)
+    white = np.array([frame.paper.white for frame in result.frames if frame.record.kind == "white"]).reshape(-1, 3)
+    spread = [
+        float(frame.paper.spread[int(np.argmax(frame.paper.white))])
+        for frame in result.frames
+        if frame.record.kind == "white"
+    ]
+    errors = truth_errors_deg(result.white, result.white_error)
+    paper = result.white.max(axis=1)
+    used = min((frame.paper.references for frame in result.frames), default=0)
+    figures = {
+        "tags_found": tags / max(tags + len(registration.framing.missing), 1),
+        "cell_px": registration.cell_px,
+        "bleed": bleed(registration.cell_px, registration.blur_px),
+        "tag_residual_px": registration.lens_residual_px,
+        "tag_final_px": registration.tag_rms_px,
+        "block_residual_px": registration.block_rms_px,
+        "blocks_good": float(registration.blocks.good.mean()),
+        "agreement": registration.agreement,
+        "unfit_share": len(result.unfit) / max(len(registration.strangers), 1),
+        "moved_anew": float(sum(frame.registered for frame in result.frames)),
+        "black_drift_counts": result.black_drift,
+        "references_used": used / max(result.white_references, 1),
+        "truth_median_deg": float(np.median(errors)),
+        "truth_worst_deg": float(errors.max()),
+        "brightest_share": float(paper.max()) / result.white_level,
+        "darkest_counts": float(paper.min()),
+    }
+    if len(white) > 1:
+        figures["white_drift"] = result.white_drift
+        figures["white_drift_deg"] = float(_angles_deg(white, np.broadcast_to(white[0], white.shape)).max())
+    if spread:
+        figures["reference_spread"] = max(spread)
+    return figures
+
+
+def bleed(cell_px: float, blur_px: float) -> float:
+    """Return the share of the worst sample's light that comes from beyond its cell.
+
+    A Gaussian of σ `blur_px`, integrated beyond the nearest edge, for the outermost of 5 pixels (2 px from the
+    middle one) with 0.5 px of rounding and 0.25 px of registration against it.
+    """
+    from scipy.special import ndtr
+
+    return float(ndtr(-(cell_px / 2 - 2.75) / max(blur_px, 1e-3)))
+
+
+def truth_errors_deg(white: _Array, error: _Array) -> _Array:
+    """Return the standard error (L,) of the direction of ground truths (L, 3) with standard errors (L, 3), degrees.
+
+    The mean square angle of a vector with small independent errors: each error's part across the vector.
+    """
+    length = np.linalg.norm(white, axis=1, keepdims=True)
+    along = white / np.maximum(length, 1e-9)
+    across = np.sqrt((error**2 * (1 - along**2)).sum(axis=1))
+    return np.degrees(across / np.maximum(length[:, 0], 1e-9))
+
+
+def _angles_deg(one: _Array, other: _Array) -> _Array:
+    crossed = np.linalg.norm(np.cross(one, other), axis=1)
+    return np.degrees(np.arctan2(crossed, (one * other).sum(axis=1)))
+
+
+def refusal(verdict: Verdict, result: BuildResult) -> str:
+    """Return why there is no table and what helps, in a line."""
+    worst = verdict.refused[0]
+    remedy = worst.threshold.remedy
+    more = f" (and {len(verdict.refused) - 1} more)" if len(verdict.refused) > 1 else ""
+    detail = ""
+    if worst.threshold.name == "unfit_share":
+        causes: dict[str, int] = {}
+        for cell in result.unfit:
+            name = cell.cause.split(":")[0]
+            causes[name] = causes.get(name, 0) + 1
+        cause = max(causes, key=lambda name: causes[name])
+        detail, remedy = f", {causes[cause]} of them {cause}", _REMEDIES.get(cause, "look at the report")
+    return f"{worst.text()}{detail}{more}; {remedy}, and take the session anew"
+
+
+def report_json(result: BuildResult) -> dict[str, Any]:
+    """Return the content of `report.json`: verdict, figures, and every limit with its reason."""
+    figures = figures_of(result)
+    verdict = judge(figures)
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "verdict": verdict.outcome,
+        "session": result.session.name,
+        "camera": result.camera,
+        "lights": result.lights,
+        "figures": {name: float(f"{value:.6g}") for name, value in figures.items()},
+        "limits": [asdict(row.threshold) | {"outcome": row.outcome} for row in verdict.rows],
+    }
