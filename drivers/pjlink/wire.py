@@ -5,10 +5,11 @@ Rules that hold inside:
 - A line is at most 136 bytes with its CR: ``%``, class digit, four letters, a space or ``=``, up to 128 bytes of
   parameter. Whoever sends more gets `ProtocolError`, never memory.
 - What we send follows the standard to the letter; what we accept is wider: any case, LF after or instead of CR, empty
-  lines.
+  lines, NUL between lines (some projectors fill their packets up with it).
 - Bytes that do not fit raise `ProtocolError`, which quotes them.
+- What class 2 says over UDP is in `drivers.pjlink.notices`.
 
-Source: JBMIA, PJLink Specifications 1.04 (class 1), 2.00 (class 2: same lines, digit 2).
+Source: JBMIA, PJLink Specifications 1.04 (class 1), 2.00 (class 2: same lines, digit 2), 2.10 (SHA-256).
 """
 
 from __future__ import annotations
@@ -25,13 +26,17 @@ from drivers.projector import Fault, Lamp, Power, Severity
 PORT = 4352
 MAX_LINE = 136
 """Bytes of a command or reply, its CR included."""
-DIGEST_LENGTH = 32
+MAX_DIGEST = 96
+"""Characters before the first command: 32 with MD5, 32 of random number and 64 of digest with SHA-256."""
 MAX_PASSWORD = 32
 IDLE_LIMIT_S = 30.0
 """Projectors hang up after about this long without a command."""
 
 QUERY = "?"
 OK = "OK"
+RAISE = "1"
+LOWER = "0"
+"""SVOL and MVOL move by one step; there is no way to ask where they stand."""
 MUTE_ON = "31"
 MUTE_OFF = "30"
 
@@ -100,7 +105,7 @@ class LineCutter:
         ProtocolError
             A line, complete or not, is longer than the limit; the rest of the stream cannot be trusted.
         """
-        self._rest += data
+        self._rest += data.replace(b"\0", b"")
         *lines, rest = re.split(rb"[\r\n]", bytes(self._rest))
         self._rest = bytearray(rest)
         for line in (*lines, rest):
@@ -115,6 +120,46 @@ class LineCutter:
 def authentication_digest(seed: str, password: str) -> str:
     """Return what proves the password: MD5 of seed and password, 32 lowercase hex digits (1.04, 5.1)."""
     return hashlib.md5((seed + password).encode(), usedforsecurity=False).hexdigest()
+
+
+def encode_security_question() -> bytes:
+    """Return the line by which a controller asks for SHA-256 instead of MD5 (2.10, 5.1)."""
+    return b"PJLINK 2\r"
+
+
+def is_security_question(line: bytes) -> bool:
+    """Return whether a line, without its end, asks for SHA-256."""
+    return line.strip().upper() == b"PJLINK 2"
+
+
+def encode_challenge(challenge: bytes) -> bytes:
+    """Return the line by which a projector agrees to SHA-256; `challenge` is its 16 random bytes."""
+    return f"PJLINK 2 {challenge.hex()}\r".encode("ascii")
+
+
+def parse_challenge(line: bytes) -> bytes | None:
+    """Return the projector's 16 random bytes, or None where the line says anything else: it knows no SHA-256."""
+    found = re.fullmatch(rb"PJLINK 2 ([0-9A-F]{32})", line.strip().upper())
+    return bytes.fromhex(found[1].decode("ascii")) if found else None
+
+
+def sha256_digest(challenge: bytes, nonce: bytes, password: str) -> str:
+    """Return what proves the password to a projector that knows SHA-256 (2.10, 5.1).
+
+    Parameters
+    ----------
+    challenge
+        The projector's 16 random bytes.
+    nonce
+        The controller's own 16 random bytes.
+
+    Returns
+    -------
+    str
+        96 lowercase hex digits: `nonce`, then SHA-256 of the hex digits of `challenge` xor `nonce` and the password.
+    """
+    mixed = bytes(ours ^ theirs for ours, theirs in zip(nonce, challenge, strict=True))
+    return nonce.hex() + hashlib.sha256((mixed.hex() + password).encode()).hexdigest()
 
 
 def encode_greeting(greeting: Greeting) -> bytes:
@@ -158,7 +203,7 @@ def encode_request(request: Request) -> bytes:
 
 def parse_request(line: bytes) -> Request:
     """Return the command in a line, without its end."""
-    found = re.fullmatch(rb"([0-9A-Fa-f]{32})?%([0-9])([0-9A-Za-z]{4}) (.{1,128})", line, re.DOTALL)
+    found = re.fullmatch(rb"([0-9A-Fa-f]{96}|[0-9A-Fa-f]{32})?%([0-9])([0-9A-Za-z]{4}) (.{1,128})", line, re.DOTALL)
     if found is None:
         raise ProtocolError(
             f"{_quoted(line)} is no PJLink command; expected %1 or %2, four letters, a space, a parameter"
@@ -247,6 +292,117 @@ def parse_lamps(value: str) -> tuple[Lamp, ...]:
         raise _unexpected("LAMP", value, "pairs of hours and 0 or 1")
     words = value.split()
     return tuple(Lamp(int(hours), lit == "1") for hours, lit in zip(words[::2], words[1::2], strict=True))
+
+
+class InputKind(Enum):
+    """What kind of terminal an input is: the first character of its code (INPT)."""
+
+    RGB = "1"
+    VIDEO = "2"
+    DIGITAL = "3"
+    STORAGE = "4"
+    NETWORK = "5"
+    INTERNAL = "6"
+    """Class 2 only, as are the numbers A … Z."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """One input: its code of two characters, kind and number, and its name, empty where the projector has none."""
+
+    code: str
+    name: str = ""
+
+    @property
+    def kind(self) -> InputKind:
+        """What kind of terminal it is."""
+        return InputKind(self.code[0])
+
+
+def is_class_1_input(code: str) -> bool:
+    """Return whether a code may be used in class 1."""
+    return re.fullmatch("[1-5][1-9]", code) is not None
+
+
+def parse_input(value: str, command: str = "INPT") -> str:
+    """Return an input's code, its letter a capital."""
+    if not re.fullmatch("[1-6][1-9A-Z]", value.upper()):
+        raise _unexpected(command, value, "a digit 1 to 6 and one of 1 to 9 or A to Z")
+    return value.upper()
+
+
+def parse_inputs(value: str) -> tuple[str, ...]:
+    """Return the codes that INST lists; none for an empty list."""
+    return tuple(parse_input(code, "INST") for code in value.split())
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """A picture's width and height in pixels."""
+
+    width: int
+    height: int
+
+
+class NoResolution(Enum):
+    """Why an input has no resolution to tell (IRES)."""
+
+    NO_SIGNAL = "-"
+    UNKNOWN_SIGNAL = "*"
+
+
+def format_resolution(resolution: Resolution | NoResolution) -> str:
+    """Return the value of IRES or RRES."""
+    if isinstance(resolution, NoResolution):
+        return resolution.value
+    return f"{resolution.width}x{resolution.height}"
+
+
+def parse_resolution(value: str, command: str = "RRES") -> Resolution:
+    """Return the resolution in a value ``1920x1080``."""
+    found = re.fullmatch(r"([0-9]{1,5})[xX]([0-9]{1,5})", value, re.ASCII)
+    if found is None:
+        raise _unexpected(command, value, "width, x and height in pixels")
+    return Resolution(int(found[1]), int(found[2]))
+
+
+def parse_input_resolution(value: str) -> Resolution | NoResolution:
+    """Return the resolution that IRES answers, or why there is none."""
+    try:
+        return NoResolution(value)
+    except ValueError:
+        return parse_resolution(value, "IRES")
+
+
+def parse_hours(value: str) -> int:
+    """Return the filter's hours that FILT answers; 0 as well where the projector does not count them."""
+    if not re.fullmatch(r"[0-9]{1,10}", value, re.ASCII):
+        raise _unexpected("FILT", value, "hours")
+    return int(value)
+
+
+def format_freeze(frozen: bool) -> str:
+    """Return FREZ's digit for a picture frozen or moving."""
+    return "1" if frozen else "0"
+
+
+def parse_freeze(value: str) -> bool:
+    """Return whether FREZ says that the picture is frozen."""
+    if value not in ("0", "1"):
+        raise _unexpected("FREZ", value, "0 moving or 1 frozen")
+    return value == "1"
+
+
+def parse_class(value: str) -> int:
+    """Return the class that CLSS answers."""
+    if not re.fullmatch("[1-9]", value, re.ASCII):
+        raise _unexpected("CLSS", value, "1 or 2")
+    return int(value)
+
+
+def parse_models(value: str) -> tuple[str, ...]:
+    """Return the part numbers that RLMP and RFIL list, divided by spaces."""
+    return tuple(value.split())
 
 
 def _unexpected(command: str, value: str, expected: str) -> ProtocolError:

@@ -1,0 +1,164 @@
+"""Finds PJLink projectors on the network, and hears what they tell unasked (class 2 only).
+
+Rules that hold inside:
+
+- A search opens no control connection: many projectors serve one controller only, who would be disturbed.
+- Answers and notices come to one's own port 4352; only one program of a computer can hear them at a time.
+- Who answers proves nothing: a search is a convenience, the address in the lab's settings is what counts.
+
+Source: JBMIA, PJLink Specifications 2.00 and 2.10, 3.2 (search) and 3.3 (status notification).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Protocol
+
+from drivers.clock import Clock, SystemClock
+from drivers.errors import LinkTimeout
+from drivers.links.udp import ANY_HOST, BROADCAST, Address, UdpSocket
+from drivers.pjlink import notices, wire
+from drivers.pjlink.notices import COLLECT_S, Found, Notice
+
+ASKED = 3
+"""A datagram may be lost, so the search is sent so often, a second apart; a projector may answer each."""
+ASK_EVERY_S = 1.0
+
+_SYSTEM_CLOCK = SystemClock()
+
+
+class Datagrams(Protocol):
+    """What is asked of `drivers.links.udp.UdpSocket`."""
+
+    def send(self, data: bytes, address: Address) -> None:
+        """Send one datagram to host and port."""
+        ...
+
+    def receive(self, timeout: float) -> tuple[bytes, Address]:
+        """Return the next datagram and who sent it; `LinkTimeout` when none comes in time."""
+        ...
+
+    def close(self) -> None:
+        """Stop listening."""
+        ...
+
+
+@dataclass(frozen=True)
+class FoundProjector:
+    """A projector that answered: where its control port is reached, and its MAC address."""
+
+    host: str
+    mac: str
+
+
+def search(
+    seconds: float = COLLECT_S,
+    enough: int | None = None,
+    address: str = BROADCAST,
+    port: int = wire.PORT,
+    listen_port: int = wire.PORT,
+    open_socket: Callable[[int], Datagrams] = UdpSocket,
+    clock: Clock = _SYSTEM_CLOCK,
+) -> tuple[FoundProjector, ...]:
+    """Ask all projectors of the network to answer, and return those that do, in the order of their answers.
+
+    Parameters
+    ----------
+    seconds
+        How long answers are collected. A projector may take 10 s by the standard, which collects for 30 s.
+    enough
+        Return as soon as so many have answered; None waits the whole time.
+    address
+        Whom to ask. With several networks, give the broadcast address of the projector's own (192.168.10.255).
+    port
+        The projectors' port.
+    listen_port
+        Our own port, to which they answer; the standard allows 4352 only.
+    open_socket
+        Opens that port.
+    clock
+        Measures `seconds`.
+
+    Raises
+    ------
+    LinkClosed
+        Another program holds the port, or there is no network to ask.
+    """
+    found: dict[FoundProjector, None] = {}
+    datagrams = open_socket(listen_port)
+    try:
+        start = clock.monotonic()
+        asked = 0
+        while enough is None or len(found) < enough:
+            passed = clock.monotonic() - start
+            if passed >= seconds:
+                break
+            if asked < ASKED and passed >= asked * ASK_EVERY_S:
+                datagrams.send(notices.SEARCH, (address, port))
+                asked += 1
+            ends = min(seconds, asked * ASK_EVERY_S) if asked < ASKED else seconds
+            try:
+                datagram, (host, _) = datagrams.receive(max(ends - passed, 0.0))
+            except LinkTimeout:
+                continue
+            for message in notices.decode(datagram):
+                if isinstance(message, Found):
+                    found[FoundProjector(host, message.mac)] = None
+    finally:
+        datagrams.close()
+    return tuple(found)
+
+
+class NoticePort:
+    """Hears the notices of all projectors in whose menus this computer's address was entered; close it.
+
+    Parameters
+    ----------
+    port
+        Where projectors send them; the standard allows 4352 only. 0 lets the system pick one, `address` tells which.
+    host
+        The own address to listen at; all of them unless given.
+
+    Raises
+    ------
+    LinkClosed
+        Another program holds the port.
+    """
+
+    def __init__(self, port: int = wire.PORT, host: str = ANY_HOST, clock: Clock = _SYSTEM_CLOCK) -> None:
+        self._socket = UdpSocket(port, host)
+        self._clock = clock
+        self._waiting: list[tuple[str, Notice]] = []
+        self.address = self._socket.address
+        """Host and port at which it listens."""
+
+    def __enter__(self) -> NoticePort:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def receive(self, timeout: float) -> tuple[str, Notice]:
+        """Return the next notice and the address of the projector that sent it.
+
+        Raises
+        ------
+        LinkTimeout
+            None came within `timeout` seconds.
+        """
+        deadline = self._clock.monotonic() + timeout
+        while not self._waiting:
+            remaining = deadline - self._clock.monotonic()
+            if remaining < 0:
+                raise LinkTimeout(f"among the datagrams that came within {timeout:g} s was no notice of a projector")
+            datagram, (host, _) = self._socket.receive(remaining)
+            self._waiting = [(host, message) for message in notices.decode(datagram) if not isinstance(message, Found)]
+        return self._waiting.pop(0)
+
+    def close(self) -> None:
+        """Stop listening; a second call does nothing."""
+        self._socket.close()
