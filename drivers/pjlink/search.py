@@ -152,11 +152,10 @@ class NoticePort:
         """
         deadline = self._clock.monotonic() + timeout
         while not self._waiting:
-            remaining = deadline - self._clock.monotonic()
-            if remaining < 0:
-                raise LinkTimeout(f"among the datagrams that came within {timeout:g} s was no notice of a projector")
-            datagram, (host, _) = self._socket.receive(remaining)
+            datagram, (host, _) = self._socket.receive(max(deadline - self._clock.monotonic(), 0.0))
             self._waiting = [(host, message) for message in notices.decode(datagram) if not isinstance(message, Found)]
+            if not self._waiting and self._clock.monotonic() >= deadline:
+                raise LinkTimeout(f"among the datagrams that came within {timeout:g} s was no notice of a projector")
         return self._waiting.pop(0)
 
     def close(self) -> None:

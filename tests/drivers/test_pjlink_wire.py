@@ -8,7 +8,18 @@ from hypothesis import strategies as st
 
 from drivers.errors import ProtocolError
 from drivers.pjlink import wire
-from drivers.pjlink.wire import ErrorCode, Greeting, LineCutter, Refused, Reply, Request
+from drivers.pjlink.wire import (
+    ErrorCode,
+    Greeting,
+    Input,
+    InputKind,
+    LineCutter,
+    NoResolution,
+    Refused,
+    Reply,
+    Request,
+    Resolution,
+)
 from drivers.projector import Fault, Lamp, Power, Severity
 
 PRINTABLE = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_size=100)
@@ -17,6 +28,27 @@ PRINTABLE = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_s
 def test_digest_is_the_standards_example() -> None:
     # PJLink 1.04, 5.1: seed 498e4a67, password JBMIAProjectorLink.
     assert wire.authentication_digest("498e4a67", "JBMIAProjectorLink") == "5d8409bc1c3fa39749434aa3a5c38682"
+
+
+CHALLENGE = bytes.fromhex("3db25e10f69c47a85adb24cf361897e0")
+NONCE = bytes.fromhex("c14b279e603d8a5f17e849ba360f2dc5")
+
+
+def test_sha256_digest_is_the_standards_example() -> None:
+    # PJLink 2.10, 5.1, as an independent client quotes it.
+    assert wire.sha256_digest(CHALLENGE, NONCE, "JBMIAProjectorLink") == (
+        "c14b279e603d8a5f17e849ba360f2dc570ab129eac6924d4c129c9c4fcf45be42e1e776325a66db67e5b6eee50f2a692"
+    )
+
+
+def test_the_offer_of_sha256_is_the_standards_bytes() -> None:
+    assert wire.encode_security_question() == b"PJLINK 2\r"
+    assert wire.is_security_question(b"pjlink 2")
+    assert not wire.is_security_question(b"PJLINK 1")
+    assert wire.encode_challenge(CHALLENGE) == b"PJLINK 2 3db25e10f69c47a85adb24cf361897e0\r"
+    assert wire.parse_challenge(b"pjlink 2 3DB25E10F69C47A85ADB24CF361897E0") == CHALLENGE
+    for other in (b"PJLINK ERRA", b"PJLINK 2", b"PJLINK 2 3db2", b"%1POWR=ERR1", b"\xff"):
+        assert wire.parse_challenge(other) is None
 
 
 @pytest.mark.parametrize(
@@ -70,6 +102,9 @@ def test_our_own_mistakes_never_reach_the_cable(request_: Request) -> None:
         (b"%1NAME=", Reply("NAME", "")),
         ("%1NAME=Höllenmaschine".encode(), Reply("NAME", "Höllenmaschine")),
         (b"%2SNUM=42", Reply("SNUM", "42", level=2)),
+        (b"%2INNM=HDMI 1", Reply("INNM", "HDMI 1", level=2)),
+        (b"%2IRES=-", Reply("IRES", "-", level=2)),
+        (b"%2IRES=*", Reply("IRES", "*", level=2)),
         (b"PJLINK ERRA", Refused.WRONG_PASSWORD),
         (b"pjlink erra", Refused.WRONG_PASSWORD),
     ],
@@ -107,9 +142,42 @@ def test_values_of_the_standard() -> None:
     assert wire.parse_lamps("120 1 3000 0") == (Lamp(120, True), Lamp(3000, False))
 
 
+def test_values_of_class_2() -> None:
+    # PJLink 2.00, 4.4, 4.9, 4.14 and 4.18 to 4.26.
+    assert [wire.parse_input(code) for code in ("11", "59", "3A", "6z")] == ["11", "59", "3A", "6Z"]
+    assert Input("3A").kind is InputKind.DIGITAL
+    assert Input("61").kind is InputKind.INTERNAL
+    assert wire.parse_inputs("11 31 3A 6Z") == ("11", "31", "3A", "6Z")
+    assert wire.parse_inputs("") == ()
+    assert [wire.is_class_1_input(code) for code in ("11", "59", "3A", "61", "10")] == [True, True, False, False, False]
+    assert wire.parse_input_resolution("1920x1080") == Resolution(1920, 1080)
+    assert wire.parse_input_resolution("1024X768") == Resolution(1024, 768)
+    assert wire.parse_input_resolution("-") is NoResolution.NO_SIGNAL
+    assert wire.parse_input_resolution("*") is NoResolution.UNKNOWN_SIGNAL
+    assert wire.parse_resolution("4096x2160") == Resolution(4096, 2160)
+    assert wire.parse_hours("99999") == 99999
+    assert [wire.parse_freeze(digit) for digit in "01"] == [False, True]
+    assert [wire.parse_class(digit) for digit in "12"] == [1, 2]
+    assert wire.parse_models("ELPLP96 ELPLP97") == ("ELPLP96", "ELPLP97")
+
+
 @pytest.mark.parametrize(
     ("parse", "value"),
     [
+        (wire.parse_input, "71"),
+        (wire.parse_input, "30"),
+        (wire.parse_input, "3"),
+        (wire.parse_inputs, "11 3"),
+        (wire.parse_input_resolution, "1920"),
+        (wire.parse_input_resolution, ""),
+        (wire.parse_resolution, "-"),
+        (wire.parse_resolution, "1920x1080p"),
+        (wire.parse_resolution, "٣x٣"),
+        (wire.parse_hours, "-1"),
+        (wire.parse_hours, ""),
+        (wire.parse_freeze, "2"),
+        (wire.parse_class, "0"),
+        (wire.parse_class, "²"),
         (wire.parse_power, "4"),
         (wire.parse_power, ""),
         (wire.parse_mute, "12"),
@@ -143,6 +211,24 @@ def test_lamps_come_back(lamps: list[Lamp]) -> None:
     assert wire.parse_lamps(wire.format_lamps(lamps)) == tuple(lamps)
 
 
+@given(st.one_of(st.sampled_from(NoResolution), st.builds(Resolution, st.integers(0, 99999), st.integers(0, 99999))))
+def test_resolutions_come_back(resolution: Resolution | NoResolution) -> None:
+    assert wire.parse_input_resolution(wire.format_resolution(resolution)) == resolution
+
+
+@given(st.from_regex("[1-6][1-9A-Za-z]", fullmatch=True))
+def test_inputs_come_back_as_capitals(code: str) -> None:
+    assert wire.parse_input(code) == code.upper()
+
+
+@given(st.binary(min_size=16, max_size=16), st.binary(min_size=16, max_size=16), PRINTABLE)
+def test_a_sha256_digest_before_a_command_comes_back(challenge: bytes, nonce: bytes, password: str) -> None:
+    digest = wire.sha256_digest(challenge, nonce, password)
+    assert len(digest) == wire.MAX_DIGEST
+    request = Request("POWR", digest=digest)
+    assert wire.parse_request(wire.encode_request(request)[:-1]) == request
+
+
 @given(
     st.builds(
         Request,
@@ -167,8 +253,14 @@ def test_any_bytes_are_a_value_or_a_protocol_error(line: bytes) -> None:
 
 @given(st.data())
 def test_any_split_gives_the_same_lines(data: st.DataObject) -> None:
-    end = st.sampled_from((b"\r", b"\r\n", b"\n", b"\r\r\n"))
-    lines = data.draw(st.lists(PRINTABLE.map(str.encode).filter(bool), max_size=6))
+    end = st.sampled_from((b"\r", b"\r\n", b"\n", b"\r\r\n", b"\r\0\0\0"))
+    value = st.one_of(
+        PRINTABLE,
+        st.sampled_from(("HDMI 1", "1920x1080", "-", "*", "3A", "11 31 3A 61", "45", "ERR3", "Höllenmaschine")),
+    )
+    command = st.sampled_from(("INNM", "IRES", "RRES", "SNUM", "SVER", "FILT", "RLMP", "RFIL", "FREZ", "INPT", "INST"))
+    reply = st.tuples(command, value).map(lambda both: f"%2{both[0]}={both[1]}")
+    lines = [line.encode() for line in data.draw(st.lists(st.one_of(PRINTABLE.filter(bool), reply), max_size=6))]
     stream = b"".join(line + data.draw(end) for line in lines)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
     cutter = LineCutter()

@@ -1,0 +1,213 @@
+"""PJLink's datagrams against the standard's own examples, and the search with a network of paper.
+
+Source: JBMIA, PJLink Specifications 2.00, 3.2 and 3.3.
+"""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import LinkClosed, LinkTimeout
+from drivers.links.udp import Address, UdpSocket
+from drivers.pjlink import notices
+from drivers.pjlink.notices import FaultsChanged, Found, InputChanged, LinkUp, Notice, PowerChanged
+from drivers.pjlink.search import FoundProjector, NoticePort, search
+from drivers.projector import Fault, Power, Severity
+from sim.clock import SimulatedClock
+
+MAC = "00:11:22:aa:bb:cc"
+
+
+@pytest.mark.parametrize(
+    ("datagram", "message"),
+    [
+        (b"%2ACKN=00:11:22:aa:bb:cc\r", Found(MAC)),
+        (b"%2LKUP=00:11:22:aa:bb:cc\r", LinkUp(MAC)),
+        (b"%2ERST=000000\r", FaultsChanged(())),
+        (
+            b"%2ERST=010020\r",
+            FaultsChanged((Fault("lamp", Severity.WARNING), Fault("filter", Severity.ERROR))),
+        ),
+        (b"%2POWR=0\r", PowerChanged(Power.STANDBY)),
+        (b"%2POWR=1\r", PowerChanged(Power.ON)),
+        (b"%2INPT=3A\r", InputChanged("3A")),
+    ],
+)
+def test_the_standards_datagrams(datagram: bytes, message: Found | Notice) -> None:
+    assert notices.decode(datagram) == (message,)
+    assert notices.encode(message) == datagram
+
+
+@pytest.mark.parametrize(
+    "datagram",
+    [b"%2ackn=00:11:22:AA:BB:CC\r\n", b"%2ACKN=00:11:22:aa:bb:cc", b"\r%2ACKN=00:11:22:aa:bb:cc \r\0\0\0\0"],
+)
+def test_tolerates_case_line_ends_and_filling(datagram: bytes) -> None:
+    assert notices.decode(datagram) == (Found(MAC),)
+
+
+@pytest.mark.parametrize(
+    "datagram",
+    [
+        b"",
+        b"%2SRCH\r",
+        b"%1POWR=1\r",
+        b"%2POWR=7\r",
+        b"%2POWR=ERR3\r",
+        b"%2ERST=0000\r",
+        b"%2INPT=00\r",
+        b"%2ACKN=001122aabbcc\r",
+        b"%2ACKN=00:11:22:aa:bb\r",
+        b"%2ACKN=0g:11:22:aa:bb:cc\r",
+        b"%2NAME=x\r",
+        b"PJLINK ERRA\r",
+        b"\xff\xfe\x00",
+        b"M-SEARCH * HTTP/1.1\r\n\r\n",
+        b"x" * 2000,
+    ],
+)
+def test_what_is_none_of_ours_is_passed_over(datagram: bytes) -> None:
+    assert notices.decode(datagram) == ()
+
+
+def test_several_in_one_datagram_keep_their_order() -> None:
+    assert notices.decode(b"%2POWR=3\r%2what\r%2INPT=31\r") == (PowerChanged(Power.WARMING), InputChanged("31"))
+
+
+def test_the_search_is_the_standards_bytes() -> None:
+    assert notices.SEARCH == b"%2SRCH\r"
+    assert all(notices.is_search(datagram) for datagram in (b"%2SRCH\r", b"%2srch\r\n", b"%2SRCH"))
+    assert not any(notices.is_search(datagram) for datagram in (b"", b"%1SRCH\r", b"%2ACKN=00:11:22:aa:bb:cc\r"))
+
+
+@given(st.binary(max_size=300))
+def test_any_datagram_is_decoded_without_complaint(datagram: bytes) -> None:
+    assert len(notices.decode(datagram)) <= len(datagram)
+
+
+@given(st.lists(st.sampled_from((Found(MAC), LinkUp(MAC), PowerChanged(Power.ON), InputChanged("6Z"))), max_size=6))
+def test_messages_come_back(messages: list[Found | Notice]) -> None:
+    assert notices.decode(b"".join(map(notices.encode, messages))) == tuple(messages)
+
+
+class PaperNetwork:
+    """Datagrams that arrive at given times, whoever asks; keeps what was sent and when."""
+
+    def __init__(self, clock: SimulatedClock, *arrivals: tuple[float, bytes, str]) -> None:
+        self._clock = clock
+        self._arrivals = list(arrivals)
+        self.sent: list[tuple[float, bytes, Address]] = []
+        self.closed = False
+
+    def send(self, data: bytes, address: Address) -> None:
+        self.sent.append((self._clock.monotonic(), data, address))
+
+    def receive(self, timeout: float) -> tuple[bytes, Address]:
+        now = self._clock.monotonic()
+        if self._arrivals and self._arrivals[0][0] <= now + timeout:
+            at, datagram, host = self._arrivals.pop(0)
+            self._clock.sleep(max(at - now, 0.0))
+            return datagram, (host, 4352)
+        self._clock.sleep(timeout)
+        raise LinkTimeout("nothing")
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def look(network: PaperNetwork, clock: SimulatedClock, enough: int | None = None) -> tuple[FoundProjector, ...]:
+    ports: list[int] = []
+
+    def opened(port: int) -> PaperNetwork:
+        ports.append(port)
+        return network
+
+    found = search(enough=enough, open_socket=opened, clock=clock)
+    assert ports == [4352]
+    assert network.closed
+    return found
+
+
+def test_collects_for_thirty_seconds_and_names_each_once() -> None:
+    clock = SimulatedClock()
+    network = PaperNetwork(
+        clock,
+        (0.0, b"%2SRCH\r", "192.168.1.2"),  # our own question, come back
+        (0.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"),
+        (1.7, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"),
+        (2.0, b"%2POWR=1\r", "192.168.1.22"),
+        (9.9, b"%2ackn=00:11:22:AA:BB:02\r\n", "192.168.1.21"),
+        (31.0, b"%2ACKN=00:11:22:aa:bb:03\r", "192.168.1.23"),
+    )
+    assert look(network, clock) == (
+        FoundProjector("192.168.1.20", "00:11:22:aa:bb:01"),
+        FoundProjector("192.168.1.21", "00:11:22:aa:bb:02"),
+    )
+    assert clock.monotonic() == pytest.approx(30.0)
+    assert [(data, address) for _, data, address in network.sent] == [(b"%2SRCH\r", ("255.255.255.255", 4352))] * 3
+    assert [at for at, _, _ in network.sent] == pytest.approx([0.0, 1.0, 2.0])
+
+
+def test_ends_as_soon_as_enough_have_answered() -> None:
+    clock = SimulatedClock()
+    network = PaperNetwork(clock, (0.5, b"%2ACKN=00:11:22:aa:bb:01\r", "192.168.1.20"))
+    assert [found.host for found in look(network, clock, enough=1)] == ["192.168.1.20"]
+    assert clock.monotonic() == pytest.approx(0.5)
+    assert len(network.sent) == 1
+
+
+def test_an_empty_network_has_no_projectors() -> None:
+    clock = SimulatedClock()
+    assert look(PaperNetwork(clock), clock) == ()
+
+
+def test_junk_without_end_does_not_prolong_the_search() -> None:
+    clock = SimulatedClock()
+    network = PaperNetwork(clock, *[(0.01 * i, b"\xff" * 40, "192.168.1.9") for i in range(4000)])
+    assert look(network, clock) == ()
+    assert clock.monotonic() == pytest.approx(30.0, abs=0.1)
+
+
+def test_a_taken_port_is_told_with_its_remedy() -> None:
+    with UdpSocket(host="127.0.0.1") as taken, pytest.raises(LinkClosed, match="end the other program"):
+        search(listen_port=taken.address[1])
+
+
+def test_notices_arrive_in_order_past_everything_else() -> None:
+    with NoticePort(0, "127.0.0.1") as controller, UdpSocket(host="127.0.0.1") as projector:
+        for datagram in (
+            b"noise",
+            b"%2ACKN=00:11:22:aa:bb:cc\r",
+            b"%2POWR=3\r%2INPT=31\r",
+            b"%2LKUP=00:11:22:aa:bb:cc\r",
+        ):
+            projector.send(datagram, controller.address)
+        assert [controller.receive(30.0) for _ in range(3)] == [
+            ("127.0.0.1", PowerChanged(Power.WARMING)),
+            ("127.0.0.1", InputChanged("31")),
+            ("127.0.0.1", LinkUp(MAC)),
+        ]
+        with pytest.raises(LinkTimeout, match="no datagram came"):
+            controller.receive(0.0)
+        projector.send(b"noise", controller.address)
+        projector.send(b"%2POWR=1\r", controller.address)
+        with pytest.raises(LinkTimeout, match="no notice of a projector"):
+            controller.receive(0.0)
+        assert controller.receive(0.0) == ("127.0.0.1", PowerChanged(Power.ON))
+
+
+def test_a_socket_that_was_closed_says_so() -> None:
+    udp = UdpSocket(host="127.0.0.1")
+    udp.close()
+    udp.close()
+    with pytest.raises(LinkClosed):
+        udp.receive(0.0)
+    with pytest.raises(LinkClosed, match=r"127\.0\.0\.1:9"):
+        udp.send(b"x", ("127.0.0.1", 9))
+
+
+def test_a_datagram_too_long_for_the_network_is_told() -> None:
+    with UdpSocket(host="127.0.0.1") as udp, pytest.raises(LinkClosed, match="cannot send a datagram"):
+        udp.send(b"x" * 70000, udp.address)
