@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
@@ -18,6 +20,13 @@ app = typer.Typer(
 )
 
 
+class Arrangement(Enum):
+    """How the colours lie on the sheet."""
+
+    TAGGED = "tagged"
+    PAPER = "paper"
+
+
 def main() -> int:
     """Run `acquire` and return its exit code."""
     return console.run(app)
@@ -25,36 +34,60 @@ def main() -> int:
 
 @app.command()
 def chart(
-    out: Annotated[Path, typer.Argument(help="New folder for chart.json, chart.tif, chart.pdf and preview.png.")],
+    out: Annotated[
+        Path, typer.Argument(help="New folder for chart.json, chart.tif, chart.pdf and what goes with them.")
+    ],
     bits: Annotated[int, typer.Option(min=1, max=5, help="Bits kept of each channel; 5 gives 32 768 colours.")] = 5,
     page: Annotated[
         str | None,
         typer.Option(help="Paper, landscape: A0 … A8, or WIDTHxHEIGHT in mm; else the smallest that fits."),
     ] = None,
+    cell_mm: Annotated[
+        float | None,
+        typer.Option(help="Side of a cell, mm, to the nearest 0.21; else 5.29, or the largest that fits on the page."),
+    ] = None,
+    arrangement: Annotated[
+        Arrangement,
+        typer.Option(help="tagged: random order, tags and references; paper: the paper's 256 × 128 grid without tags."),
+    ] = Arrangement.TAGGED,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the order of the colours.")] = 1,
     tiff: Annotated[bool, typer.Option(help="Write the 600-dpi TIFF.")] = True,
 ) -> None:
     """Make the print: every colour once, AprilTags and achromatic references, at true size.
 
-    Writes OUT/chart.json (what calibration reads), chart.pdf (vector), chart.tif (600 dpi) and preview.png. Print one
-    of the two with the printer's colour management off, at 100 %, on matte paper.
+    Writes OUT/chart.json (what calibration reads), chart.pdf (vector), chart.tif (600 dpi), preview.png, proof.pdf (an
+    A4 page to try the printer with) and PRINTING.txt. Print the PDF or the TIFF with the printer's colour management
+    off, at 100 %, on matte paper. A line on stderr tells when cells are too small for the paper's cameras.
     """
-    from acquisition.layout import design_chart
+    from acquisition.layout import design_chart, paper_chart
     from acquisition.printing import save_pdf, save_preview, save_tiff
+    from acquisition.proof import save_instructions, save_proof
+    from acquisition.visibility import warning
     from drivers.storage import whole_folder
 
-    design = design_chart(bits, _page(page), seed)
+    if arrangement is Arrangement.PAPER:
+        if bits != 5 or cell_mm is not None:
+            raise InputError("the paper's arrangement has 5 bits and fills its page; leave --bits and --cell-mm out")
+        design = paper_chart(_page(page))
+    else:
+        design = design_chart(bits, _page(page), seed, cell_mm)
     with whole_folder(out, "the chart") as folder:
         save_preview(design, folder / "preview.png")
         save_pdf(design, folder / "chart.pdf")
         if tiff:
             save_tiff(design, folder / "chart.tif")
+        save_proof(design, folder / "proof.pdf")
+        save_instructions(design, folder / "PRINTING.txt", tiff)
         design.save(folder / "chart.json")
     width, height = design.page_mm
+    cell = " × ".join(dict.fromkeys(f"{side:.2f}" for side in design.cell_mm))
     print(
         f"{out}: {design.colour_count} colours, {len(design.tags)} tags, {len(design.references)} references "
-        f"on {width:g} × {height:g} mm"
+        f"on {width:g} × {height:g} mm, cells of {cell} mm"
     )
+    small = warning(design)
+    if small is not None:
+        print(f"warning: {small}", file=sys.stderr)
 
 
 def _page(text: str | None) -> str | tuple[float, float] | None:

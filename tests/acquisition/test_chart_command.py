@@ -1,0 +1,101 @@
+"""The command `acquire chart` as a user meets it: what it writes, prints and returns."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from pyapriltags import Detector
+
+from acquisition.chart import load_chart
+from acquisition.cli import main
+from acquisition.layout import design_chart
+
+Run = Callable[..., int]
+
+
+@pytest.fixture
+def chart(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Return a caller of `acquire chart` in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["acquire", "chart", *arguments])
+        return main()
+
+    return call
+
+
+def test_everything_for_the_print_shop(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert chart("out", "--bits", "1", "--seed", "4") == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert printed.out.startswith("out: 8 colours, 4 tags, ")
+    assert "cells of 5.29 mm" in printed.out
+    assert sorted(path.name for path in Path("out").iterdir()) == [
+        "PRINTING.txt",
+        "chart.json",
+        "chart.pdf",
+        "chart.tif",
+        "preview.png",
+        "proof.pdf",
+    ]
+    saved = load_chart(Path("out/chart.json"))
+    assert saved.seed == 4
+    assert saved.sha256 == design_chart(1, seed=4).sha256
+    assert saved.sha256[:16] in Path("out/PRINTING.txt").read_text(encoding="utf-8")
+    # The marks in the margins do not mislead who looks for tags.
+    grey = tifffile.imread("out/chart.tif")[:, :, 1]
+    found = Detector(families="tag36h11", nthreads=1, quad_decimate=1.0).detect(np.ascontiguousarray(grey))
+    assert sorted(tag.tag_id for tag in found) == [tag.id for tag in saved.tags]
+
+
+def test_a_page_too_small_for_the_usual_cells_gets_smaller_ones(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert chart("out", "--bits", "2", "--page", "A8", "--no-tiff") == 0
+    printed = capsys.readouterr()
+    assert printed.err == "", "a camera goes nearer to a small sheet, so its cells are as large in the frame"
+    # 85 px: 16 × 10 slots, less 4 × 16 of tags, are the 64 colours and 32 references; of 90 px there are 15 × 9.
+    assert "on 74 × 52 mm, cells of 3.60 mm" in printed.out
+    assert not Path("out/chart.tif").exists()
+
+
+def test_cells_that_a_camera_cannot_separate_are_made_and_warned_of(
+    chart: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert chart("out", "--bits", "3", "--page", "1000x60", "--cell-mm", "1.5", "--no-tiff") == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("warning: cells of 1.48 mm are small for a camera")
+    # 0.94 × 2601 and 3132 px for 1000 mm: 2.44 and 2.94 px a millimetre, of which a module has 0.593 and a cell 1.482.
+    assert "EOS 550D: 3.6 px a cell, 1.4 px a tag module; EOS 6D Mark II: 4.4 px a cell, 1.7 px a tag module" in line
+    assert load_chart(Path("out/chart.json")).cell_mm[0] == pytest.approx(35 * 25.4 / 600)
+
+
+def test_the_paper_s_arrangement(chart: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert chart("out", "--arrangement", "paper", "--no-tiff") == 0
+    assert "32768 colours, 0 tags, 23 references on 1189 × 841 mm, cells of 4.57 × 6.43 mm" in capsys.readouterr().out
+    assert load_chart(Path("out/chart.json")).tags == ()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--page", "A5"), "too small for the 32768 colours"),
+        (("--page", "A1", "--cell-mm", "5.29"), "3.60 mm fit"),
+        (("--cell-mm", "0.5"), "cannot be printed evenly"),
+        (("--arrangement", "paper", "--bits", "3"), "leave --bits and --cell-mm out"),
+        (("--arrangement", "paper", "--page", "A6"), "256 × 128 cells"),
+        (("--page", "letter"), "is not known"),
+    ],
+)
+def test_what_cannot_be_printed_is_refused_in_one_line(
+    chart: Run, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
+) -> None:
+    assert chart("out", *arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert message in line
+    assert not Path("out").exists()
