@@ -1,0 +1,54 @@
+"""What every presenter keeps to, written once: a suite names its presenter by the fixture `bench`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+
+from drivers.errors import DeviceError
+from drivers.presenter import BLACK, WHITE, Colour, Presenter
+
+RAMPS = tuple(
+    colour for code in range(0, 256, 17) for colour in (Colour(code, 0, 0), Colour(0, code, 0), Colour(0, 0, code))
+)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A presenter under test; `seen` looks at the light itself, past the presenter, and gives codes."""
+
+    presenter: Presenter
+    seen: Callable[[], Colour]
+
+
+class PresenterContract:
+    """Subclass as ``TestX`` and supply the fixture `bench`."""
+
+    def test_is_black_from_the_start(self, bench: Bench) -> None:
+        assert bench.seen() == BLACK
+
+    def test_shows_each_channel_at_every_height(self, bench: Bench) -> None:
+        for colour in RAMPS:
+            bench.presenter.show(colour)
+            assert bench.seen() == colour
+
+    def test_keeps_the_channels_apart(self, bench: Bench) -> None:
+        for colour in (Colour(1, 2, 3), Colour(254, 128, 127), Colour(3, 2, 1), WHITE, BLACK):
+            bench.presenter.show(colour)
+            assert bench.seen() == colour
+
+    def test_shows_the_same_twice(self, bench: Bench) -> None:
+        for _ in range(2):
+            bench.presenter.show(Colour(200, 100, 50))
+            assert bench.seen() == Colour(200, 100, 50)
+
+    def test_is_black_when_closed_and_stays_closed(self, bench: Bench) -> None:
+        bench.presenter.show(WHITE)
+        bench.presenter.close()
+        bench.presenter.close()
+        assert bench.seen() == BLACK
+        with pytest.raises(DeviceError, match="closed"):
+            bench.presenter.show(WHITE)
+        assert bench.seen() == BLACK
