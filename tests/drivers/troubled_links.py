@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from drivers.clock import Clock
 from drivers.errors import LinkClosed, LinkTimeout
 from drivers.link import Link
 
@@ -66,3 +67,18 @@ class Deaf(Dribbling):
             raise LinkTimeout(f"swallowed {data!r} on purpose")
         self._left -= 1
         return data
+
+
+class Slow(Dribbling):
+    """Takes `seconds` of `clock` for each read, or times out where it may not take as long."""
+
+    def __init__(self, good: Link, clock: Clock, seconds: float) -> None:
+        super().__init__(good)
+        self._clock = clock
+        self._seconds = seconds
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        self._clock.sleep(min(self._seconds, timeout))
+        if timeout < self._seconds:
+            raise LinkTimeout(f"an answer takes {self._seconds:g} s on purpose")
+        return self.good.read(limit, timeout)
