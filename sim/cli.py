@@ -11,6 +11,7 @@ from drivers import console
 from drivers.console import EXIT_CODES
 
 if TYPE_CHECKING:
+    from sim.projector import SimulatedProjector
     from sim.world import Print
 
 app = typer.Typer(
@@ -32,26 +33,55 @@ def _devices() -> None:  # pyright: ignore[reportUnusedFunction]  # typer calls 
 
 @app.command()
 def projector(
-    pjlink: Annotated[int, typer.Option(min=0, max=65535, help="TCP port for PJLink; 0 picks a free one.")],
+    pjlink: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="TCP port for PJLink; 0 picks a free one.")
+    ] = None,
     password: Annotated[str | None, typer.Option(help="PJLink password, at most 32 characters.")] = None,
+    serial: Annotated[str | None, typer.Option(help="Language on a serial port: benq, epson, nec or optoma.")] = None,
 ) -> None:
     """Serve a simulated projector: standby, 30 s of warm-up, on, 60 s of cooling.
 
-    Reads and writes no file. Prints the address it listens on, then serves until interrupted (Ctrl-C), which is its
-    proper end: exit code 0. Exit code 3 when the port is taken.
+    Reads and writes no file. With --pjlink it listens on the network, with --serial at a pseudo-terminal, which any
+    serial software can open (Linux and macOS). Prints the address or the port's path, then serves until interrupted
+    (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there is no such language or not exactly one
+    cable, 3 when the port is taken.
     """
     from drivers.clock import SystemClock
-    from drivers.errors import InputError
+    from drivers.errors import ConfigurationError, InputError
     from drivers.pjlink.wire import MAX_PASSWORD
     from sim.projector import SimulatedProjector, serve_pjlink
 
+    if (pjlink is None) == (serial is None):
+        raise ConfigurationError("one projector hangs on one cable: either --pjlink PORT or --serial LANGUAGE")
+    if pjlink is None and password is not None:
+        raise ConfigurationError("--password is PJLink's; a serial cable has none")
     if password is not None and not 1 <= len(password) <= MAX_PASSWORD:
         raise InputError(
             f"the password has {len(password)} characters; PJLink allows at least 1, at most {MAX_PASSWORD}"
         )
-    with serve_pjlink(SimulatedProjector(SystemClock()), pjlink, password) as server:
-        host, port = server.address
-        print(f"PJLink projector at {host}:{port}", flush=True)
+    device = SimulatedProjector(SystemClock())
+    if serial is not None:
+        _serve_serial(device, serial)
+    elif pjlink is not None:
+        with serve_pjlink(device, pjlink, password) as server:
+            host, port = server.address
+            print(f"PJLink projector at {host}:{port}", flush=True)
+            _until_interrupted()
+
+
+def _serve_serial(device: SimulatedProjector, name: str) -> None:
+    from drivers.errors import ConfigurationError
+    from drivers.serial_projectors import language
+
+    spoken = language(name)
+    try:
+        from sim.pty import PseudoTerminal
+    except ImportError as error:
+        raise ConfigurationError("this system has no pseudo-terminals; --serial needs Linux or macOS") from error
+    from sim.serial_projectors import PEERS
+
+    with PseudoTerminal(PEERS[spoken.name](device)) as terminal:
+        print(f"{spoken.maker} projector at {terminal.path}", flush=True)
         _until_interrupted()
 
 
@@ -125,6 +155,15 @@ def _grey_squares() -> Print:
     boxes = np.stack([left, top, left + 45, top + 45], axis=-1).astype(np.float64)
     grey = np.linspace(0, 248, len(left)).round().astype(np.uint8)
     return Print((297, 210), boxes, np.stack([grey] * 3, axis=-1))
+
+
+def _host_and_port(text: str) -> tuple[str, int]:
+    from drivers.errors import InputError
+
+    host, _, port = text.rpartition(":")
+    if not host or not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:
+        raise InputError(f"{text!r} is no address; expected HOST:PORT, such as 127.0.0.1:4352")
+    return host, int(port)
 
 
 def _until_interrupted() -> None:

@@ -11,7 +11,10 @@ import usbip
 import usbip.host
 
 from drivers.links.tcp import TcpLink, TcpServer
+from drivers.links.udp import UdpSocket
+from drivers.pjlink.notices import LinkUp
 from drivers.pjlink.projector import PjLinkProjector
+from drivers.pjlink.search import NoticePort, search
 from drivers.projector import Power
 from sim.cli import main
 
@@ -42,6 +45,31 @@ def test_serves_a_projector_until_interrupted() -> None:
     assert err == ""
 
 
+def test_is_found_and_announces_itself() -> None:
+    with (
+        NoticePort(0, "127.0.0.1") as controller,
+        subprocess.Popen(
+            [*SIM, "projector", "--pjlink", "0", "--udp", "0", "--notify", f"127.0.0.1:{controller.address[1]}"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process,
+    ):
+        try:
+            assert process.stdout is not None
+            host, port = process.stdout.readline().split()[-1].split(":")
+            process.stdout.readline()
+            found = search(30.0, enough=1, address=host, port=int(port), listen_port=0)
+            _, notice = controller.receive(30.0)
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    assert [projector.mac for projector in found] == ["02:00:00:00:00:01"]
+    assert notice == LinkUp("02:00:00:00:00:01")
+    assert (process.returncode, out, err) == (0, "stopped\n", "")
+
+
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr(sys, "argv", ["sim", *arguments])
     return main()
@@ -61,12 +89,23 @@ def test_a_taken_port_is_one_line(
     assert error.count("\n") == 1
 
 
+def test_a_taken_udp_port_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    with UdpSocket(host="127.0.0.1") as taken:
+        assert run(monkeypatch, "projector", "--pjlink", "0", "--udp", str(taken.address[1])) == 3
+    error = capsys.readouterr().err
+    assert error.startswith("error: cannot receive datagrams at 127.0.0.1:")
+    assert error.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
         ["projector"],
         ["projector", "--pjlink", "x"],
         ["projector", "--pjlink", "70000"],
+        ["projector", "--pjlink", "0", "--udp", "70000"],
+        ["projector", "--pjlink", "0", "--notify", "here"],
+        ["projector", "--pjlink", "0", "--notify", "127.0.0.1:0"],
         ["camera"],
         ["toaster"],
         ["camera", "--port", "0", "--usbip", "0"],
