@@ -95,9 +95,9 @@ class DarkReading:
         self._files.append(file)
         self._sha256.append(sha256)
         self._blacks.append(black)
-        flat = paper.mean(axis=1, dtype=np.float64) / shape
+        flat: _Array = paper.mean(axis=1, dtype=np.float64) / shape
         count = max(len(flat), 1)
-        middle: _Array = np.median(flat, axis=0)
+        middle: _Array = np.asarray(np.median(flat, axis=0), dtype=np.float64)
         self._lights.append(middle)
         # The median of normal values has a standard error 1.25 times that of the mean.
         spread: _Array = 1.4826 * np.median(np.abs(flat - middle), axis=0)
