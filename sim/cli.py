@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -37,6 +38,12 @@ def projector(
         int | None, typer.Option(min=0, max=65535, help="TCP port for PJLink; 0 picks a free one.")
     ] = None,
     password: Annotated[str | None, typer.Option(help="PJLink password, at most 32 characters.")] = None,
+    udp: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="UDP port where PJLink searches are answered; 0 picks one.")
+    ] = None,
+    notify: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Send PJLink status notices there, by UDP.")
+    ] = None,
     serial: Annotated[str | None, typer.Option(help="Language on a serial port: benq, epson, nec or optoma.")] = None,
 ) -> None:
     """Serve a simulated projector: standby, 30 s of warm-up, on, 60 s of cooling.
@@ -49,12 +56,12 @@ def projector(
     from drivers.clock import SystemClock
     from drivers.errors import ConfigurationError, InputError
     from drivers.pjlink.wire import MAX_PASSWORD
-    from sim.projector import SimulatedProjector, serve_pjlink
+    from sim.projector import SimulatedProjector
 
     if (pjlink is None) == (serial is None):
         raise ConfigurationError("one projector hangs on one cable: either --pjlink PORT or --serial LANGUAGE")
-    if pjlink is None and password is not None:
-        raise ConfigurationError("--password is PJLink's; a serial cable has none")
+    if pjlink is None and (password, udp, notify) != (None, None, None):
+        raise ConfigurationError("--password, --udp and --notify are PJLink's; a serial cable has none of them")
     if password is not None and not 1 <= len(password) <= MAX_PASSWORD:
         raise InputError(
             f"the password has {len(password)} characters; PJLink allows at least 1, at most {MAX_PASSWORD}"
@@ -63,10 +70,22 @@ def projector(
     if serial is not None:
         _serve_serial(device, serial)
     elif pjlink is not None:
-        with serve_pjlink(device, pjlink, password) as server:
-            host, port = server.address
-            print(f"PJLink projector at {host}:{port}", flush=True)
-            _until_interrupted()
+        _serve_network(device, pjlink, password, udp, None if notify is None else _host_and_port(notify))
+
+
+def _serve_network(
+    device: SimulatedProjector, pjlink: int, password: str | None, udp: int | None, controller: tuple[str, int] | None
+) -> None:
+    from sim.projector import ProjectorDatagrams, serve_pjlink
+
+    with ExitStack() as served:
+        host, port = served.enter_context(serve_pjlink(device, pjlink, password)).address
+        if udp is not None or controller is not None:
+            datagrams = served.enter_context(ProjectorDatagrams(device, udp or 0, controller))
+            if udp is not None:
+                print(f"PJLink searches at {datagrams.address[0]}:{datagrams.address[1]}")
+        print(f"PJLink projector at {host}:{port}", flush=True)
+        _until_interrupted()
 
 
 def _serve_serial(device: SimulatedProjector, name: str) -> None:
