@@ -6,39 +6,51 @@ Laws that hold inside:
 - The last accepted frame of a light counts; a session that lacks a light makes no table.
 - The chart must lie where it was registered: a movement up to a tenth of a pixel is let be, up to half a pixel the
   grid is moved along, and beyond it the frame is registered anew.
-- The table appears whole or not at all.
+- The table appears whole or not at all. Until then it grows under a hidden name (`calibration.growing`), and a build
+  that was stopped, anywhere, goes on from its last checkpoint and ends in the bytes of one that was not: frames enter
+  in the order taken, and what one adds depends on those before it alone.
 
-Two threads read and decode ahead, one measures in order, so the memory is that of a few frames whatever the session.
+Threads read and decode ahead, one measures in order, so the memory is that of a few frames whatever the session.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from acquisition.framing import CHANNELS, Channel, Plane, Shift, frame_black, plane_of, shift_between, strongest_plane
-from acquisition.session import FrameRecord, Session, file_sha256
-from calibration.lut import LutWriter, Provenance, Unfit
+from acquisition.session import FrameRecord, Session
+from calibration.darkness import Darkness, DarkReading, additivity, drift_gains
+from calibration.growing import Checkpoint, Growing, growing
+from calibration.lut import SAMPLES as SAMPLES_FILE
+from calibration.lut import Frame, Lut, LutWriter, Provenance, Unfit, frames_sha256
+from calibration.noise import PhotonTransfer, photon_transfer
 from calibration.radiometry import CLIPPED, Field, Paper, black_drift, corrections, read_paper, saturation
+from calibration.references import NAME as REFERENCES_FILE
+from calibration.references import Levels, references_csv
 from calibration.registration import MIN_BLOCK_SCORE, Registration, register
-from calibration.sampling import SAMPLES, Sites, gather, noise_of, sites_at, table_values, uneven
+from calibration.sampling import SAMPLES, Sites, dead_samples, gather, noise_of, sites_at, table_values, uneven
 from calibration.verdict import Verdict, figures_of, judge, refusal
 from drivers.errors import FormatError, QualityError
-from drivers.rawfile import Mosaic, read_raw
-from drivers.storage import whole_folder, write_whole
+from drivers.rawfile import Mosaic, decode_raw
+from drivers.storage import write_whole
 
 STILL_PX = 0.1
 BUMP_PX = 0.5
 REPORT_FILES = ("report.html", "report.json")
+
+CHECKPOINT_EVERY = 16
+"""Frames from one checkpoint to the next: what a build that is killed has to do again."""
 
 _THREADS = 2
 _AHEAD = 3
@@ -66,6 +78,8 @@ class FrameFigures:
         Whether this frame was registered anew.
     paper
         Field and white.
+    greys, grey_errors
+        (G, 3) float64 counts above black of each level of grey, field divided out, and their standard errors.
     """
 
     record: FrameRecord
@@ -74,6 +88,50 @@ class FrameFigures:
     shift: Shift
     registered: bool
     paper: Paper
+    greys: _Array = field(default_factory=lambda: np.zeros((0, 3)))
+    grey_errors: _Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def told(self) -> dict[str, Any]:
+        """Return the figures as JSON holds them; `recall` makes them again to the last bit."""
+        return {
+            "black": self.black.tolist(),
+            "channel": self.channel,
+            "shift": [self.shift.dx, self.shift.dy, self.shift.largest_px, self.shift.tags],
+            "registered": self.registered,
+            "field": [[factor.tolist() for factor in factors] for factors in self.paper.field.coefficients],
+            "white": self.paper.white.tolist(),
+            "error": self.paper.error.tolist(),
+            "references": self.paper.references,
+            "spread": self.paper.spread.tolist(),
+            "greys": self.greys.tolist(),
+            "grey_errors": self.grey_errors.tolist(),
+        }
+
+    @staticmethod
+    def recall(record: FrameRecord, page_mm: tuple[float, float], told: dict[str, Any]) -> FrameFigures:
+        """Return the figures of a frame from what `told` returned."""
+        red, green, blue = (tuple(np.array(factor) for factor in factors) for factors in told["field"])
+        field = Field(page_mm, (red, green, blue))
+        white, error, spread = (np.array(told[name]) for name in ("white", "error", "spread"))
+        return FrameFigures(
+            record,
+            np.array(told["black"]),
+            told["channel"],
+            Shift(*told["shift"]),
+            told["registered"],
+            Paper(field, white, error, told["references"], spread),
+            *(np.array(told[name]).reshape(-1, 3) for name in ("greys", "grey_errors")),
+        )
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How far a table is that still lacks frames: lights in it, of how many, and frames taken in now and before."""
+
+    lights: int
+    of: int
+    new_frames: int
+    frames: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +164,20 @@ class BuildResult:
         (3,) float64, median standard deviation of one sample under white, relative to paper white.
     white_references
         White references of the chart.
+    grey_names
+        Levels of grey of the chart, G.
+    greys, grey_errors
+        (L, G, 3) float64, each level under each light and its standard error, units of the samples.
+    darkness
+        What the dark frames say; of a check, the first of them.
+    added
+        (3,) by how much the primaries together differ from white, relative; None where the session cannot tell.
+    gains
+        (L, 3) the lamp's drift at each light, as the white frames have it.
+    transfer
+        Noise of the cells of the frame that was registered first.
+    saturated
+        Whether a photosite of a cell reached saturation, so that its count was measured.
     """
 
     session: Path
@@ -121,6 +193,14 @@ class BuildResult:
     frames: tuple[FrameFigures, ...] = field(default=())
     noise: _Array = field(default_factory=lambda: np.zeros(3))
     white_references: int = 0
+    grey_names: tuple[str, ...] = ()
+    greys: _Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    grey_errors: _Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    darkness: Darkness = field(default_factory=Darkness)
+    added: _Array | None = None
+    gains: _Array = field(default_factory=lambda: np.ones((0, 3)))
+    transfer: PhotonTransfer | None = None
+    saturated: bool = False
 
     @property
     def verdict(self) -> Verdict:
@@ -135,7 +215,7 @@ class BuildResult:
     @property
     def black_drift(self) -> float:
         """Drift of the black level over the session, counts."""
-        return black_drift([figures.black for figures in self.frames])
+        return black_drift([*(figures.black for figures in self.frames), *self.darkness.blacks])
 
     @property
     def white_drift(self) -> float:
@@ -170,6 +250,7 @@ def check(session: Session) -> BuildResult:
     registration = register(decoded.mosaic, session.chart, best.file)
     work = _Measurement(session, decoded, registration)
     figures, _ = work.measure(decoded)
+    darkness = work.darkness(_decoded(session, _darks(session)[:1]))
     level = decoded.saturation - float(decoded.black.mean())
     return BuildResult(
         session=session.folder,
@@ -181,8 +262,14 @@ def check(session: Session) -> BuildResult:
         white=figures.paper.white[None],
         white_error=figures.paper.error[None],
         white_level=round(level),
-        unfit=work.unfit(decoded.saturation),
+        unfit=work.unfit(decoded.saturation, darkness),
         frames=(figures,),
+        grey_names=work.levels.names,
+        greys=figures.greys[None],
+        grey_errors=figures.grey_errors[None],
+        darkness=darkness,
+        transfer=work.transfer,
+        saturated=work.saturated(decoded.saturation),
         noise=work.noise(),
         white_references=len(session.chart.white_references),
     )
@@ -221,43 +308,162 @@ def build(
     StorageError
         The disk is full or read-only.
     """
-    told = progress or _silent
-    chart, lights = session.chart, session.illuminations
-    chosen = _chosen(session)
-    with whole_folder(out, "the table") as folder:
-        writer = LutWriter(folder, len(lights), chart.colour_count, SAMPLES)
-        told(0, len(chosen), "finding the chart")
-        best = _best_frame(session)
-        first = _decode(session, best)
-        registration = register(first.mosaic, chart, best.file)
-        work = _Measurement(session, first, registration)
+    chosen, missing = _chosen(session)
+    if missing:
+        named = ", ".join(str(index) for index in missing[:10]) + (" …" if len(missing) > 10 else "")
+        raise FormatError(
+            f"{session.folder}: {len(missing)} of {len(session.illuminations)} lights have no accepted frame: {named}; "
+            "finish the session with acquire run, then build the table; or let it grow with build-lut --append"
+        )
+    with growing(out) as making:
+        work = _Work(session, making, chosen, progress or _silent)
+        work.take_in()
+        return work.finish(out, report)
+
+
+def append(
+    session: Session,
+    out: Path,
+    progress: Progress | None = None,
+    report: Callable[[BuildResult, Session, Path], None] | None = None,
+) -> BuildResult | Growth:
+    """Let the table of a session that is being taken grow by the frames that have come.
+
+    It grows under a hidden name and appears when the plan's last frame has been taken in, the same to the byte as if
+    it had been built at once. Parameters and errors are those of `build`, but that lights may lack.
+    """
+    chosen, missing = _chosen(session)
+    # The plan of a session that was put together otherwise may be empty; its lights are the plan then.
+    complete = not missing and {step.number for step in session.steps} <= session.done_steps()
+    with growing(out) as making:
+        work = _Work(session, making, chosen, progress or _silent)
+        before = work.taken_in
+        if complete:
+            work.take_in()
+            return work.finish(out, report)
+        if before < len(chosen):
+            work.take_in()
+            work.save()
+        return Growth(
+            len(session.illuminations) - len(missing), len(session.illuminations), len(chosen) - before, len(chosen)
+        )
+
+
+class _Work:
+    """One table being made: what was taken in before, and what is to follow."""
+
+    def __init__(self, session: Session, making: Growing, chosen: Sequence[FrameRecord], told: Progress) -> None:
+        self._session, self._making, self._chosen, self._told = session, making, chosen, told
+        self._best = _best_frame(session)
+        self._keys = [f"{record.kind},{record.illumination},{record.sha256}" for record in chosen]
+        self._identity = {
+            "software": _software(),
+            "chart": session.chart.sha256,
+            "lights": hashlib.sha256(repr(session.illuminations).encode()).hexdigest(),
+            "registered": self._best.sha256,
+        }
+        self._before = self._usable(making.load())
+        self._figures: list[FrameFigures] = []
+
+    @property
+    def taken_in(self) -> int:
+        """Frames that an earlier program, or this one, has taken in."""
+        return max(len(self._figures), len(self._before.frames) if self._before else 0)
+
+    def _usable(self, before: Checkpoint | None) -> Checkpoint | None:
+        """Return a checkpoint if this work goes on from it."""
+        if before is None or before.identity != self._identity or not before.frames:
+            return None
+        known = before.frames == self._keys[: len(before.frames)]
+        return before if known and (self._making.folder / SAMPLES_FILE).is_file() else None
+
+    def _open_writer(self) -> LutWriter:
+        """Return the writer of the samples, in a folder that holds what the checkpoint tells and nothing else."""
+        shape = len(self._session.illuminations), self._session.chart.colour_count, SAMPLES
+        if self._before is not None:
+            written = {int(light): known for light, known in self._before.told["sha256"].items()}
+            writer = LutWriter(self._making.folder, *shape, written=written)
+            if not writer.damaged():
+                return writer
+            self._before = None
+        self._making.begin_anew()
+        return LutWriter(self._making.folder, *shape)
+
+    def take_in(self) -> None:
+        """Measure every frame that was not taken in before."""
+        session, chart = self._session, self._session.chart
+        self._writer = self._open_writer()
+        self._told(0, len(self._chosen), "finding the chart")
+        first = _decode(session, self._best)
+        self._camera = first.mosaic.camera
+        self._registration = register(first.mosaic, chart, self._best.file)
+        self._measurement = _Measurement(session, first, self._registration)
+        self._limit = first.saturation
+        if self._before is not None:
+            told = self._before.told
+            self._limit = int(told["limit"])
+            self._figures = [
+                FrameFigures.recall(record, chart.page_mm, figures)
+                for record, figures in zip(self._chosen, told["figures"], strict=False)
+            ]
+            adopted = first
+            if told["adopted"] != self._best.file:
+                adopted = _decode(session, next(record for record in self._chosen if record.file == told["adopted"]))
+            self._measurement.restore(self._before.arrays, adopted, session)
+        saved = len(self._figures)
+        for decoded in _decoded(session, self._chosen[saved:]):
+            figures, samples = self._measurement.measure(decoded)
+            self._figures.append(figures)
+            self._limit = min(self._limit, decoded.saturation)
+            light = decoded.record.illumination
+            if decoded.record.kind == "light" and light is not None:
+                self._writer.put(light, samples)
+            if (len(self._figures) - saved) % CHECKPOINT_EVERY == 0:
+                self.save()
+            self._told(len(self._figures), len(self._chosen), decoded.record.file)
+
+    def save(self) -> None:
+        """Write a checkpoint: a later program goes on from here."""
+        told = {
+            "limit": self._limit,
+            "adopted": self._measurement.adopted_file,
+            "sha256": self._writer.sha256,
+            "figures": [figures.told() for figures in self._figures],
+        }
+        taken_in = self._keys[: len(self._figures)]
+        self._making.save(Checkpoint(self._identity, taken_in, told, self._measurement.state()))
+
+    def finish(self, out: Path, report: Callable[[BuildResult, Session, Path], None] | None) -> BuildResult:
+        """Judge the table and give it its name."""
+        session, chart, lights = self._session, self._session.chart, self._session.illuminations
+        frames, limit, work = self._figures, self._limit, self._measurement
+        self._told(len(frames), len(frames), "writing the report")
         white, error = np.zeros((len(lights), 3)), np.zeros((len(lights), 3))
         fields: list[Field | None] = [None] * len(lights)
         blacks = np.zeros((len(lights), 2, 2))
-        frames: list[FrameFigures] = []
-        limit = first.saturation
-        for decoded in _decoded(session, chosen):
-            figures, samples = work.measure(decoded)
-            frames.append(figures)
-            limit = min(limit, decoded.saturation)
-            light = decoded.record.illumination
-            if decoded.record.kind == "light" and light is not None:
-                writer.put(light, samples)
+        for figures in frames:
+            light = figures.record.illumination
+            if figures.record.kind == "light" and light is not None:
                 # A channel without light may be measured at or below 0; its standard error is what is known of it.
                 white[light] = np.maximum(figures.paper.white, np.maximum(figures.paper.error, 1e-3))
                 error[light] = figures.paper.error
                 fields[light] = figures.paper.field
                 blacks[light] = figures.black
-            told(len(frames), len(chosen), decoded.record.file)
-        told(len(chosen), len(chosen), "writing the report")
-        unfit = work.unfit(limit)
+        greys, grey_errors = (np.full((len(lights), len(work.levels.names), 3), np.nan) for _ in range(2))
+        for figures in frames:
+            if figures.record.kind == "light" and figures.record.illumination is not None:
+                greys[figures.record.illumination] = figures.greys
+                grey_errors[figures.record.illumination] = figures.grey_errors
+        darkness = self._measurement.darkness(_decoded(session, _darks(session)))
+        gains, full_white = _drift(frames, len(lights))
+        unfit = work.unfit(limit, darkness)
         level = round(limit - float(np.mean([figures.black.mean() for figures in frames])))
         result = BuildResult(
             session=session.folder,
             lut=out,
-            camera=first.mosaic.camera,
-            registration=registration,
-            registered_file=best.file,
+            camera=self._camera,
+            registration=self._registration,
+            registered_file=self._best.file,
             lights=len(lights),
             white=white,
             white_error=error,
@@ -266,25 +472,52 @@ def build(
             frames=tuple(frames),
             noise=work.noise(),
             white_references=len(chart.white_references),
+            grey_names=work.levels.names,
+            greys=greys,
+            grey_errors=grey_errors,
+            darkness=darkness,
+            added=additivity(lights, white, full_white, darkness.light, gains),
+            gains=gains,
+            transfer=work.transfer,
+            saturated=work.saturated(limit),
         )
-        writer.finish(
+        records = [figures.record for figures in frames]
+        self._writer.finish(
             lights,
             white,
             Provenance(
-                camera=first.mosaic.camera,
+                camera=self._camera,
                 bits=chart.bits,
                 white_level=level,
-                corrections=corrections(chart.page_mm, blacks, limit, [shape for shape in fields if shape]),
-                session_sha256=session_sha256([figures.record for figures in frames]),
+                corrections=corrections(
+                    chart.page_mm,
+                    blacks,
+                    limit,
+                    [shape for shape in fields if shape],
+                    measured=result.saturated,
+                    gains=None if full_white is None else gains,
+                ),
+                session_sha256=session_sha256(records),
                 chart_sha256=chart.sha256,
-                software=f"croplab {version('croplab')}",
+                software=_software(),
                 unfit=list(unfit),
             ),
+            _frames(records),
         )
+        folder = self._making.folder
+        if work.levels.names:
+            write_whole(folder / REFERENCES_FILE, references_csv(work.levels.names, white, error, greys, grey_errors))
         if report is not None:
             report(result, session, folder)
+        if result.verdict.refused:
+            self._making.discard()
         _require_good(result, out, folder)
-    return result
+        self._making.publish()
+        return result
+
+
+def _software() -> str:
+    return f"croplab {version('croplab')}"
 
 
 def _silent(done: int, total: int, what: str) -> None:
@@ -293,29 +526,75 @@ def _silent(done: int, total: int, what: str) -> None:
 
 def session_sha256(records: Sequence[FrameRecord]) -> str:
     """Return the hash that names a session: SHA-256 over kind, light and hash of each frame used, a line each."""
-    lines = [f"{record.kind},{record.illumination},{record.sha256}\n" for record in records]
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+    return frames_sha256(_frames(records))
+
+
+def _frames(records: Sequence[FrameRecord]) -> list[Frame]:
+    return [Frame(record.kind, record.illumination, record.file, record.sha256) for record in records]
+
+
+def lost_frames(lut: Lut, session: Session, progress: Progress | None = None) -> list[str]:
+    """Return which of the frames that a table was made of are not in a session, or not as they were, each in words.
+
+    Raises
+    ------
+    FormatError
+        The table lists no frames, as those made before they were recorded.
+    """
+    if not lut.frames:
+        raise FormatError(f"{lut.folder} lists no frames; build it again from its session to have them listed")
+    faults: list[str] = []
+    if session.chart.sha256 != lut.provenance.chart_sha256:
+        faults.append(f"{session.folder / 'chart.json'} is not the chart of the table")
+    for done, frame in enumerate(lut.frames, 1):
+        path = session.folder / frame.file
+        try:
+            with path.open("rb") as stream:
+                found = hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as error:
+            faults.append(f"{path} cannot be read: {error.strerror}")
+        else:
+            if found != frame.sha256:
+                faults.append(f"{path} has changed: its SHA-256 is {found[:16]}…, the table's {frame.sha256[:16]}…")
+        if progress is not None:
+            progress(done, len(lut.frames), frame.file)
+    return faults
+
+
+def _darks(session: Session) -> list[FrameRecord]:
+    return [record for record in session.frames() if record.kind == "dark" and record.accepted]
+
+
+def _drift(frames: Sequence[FrameFigures], lights: int) -> tuple[_Array, _Array | None]:
+    """Return the lamp's drift at each light (L, 3), and paper in the first white frame, None without one."""
+    whites = [figures for figures in frames if figures.record.kind == "white"]
+    if not whites:
+        return np.ones((lights, 3)), None
+    start = whites[0].record.taken_at
+    at = np.zeros(lights)
+    for figures in frames:
+        if figures.record.kind == "light" and figures.record.illumination is not None:
+            at[figures.record.illumination] = (figures.record.taken_at - start).total_seconds()
+    white_at = np.array([(figures.record.taken_at - start).total_seconds() for figures in whites])
+    return drift_gains(at, white_at, np.array([figures.paper.white for figures in whites])), whites[0].paper.white
 
 
 def _lights(session: Session) -> list[FrameRecord]:
     return [record for record in session.frames() if record.kind == "light" and record.accepted]
 
 
-def _chosen(session: Session) -> list[FrameRecord]:
-    """Return the frames a table is made of, in the order taken: every light's last accepted, and the white ones."""
+def _chosen(session: Session) -> tuple[list[FrameRecord], list[int]]:
+    """Return the frames a table is made of, and the lights that have none.
+
+    The frames are every light's last accepted, and the white ones, in the order taken.
+    """
     last: dict[int, FrameRecord] = {}
     for record in _lights(session):
         if record.illumination is not None:
             last[record.illumination] = record
     missing = [light.index for light in session.illuminations if light.index not in last]
-    if missing:
-        named = ", ".join(str(index) for index in missing[:10]) + (" …" if len(missing) > 10 else "")
-        raise FormatError(
-            f"{session.folder}: {len(missing)} of {len(session.illuminations)} lights have no accepted frame: {named}; "
-            "finish the session with acquire run, then build the table"
-        )
     whites = [record for record in session.frames() if record.kind == "white" and record.accepted]
-    return sorted([*last.values(), *whites], key=lambda record: (record.taken_at, record.file))
+    return sorted([*last.values(), *whites], key=lambda record: (record.taken_at, record.file)), missing
 
 
 def _best_frame(session: Session) -> FrameRecord:
@@ -340,18 +619,22 @@ def _best_frame(session: Session) -> FrameRecord:
 
 def _decode(session: Session, record: FrameRecord) -> _Decoded:
     path = session.folder / record.file
-    if not path.is_file():
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
         raise FormatError(
             f"{path} is missing, but the session's journal counts it; restore the file from a copy, "
             "or take the light again with acquire run"
-        )
-    found = file_sha256(path)
+        ) from error
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk") from error
+    found = hashlib.sha256(data).hexdigest()
     if found != record.sha256:
         raise FormatError(
             f"{path} is not the file that was taken: its SHA-256 is {found[:16]}…, the journal says "
             f"{record.sha256[:16]}…; restore the file from a copy, or take the light again with acquire run"
         )
-    mosaic = read_raw(path)
+    mosaic = decode_raw(data, path)
     black = frame_black(mosaic)
     return _Decoded(record, mosaic, black, strongest_plane(mosaic, black), saturation(mosaic))
 
@@ -380,6 +663,9 @@ class _Measurement:
         self._chart = session.chart
         self._references = [reference for reference in session.chart.references if reference.is_white]
         self._reference_mm = np.array([reference.centre_mm for reference in self._references]).reshape(-1, 2)
+        greys = [reference for reference in session.chart.references if not reference.is_white]
+        self.levels = Levels.of(greys)
+        self._grey_mm = np.array([reference.centre_mm for reference in greys]).reshape(-1, 2)
         # The table is ordered by colour index, the chart by its own order.
         self._cells_mm = self._chart.centres_mm[self._chart.cell_of_colour]
         self._shape = first.mosaic.block_planes().shape[2:]
@@ -397,10 +683,14 @@ class _Measurement:
         self._base: Field | None = None
         samples, highest = gather(first.mosaic, first.black, self._sites)
         self._base = self._paper(first, samples, highest, self._sites).field
+        self._first_sites = self._sites
+        first_cells = samples[:count].astype(np.float64)
+        self.transfer = photon_transfer(first_cells.mean(axis=1), first_cells.var(axis=1, ddof=1))
 
     def _adopt(self, decoded: _Decoded, registration: Registration) -> None:
         """Make a frame the one that others are compared with."""
         self._registration = registration
+        self.adopted_file = decoded.record.file
         self._sites = self._sites_of(registration)
         self._planes = {channel: plane_of(decoded.mosaic, channel, decoded.black) for channel in CHANNELS}
 
@@ -410,6 +700,27 @@ class _Measurement:
         nearest = np.asarray(cKDTree(blocks.centres_mm).query(self._cells_mm)[1])
         strangers = registration.strangers[self._chart.cell_of_colour]
         return strangers | np.asarray(blocks.score[nearest] < MIN_BLOCK_SCORE)
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """Return what the frames measured so far leave behind, but for the registration."""
+        return {
+            "highest": self._highest,
+            "highest_at": self._highest_at,
+            "outside": self._outside,
+            "covered": self._covered,
+            "even_sum": self._even_sum,
+            "even_noise": self._even_noise,
+            "even_frames": np.array(self._even_frames),
+        }
+
+    def restore(self, state: dict[str, npt.NDArray[Any]], adopted: _Decoded, session: Session) -> None:
+        """Go on from what `state` returned; `adopted` is the frame that was registered last."""
+        if adopted.record.file != self.adopted_file:
+            self._adopt(adopted, register(adopted.mosaic, session.chart, adopted.record.file))
+        self._highest, self._highest_at = state["highest"], state["highest_at"]
+        self._outside, self._covered = state["outside"], state["covered"]
+        self._even_sum, self._even_noise = state["even_sum"], state["even_noise"]
+        self._even_frames = int(state["even_frames"])
 
     def measure(self, decoded: _Decoded) -> tuple[FrameFigures, npt.NDArray[np.uint16]]:
         """Return a frame's figures and its samples (colours, 25, 3) uint16 in the order of colour indices."""
@@ -446,23 +757,54 @@ class _Measurement:
             self._even_noise += noise_of(samples[:cells]) ** 2
             self._even_frames += 1
         values = table_values(samples[:cells], paper.field.at(self._cells_mm))
-        return FrameFigures(decoded.record, decoded.black, channel, shift, anew, paper), values
+        greys = self._mean_of(slice(cells + len(self._references), None), decoded, samples, highest, sites)
+        levels = self.levels.read(greys, paper.field.at(self._grey_mm))
+        return FrameFigures(decoded.record, decoded.black, channel, shift, anew, paper, *levels), values
 
     def _sites_of(self, registration: Registration) -> Sites:
-        """Return the sites of the cells in the order of colour indices, then of the white references."""
-        places = registration.to_pixels(np.concatenate([self._cells_mm, self._reference_mm]))
+        """Return the sites of the cells in the order of colour indices, then of the white references, then grey."""
+        places = registration.to_pixels(np.concatenate([self._cells_mm, self._reference_mm, self._grey_mm]))
         return sites_at(places, (self._shape[0], self._shape[1]))
 
     def _paper(
         self, decoded: _Decoded, samples: npt.NDArray[np.float32], highest: npt.NDArray[np.uint16], sites: Sites
     ) -> Paper:
         cells = self._chart.colour_count
-        usable = sites.inside[cells:] & (highest[cells:] < CLIPPED * decoded.saturation)
-        seen = samples[cells:].mean(axis=1, dtype=np.float64)
-        seen[~usable] = np.nan
+        whites = slice(cells, cells + len(self._references))
+        seen = self._mean_of(whites, decoded, samples, highest, sites)
         return read_paper(
             self._reference_mm, seen, self._cells_mm, self._chart.page_mm, self._base, decoded.record.file
         )
+
+    def _mean_of(
+        self,
+        patches: slice,
+        decoded: _Decoded,
+        samples: npt.NDArray[np.float32],
+        highest: npt.NDArray[np.uint16],
+        sites: Sites,
+    ) -> _Array:
+        """Return the mean counts (N, 3) of patches, NaN where one is cut off or clipped."""
+        seen = samples[patches].mean(axis=1, dtype=np.float64)
+        seen[~(sites.inside[patches] & (highest[patches] < CLIPPED * decoded.saturation))] = np.nan
+        return seen
+
+    def darkness(self, frames: Iterable[_Decoded]) -> Darkness:
+        """Return what dark frames say, at the places of the frame that was registered first: no tag is seen in them."""
+        assert self._base is not None
+        reading, cells, sites = DarkReading(), self._chart.colour_count, self._first_sites
+        whites = slice(cells, cells + len(self._references))
+        shape = self._base.at(self._reference_mm)[sites.inside[whites]]
+        for decoded in frames:
+            samples, _ = gather(decoded.mosaic, decoded.black, sites)
+            paper = samples[whites][sites.inside[whites]]
+            record = decoded.record
+            reading.add(record.file, record.sha256, decoded.black, samples[:cells], paper, shape)
+        return reading.result()
+
+    def saturated(self, saturation_counts: int) -> bool:
+        """Return whether a photosite of a cell reached saturation."""
+        return bool((self._highest >= saturation_counts).any())
 
     def noise(self) -> _Array:
         """Return the median standard deviation of one sample of the even frames, relative to the brightest cells."""
@@ -470,9 +812,11 @@ class _Measurement:
         level = np.percentile(self._even_sum.mean(axis=1) / frames, 99.5, axis=0)
         return np.sqrt(np.median(self._even_noise / frames, axis=0)) / np.maximum(level, 1e-6)
 
-    def unfit(self, saturation_counts: int) -> tuple[Unfit, ...]:
+    def unfit(self, saturation_counts: int, darkness: Darkness) -> tuple[Unfit, ...]:
         """Return the cells not to be used, each with the first cause that applies."""
         frames = max(self._even_frames, 1)
+        hottest = darkness.hottest if len(darkness.hottest) else np.zeros(self._chart.colour_count)
+        dead = dead_samples(self._even_sum / frames)
         unevenness = uneven(self._even_sum / frames, np.sqrt(self._even_noise) / frames)
         allowed = CLIPPED * saturation_counts
         found: list[Unfit] = []
@@ -486,6 +830,10 @@ class _Measurement:
                 cause = f"clipped: {int(self._highest[colour])} counts under {under}, below {allowed:.0f} allowed"
             elif self._covered[colour]:
                 cause = "covered: it does not look like the chart's (covered, damaged, or printed otherwise)"
+            elif hottest[colour] > 0:
+                cause = f"hot: a photosite stands out by {hottest[colour]:.0f} counts in every dark frame"
+            elif dead[colour]:
+                cause = "dead: a photosite sees less than half of the light of its cell"
             elif unevenness[colour] > 0:
                 cause = f"uneven: rim and middle differ by {unevenness[colour]:.1%} under white"
             if cause:

@@ -166,7 +166,19 @@ def read_raw(path: Path) -> Mosaic:
     FormatError
         The file is missing, no raw file, cut or damaged, or its sensor is not of the Bayer kind.
     """
-    data = _read_bytes(path)
+    return decode_raw(_read_bytes(path), path)
+
+
+def decode_raw(data: bytes, path: Path) -> Mosaic:
+    """Return the mosaic of a raw file's bytes, for those who have read them already; `path` names it in messages.
+
+    Raises
+    ------
+    FormatError
+        As in `read_raw`.
+    """
+    if not data:
+        raise _unreadable(path, "it is empty")
     directories = _check_structure(path, data)
     import rawpy
 
@@ -240,8 +252,6 @@ def _read_bytes(path: Path) -> bytes:
         raise FormatError(
             f"cannot read {path}: {error.strerror or error}; check its permissions and the disk"
         ) from error
-    if not data:
-        raise _unreadable(path, "it is empty")
     return data
 
 
