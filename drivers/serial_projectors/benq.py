@@ -1,0 +1,222 @@
+"""BenQ projectors: commands between ``*`` and ``#``, over a serial cable or over TCP (port 8000).
+
+Rules that hold inside:
+
+- ``*pow=?#`` asks, ``*pow=on#`` sets; the answer repeats the name, ``*POW=ON#``. Between them may stand an echo of
+  what was sent and the prompt ``>``; projectors on a network send neither.
+- A command that changes nothing may be answered as wrong, so that none is sent.
+- The language knows power on and off only. `BenqProjector.power` takes ``Block item`` for the way between: from where
+  it was last seen. A projector that says on while its lamp still warms up is taken at its word.
+- It cannot tell faults, and `BenqProjector.faults` is always empty.
+
+Source: BenQ, RS232 Command Control (command table, baud rates, the three refusals, echo). Not confirmed by a manual:
+what pow=? answers in warm-up and cooling (as other drivers have met it); which questions standby answers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable
+
+from drivers.clock import Clock
+from drivers.errors import DeviceRefused, ProtocolError
+from drivers.link import Link
+from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
+from drivers.serial_projectors.exchange import (
+    CHECK_SPEED,
+    DEFAULT_TIMEOUT_S,
+    SYSTEM_CLOCK,
+    Exchange,
+    Taker,
+    text_of,
+)
+
+BAUD = 115200
+TCP_PORT = 8000
+PROMPT = b">"
+QUERY = "?"
+ILLEGAL = "Illegal format"
+UNSUPPORTED = "Unsupported item"
+BLOCKED = "Block item"
+
+_WORD = re.compile(rb"[\r\n\0 ]*(?:(>)|([^\r\n\0>#]+#?)(?:(?<=#)|(?=[\r\n])))")
+
+
+class Blocked(DeviceRefused):
+    """The projector knows the command, and cannot carry it out now."""
+
+
+def encode_command(name: str, value: str = QUERY) -> bytes:
+    """Return a command, a question unless `value` is given."""
+    return f"\r*{name}={value}#\r".encode("ascii")
+
+
+def encode_answer(text: str) -> bytes:
+    """Return an answer, such as ``POW=ON`` or `BLOCKED`."""
+    return f"*{text}#\r\n".encode("ascii")
+
+
+def take_command(data: bytes) -> tuple[str, int] | None:
+    """Take one line, without its CR, off the front of `data`."""
+    end = data.find(b"\r")
+    return None if end < 0 else (data[:end].decode("ascii", "replace").strip(), end + 1)
+
+
+def reply_taker(command: bytes) -> Taker[str]:
+    """Return what takes the answer to `command` off the front of the bytes, past echo and prompts.
+
+    Where the answer and the echo look the same and only one comes, the prompt after it tells that it was the answer.
+    """
+    sent = command.strip(b"\r").decode("ascii")
+
+    def take(data: bytes) -> tuple[str, int] | None:
+        place, echoed = 0, False
+        while found := _WORD.match(data, place):
+            place = found.end()
+            if found[1]:
+                if echoed:
+                    return sent, place
+                continue
+            word = text_of(found[2]).strip()
+            if word != sent or echoed:
+                return word, place
+            echoed = True
+        text_of(data[place:].translate(None, b"\r\n\0"))
+        return None
+
+    return take
+
+
+def value_of(name: str, reply: str) -> str:
+    """Return the value in the answer to a command about `name`.
+
+    Raises
+    ------
+    Blocked
+        The projector cannot do it now.
+    DeviceRefused
+        The projector does not know the command, or not on this model.
+    ProtocolError
+        The answer belongs to another command.
+    """
+    text = reply.removeprefix("*").removesuffix("#").strip()
+    match text.lower():
+        case "block item":
+            raise Blocked(f"the projector answers {BLOCKED} to {name}; wait until its power is on and try again")
+        case "unsupported item":
+            raise DeviceRefused(f"the projector answers {UNSUPPORTED} to {name}; do it with its remote control")
+        case "illegal format":
+            raise DeviceRefused(f"the projector answers {ILLEGAL} to {name}; do it with its remote control")
+        case _:
+            pass
+    found, equals, value = text.partition("=")
+    if not equals and name == "modelname":
+        # Some models say their name and nothing else.
+        return text
+    if not equals or found.strip().lower() != name:
+        raise ProtocolError(f"the projector answers {reply!r} to {name}; expected *{name.upper()}=…#; {CHECK_SPEED}")
+    return value.strip()
+
+
+def on_or_off(name: str, value: str) -> bool:
+    """Return whether `value` says on."""
+    if value.upper() not in ("ON", "OFF"):
+        raise ProtocolError(f"the projector answers {name}={value}; expected ON or OFF")
+    return value.upper() == "ON"
+
+
+class BenqProjector:
+    """A `drivers.projector.Projector` over BenQ's commands."""
+
+    def __init__(
+        self,
+        connect: Callable[[], Link],
+        timeout: float = DEFAULT_TIMEOUT_S,
+        label: str = "the projector",
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
+        self._label = label
+        self._exchange = Exchange(connect, timeout, label, clock)
+        self._settled: Power | None = None
+
+    def identity(self) -> ProjectorIdentity:
+        """Return maker and model; empty what it does not say."""
+        try:
+            return ProjectorIdentity("BenQ", self._command("modelname"), "")
+        except DeviceRefused:
+            return ProjectorIdentity("BenQ", "", "")
+
+    def power(self) -> Power:
+        """Return the power state now.
+
+        Raises
+        ------
+        DeviceRefused
+            It is on the way from one state to another, and was not asked before: which way, it does not tell.
+        """
+        try:
+            lit = on_or_off("pow", self._command("pow"))
+        except Blocked as error:
+            match self._settled:
+                case Power.STANDBY:
+                    return Power.WARMING
+                case Power.ON:
+                    return Power.COOLING
+                case _:
+                    raise DeviceRefused(
+                        f"{self._label} is warming up or cooling down, and does not tell which; wait two minutes"
+                    ) from error
+        self._settled = Power.ON if lit else Power.STANDBY
+        return self._settled
+
+    def switch_on(self) -> None:
+        """Begin to switch on; refused while it cools down."""
+        if self.power() not in (Power.ON, Power.WARMING):
+            self._command("pow", "on")
+
+    def switch_off(self) -> None:
+        """Begin to switch off; refused while it warms up."""
+        if self.power() not in (Power.STANDBY, Power.COOLING):
+            self._command("pow", "off")
+
+    def muted(self) -> bool:
+        """Return whether the picture is blanked; refused unless the projector is on."""
+        return on_or_off("blank", self._command("blank"))
+
+    def set_muted(self, muted: bool) -> None:
+        """Blank the picture, or show it; refused unless the projector is on."""
+        if self.muted() is not muted:
+            self._command("blank", "on" if muted else "off")
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Return nothing: the language has no question about faults; look at the projector's indicators."""
+        # To be silent because the cable is out must not look like health.
+        with contextlib.suppress(Blocked):
+            self._command("pow")
+        return ()
+
+    def lamps(self) -> tuple[Lamp, ...]:
+        """Return the first lamp; empty for a lampless projector, which does not know the question."""
+        try:
+            value = self._command("ltim")
+        except Blocked:
+            raise
+        except DeviceRefused:
+            return ()
+        if not re.fullmatch("[0-9]+", value):
+            raise ProtocolError(f"{self._label} answers ltim={value}; expected hours")
+        return (Lamp(int(value), self.power() in (Power.ON, Power.WARMING)),)
+
+    def close(self) -> None:
+        """Release the cable; the power state stays."""
+        self._exchange.close()
+
+    def _command(self, name: str, value: str = QUERY) -> str:
+        command = encode_command(name, value)
+        reply = self._exchange.ask(command, reply_taker(command))
+        try:
+            return value_of(name, reply)
+        except ProtocolError:
+            self._exchange.close()
+            raise

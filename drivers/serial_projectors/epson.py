@@ -1,0 +1,304 @@
+"""Epson projectors: ESC/VP21 over a serial cable, or over TCP after the ESC/VP.net handshake.
+
+Rules that hold inside:
+
+- Every command ends with CR, every answer with a colon; ``ERR`` before the colon is a refusal. A CR alone is answered
+  by the colon alone.
+- One command at a time. ``PWR ON`` and ``PWR OFF`` are answered only when they are done, after up to 130 s: until then
+  nothing else is asked, and `EpsonProjector.power` says what is under way.
+- The wire knows no model: `EpsonProjector.identity` gives the serial number as the name.
+
+Source: Epson, ESC/VP21 Command User's Guide (PWR, SOURCE, MSEL, times, ERR). Not confirmed by a manual: the state 09,
+the codes of ERR? (as other drivers have them), the events that newer projectors send unasked, the handshake's states.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+
+from drivers.clock import Clock
+from drivers.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
+from drivers.link import Link
+from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
+from drivers.serial_projectors.exchange import CHECK_SPEED, DEFAULT_TIMEOUT_S, SYSTEM_CLOCK, Exchange, quoted, text_of
+
+BAUD = 9600
+TCP_PORT = 3629
+SWITCHING_LIMIT_S = 130.0
+"""Three attempts to strike the lamp, and the time for which an abnormal state lasts."""
+
+HELLO = b"ESC/VP.net\x10\x03\x00\x00\x00\x00"
+"""What opens a connection over TCP: name, version 1.0, the request to connect, no password."""
+WELCOME = 0x20
+_HELLO_STATES = {
+    0x40: "a bad request",
+    0x41: "a password is wanted; switch the password for network control off in its menu",
+    0x43: "a wrong password; switch the password for network control off in its menu",
+    0x45: "the request is not allowed",
+    0x53: "it is busy; close the other controller",
+    0x55: "this version of ESC/VP.net is not supported",
+}
+
+_POWERS = {
+    "00": Power.STANDBY,
+    "01": Power.ON,
+    "02": Power.WARMING,
+    "03": Power.COOLING,
+    "04": Power.STANDBY,
+    "09": Power.STANDBY,
+}
+_ABNORMAL = "05"
+_POWER_CODES = {Power.STANDBY: "04", Power.ON: "01", Power.WARMING: "02", Power.COOLING: "03"}
+_PARTS: Mapping[str, str] = {
+    "01": "fan",
+    "03": "lamp",
+    "04": "temperature",
+    "06": "lamp",
+    "07": "cover",
+    "08": "filter",
+    "0D": "filter",
+}
+_FAULT_CODES = {"fan": "01", "lamp": "06", "temperature": "04", "cover": "07", "filter": "0D", "other": "0B"}
+REFUSAL = "ERR"
+_EVENT = "IMEVENT="
+
+
+def encode_get(name: str) -> bytes:
+    """Return the question after the value of `name`."""
+    return f"{name}?\r".encode("ascii")
+
+
+def encode_set(name: str, value: str) -> bytes:
+    """Return the command that sets `name` to `value`."""
+    return f"{name} {value}\r".encode("ascii")
+
+
+def encode_reply(text: str = "") -> bytes:
+    """Return the projector's answer; without a text, that a command is done."""
+    return f"{text}\r:".encode("ascii") if text else b":"
+
+
+def take_reply(data: bytes) -> tuple[str, int] | None:
+    """Take one answer, without CR and colon, off the front of `data`; events sent unasked are passed over."""
+    start = 0
+    while (end := data.find(b":", start)) >= 0:
+        text = text_of(data[start:end].strip(b"\r\n"))
+        if not text.startswith(_EVENT):
+            return text, end + 1
+        start = end + 1
+    # At the wrong speed a colon may never come; what stands there tells it earlier.
+    text_of(data[start:].replace(b"\r", b"").replace(b"\n", b""))
+    return None
+
+
+def take_command(data: bytes) -> tuple[str, int] | None:
+    """Take one command, without its CR, off the front of `data`."""
+    end = data.find(b"\r")
+    return None if end < 0 else (data[:end].decode("ascii", "replace").strip(), end + 1)
+
+
+def value_of(name: str, reply: str) -> str:
+    """Return the value in the answer to the question after `name`.
+
+    Raises
+    ------
+    DeviceRefused
+        The projector answers ERR.
+    ProtocolError
+        The answer belongs to another question.
+    """
+    if reply == REFUSAL:
+        raise DeviceRefused(f"the projector answers ERR to {name}?; wait until its power is on and try again")
+    found, equals, value = reply.partition("=")
+    if not equals or found.strip() != name:
+        raise ProtocolError(f"the projector answers {reply!r} to {name}?; expected {name}= and a value; {CHECK_SPEED}")
+    return value.strip()
+
+
+def encode_welcome(state: int = WELCOME) -> bytes:
+    """Return the projector's answer to `HELLO`."""
+    return HELLO[:14] + bytes([state, 0])
+
+
+def take_welcome(data: bytes) -> tuple[int, int] | None:
+    """Take the answer to `HELLO` off the front of `data` and return its state."""
+    if not HELLO.startswith(data[:10]):
+        raise ProtocolError(f"the projector greets with {quoted(data)}, not with ESC/VP.net; check the port")
+    return None if len(data) < len(HELLO) else (data[14], len(HELLO))
+
+
+def format_power(power: Power) -> str:
+    """Return PWR's code; standby is the one in which the network is on."""
+    return _POWER_CODES[power]
+
+
+def parse_power(code: str) -> Power:
+    """Return the power state of PWR's code.
+
+    Raises
+    ------
+    DeviceFault
+        The code says that the projector is in an abnormal state.
+    """
+    if code == _ABNORMAL:
+        raise DeviceFault("the projector answers PWR=05: it stopped itself; look at its indicators, unplug and plug it")
+    if code not in _POWERS:
+        raise ProtocolError(f"the projector answers PWR={code}; expected one of {', '.join(_POWERS)}, {_ABNORMAL}")
+    return _POWERS[code]
+
+
+def format_fault(part: str) -> str:
+    """Return ERR's code for an ill part; the language knows neither warnings nor two faults at once."""
+    return _FAULT_CODES[part]
+
+
+def parse_faults(codes: str) -> tuple[Fault, ...]:
+    """Return the faults of ERR's code or codes."""
+    words = codes.upper().split()
+    if not words or any(not re.fullmatch("[0-9A-F]{2}", word) for word in words):
+        raise ProtocolError(f"the projector answers ERR={codes}; expected two hexadecimal digits")
+    parts = dict.fromkeys(_PARTS.get(word, "other") for word in words if word != "00")
+    return tuple(Fault(part, Severity.ERROR) for part in parts)
+
+
+class EpsonProjector:
+    """A `drivers.projector.Projector` over ESC/VP21.
+
+    Parameters
+    ----------
+    network
+        Whether the cable is a TCP connection to port 3629, which wants the handshake of ESC/VP.net.
+    """
+
+    def __init__(
+        self,
+        connect: Callable[[], Link],
+        timeout: float = DEFAULT_TIMEOUT_S,
+        label: str = "the projector",
+        clock: Clock = SYSTEM_CLOCK,
+        network: bool = False,
+    ) -> None:
+        self._label = label
+        self._clock = clock
+        self._exchange = Exchange(connect, timeout, label, clock, self._greet_network if network else self._greet)
+        self._under_way: Power | None = None
+        self._give_up_at = 0.0
+
+    def identity(self) -> ProjectorIdentity:
+        """Return the maker, and the serial number for the name; empty what it does not say."""
+        try:
+            return ProjectorIdentity("Epson", "", self._get("SNO"))
+        except DeviceRefused:
+            return ProjectorIdentity("Epson", "", "")
+
+    def power(self) -> Power:
+        """Return the power state now; while it carries out our own command, what that brings about."""
+        self._meet_late_answer()
+        return self._under_way or parse_power(self._get("PWR"))
+
+    def switch_on(self) -> None:
+        """Begin to switch on; refused while it cools down."""
+        match self.power():
+            case Power.STANDBY:
+                self._begin("ON", Power.WARMING)
+            case Power.COOLING:
+                raise DeviceRefused(f"{self._label} is cooling down; wait until it is in standby and try again")
+            case Power.ON | Power.WARMING:
+                pass
+
+    def switch_off(self) -> None:
+        """Begin to switch off; refused while it warms up."""
+        match self.power():
+            case Power.ON:
+                self._begin("OFF", Power.COOLING)
+            case Power.WARMING:
+                raise DeviceRefused(f"{self._label} is warming up; wait until it is on and try again")
+            case Power.STANDBY | Power.COOLING:
+                pass
+
+    def muted(self) -> bool:
+        """Return whether the picture is blanked by mute; refused unless the projector is on."""
+        value = self._get("MUTE")
+        if value not in ("ON", "OFF"):
+            raise ProtocolError(f"{self._label} answers MUTE={value}; expected ON or OFF")
+        return value == "ON"
+
+    def set_muted(self, muted: bool) -> None:
+        """Blank picture and sound, or show them; refused unless the projector is on."""
+        self._wait_its_turn()
+        command = encode_set("MUTE", "ON" if muted else "OFF")
+        reply = self._exchange.ask(command, take_reply)
+        if reply == REFUSAL:
+            raise DeviceRefused(f"{self._label} answers ERR to MUTE; wait until its power is on and try again")
+        if reply:
+            self._exchange.close()
+            raise ProtocolError(f"{self._label} answers {reply!r} to MUTE; expected the colon alone")
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Return the fault reported now; empty when healthy. Warnings are not told."""
+        return parse_faults(self._get("ERR"))
+
+    def lamps(self) -> tuple[Lamp, ...]:
+        """Return every lamp; refused where the projector does not tell its hours now."""
+        value = self._get("LAMP")
+        if not re.fullmatch(r"[0-9]+( +[0-9]+)*", value):
+            raise ProtocolError(f"{self._label} answers LAMP={value}; expected hours")
+        lit = self.power() in (Power.ON, Power.WARMING)
+        return tuple(Lamp(int(hours), lit) for hours in value.split())
+
+    def close(self) -> None:
+        """Release the cable; the power state stays."""
+        self._under_way = None
+        self._exchange.close()
+
+    def _begin(self, value: str, brings: Power) -> None:
+        self._exchange.send(encode_set("PWR", value))
+        self._under_way = brings
+        self._give_up_at = self._clock.monotonic() + SWITCHING_LIMIT_S
+
+    def _meet_late_answer(self) -> None:
+        """See whether the command under way has been carried out."""
+        if self._under_way is None:
+            return
+        command = "PWR ON" if self._under_way is Power.WARMING else "PWR OFF"
+        try:
+            reply = self._exchange.glance(take_reply)
+        except BaseException:
+            self._under_way = None
+            raise
+        if reply is None:
+            if self._clock.monotonic() >= self._give_up_at:
+                self.close()
+                raise LinkTimeout(
+                    f"{self._label} has not carried out {command} within {SWITCHING_LIMIT_S:g} s; "
+                    "look at its indicators and its cable"
+                )
+            return
+        self._under_way = None
+        if reply == REFUSAL:
+            raise DeviceRefused(f"{self._label} answers ERR to {command}; look at its indicators and try again")
+
+    def _wait_its_turn(self) -> None:
+        self._meet_late_answer()
+        if self._under_way is not None:
+            raise DeviceRefused(f"{self._label} is busy with its {self._under_way.value}; wait until that is done")
+
+    def _get(self, name: str) -> str:
+        self._wait_its_turn()
+        reply = self._exchange.ask(encode_get(name), take_reply)
+        try:
+            return value_of(name, reply)
+        except ProtocolError:
+            self._exchange.close()
+            raise
+
+    def _greet(self, exchange: Exchange) -> None:
+        # The colon shows that it listens, and ends whatever stood half-said on the line.
+        exchange.open_with(b"\r", take_reply)
+
+    def _greet_network(self, exchange: Exchange) -> None:
+        state = exchange.open_with(HELLO, take_welcome)
+        if state != WELCOME:
+            reason = _HELLO_STATES.get(state, "look into its network menu")
+            raise DeviceRefused(f"{self._label} refuses the connection with {state:#04x}: {reason}")

@@ -1,0 +1,268 @@
+"""Optoma projectors: ``~``, the projector's number, a command and its value, over a serial cable.
+
+Rules that hold inside:
+
+- A command is answered by ``P`` or ``F``, a question by ``OK`` and a value, all ended by CR.
+- The projector says unasked ``INFO`` and a number when it changes its power state or falls ill. `OptomaProjector` keeps
+  what it has overheard: warm-up and cooling are known from there only, as power is else on or off.
+- A fault once overheard is reported until the projector warms up again; none can be asked for.
+- Mute cannot be asked of older models; then what this driver has set last is the answer.
+
+Source: Optoma, RS232 Protocol Function List of several models (syntax, P, F, OK, 00, 02, 108, 124, 150, 151, INFO 0 to
+3). Not confirmed by a manual: 355, INFO 4, 6 and 7, and what 124 answers in warm-up and cooling.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drivers.clock import Clock
+from drivers.errors import DeviceRefused, ProtocolError
+from drivers.link import Link
+from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
+from drivers.serial_projectors.exchange import CHECK_SPEED, DEFAULT_TIMEOUT_S, SYSTEM_CLOCK, Exchange, quoted, text_of
+
+BAUD = 9600
+EVERYBODY = 0
+"""The number that every projector listens to."""
+
+POWER = 0
+AV_MUTE = 2
+LAMP_HOURS = 108
+POWER_STATE = 124
+MODEL = 151
+AV_MUTE_STATE = 355
+
+_POWERS = {0: Power.STANDBY, 1: Power.WARMING, 2: Power.COOLING}
+_POWER_NUMBERS = {power: number for number, power in _POWERS.items()}
+_PARTS = {4: "lamp", 6: "fan", 7: "temperature"}
+_PART_NUMBERS = {part: number for number, part in _PARTS.items()}
+
+
+@dataclass(frozen=True)
+class Done:
+    """The answer to a command: whether it was passed."""
+
+    passed: bool
+
+
+@dataclass(frozen=True)
+class Value:
+    """The answer to a question."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Info:
+    """What a projector says unasked."""
+
+    number: int
+
+
+Message = Done | Value | Info
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command or question: its number and what it is given."""
+
+    number: int
+    value: str
+    projector: int = EVERYBODY
+
+
+_MESSAGE = re.compile(rb"[\r\n\0 ]*(?:([PF])|(?i:OK)([^\r\n]*)[\r\n]|INFO([0-9]{1,3})(?=[^0-9]))")
+_BEGINNING = re.compile(rb"[\r\n\0 ]*(?:[oO]([kK][^\r\n]*)?|I(N(F(O[0-9]{0,3})?)?)?)?")
+_COMMAND = re.compile(r"~([0-9]{2})([0-9]{2,3}) (.{1,20})")
+
+
+def encode_command(command: Command) -> bytes:
+    """Return a command's line."""
+    return f"~{command.projector:02d}{command.number:02d} {command.value}\r".encode("ascii")
+
+
+def take_command(data: bytes) -> tuple[Command | None, int] | None:
+    """Take one line off the front of `data`; None stands for a line that is no command."""
+    end = data.find(b"\r")
+    if end < 0:
+        return None
+    found = _COMMAND.fullmatch(data[:end].decode("ascii", "replace").strip())
+    return (Command(int(found[2]), found[3].strip(), int(found[1])) if found else None), end + 1
+
+
+def encode_message(message: Message) -> bytes:
+    """Return what the projector says."""
+    match message:
+        case Done(passed):
+            return b"P\r" if passed else b"F\r"
+        case Value(text):
+            return f"OK{text}\r".encode("ascii")
+        case Info(number):
+            return f"INFO{number}\r".encode("ascii")
+
+
+def take_message(data: bytes) -> tuple[Message, int] | None:
+    """Take one message off the front of `data`."""
+    found = _MESSAGE.match(data)
+    if found is None:
+        if not _BEGINNING.fullmatch(data):
+            raise ProtocolError(f"the projector answers {quoted(data)}; expected P, F, OK… or INFO…; {CHECK_SPEED}")
+        return None
+    done, value, info = found.groups()
+    if done is not None:
+        return Done(done == b"P"), found.end()
+    if value is not None:
+        return Value(text_of(value).strip()), found.end()
+    return Info(int(info)), found.end()
+
+
+def info_of_power(power: Power) -> Info | None:
+    """Return what is said when a power state begins; nothing when the projector has warmed up."""
+    number = _POWER_NUMBERS.get(power)
+    return None if number is None else Info(number)
+
+
+def info_of_fault(part: str) -> Info | None:
+    """Return what is said when a part fails, if there is a number for it."""
+    number = _PART_NUMBERS.get(part)
+    return None if number is None else Info(number)
+
+
+class OptomaProjector:
+    """A `drivers.projector.Projector` over Optoma's commands."""
+
+    def __init__(
+        self,
+        connect: Callable[[], Link],
+        timeout: float = DEFAULT_TIMEOUT_S,
+        label: str = "the projector",
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
+        self._label = label
+        self._exchange = Exchange(connect, timeout, label, clock)
+        self._on_the_way: Power | None = None
+        self._faults: dict[str, None] = {}
+        self._muted: bool | None = None
+
+    def identity(self) -> ProjectorIdentity:
+        """Return the maker, and the number that the language has for the model."""
+        try:
+            return ProjectorIdentity("Optoma", f"model {self._get(MODEL)}", "")
+        except DeviceRefused:
+            return ProjectorIdentity("Optoma", "", "")
+
+    def power(self) -> Power:
+        """Return the power state now; before the first change is overheard, on or standby only."""
+        value = self._get(POWER_STATE)
+        match value, self._on_the_way:
+            case "1", Power.COOLING:
+                return Power.COOLING
+            case "1", _:
+                self._on_the_way = None
+                return Power.ON
+            case "0", on_the_way:
+                return on_the_way or Power.STANDBY
+            case _:
+                raise ProtocolError(f"{self._label} answers OK{value} to its power state; expected OK0 or OK1")
+
+    def switch_on(self) -> None:
+        """Begin to switch on; refused while it cools down."""
+        match self.power():
+            case Power.STANDBY:
+                self._set(POWER, "1")
+                self._on_the_way = Power.WARMING
+            case Power.COOLING:
+                raise DeviceRefused(f"{self._label} is cooling down; wait until it is in standby and try again")
+            case Power.ON | Power.WARMING:
+                pass
+
+    def switch_off(self) -> None:
+        """Begin to switch off; refused while it warms up."""
+        match self.power():
+            case Power.ON:
+                self._set(POWER, "0")
+                self._on_the_way = Power.COOLING
+            case Power.WARMING:
+                raise DeviceRefused(f"{self._label} is warming up; wait until it is on and try again")
+            case Power.STANDBY | Power.COOLING:
+                pass
+
+    def muted(self) -> bool:
+        """Return whether the picture is blanked; refused where neither the projector nor this driver knows."""
+        try:
+            return self._get(AV_MUTE_STATE) == "1"
+        except DeviceRefused:
+            if self._muted is None:
+                raise
+            return self._muted
+
+    def set_muted(self, muted: bool) -> None:
+        """Blank picture and sound, or show them; refused unless the projector is on."""
+        self._set(AV_MUTE, "1" if muted else "0")
+        self._muted = muted
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Return every fault overheard since the lamp was last struck; the language cannot ask for them."""
+        # To be silent because the cable is out must not look like health.
+        self.power()
+        while (message := self._exchange.glance(take_message)) is not None:
+            self._overheard(message)
+        return tuple(Fault(part, Severity.ERROR) for part in self._faults)
+
+    def lamps(self) -> tuple[Lamp, ...]:
+        """Return its lamp; empty where the projector tells no hours."""
+        try:
+            value = self._get(LAMP_HOURS)
+        except DeviceRefused:
+            return ()
+        if not re.fullmatch("[0-9]+", value):
+            raise ProtocolError(f"{self._label} answers OK{value} to its lamp hours; expected digits")
+        return (Lamp(int(value), self.power() in (Power.ON, Power.WARMING)),)
+
+    def close(self) -> None:
+        """Release the cable; the power state stays."""
+        self._exchange.close()
+
+    def _get(self, number: int) -> str:
+        match self._ask(Command(number, "1")):
+            case Value(text):
+                return text
+            case Done(passed=False):
+                raise DeviceRefused(f"{self._label} answers F to question {number}: its model does not know it, or now")
+            case message:
+                self._exchange.close()
+                raise ProtocolError(f"{self._label} answers {message} to question {number}; expected OK…")
+
+    def _set(self, number: int, value: str) -> None:
+        match self._ask(Command(number, value)):
+            case Done(passed=True):
+                return
+            case Done(passed=False):
+                raise DeviceRefused(
+                    f"{self._label} answers F to command {number} {value}; wait until its power is on and try again"
+                )
+            case message:
+                self._exchange.close()
+                raise ProtocolError(f"{self._label} answers {message} to command {number} {value}; expected P or F")
+
+    def _ask(self, command: Command) -> Message:
+        # The exchange throws away what waits when a question is asked; here it may be news.
+        while (message := self._exchange.glance(take_message, 0.0)) is not None:
+            self._overheard(message)
+        return self._exchange.ask(encode_command(command), take_message, self._overheard)
+
+    def _overheard(self, message: Message) -> bool:
+        if not isinstance(message, Info):
+            return False
+        if message.number in _POWERS:
+            power = _POWERS[message.number]
+            self._on_the_way = None if power is Power.STANDBY else power
+            self._muted = None if power is Power.STANDBY else self._muted
+            if power is Power.WARMING:
+                self._faults.clear()
+        if message.number in _PARTS:
+            self._faults[_PARTS[message.number]] = None
+        return True
