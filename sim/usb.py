@@ -19,11 +19,12 @@ from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Protocol
 
 import usb.core
 from usb.backend import IBackend
 
-from sim.usb_device import BULK_IN, BULK_OUT, INTERRUPT_IN, Overflowed, PtpUsbDevice, Setup, Stalled
+from sim.usb_device import BULK_IN, BULK_OUT, INTERRUPT_IN, Overflowed, Setup, Stalled
 
 _ERRORS = {
     errno.EIO: (-1, "Input/Output Error"),
@@ -83,11 +84,29 @@ _ENDPOINT_FIELDS = (
 )
 
 
+class UsbDevice(Protocol):
+    """What the bus asks of a device; `sim.usb_device.PtpUsbDevice` says what each method does."""
+
+    def device_descriptor(self) -> bytes: ...  # noqa: D102
+
+    def configuration_descriptor(self) -> bytes: ...  # noqa: D102
+
+    def control(self, setup: Setup, data: bytes = b"") -> bytes: ...  # noqa: D102
+
+    def bulk_out(self, data: bytes) -> None: ...  # noqa: D102
+
+    def bulk_in(self, limit: int) -> bytes | None: ...  # noqa: D102
+
+    def interrupt_in(self, limit: int) -> bytes | None: ...  # noqa: D102
+
+    def unplugged(self) -> None: ...  # noqa: D102
+
+
 @dataclass(frozen=True)
 class Place:
     """Where a device is plugged in, and since when: two places of one device differ in their address."""
 
-    device: PtpUsbDevice
+    device: UsbDevice
     port: int
     address: int
 
@@ -107,45 +126,45 @@ class SimulatedBus(IBackend):
         self._places: list[Place] = []
         self._addresses = 1
         self._claims: dict[Place, Handle] = {}
-        self._held: set[PtpUsbDevice] = set()
-        self._locked: set[PtpUsbDevice] = set()
-        self._kernel: set[PtpUsbDevice] = set()
+        self._held: set[UsbDevice] = set()
+        self._locked: set[UsbDevice] = set()
+        self._kernel: set[UsbDevice] = set()
 
-    def plug(self, device: PtpUsbDevice, port: int = 1) -> None:
+    def plug(self, device: UsbDevice, port: int = 1) -> None:
         """Plug a device in."""
         self._addresses += 1
         self._places.append(Place(device, port, self._addresses))
 
-    def unplug(self, device: PtpUsbDevice) -> None:
+    def unplug(self, device: UsbDevice) -> None:
         """Pull a device out; does nothing if it is not plugged in."""
         for place in [place for place in self._places if place.device is device]:
             self._places.remove(place)
             self._claims.pop(place, None)
             device.unplugged()
 
-    def replug(self, device: PtpUsbDevice) -> None:
+    def replug(self, device: UsbDevice) -> None:
         """Pull a device out and plug it in again at its port, as it does itself when it restarts."""
         port = next((place.port for place in self._places if place.device is device), 1)
         self.unplug(device)
         self.plug(device, port)
 
-    def hold(self, device: PtpUsbDevice, held: bool = True) -> None:
+    def hold(self, device: UsbDevice, held: bool = True) -> None:
         """Have another program hold the device's interface, or let go of it."""
         (self._held.add if held else self._held.discard)(device)
 
-    def lock(self, device: PtpUsbDevice, locked: bool = True) -> None:
+    def lock(self, device: UsbDevice, locked: bool = True) -> None:
         """Take away the permission to open the device, or give it."""
         (self._locked.add if locked else self._locked.discard)(device)
 
-    def bind_kernel_driver(self, device: PtpUsbDevice) -> None:
+    def bind_kernel_driver(self, device: UsbDevice) -> None:
         """Have the system's own driver sit on the interface."""
         self._kernel.add(device)
 
-    def kernel_driver_sits_on(self, device: PtpUsbDevice) -> bool:
+    def kernel_driver_sits_on(self, device: UsbDevice) -> bool:
         """Return whether the system's own driver sits on the interface."""
         return device in self._kernel
 
-    def is_claimed(self, device: PtpUsbDevice) -> bool:
+    def is_claimed(self, device: UsbDevice) -> bool:
         """Return whether the interface is claimed on this bus."""
         return any(place.device is device for place in self._claims)
 
