@@ -237,7 +237,13 @@ def black_drift(blacks: Sequence[_Array]) -> float:
 
 
 def corrections(
-    page_mm: tuple[float, float], black: _Array, saturation_counts: int, fields: Sequence[Field]
+    page_mm: tuple[float, float],
+    black: _Array,
+    saturation_counts: int,
+    fields: Sequence[Field],
+    *,
+    measured: bool = False,
+    gains: _Array | None = None,
 ) -> list[dict[str, Any]]:
     """Return what was done to the counts, in order, for `lut.json`.
 
@@ -251,8 +257,12 @@ def corrections(
         Raw count of saturation.
     fields
         The field divided out of each light.
+    measured
+        Whether saturation was seen, rather than stated by the raw file.
+    gains
+        (L, 3) the lamp's drift at each light; None where no white frame tells.
     """
-    return [
+    done: list[dict[str, Any]] = [
         {
             "name": "black",
             "how": "subtracted: mean of the frame's masked border for each position of the 2x2 block, "
@@ -269,6 +279,10 @@ def corrections(
             "how": f"cells with a count of {CLIPPED:g} of it or more are unfit",
             "unit": "raw counts",
             "value": saturation_counts,
+            "from": "measured: photosites of this session reached it"
+            if measured
+            else "the raw files' statement, which may be too high, as no photosite of a cell came near; "
+            "no sample is affected, but white_level may be",
         },
         {
             "name": "field",
@@ -281,3 +295,14 @@ def corrections(
         },
         {"name": "rounding", "how": "to the nearest integer, negative values to 0"},
     ]
+    if gains is not None:
+        done.append(
+            {
+                "name": "drift",
+                "applied": False,
+                "how": "the lamp's light over that of the first white frame, linear in time between white frames; "
+                "not applied: divide samples and ground truth of a light by it to have all lights of one lamp",
+                "per_light": np.round(gains, 6).tolist(),
+            }
+        )
+    return done

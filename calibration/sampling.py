@@ -156,6 +156,22 @@ def uneven(samples: npt.NDArray[np.floating], noise: npt.NDArray[np.floating]) -
     return np.where(significant, difference / level, 0.0).max(axis=1)
 
 
+DEAD_SHARE = 0.5
+DEAD_LEVEL = 300.0
+"""Counts that a cell must have for a dead photosite to be told from noise: 21 σ there."""
+
+
+def dead_samples(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+    """Return which patches (N,) hold a photosite that sees less than half of what the others do.
+
+    `samples` (N, 25, 3) are counts above black, the mean of one or more frames. A green sample is the mean of two
+    photosites, so that one of them dead halves it.
+    """
+    middle = np.median(samples, axis=1, keepdims=True)
+    allowed = np.array([DEAD_SHARE, 0.5 * (1 + DEAD_SHARE), DEAD_SHARE])
+    return np.asarray(((samples < allowed * middle) & (middle > DEAD_LEVEL)).any(axis=(1, 2)))
+
+
 def noise_of(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Return the standard deviation of one value of each patch, (N, 3), as usual for patches of its level.
 

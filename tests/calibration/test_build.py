@@ -100,7 +100,7 @@ def test_nothing_is_unfit_in_a_healthy_session(built: BuildResult) -> None:
 def test_the_field_can_be_undone(table: Lut, built: BuildResult, session: Session, lab: Lab) -> None:
     """Multiplied by the field of `lut.json`, the table gives the counts of the frame again."""
     told = {correction["name"]: correction for correction in table.provenance.corrections}
-    assert list(told) == ["black", "half size", "saturation", "field", "rounding"]
+    assert list(told) == ["black", "half size", "saturation", "field", "rounding", "drift"]
     assert len(told["field"]["per_light"]) == len(told["black"]["per_light"]) == len(LIGHTS)
     figures = next(f for f in built.frames if f.record.illumination == 5)
     field = figures.paper.field.at(lab.chart.centres_mm[lab.chart.cell_of_colour])
@@ -251,7 +251,7 @@ def test_cells_that_cannot_be_used_are_listed_with_their_cause(lab: Lab, tmp_pat
             rows, columns = visible.top + 2 * places[:, 1], visible.left + 2 * places[:, 0]
             if step.kind == "light":
                 counts[rows[0], columns[0]] = lab.world.body.saturation
-            else:
+            elif step.kind == "white":
                 counts[rows[1] - 4 : rows[1] - 2, columns[1] - 4 : columns[1] + 5] += 2500
 
         return lab.dng(step.colour, step.number, paint=paint)
