@@ -127,6 +127,26 @@ def illuminations(
 
 
 @app.command()
+def devices(
+    search: Annotated[
+        float, typer.Option(min=0, help="Seconds to wait for PJLink projectors to answer; 0 does not ask.")
+    ] = 10.0,
+    identify: Annotated[bool, typer.Option(help="Show on every display its number for ten seconds.")] = False,
+) -> None:
+    """List what is attached and reachable: cameras, serial ports, displays, projectors on the network."""
+    from acquisition.rig import attached_devices, identify_displays
+
+    for attached in attached_devices(search):
+        print(f"{attached.kind}:")
+        for name in attached.found:
+            print(f"  {name}")
+        if not attached.found:
+            print(f"  none{': ' + attached.trouble if attached.trouble else ''}")
+    if identify:
+        identify_displays(10.0)
+
+
+@app.command()
 def check(
     lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
     picture: Annotated[Path | None, typer.Option(help="Save the frame with what was found on it as PNG.")] = None,

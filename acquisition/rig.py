@@ -7,25 +7,47 @@ taken; so an interrupted session ends in the same bytes as an undisturbed one.
 
 from __future__ import annotations
 
+import uuid
 from collections import Counter
-from collections.abc import Generator
-from contextlib import contextmanager
-from dataclasses import fields
+from collections.abc import Callable, Generator, Iterable
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
 from acquisition.chart import Chart
-from acquisition.config import LabSettings, unknown_key
+from acquisition.config import (
+    CameraCable,
+    LabSettings,
+    LightSource,
+    ProjectorCable,
+    require_whole_turns,
+    unknown_key,
+)
 from acquisition.printing import drawing
 from acquisition.sequencer import Devices
 from acquisition.session import Session
-from drivers.errors import ConfigurationError, FormatError
+from drivers.camera import Camera
+from drivers.clock import Clock, SystemClock
+from drivers.errors import ConfigurationError, CropError, FormatError
+from drivers.fullscreen import FullScreen, identify_displays, list_displays
+from drivers.gphoto2_camera import Gphoto2Camera
+from drivers.links.serial import SerialLink, list_serial_ports
+from drivers.links.tcp import TcpLink
+from drivers.links.usb import list_devices, open_usb
+from drivers.pipes import UsbPipes
 from drivers.pjlink.projector import PjLinkProjector
-from drivers.presenter import Colour
-from drivers.projector import Power
+from drivers.pjlink.search import search
+from drivers.pjlink.wire import PORT as PJLINK_PORT
+from drivers.presenter import Colour, Presenter
+from drivers.projector import Power, Projector
 from drivers.ptp.canon_eos import CanonEos
+from drivers.ptp.codes import VENDOR_CANON_USB
+from drivers.ptp.ip_transport import IpTransport
+from drivers.ptp.usb_transport import UsbTransport
+from drivers.serial_projectors import language
 from sim.bodies import BODIES, Body
 from sim.clock import OPENING, SimulatedClock
 from sim.eos import SimulatedEos
@@ -37,11 +59,26 @@ from sim.ptp_memory import MemoryTransport
 from sim.replay import RecordedFrame, ReplayFilm
 from sim.world import Print, Room, World
 
+__all__ = [
+    "Attached",
+    "attached_devices",
+    "identify_displays",
+    "open_rig",
+    "sheet",
+    "simulated_body",
+    "simulated_room",
+]
+
 SERIAL = "0000000001"
+CONNECT_S = 5.0
 
 
 @contextmanager
-def open_rig(settings: LabSettings, chart: Chart, session: Session | None = None) -> Generator[Devices]:
+def open_rig(
+    settings: LabSettings,
+    chart: Chart,
+    session: Session | None = None,
+) -> Generator[Devices]:
     """Open every device that the settings name; close them all at the end, whatever the end.
 
     Parameters
@@ -64,28 +101,101 @@ def open_rig(settings: LabSettings, chart: Chart, session: Session | None = None
         raise ConfigurationError(
             'rig = "imported" marks a session whose frames were taken by other means; nothing more can be taken of it'
         )
+    with ExitStack() as opened:
+        if settings.rig == "lab":
+            yield _open_lab(settings, opened)
+        else:
+            yield _open_simulated(settings, chart, session, opened)
+
+
+def _open_lab(settings: LabSettings, opened: ExitStack) -> Devices:
+    clock = SystemClock()
+    require_whole_turns(settings.camera, settings.lab.projector)
+    projector = _lab_projector(settings.lab.projector, clock)
+    if projector is not None:
+        opened.callback(projector.close)
+    presenter = _lab_presenter(settings.lab.light, clock)
+    opened.callback(presenter.close)
+    camera = _lab_camera(settings.lab.camera, clock)
+    opened.callback(camera.close)
+    return Devices(camera, presenter, projector, clock)
+
+
+def _lab_camera(cable: CameraCable, clock: Clock) -> Camera:
+    match cable.connection:
+        case "usb":
+            return CanonEos(lambda: UsbTransport(_usb_pipes(cable), clock), clock)
+        case "ptpip":
+            host = _required(cable.host, "lab.camera.host", "the camera's address")
+            # A body remembers the computers it was paired with by this number.
+            guid = uuid.uuid5(uuid.NAMESPACE_DNS, f"croplab.{uuid.getnode()}").bytes
+            return CanonEos(
+                lambda: IpTransport.connect(
+                    host, cable.port, event_port=cable.event_port, guid=guid, name="CroP", clock=clock
+                ),
+                clock,
+            )
+        case "gphoto2":
+            return Gphoto2Camera(cable.gphoto2_port, cable.gphoto2_model, clock)
+
+
+def _usb_pipes(cable: CameraCable) -> UsbPipes:
+    return open_usb(vendor=VENDOR_CANON_USB, serial=cable.serial, port=cable.usb_port)
+
+
+def _lab_projector(cable: ProjectorCable, clock: Clock) -> Projector | None:
+    if cable.control == "none":
+        return None
+    if cable.control == "pjlink":
+        host = _required(cable.host, "lab.projector.host", "the projector's address")
+        port = cable.port or PJLINK_PORT
+        label = f"the projector at {host}:{port}"
+        return PjLinkProjector(lambda: TcpLink.connect(host, port, CONNECT_S), cable.password, label=label, clock=clock)
+    spoken = language(cable.control)
+    device = _required(cable.device, "lab.projector.device", "the serial port")
+    return spoken.projector(
+        lambda: SerialLink.open(device, cable.baud or spoken.baud, spoken.parity),
+        label=f"the projector at {device}",
+        clock=clock,
+    )
+
+
+def _lab_presenter(light: LightSource, clock: Clock) -> Presenter:
+    if light.shown_by == "display":
+        return FullScreen(light.display, clock)
+    raise ConfigurationError(f"lab.light.shown_by = {light.shown_by!r} is not there yet; known is 'display'")
+
+
+def _required(value: str | None, key: str, what: str) -> str:
+    if value is None:
+        raise ConfigurationError(f"LAB.toml: {key} is missing; name {what}, acquire devices lists what is there")
+    return value
+
+
+def _open_simulated(settings: LabSettings, chart: Chart, session: Session | None, opened: ExitStack) -> Devices:
     exposed = _exposed(session)
     clock = SimulatedClock(_last_moment(session) if session is not None else OPENING)
     screen = Screen()
     beamer = SimulatedProjector(clock, power=Power.ON if exposed else Power.STANDBY)
-    name = settings.simulated.body
+    sensor = simulated_body(settings)
     if settings.rig == "simulated":
-        world = World(sheet(chart), simulated_body(settings), simulated_room(settings))
-        film: Film = WorldFilm(world, screen, beamer.light, SERIAL, exposed)
+        world = World(sheet(chart), sensor, simulated_room(settings))
+        film: Film = WorldFilm(world, lambda: screen.colour, beamer.light, SERIAL, exposed)
     else:
         assert settings.replay is not None
-        film = ReplayFilm(_recording(settings.replay.session), screen, exposed)
-    eos = SimulatedEos(EOS_BODIES[name], film, clock, serial=SERIAL, auto_power_off_s=0)
+        film = ReplayFilm(_recording(settings.replay.session), lambda: screen.colour, exposed)
+        film.accept(settings.camera.exposure)
+    # On mains power, as a camera that takes 707 frames is.
+    body = replace(EOS_BODIES[settings.simulated.body], shots_per_charge=10**9)
+    eos = SimulatedEos(body, film, clock, serial=SERIAL, auto_power_off_s=0)
     peer = PjLinkPeer(beamer)
-    camera = CanonEos(lambda: MemoryTransport(eos), clock)
-    presenter = SimulatedPresenter(screen, clock)
     projector = PjLinkProjector(lambda: memory_link(peer))
-    try:
-        yield Devices(camera, presenter, projector, clock)
-    finally:
-        presenter.close()
-        camera.close()
-        projector.close()
+    opened.callback(projector.close)
+    presenter = SimulatedPresenter(screen, clock)
+    opened.callback(presenter.close)
+    camera = CanonEos(lambda: MemoryTransport(eos), clock)
+    opened.callback(camera.close)
+    return Devices(camera, presenter, projector, clock)
 
 
 def sheet(chart: Chart) -> Print:
@@ -150,3 +260,36 @@ def _recording(folder: Path) -> list[RecordedFrame]:
     if not frames:
         raise FormatError(f"{folder} holds no frames; name a session in which some were taken")
     return frames
+
+
+@dataclass(frozen=True)
+class Attached:
+    """What of one kind is attached or reachable: `kind` in the plural, what was found, or why it could not be asked."""
+
+    kind: str
+    found: tuple[str, ...]
+    trouble: str = ""
+
+
+def attached_devices(search_s: float) -> Generator[Attached]:
+    """Yield what is attached and reachable, kind by kind; a kind that cannot be asked says why.
+
+    Parameters
+    ----------
+    search_s
+        Seconds to collect the answers of PJLink projectors on the network; 0 does not ask.
+    """
+    yield _attached("cameras on USB", lambda: [str(device) for device in list_devices()])
+    yield _attached("serial ports", list_serial_ports)
+    yield _attached("displays", lambda: [str(display) for display in list_displays()])
+    if search_s > 0:
+        yield _attached(
+            "projectors by PJLink", lambda: [f"{found.host}, MAC {found.mac}" for found in search(search_s)]
+        )
+
+
+def _attached(kind: str, ask: Callable[[], Iterable[str]]) -> Attached:
+    try:
+        return Attached(kind, tuple(ask()))
+    except CropError as error:
+        return Attached(kind, (), str(error))

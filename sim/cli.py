@@ -134,7 +134,6 @@ def camera(
     from sim.eos import SimulatedEos
     from sim.eos_bodies import EOS_BODIES
     from sim.film import WorldFilm
-    from sim.presenter import Screen
     from sim.ptpip_server import serve_ptpip
     from sim.usb_device import Identity, PtpUsbDevice
     from sim.usbip import serve_usbip
@@ -148,7 +147,7 @@ def camera(
         raise ConfigurationError(f"--model {model!r}: known are {', '.join(sorted(EOS_BODIES))}")
     # A lamp that ages would be dark by now: its drift counts from the day when the simulated lab opened.
     world = World(_grey_squares(), BODIES[model], Room(lamp_drift_per_hour=0))
-    film = WorldFilm(world, Screen(WHITE), lambda: 1.0, "0000000001", {})
+    film = WorldFilm(world, lambda: WHITE, lambda: 1.0, "0000000001", {})
     with ThreadPoolExecutor(1, "darkroom") as darkroom:
         eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, darkroom=darkroom)
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))

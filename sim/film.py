@@ -16,7 +16,6 @@ from drivers.errors import DeviceRefused
 from drivers.presenter import Colour
 from sim.clock import OPENING
 from sim.dng import write_dng
-from sim.presenter import Screen
 from sim.world import World
 
 
@@ -38,10 +37,12 @@ class Film(Protocol):
 
 
 class WorldFilm:
-    """Pictures of a `World` lit by what stands on a `Screen`.
+    """Pictures of a `World` lit by what the projector shows.
 
     Parameters
     ----------
+    look
+        Tells the colour that stands on the screen now.
     light
         Tells the share of its light that leaves the projector now, 0 … 1.
     exposed
@@ -52,10 +53,15 @@ class WorldFilm:
     suffix = ".dng"
 
     def __init__(
-        self, world: World, screen: Screen, light: Callable[[], float], serial: str, exposed: Mapping[Colour, int]
+        self,
+        world: World,
+        look: Callable[[], Colour],
+        light: Callable[[], float],
+        serial: str,
+        exposed: Mapping[Colour, int],
     ) -> None:
         self._world = world
-        self._screen = screen
+        self._look = look
         self._light = light
         self._serial = serial
         self._exposed = Counter(dict(exposed))
@@ -72,7 +78,7 @@ class WorldFilm:
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
         """Photograph the world as it is lit now."""
-        colour = self._screen.colour
+        colour = self._look()
         hours = (released_at - OPENING).total_seconds() / 3600
         lamp = self._light() * (1 - self._world.room.lamp_drift_per_hour * hours)
         key = (colour.red, colour.green, colour.blue, self._exposed[colour])

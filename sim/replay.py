@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -17,7 +17,6 @@ from typing import BinaryIO
 from drivers.camera import ExposureSettings
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.presenter import Colour
-from sim.presenter import Screen
 
 
 @dataclass(frozen=True)
@@ -36,15 +35,19 @@ class ReplayFilm:
     ----------
     frames
         The recording in the order in which it was taken; at least one.
+    look
+        Tells the colour that stands on the screen now.
     exposed
         How many frames of each colour have been handed out before.
     """
 
-    def __init__(self, frames: Sequence[RecordedFrame], screen: Screen, exposed: Mapping[Colour, int]) -> None:
+    def __init__(
+        self, frames: Sequence[RecordedFrame], look: Callable[[], Colour], exposed: Mapping[Colour, int]
+    ) -> None:
         self._frames: dict[Colour, list[RecordedFrame]] = {}
         for frame in frames:
             self._frames.setdefault(frame.colour, []).append(frame)
-        self._screen = screen
+        self._look = look
         self._exposed = Counter(dict(exposed))
         self._suffix = frames[0].path.suffix.lower()
 
@@ -66,7 +69,7 @@ class ReplayFilm:
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
         """Hand out the next recorded file of the colour on the screen."""
         del settings, released_at
-        colour = self._screen.colour
+        colour = self._look()
         frames = self._frames.get(colour, [])
         number = self._exposed[colour]
         if number >= len(frames):

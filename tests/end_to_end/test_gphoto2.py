@@ -33,7 +33,6 @@ from sim.bodies import BODIES
 from sim.eos import SimulatedEos
 from sim.eos_bodies import EOS_6D_MARK_II, EOS_550D_AS_LISTED, TEST_BODY
 from sim.film import Film, WorldFilm
-from sim.presenter import Screen
 from sim.ptpip_server import serve_ptpip
 from sim.world import Print, Room, World
 
@@ -112,7 +111,7 @@ def world() -> World:
 def served(world: World, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Served]:
     """Return a served camera; parametrise indirectly with another body than the test body."""
     body = getattr(request, "param", TEST_BODY)
-    film = WitnessedFilm(WorldFilm(world, Screen(WHITE), lambda: 1.0, "1", {}))
+    film = WitnessedFilm(WorldFilm(world, lambda: WHITE, lambda: 1.0, "1", {}))
     with ThreadPoolExecutor(1) as darkroom:
         eos = SimulatedEos(body, film, SystemClock(), serial="1", auto_power_off_s=0, darkroom=darkroom)
         with serve_ptpip(eos, 0) as server:

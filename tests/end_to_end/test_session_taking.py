@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
@@ -235,3 +236,24 @@ def test_a_full_disk_costs_nothing_taken(
     assert run(monkeypatch, "run", lab, folder) == 0
     after: dict[Any, list[str]] = frame_hashes(folder)
     assert all(set(files) <= set(after[key]) for key, files in kept.items())
+
+
+def test_a_replay_with_another_exposure_is_told_the_recordings(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "run", lab, lab.parent / "recorded") == 0
+    text = lab.read_text().replace('"simulated"', '"replay"')
+    lab.write_text(text + '[replay]\nsession = "recorded"\n[camera]\nshutter_s = 1.0\n')
+    assert run(monkeypatch, "run", lab, lab.parent / "replayed") == 3
+    assert "was taken with 0.5 s" in capsys.readouterr().err
+
+
+def test_a_series_longer_than_a_battery_lasts(lab: Path) -> None:
+    from acquisition.chart import load_chart
+    from acquisition.rig import open_rig
+
+    settings = load_lab(lab)
+    with open_rig(settings, load_chart(settings.chart)) as devices:
+        devices.camera.configure(settings.camera.exposure)
+        frames = {devices.camera.capture(io.BytesIO()).name for _ in range(430)}
+    assert len(frames) == 430

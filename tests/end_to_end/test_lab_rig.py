@@ -1,0 +1,120 @@
+"""A real lab in which nothing but the world is simulated: every wire and cable is the one that real devices use.
+
+The camera hangs on loopback PTP/IP, or on the simulated USB bus; the projector on loopback PJLink, or on a
+pseudo-terminal; the light is a window on a virtual X display, which the world watches from outside. The frames are
+those of `rig = "simulated"` with the same seed.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from acquisition.chart import load_chart
+from acquisition.config import load_lab
+from acquisition.rig import sheet, simulated_body, simulated_room
+from acquisition.session import Session
+from acquisition.taking import run_session
+from drivers.clock import SystemClock
+from drivers.links.usb import open_usb
+from drivers.presenter import Colour
+from drivers.projector import Power
+from drivers.rawfile import read_raw
+from sim.clock import OPENING
+from sim.eos import SimulatedEos
+from sim.eos_bodies import EOS_BODIES
+from sim.film import WorldFilm
+from sim.projector import SimulatedProjector, serve_pjlink
+from sim.ptpip_server import serve_ptpip
+from sim.pty import PseudoTerminal
+from sim.serial_projectors import PEERS
+from sim.usb import SimulatedBus
+from sim.usb_device import PtpUsbDevice
+from sim.world import World
+
+FRAMES = 10
+ROOM = """
+[camera]
+shutter_s = 0.1
+[simulated.room]
+lamp_drift_per_hour = 0.0
+white_level_share = 3.5
+"""
+
+
+@pytest.fixture(scope="module")
+def x_servers() -> ModuleType:
+    """Return the module that runs X servers; it stands with the tests of the display."""
+    path = Path(__file__).parents[1] / "drivers" / "x_servers.py"
+    spec = importlib.util.spec_from_file_location("x_servers_for_the_lab", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # dataclasses look their module up by name.
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("cables", ["network", "usb and serial"])
+def test_a_real_lab_takes_the_frames_of_the_simulated_one(
+    lab: Path, cables: str, monkeypatch: pytest.MonkeyPatch, x_servers: ModuleType
+) -> None:
+    folder = lab.parent
+    lab.write_text(lab.read_text() + ROOM)
+    settings = load_lab(lab)
+    assert run_session(settings, folder / "simulated", lambda done, total: None).complete
+    with ExitStack() as opened:
+        screen = opened.enter_context(x_servers.virtual_screen(folder, "320x240"))
+        monkeypatch.setenv("DISPLAY", screen.display)
+        monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+        def look() -> Colour:
+            colours = np.unique(screen.picture())
+            assert len(colours) == 1, "the screen is not of one plain colour"
+            code = int(colours[0])
+            return Colour(code >> 16 & 255, code >> 8 & 255, code & 255)
+
+        clock = SystemClock()
+        beamer = SimulatedProjector(clock, power=Power.ON)
+        world = World(sheet(load_chart(settings.chart)), simulated_body(settings), simulated_room(settings))
+        film = WorldFilm(world, look, beamer.light, "0000000001", {})
+        darkroom = opened.enter_context(ThreadPoolExecutor(1))
+        world.expose(Colour(0, 0, 0), settings.camera.exposure, key=(0,))  # renders before time counts
+        eos = SimulatedEos(EOS_BODIES["Test"], film, clock, auto_power_off_s=0, darkroom=darkroom)
+        bus = SimulatedBus()
+        text = lab.read_text().replace('rig = "simulated"', 'rig = "lab"')
+        text += "[sequence]\nsettle_s = 0.0\n" if "[sequence]" not in text else ""
+        text = text.replace("[sequence]\n", "[sequence]\nsettle_s = 0.0\nwarm_up_s = 0.0\n")
+        if cables == "network":
+            _, port = opened.enter_context(serve_ptpip(eos, 0)).address
+            _, control = opened.enter_context(serve_pjlink(beamer, 0, "secret")).address
+            text += f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\nport = {port}\n'
+            text += f'[lab.projector]\ncontrol = "pjlink"\nhost = "127.0.0.1"\nport = {control}\npassword = "secret"\n'
+        else:
+            bus.plug(PtpUsbDevice(eos))
+            terminal = opened.enter_context(PseudoTerminal(PEERS["benq"](beamer)))
+            text += '[lab.camera]\nconnection = "usb"\n'
+            text += f'[lab.projector]\ncontrol = "benq"\ndevice = "{terminal.path}"\n'
+        lab.write_text(text)
+        monkeypatch.setattr("acquisition.rig.open_usb", partial(open_usb, backend=bus))
+        assert run_session(load_lab(lab), folder / "real", lambda done, total: None).complete
+        assert beamer.power() is not Power.ON, "a complete session switches the lamp off"
+        assert look() == Colour(0, 0, 0), "the screen is black when the lab is left"
+    with Session.open(folder / "simulated") as simulated, Session.open(folder / "real") as real:
+        pairs = list(zip(simulated.frames(), real.frames(), strict=True))
+        assert len(pairs) == FRAMES
+        for ours, theirs in pairs:
+            assert (ours.kind, ours.illumination) == (theirs.kind, theirs.illumination)
+            one = read_raw(simulated.folder / ours.file)
+            other = read_raw(real.folder / theirs.file)
+            np.testing.assert_array_equal(one.sensor, other.sensor)
+            assert theirs.taken_at > OPENING
