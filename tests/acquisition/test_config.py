@@ -77,3 +77,9 @@ def test_a_projector_without_a_wheel_needs_whole_pictures() -> None:
     require_whole_turns(CameraSettings(shutter_s=0.02), steady)
     with pytest.raises(ConfigurationError, match="50 a second"):
         require_whole_turns(CameraSettings(shutter_s=1 / 60), steady)
+
+
+@pytest.mark.parametrize("name", ["demo.toml", "lab.toml"])
+def test_the_examples_are_read(name: str) -> None:
+    settings = load_lab(Path(__file__).parents[2] / "examples" / name)
+    require_whole_turns(settings.camera, settings.lab.projector)
