@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import pytest
 
 from drivers.errors import DeviceFault, LinkTimeout
@@ -280,6 +282,31 @@ def test_the_port_asks_for_the_password_once_a_connection() -> None:
     assert peer.closed
     peer.connect()
     assert peer.receive(b"%1ERST ?\r%1POWR 1\r") == b"PJLINK ERRA\r"
+
+
+def test_sha256_is_asked_for_and_proved() -> None:
+    # PJLink 2.10, 5.1, with a random number of the projector's own.
+    device = SimulatedProjector(SimulatedClock(), traits=ProjectorTraits(sha256=True))
+    peer = PjLinkPeer(device, "secret", seed="498e4a67")
+    nonce = bytes(range(16))
+    answer = peer.receive(b"PJLINK 2\r")
+    assert answer.startswith(b"PJLINK 2 ")
+    challenge = bytes.fromhex(answer[9:-1].decode("ascii"))
+    mixed = bytes(ours ^ theirs for ours, theirs in zip(nonce, challenge, strict=True)).hex()
+    digest = nonce.hex() + hashlib.sha256((mixed + "secret").encode()).hexdigest()
+    assert conversation(peer, digest.encode() + b"%1POWR ?\r", b"%1POWR ?\r") == [b"%1POWR=0\r"] * 2
+    # Without, or with the digest of another connection, it is refused.
+    for wrong in (b"", digest.encode(), b"5d8409bc1c3fa39749434aa3a5c38682"):
+        peer.connect()
+        peer.receive(b"PJLINK 2\r")
+        assert peer.receive(wrong + b"%1POWR ?\r") == b"PJLINK ERRA\r"
+        assert peer.closed
+
+
+def test_a_port_without_sha256_takes_the_question_for_a_wrong_digest() -> None:
+    peer = PjLinkPeer(SimulatedProjector(SimulatedClock()), "secret")
+    assert peer.receive(b"PJLINK 2\r") == b"PJLINK ERRA\r"
+    assert peer.closed
 
 
 def test_each_connection_is_greeted_with_its_own_seed() -> None:
