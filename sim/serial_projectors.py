@@ -145,8 +145,11 @@ class BenqPeer:
         while (taken := benq.take_command(self._heard)) is not None:
             line, length = taken
             self._heard = self._heard[length:]
-            echo, end = (b"", b"") if self._network else (line.encode("ascii", "replace") + b"\r\n", benq.PROMPT)
-            said += echo + (benq.encode_answer(self._answer(line)) if line else b"") + end
+            if line:
+                echo = b"" if self._network else line.encode("ascii", "replace") + b"\r\n"
+                said += echo + benq.encode_answer(self._answer(line))
+            if not self._network:
+                said += benq.PROMPT
         return said
 
     def _answer(self, line: str) -> str:

@@ -1,0 +1,158 @@
+"""The serial cable: the link contract on a pseudo-terminal, and every way in which a port cannot be opened."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+if sys.platform == "win32":
+    pytest.skip("Windows has no pseudo-terminals", allow_module_level=True)
+
+import tty
+
+import serial
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+
+from drivers.errors import ConfigurationError, DeviceError, DeviceRefused, LinkClosed, LinkTimeout
+from drivers.links.serial import SerialLink
+from tests.contracts.link import PATIENCE_S, Ends, LinkContract, read_exactly
+
+
+class FarEnd:
+    """The other end of a pseudo-terminal's cable."""
+
+    def __init__(self) -> None:
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.path = os.ttyname(self._slave)
+        self._open = True
+
+    def write(self, data: bytes, timeout: float) -> None:
+        while data:
+            data = data[os.write(self._master, data) :]
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        if not select.select([self._master], [], [], timeout)[0]:
+            raise LinkTimeout("nothing came")
+        return os.read(self._master, limit)
+
+    def close(self) -> None:
+        if self._open:
+            self._open = False
+            os.close(self._master)
+            os.close(self._slave)
+
+
+@pytest.fixture
+def far() -> Iterator[FarEnd]:
+    end = FarEnd()
+    yield end
+    end.close()
+
+
+class TestSerialLink(LinkContract):
+    @pytest.fixture
+    def ends(self, far: FarEnd) -> Iterator[Ends]:
+        near = SerialLink.open(far.path, 9600)
+        yield near, far
+        near.close()
+
+    def test_what_was_sent_before_hanging_up_is_still_read(self, ends: Ends) -> None:
+        # A cable that is pulled out takes along what the system had not handed over: only the end is certain.
+        near, far = ends
+        far.write(b"last words", PATIENCE_S)
+        assert read_exactly(near, 10) == b"last words"
+        far.close()
+        with pytest.raises(LinkClosed, match="plug its cable in again"):
+            near.read(1, PATIENCE_S)
+
+
+def test_what_waited_before_is_thrown_away(far: FarEnd) -> None:
+    first = SerialLink.open(far.path, 9600)
+    far.write(b"ab", PATIENCE_S)
+    assert read_exactly(first, 1) == b"a"
+    first.close()
+    second = SerialLink.open(far.path, 9600)
+    with pytest.raises(LinkTimeout, match="brought nothing"):
+        second.read(10, 0.0)
+    second.close()
+
+
+def test_speed_and_parity_reach_the_port(far: FarEnd) -> None:
+    import termios
+
+    link = SerialLink.open(far.path, 38400, "E")
+    probe = os.open(far.path, os.O_RDWR | os.O_NOCTTY)
+    _, _, flags, _, speed_in, speed_out, _ = termios.tcgetattr(probe)
+    os.close(probe)
+    link.close()
+    assert (speed_in, speed_out) == (termios.B38400, termios.B38400)
+    assert flags & termios.CSIZE == termios.CS8
+    assert not flags & (termios.CSTOPB | termios.PARODD)
+
+
+def test_a_port_that_is_not_there_lists_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    def two_ports() -> list[ListPortInfo]:
+        return [ListPortInfo("/dev/ttyUSB1"), ListPortInfo("/dev/ttyACM0")]
+
+    monkeypatch.setattr(list_ports, "comports", two_ports)
+    with pytest.raises(LinkClosed, match="no serial port /dev/ttyUSB7; found: /dev/ttyACM0, /dev/ttyUSB1"):
+        SerialLink.open("/dev/ttyUSB7", 9600)
+    monkeypatch.setattr(list_ports, "comports", list[ListPortInfo])
+    with pytest.raises(LinkClosed, match="found: none at all"):
+        SerialLink.open("/dev/ttyUSB7", 9600)
+
+
+@pytest.mark.parametrize(
+    ("said", "kind", "remedy"),
+    [
+        (serial.SerialException(errno.EACCES, "Permission denied"), DeviceRefused, "dialout"),
+        (serial.SerialException("could not open port 'COM3': PermissionError(13)"), DeviceRefused, "another program"),
+        (serial.SerialException("could not open port 'COM9': FileNotFoundError(2)"), LinkClosed, "found:"),
+        (serial.SerialException(errno.EIO, "Could not configure port"), LinkClosed, "check that it is a serial port"),
+        (ValueError("Not a valid baudrate: 12"), ConfigurationError, "choose another speed"),
+    ],
+)
+def test_a_port_that_cannot_be_opened_names_the_remedy(
+    monkeypatch: pytest.MonkeyPatch, said: Exception, kind: type[Exception], remedy: str
+) -> None:
+    def refuse(*_: object, **__: object) -> serial.Serial:
+        raise said
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    with pytest.raises(kind, match=remedy) as caught:
+        SerialLink.open("/dev/ttyUSB0", 9600)
+    assert "/dev/ttyUSB0" in str(caught.value)
+    assert caught.value.__cause__ is said
+
+
+def test_one_port_one_program(far: FarEnd) -> None:
+    link = SerialLink.open(far.path, 9600)
+    with pytest.raises(DeviceRefused, match="in use by another program"):
+        SerialLink.open(far.path, 9600)
+    link.close()
+    SerialLink.open(far.path, 9600).close()
+
+
+def test_no_serial_port_at_all(tmp_path: object) -> None:
+    with pytest.raises(DeviceError, match="check that it is a serial port"):
+        SerialLink.open("/dev/null", 9600)
+
+
+def test_parities_are_three(far: FarEnd) -> None:
+    with pytest.raises(ConfigurationError, match="N, E, O"):
+        SerialLink.open(far.path, 9600, "X")
+
+
+def test_a_full_cable_is_a_timeout(far: FarEnd) -> None:
+    link = SerialLink.open(far.path, 9600)
+    # More than the system's buffer; the far end never reads.
+    with pytest.raises(LinkTimeout, match="takes no data"):
+        link.write(bytes(1 << 20), 0.05)
+    link.close()
