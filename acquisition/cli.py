@@ -182,7 +182,7 @@ def run(
 
     settings = load_lab(lab)
     with progress("frames") as advance:
-        outcome = run_session(settings, session, advance)
+        outcome = run_session(settings, session, advance, lambda sentence: print(sentence, file=sys.stderr))
     if not outcome.complete:
         raise QualityError(
             f"{outcome.left} of {outcome.total} frames are without an accepted frame; " + "; ".join(outcome.refused)

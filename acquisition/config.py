@@ -55,6 +55,8 @@ class SequenceSettings(_Settings):
     """Tries at a frame before it is left for the next run."""
     warm_up_s: NotNegative = 1200.0
     """Seconds that the lamp burns after it was switched on before the first frame."""
+    patience_s: NotNegative = 600.0
+    """Seconds that a run pauses for a projector that reports a fault, is off or muted, before it ends."""
     switch_off: bool = True
     """Whether the projector is switched off when the session is complete."""
 

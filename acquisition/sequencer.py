@@ -22,6 +22,8 @@ from drivers.rawfile import read_raw
 
 POWER_LIMIT_S = 300.0
 """How long a lamp may take to light; makers state up to 130 s with repeated ignition."""
+PAUSE_S = 5.0
+"""Between two looks at a projector that complains."""
 REFUSED_IN_A_ROW = 3
 """Steps refused one after another that end a run: something lasting is wrong."""
 
@@ -55,6 +57,7 @@ def take_session(
     devices: Devices,
     settings: LabSettings,
     observe: Callable[[Step, bool], None] = lambda step, accepted: None,
+    announce: Callable[[str], None] = lambda sentence: None,
 ) -> Outcome:
     """Take every step of the session's plan that has no accepted frame yet.
 
@@ -62,6 +65,8 @@ def take_session(
     ----------
     observe
         Called after each step with whether it got an accepted frame.
+    announce
+        Called with a sentence when the run pauses and when it goes on.
 
     Raises
     ------
@@ -91,7 +96,7 @@ def _take(session: Session, devices: Devices, settings: LabSettings, observe: Ca
     taken = 0
     in_a_row = 0
     for step in open_steps:
-        reason = _take_step(session, step, devices, settings)
+        reason = _take_step(session, step, devices, settings, announce)
         observe(step, reason is None)
         if reason is None:
             taken += 1
@@ -153,6 +158,45 @@ def require_healthy(projector: Projector) -> None:
         raise DeviceFault("the projector's picture is muted; release mute on its remote control, then run again")
 
 
+def _fault(projector: Projector | None) -> str | None:
+    """Return what the projector complains of now, or None."""
+    try:
+        if projector is not None:
+            require_healthy(projector)
+    except DeviceFault as fault:
+        return str(fault)
+    return None
+
+
+def _await_health(
+    session: Session,
+    projector: Projector,
+    clock: Clock,
+    sequence: SequenceSettings,
+    announce: Callable[[str], None],
+) -> None:
+    """Pause while the projector complains; go on when it is well again.
+
+    Raises
+    ------
+    DeviceFault
+        It still complains after `sequence.patience_s`.
+    """
+    complaint = _fault(projector)
+    if complaint is None:
+        return
+    session.note(clock.now(), "paused", complaint)
+    announce(f"paused: {complaint}")
+    begun = clock.monotonic()
+    while (complaint := _fault(projector)) is not None:
+        if clock.monotonic() - begun >= sequence.patience_s:
+            raise DeviceFault(complaint)
+        clock.sleep(min(PAUSE_S, sequence.patience_s))
+    well = f"the projector is well again after {clock.monotonic() - begun:.0f} s"
+    session.note(clock.now(), "resumed", well)
+    announce(f"resumed: {well}")
+
+
 def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None:
     """Decode a raw file and return why it cannot be used, or None when it can."""
     try:
@@ -164,13 +208,15 @@ def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None
     return differs or refusal(measure_exposure(mosaic), kind, settings.limits)
 
 
-def _take_step(session: Session, step: Step, devices: Devices, settings: LabSettings) -> str | None:
+def _take_step(
+    session: Session, step: Step, devices: Devices, settings: LabSettings, announce: Callable[[str], None]
+) -> str | None:
     """Try a step until its frame is accepted; return None then, else the last refusal."""
     clock = devices.clock
     reason: str | None = None
     for remaining in reversed(range(settings.sequence.attempts)):
         if devices.projector is not None:
-            require_healthy(devices.projector)
+            _await_health(session, devices.projector, clock, settings.sequence, announce)
         kept = session.kept_files(step)
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
         attempt = session.begin(step, f"frames/{stem}", clock.now())
@@ -183,7 +229,7 @@ def _take_step(session: Session, step: Step, devices: Devices, settings: LabSett
             if remaining == 0 or isinstance(error, DeviceFault | DeviceRefused):
                 raise
             continue
-        reason = judge_file(received.path, step.kind, settings)
+        reason = judge_file(received.path, step.kind, settings) or _fault(devices.projector)
         session.commit(
             attempt,
             file=f"frames/{received.path.name}",

@@ -18,13 +18,20 @@ FIXED = ("rig", "camera", "simulated", "sequence.reference_every")
 """Settings that must stay for a whole session: they decide what its frames show."""
 
 
-def run_session(settings: LabSettings, folder: Path, observe: Callable[[int, int], None]) -> Outcome:
+def run_session(
+    settings: LabSettings,
+    folder: Path,
+    observe: Callable[[int, int], None],
+    announce: Callable[[str], None] = lambda sentence: None,
+) -> Outcome:
     """Take the session `folder`, new or interrupted, with the rig that the settings name.
 
     Parameters
     ----------
     observe
         Called with frames done and in all, once at the start and after each frame.
+    announce
+        Called with a sentence when the run pauses and when it goes on.
 
     Raises
     ------
@@ -46,7 +53,7 @@ def run_session(settings: LabSettings, folder: Path, observe: Callable[[int, int
             observe(done, total)
 
         with open_rig(settings, session.chart, session) as devices:
-            return take_session(session, devices, settings, count)
+            return take_session(session, devices, settings, count, announce)
 
 
 def open_session(settings: LabSettings, folder: Path) -> Session:

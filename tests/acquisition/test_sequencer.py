@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from acquisition.config import LabSettings, SequenceSettings
 from acquisition.illuminations import Illumination
 from acquisition.layout import design_chart
-from acquisition.sequencer import POWER_LIMIT_S, Devices, make_ready, take_session
+from acquisition.sequencer import PAUSE_S, POWER_LIMIT_S, Devices, make_ready, take_session
 from acquisition.session import Session, plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.errors import DeviceError, DeviceFault, DeviceRefused, LinkTimeout
@@ -195,28 +196,65 @@ def test_lasting_darkness_ends_the_run_with_its_reason(folder: Path) -> None:
     assert take_session(lab.session, lab.devices, SETTINGS).complete
 
 
-def test_a_failing_lamp_is_noticed_before_the_next_frame(folder: Path) -> None:
+def test_a_failing_lamp_ends_the_run_when_patience_does(folder: Path) -> None:
     lab = Lab(folder)
 
     def fail(step: object, accepted: bool) -> None:
         if lab.camera.captures == 3:
             lab.projector.break_part("lamp", Severity.ERROR)
 
+    begun = lab.clock.monotonic()
     with pytest.raises(DeviceFault, match="lamp"):
         take_session(lab.session, lab.devices, SETTINGS, fail)
+    assert lab.clock.monotonic() - begun >= SETTINGS.sequence.patience_s
     assert len(lab.session.frames()) == 3
     lab.projector.repair()
+    lab.projector.switch_on()
     assert take_session(lab.session, lab.devices, SETTINGS).complete
 
 
-def test_somebody_presses_mute(folder: Path) -> None:
+class Hurried(SimulatedClock):
+    """A clock that calls somebody when a pause is slept through."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: dict[float, Callable[[], None]] = {}
+
+    def sleep(self, seconds: float) -> None:
+        super().sleep(seconds)
+        if call := self.calls.pop(seconds, None):
+            call()
+
+
+def test_a_muted_picture_pauses_the_run_until_it_is_released(folder: Path) -> None:
     lab = Lab(folder)
+    lab.clock = clock = Hurried()
+    lab.camera.clock = clock
+    lab.projector = SimulatedProjector(clock, power=Power.ON)
+    clock.calls[PAUSE_S] = lambda: lab.projector.set_muted(False)
 
     def mute(step: object, accepted: bool) -> None:
-        lab.projector.set_muted(True)
+        if lab.camera.captures == 2:
+            lab.projector.set_muted(True)
 
-    with pytest.raises(DeviceFault, match="mute"):
-        take_session(lab.session, lab.devices, SETTINGS, mute)
+    said: list[str] = []
+    assert take_session(lab.session, lab.devices, SETTINGS, mute, said.append).complete
+    assert [sentence.split(":")[0] for sentence in said] == ["paused", "resumed"]
+    assert [event.what for event in lab.session.events()] == ["start", "paused", "resumed", "complete"]
+    assert "mute" in lab.session.events()[1].detail
+    assert lab.verdicts() == ["accepted"] * 6
+
+
+def test_a_frame_during_which_the_picture_was_muted_is_taken_again(folder: Path) -> None:
+    lab = Lab(folder)
+    lab.clock = clock = Hurried()
+    lab.camera.clock = clock
+    lab.projector = SimulatedProjector(clock, power=Power.ON)
+    # The scripted camera sleeps 1.5 s for its first frame: that is when somebody presses mute.
+    clock.calls = {1.5: lambda: lab.projector.set_muted(True), PAUSE_S: lambda: lab.projector.set_muted(False)}
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    assert lab.verdicts() == ["refused"] + ["accepted"] * 6
+    assert "muted" in lab.session.frames()[0].verdict
 
 
 def test_a_cold_lamp_is_lit_and_given_its_minutes() -> None:
