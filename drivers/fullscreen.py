@@ -50,7 +50,8 @@ _LOOK_AGAIN_S = 0.002
 _GL_FRONT, _GL_BACK = 0x0404, 0x0405
 _GL_COLOUR_BIT = 0x4000
 _GL_DITHER, _GL_SCISSOR = 0x0BD0, 0x0C11
-_GL_RGBA, _GL_BYTE = 0x1908, 0x1401
+_GL_BGRA, _GL_8888_REVERSED = 0x80E1, 0x8367
+"""Read so, a pixel is the number 0xAARRGGBB, which is how drivers keep it: nothing needs converting."""
 _DIGITS = ("111101101101111", "010110010010111", "111001111100111", "111001111001111", "101101111001001",
            "111100111001111", "111100111101111", "111001001001001", "111101111101111", "111101111001111")  # fmt: skip
 """0 … 9 in 3×5 blocks, rows from the top."""
@@ -174,7 +175,7 @@ class FullScreen:
             self._window: Any = self._open_window()
             opening.callback(glfw.destroy_window, self._window)
             self._gl = _Gl(glfw)
-            self._drawn: npt.NDArray[np.uint8] = np.empty((self.display.height, self.display.width, 4), np.uint8)
+            self._drawn: npt.NDArray[np.uint32] = np.empty((self.display.height, self.display.width), np.uint32)
             glfw.swap_interval(1)
             self._wait_until_full()
             self._present(BLACK)
@@ -355,8 +356,9 @@ class FullScreen:
         """Return a buffer of the window as (height, width) uint32, 0xRRGGBB, bottom row first."""
         display = self.display
         self._gl.read_buffer(buffer)
-        self._gl.read_pixels(0, 0, display.width, display.height, _GL_RGBA, _GL_BYTE, self._drawn.ctypes.data)
-        return self._drawn.view(">u4")[..., 0] >> np.uint32(8)
+        self._gl.read_pixels(0, 0, display.width, display.height, _GL_BGRA, _GL_8888_REVERSED, self._drawn.ctypes.data)
+        np.bitwise_and(self._drawn, np.uint32(0xFFFFFF), out=self._drawn)
+        return self._drawn
 
     def _require(self, pixels: npt.NDArray[np.uint32], colour: Colour, subject: str) -> None:
         expected = colour.red << 16 | colour.green << 8 | colour.blue
@@ -413,7 +415,7 @@ def identify_displays(seconds: float, clock: Clock = _SYSTEM_CLOCK) -> tuple[Dis
 
 
 class _Gl:
-    """The functions of OpenGL 1.1 that fill a window and read it, found at run time."""
+    """The functions of OpenGL that fill a window and read it, found at run time."""
 
     def __init__(self, glfw: ModuleType) -> None:
         kind: Callable[..., Any] = ctypes.WINFUNCTYPE if sys.platform == "win32" else ctypes.CFUNCTYPE
