@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 DEMO := build/demo
 ROOMS := drivers sim acquisition calibration generator evaluation
 
-.PHONY: demo test lint bench lock clean
+.PHONY: demo test lint bench full-session lock clean
 
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; name one with make PYTHON=python3.12 ...")'
@@ -45,6 +45,10 @@ lint: $(READY)
 
 bench: $(READY)
 	@for file in benchmarks/[!_]*.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
+
+# A complete table of full-size frames, 707 lights, in the simulated lab: half an hour or more, 60 GB of disk meanwhile.
+full-session: $(READY)
+	$(BIN)/python examples/full_session.py build/full-session
 
 # Rewrites the lock from pyproject.toml; needs the network.
 lock:

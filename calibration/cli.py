@@ -1,7 +1,9 @@
-"""`build-lut`: makes the table of a session, or only judges it. Parse, build, call, print; nothing else."""
+"""`build-lut`: makes the table of a session, judges it, tells of it, verifies it. Parse, call, print; nothing else."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,11 +11,11 @@ import typer
 
 from drivers import console
 from drivers.console import EXIT_CODES
-from drivers.errors import InputError
+from drivers.errors import FormatError, InputError
 
 if TYPE_CHECKING:
     from acquisition.session import Session
-    from calibration.build import BuildResult
+    from calibration.build import BuildResult, Growth
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -36,22 +38,71 @@ def _version(asked: bool) -> None:
     help="Build the look-up table of a session: 25 samples of every colour under every light, and the ground truth.\n\n"
     "Reads SESSION (chart.json, illuminations.csv, journal.sqlite, frames/) and checks each frame's SHA-256. Finds the "
     "chart once, follows it if it moves, divides the light's unevenness out, and writes LUT: samples.npy, "
-    "illuminations.csv with the ground truth, lut.json, report.html. LUT appears whole or not at all.\n\n"
+    "illuminations.csv with the ground truth, lut.json, frames.csv, report.html. LUT appears whole or not at all; a "
+    "build that was stopped goes on when the same command is run again.\n\n"
     "Every figure is held against its limit: accept, accept with remarks, or refuse. A refused table is not written; "
     "its report is then in LUT.refused/, and the exit code 4.\n\n"
-    "With --check, finds the chart in the session's best frame, judges it, and writes nothing.\n\n" + EXIT_CODES,
+    "With --check, finds the chart in the session's best frame, judges it, and writes nothing. With --append, takes in "
+    "the frames that have come so far of a session that is being taken; LUT appears with the last of them. With "
+    "--info, --verify and --match, reads a table and writes nothing.\n\n" + EXIT_CODES,
 )
 def build_lut(
-    session: Annotated[Path, typer.Argument(help="Folder of a session, made by acquire run or acquire import.")],
+    session: Annotated[
+        Path | None, typer.Argument(help="Folder of a session, made by acquire run or acquire import.")
+    ] = None,
     lut: Annotated[Path | None, typer.Argument(help="New folder for the table; not with --check.")] = None,
     check: Annotated[bool, typer.Option("--check", help="Register and judge only; write nothing.")] = False,
+    append: Annotated[
+        bool, typer.Option("--append", help="Take in what has come of a session that is being taken.")
+    ] = False,
+    info: Annotated[
+        Path | None,
+        typer.Option("--info", metavar="LUT", help="Tell what a table is and came from.", show_default=False),
+    ] = None,
+    verify: Annotated[
+        Path | None,
+        typer.Option(
+            "--verify",
+            metavar="LUT",
+            help="Hash every byte of a table again and name what has changed; with SESSION, its frames too.",
+            show_default=False,
+        ),
+    ] = None,
+    match: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(
+            "--match",
+            metavar="LUT LUT",
+            help="Tell whether colours and lights of two tables, of two cameras perhaps, correspond number by number.",
+            show_default=False,
+        ),
+    ] = None,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
     ] = False,
 ) -> None:
-    """Build or check; what the command does is told by its help text."""
+    """Build, check or read; what the command does is told by its help text."""
+    asked = {"--check": check, "--append": append, "--info": info, "--verify": verify, "--match": match}
+    given = [name for name, value in asked.items() if value]
+    if len(given) > 1:
+        raise InputError(f"{' and '.join(given)} are two commands; give one of them")
+    if (lut if verify else session if info or match else None) is not None:
+        raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
+    if info is not None:
+        _tell_table(info)
+    elif verify is not None:
+        _verify(verify, session)
+    elif match is not None:
+        _match(*match)
+    else:
+        _make(session, lut, check, append)
+
+
+def _make(session: Path | None, lut: Path | None, check: bool, append: bool) -> None:
     if check and lut is not None:
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
+    if session is None:
+        raise InputError("a session is expected: build-lut SESSION LUT; see build-lut --help")
     if not check and lut is None:
         raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
     from acquisition.session import Session
@@ -62,7 +113,15 @@ def build_lut(
 
             result = judge(opened)
         else:
-            result = _build(opened, lut)
+            result = _build(opened, lut, append)
+    from calibration.build import Growth
+
+    if isinstance(result, Growth):
+        print(
+            f"{lut}: {result.lights} of {result.of} lights, {result.new_frames} frames taken in now, {result.frames} "
+            "in all; run the same command again when more have come"
+        )
+        return
     _tell(result)
     if lut is None and (verdict := result.verdict).refused:
         from calibration.verdict import refusal
@@ -71,12 +130,57 @@ def build_lut(
         raise QualityError(f"{result.session}: {refusal(verdict, result)}")
 
 
-def _build(opened: Session, lut: Path) -> BuildResult:
+def _build(opened: Session, lut: Path, growing: bool) -> BuildResult | Growth:
+    from calibration.build import append, build
+    from calibration.report import write_report
+
+    with _bar("finding the chart") as told:
+        return (append if growing else build)(opened, lut, told, write_report)
+
+
+def _tell_table(folder: Path) -> None:
+    from calibration.lut import open_lut, summary
+
+    for name, value in summary(open_lut(folder)):
+        print(f"{name + ':':17}{value}")
+
+
+def _verify(folder: Path, session: Path | None) -> None:
+    from calibration.lut import damage, open_lut
+
+    lut = open_lut(folder)
+    with _bar("reading the samples") as told:
+        faults = damage(lut, lambda done, total: told(done, total, "reading the samples"))
+    if session is not None:
+        from acquisition.session import Session
+        from calibration.build import lost_frames
+
+        with Session.open(session) as opened, _bar("reading the frames") as told:
+            faults += lost_frames(lut, opened, told)
+    for fault in faults:
+        print(fault)
+    if faults:
+        raise FormatError(
+            f"{folder} is not as it was built: {len(faults)} faults; restore it from a copy, or build it again"
+        )
+    frames = "" if session is None else f", and so are its {len(lut.frames)} frames in {session}"
+    print(f"{folder}: every byte is as it was built{frames}")
+
+
+def _match(one: Path, other: Path) -> None:
+    from calibration.lut import open_lut, require_match
+
+    tables = open_lut(one), open_lut(other)
+    require_match(*tables)
+    cameras = " and ".join(table.provenance.camera for table in tables)
+    print(f"{one} and {other} ({cameras}): colours and lights correspond number by number")
+
+
+@contextmanager
+def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
+    """Show a bar of progress on stderr; yields what is to be called with done, total, and what is being done."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from calibration.build import build
-    from calibration.report import write_report
 
     columns = (
         TextColumn("{task.description}"),
@@ -85,12 +189,12 @@ def _build(opened: Session, lut: Path) -> BuildResult:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("finding the chart", total=None)
+        task = progress.add_task(beginning, total=None)
 
         def told(done: int, total: int, what: str) -> None:
             progress.update(task, completed=done, total=total, description=what)
 
-        return build(opened, lut, told, write_report)
+        yield told
 
 
 def _tell(result: BuildResult) -> None:
