@@ -76,10 +76,16 @@ def take_session(
         The disk is full; likewise.
     """
     with session.held():
-        return _take(session, devices, settings, observe)
+        return _take(session, devices, settings, observe, announce)
 
 
-def _take(session: Session, devices: Devices, settings: LabSettings, observe: Callable[[Step, bool], None]) -> Outcome:
+def _take(
+    session: Session,
+    devices: Devices,
+    settings: LabSettings,
+    observe: Callable[[Step, bool], None],
+    announce: Callable[[str], None],
+) -> Outcome:
     clock = devices.clock
     for stray in session.set_aside_strays():
         session.note(clock.now(), "stray", f"{stray.name}: complete but never counted; kept, not used")
