@@ -29,7 +29,7 @@ from calibration.mosaic import half_size
 from calibration.radiometry import MAX_BLACK_DRIFT
 from calibration.registration import Registration
 from calibration.sampling import WINDOW, noise_of
-from calibration.verdict import Judged, Verdict, report_json, shown
+from calibration.verdict import Judged, Verdict, grey_tints_deg, report_json, shown
 from drivers.rawfile import read_raw
 from drivers.storage import write_whole
 
@@ -198,8 +198,50 @@ def summary(result: BuildResult) -> list[tuple[str, str, str]]:
             " / ".join(f"{value:.2%}" for value in result.noise.tolist()),
             "R, G, B, of paper under white",
         ),
+        *_light_figures(result),
         ("Cells unfit", str(len(result.unfit)), "listed in lut.json, never filled"),
     ]
+
+
+def _percents(values: npt.NDArray[np.floating]) -> str:
+    return " / ".join(f"{value:.2%}" for value in values.tolist())
+
+
+def _light_figures(result: BuildResult) -> list[tuple[str, str, str]]:
+    """Return what dark frames, primaries, greys and noise say."""
+    told: list[tuple[str, str, str]] = []
+    white = [figures.paper.white for figures in result.frames if figures.record.kind == "white"]
+    dark = result.darkness
+    if dark.files and white:
+        counts = " / ".join(f"{value:.2f}" for value in dark.light.tolist())
+        share = _percents(dark.light / np.mean(white, axis=0))
+        told.append(
+            (
+                "Light while black is shown",
+                f"{counts} counts, {share} of white",
+                f"leak and ambient light on bare paper, {len(dark.files)} dark frames; not subtracted",
+            )
+        )
+    if result.added is not None:
+        told.append(("Red + green + blue − white", _percents(result.added), "of white; 0 where light adds"))
+    tints = zip(result.grey_names, grey_tints_deg(result).tolist(), strict=True)
+    if result.grey_names:
+        shown_tints = ", ".join(f"{name}: {angle:.2f}°" for name, angle in tints)
+        told.append(("Tint of the greys", shown_tints, "angle to bare paper's camera RGB; 0 is a neutral print"))
+    if result.transfer is not None:
+        transfer = result.transfer
+        gain = " / ".join(f"{value:.2f}" for value in transfer.gain_e.tolist())
+        read = " / ".join(f"{value:.1f}" for value in transfer.read_noise.tolist())
+        told.append(
+            (
+                "Photon transfer",
+                f"{gain} e⁻ a count, {read} counts of read noise",
+                f"R, G, B of half-size pixels; {int(transfer.noisy.sum())} cells noisier than the curve",
+            )
+        )
+    measured = "measured" if result.saturated else "as the raw files state it; no photosite reached it"
+    told.append(("Saturation's source", measured, "a statement may be too high; samples do not suffer"))
+    return told
 
 
 def _grid_caption(result: BuildResult) -> str:

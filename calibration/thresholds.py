@@ -134,6 +134,32 @@ THRESHOLDS: tuple[Threshold, ...] = (
         JUDGEMENT + ": a tenth of a good method's error", _LAMP,
     ),
     Threshold(
+        "leak_share", "Light while the projector shows black, of white", "share", "at most", 0.005, 0.1,
+        "every light holds this much of the projector's leak and the room's light, so that deep colours are paler",
+        JUDGEMENT + "; a contrast of 1 : 1500 leaks 0.07 %", "darken the room, and cover lamps and displays",
+    ),
+    Threshold(
+        "additivity", "White against the sum of the primaries", "share", "at most", 0.02, None,
+        "the projector brightens or converts white, so a light cannot be predicted from its codes; the table holds",
+        JUDGEMENT + "; the drift of the lamp is taken out first",
+        "switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
+    ),
+    Threshold(
+        "grey_tint_deg", "Tint of the print's greys against paper", "degrees", "at most", 3.0, None,
+        "greys are not neutral; the ground truth is paper's, so methods that trust in grey are judged by another grey",
+        JUDGEMENT, "print without colour management on matte paper, or live with it",
+    ),
+    Threshold(
+        "noise_misfit", "Cells' noise about the photon-transfer curve", "share", "at most", 0.3, None,
+        "scatter that light and sensor do not explain: the camera smooths its raw files, or the light flickers",
+        "EMVA 1288 model; " + SIMULATED + ": 0.05 to 0.15", "switch the camera's noise reduction off",
+    ),
+    Threshold(
+        "noisy_share", "Cells noisier than their level allows", "share", "at most", 0.002, 0.1,
+        "they are not of one colour: dirt, a fold, a neighbour's edge", "a variance 3.5 times the model's",
+        "clean the print, focus, and hang it flatter",
+    ),
+    Threshold(
         "references_used", "White references used, worst frame", "share", "at least", 0.9, 0.3,
         "field and ground truth rest on few places", JUDGEMENT,
         "uncover the print, bring all of it into the picture, expose so that bare paper stays below saturation",

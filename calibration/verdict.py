@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from calibration.references import tint_deg
 from calibration.thresholds import THRESHOLDS, Threshold
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ _REMEDIES = {
     "outside": "bring all of the chart into the picture",
     "clipped": "expose less",
     "covered": "uncover the chart",
+    "hot": "let the camera cool",
+    "dead": "have the camera's pixels remapped",
     "uneven": "focus on the print and keep the camera still",
 }
 _Array = npt.NDArray[np.float64]
@@ -134,12 +137,30 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "brightest_share": float(paper.max()) / result.white_level,
         "darkest_counts": float(paper.min()),
     }
+    full = white.mean(axis=0) if len(white) else result.white[int(np.argmax(result.white.sum(axis=1)))]
+    if np.isfinite(result.darkness.light).all():
+        figures["leak_share"] = float(np.abs(result.darkness.light / full).max())
+    if result.added is not None:
+        figures["additivity"] = float(np.abs(result.added).max())
+    if (tint := grey_tints_deg(result)).size and np.isfinite(tint).any():
+        figures["grey_tint_deg"] = float(np.nanmax(tint))
+    if result.transfer is not None:
+        figures["noise_misfit"] = float(result.transfer.misfit.max())
+        figures["noisy_share"] = float(result.transfer.noisy.mean())
     if len(white) > 1:
         figures["white_drift"] = result.white_drift
         figures["white_drift_deg"] = float(_angles_deg(white, np.broadcast_to(white[0], white.shape)).max())
     if spread:
         figures["reference_spread"] = max(spread)
     return figures
+
+
+def grey_tints_deg(result: BuildResult) -> _Array:
+    """Return the angle (G,) between each level of grey and white, degrees, in the light with most of all channels."""
+    if not len(result.grey_names):
+        return np.zeros(0)
+    best = int(np.argmax(result.white.min(axis=1)))
+    return tint_deg(result.white[best], result.greys[best])
 
 
 def bleed(cell_px: float, blur_px: float) -> float:
@@ -185,6 +206,29 @@ def refusal(verdict: Verdict, result: BuildResult) -> str:
     return f"{worst.text()}{detail}{more}; {remedy}, and take the session anew"
 
 
+def _channels(result: BuildResult) -> dict[str, Any]:
+    """Return what is known for each channel, for `report.json`; what could not be measured is null."""
+    transfer, dark = result.transfer, result.darkness
+
+    def told(values: _Array | None) -> list[float | None] | None:
+        if values is None:
+            return None
+        return [float(f"{value:.6g}") if np.isfinite(value) else None for value in values.tolist()]
+
+    return {
+        "dark_frames": len(dark.files),
+        "dark_counts": told(dark.light),
+        "dark_error": told(dark.error),
+        "dark_noise": told(dark.noise),
+        "additivity": told(result.added),
+        "gain_e_per_count": told(None if transfer is None else transfer.gain_e),
+        "read_noise_counts": told(None if transfer is None else transfer.read_noise),
+        "response_spread": told(None if transfer is None else transfer.response),
+        "noisy_colours": [] if transfer is None else np.flatnonzero(transfer.noisy).tolist(),
+        "grey_tint_deg": dict(zip(result.grey_names, told(grey_tints_deg(result)) or [], strict=True)),
+    }
+
+
 def report_json(result: BuildResult) -> dict[str, Any]:
     """Return the content of `report.json`: verdict, figures, and every limit with its reason."""
     figures = figures_of(result)
@@ -196,6 +240,7 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "session": result.session.name,
         "camera": result.camera,
         "lights": result.lights,
+        "channels": _channels(result),
         "figures": {name: float(f"{value:.6g}") for name, value in figures.items()},
         "limits": [asdict(row.threshold) | {"outcome": row.outcome} for row in verdict.rows],
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import re
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +14,17 @@ import pytest
 
 from acquisition.chart import Chart
 from acquisition.layout import A_SERIES_MM, design_chart
-from acquisition.session import Session, Step
+from acquisition.session import Session, Step, plan_steps
 from calibration.build import BuildResult, build, check, session_sha256
 from calibration.cli import main
 from calibration.lut import Lut, open_lut
 from calibration.report import summary, write_report
 from drivers.camera import ExposureSettings
 from drivers.errors import FormatError, InputError, QualityError, RegistrationError
-from drivers.presenter import WHITE
+from drivers.presenter import BLACK, WHITE
+from sim.dng import write_dng
 from sim.world import Room
-from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
+from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
 
 
 def angle_deg(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> float:
@@ -111,6 +113,88 @@ def test_the_field_can_be_undone(table: Lut, built: BuildResult, session: Sessio
     assert (
         np.corrcoef(raw[:, 1], white[:, 1])[0, 1] < np.corrcoef(table.samples[5].mean(axis=1)[:, 1], white[:, 1])[0, 1]
     )
+
+
+def test_dark_frames_tell_the_projector_s_black(built: BuildResult, lab: Lab) -> None:
+    true = lab.world.white(BLACK, SETTINGS) / lab.world.white(WHITE, SETTINGS)
+    white = next(figures.paper.white for figures in built.frames if figures.record.kind == "white")
+    assert (built.darkness.light > 2).all()
+    assert (np.abs(built.darkness.light / white - true) < 4 * built.darkness.error / white + 0.02 * true).all()
+    assert len(built.darkness.files) >= 2
+    assert not built.darkness.hottest.any()
+
+
+def test_the_simulated_projector_s_light_adds(built: BuildResult) -> None:
+    assert built.added is not None
+    assert np.abs(built.added).max() < 0.006
+
+
+def test_every_level_of_grey_is_the_print_s(built: BuildResult, lab: Lab, table: Lut) -> None:
+    codes = sorted({reference.rgb for reference in lab.chart.references if not reference.is_white}, reverse=True)
+    assert len(codes) == len(built.grey_names) >= 2
+    for light in table.illuminations:
+        true = lab.world.reflected(codes, light.colour, SETTINGS) / lab.world.white(light.colour, SETTINGS)
+        seen, error = (values[light.index] / table.white[light.index] for values in (built.greys, built.grey_errors))
+        assert (np.abs(seen - true) < 5 * error + 0.006 * true).all()
+    assert built.lut is not None
+    lines = (built.lut / "references.csv").read_text().splitlines()
+    assert lines[0] == "light,name,r,g,b,r_error,g_error,b_error"
+    assert len(lines) == 1 + len(LIGHTS) * (1 + len(codes))
+
+
+def test_the_noise_curve_is_the_sensor_s(built: BuildResult, lab: Lab) -> None:
+    assert built.transfer is not None
+    body = lab.world.body
+    assert built.transfer.gain_e == pytest.approx(body.electrons_per_dn * np.array([1, 2, 1]), rel=0.2)
+    assert built.transfer.noisy.sum() <= 1
+
+
+def test_a_hot_and_a_dead_photosite_are_named(lab: Lab, tmp_path: Path) -> None:
+    visible, chart = lab.world.body.visible, lab.chart
+    rgb = codes(chart)
+    hot, dead = 100, int(np.argmax((rgb.min(axis=1) > 150) & (rgb.max(axis=1) < 255)))
+
+    def frame(step: Step) -> bytes:
+        def paint(counts: npt.NDArray[np.uint16]) -> None:
+            places = np.rint(lab.world.project(chart.centres_mm[chart.cell_of_colour[[hot, dead]]])).astype(int)
+            rows, columns = visible.top + 2 * places[:, 1], visible.left + 2 * places[:, 0]
+            counts[rows[0], columns[0]] += 300
+            counts[rows[1], columns[1]] = 2048
+
+        return lab.dng(step.colour, step.number, paint=paint)
+
+    with take(lab, tmp_path / "session", renumbered(LIGHTS[5:6]), frame=frame) as session:
+        result = build(session, tmp_path / "lut")
+    unfit = {cell.colour: cell.cause for cell in result.unfit}
+    assert unfit[hot].startswith("hot: a photosite stands out by ")
+    assert unfit[dead].startswith("dead: ")
+    assert len(unfit) <= 4
+
+
+def test_a_lamp_that_fades_is_told_and_not_corrected(lab: Lab, tmp_path: Path) -> None:
+    """3 % over the session: each light keeps its own ground truth, and the gain brings them to one lamp."""
+    lights = LIGHTS[:6]
+    steps = len(plan_steps(lights, 2))
+
+    def frame(step: Step) -> bytes:
+        counts = lab.world.expose(step.colour, SETTINGS, key=(step.number,), lamp=1 - 0.03 * step.number / (steps - 1))
+        stream = BytesIO()
+        write_dng(stream, counts, lab.world.body, settings=SETTINGS, taken_at=TAKEN_AT)
+        return stream.getvalue()
+
+    with take(lab, tmp_path / "session", lights, every=2, frame=frame) as session:
+        result = build(session, tmp_path / "lut")
+    assert result.white_drift == pytest.approx(0.03, abs=0.002)
+    assert "white_drift" in {row.threshold.name for row in result.verdict.remarks}
+    table = open_lut(tmp_path / "lut")
+    drift = next(correction for correction in table.provenance.corrections if correction["name"] == "drift")
+    assert drift["applied"] is False
+    undone = table.white / np.array(drift["per_light"])
+    true = np.array([lab.world.white(light.colour, SETTINGS) for light in lights])
+    lit = true > 300
+    # The table's level is that of the mean over the cells, the room's that of the brightest point.
+    assert np.ptp((undone / true)[lit]) < 0.008
+    assert np.ptp((table.white / true)[lit]) > 0.015
 
 
 def test_the_report_stands_alone(built: BuildResult) -> None:
