@@ -236,8 +236,13 @@ class EpsonProjector:
             raise ProtocolError(f"{self._label} answers {reply!r} to MUTE; expected the colon alone")
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return the fault reported now; empty when healthy. Warnings are not told."""
-        return parse_faults(self._get("ERR"))
+        """Return the fault reported now; empty when healthy, and during warm-up and cooling, when none is told."""
+        try:
+            return parse_faults(self._get("ERR"))
+        except DeviceRefused:
+            if self.power() in (Power.WARMING, Power.COOLING):
+                return ()
+            raise
 
     def lamps(self) -> tuple[Lamp, ...]:
         """Return every lamp; refused where the projector does not tell its hours now."""
@@ -295,7 +300,12 @@ class EpsonProjector:
 
     def _greet(self, exchange: Exchange) -> None:
         # The colon shows that it listens, and ends whatever stood half-said on the line.
-        exchange.open_with(b"\r", take_reply)
+        try:
+            exchange.open_with(b"\r", take_reply)
+        except LinkTimeout as error:
+            raise LinkTimeout(
+                f"{error}; or it is still switching on or off for an earlier program: wait {SWITCHING_LIMIT_S:g} s"
+            ) from error
 
     def _greet_network(self, exchange: Exchange) -> None:
         state = exchange.open_with(HELLO, take_welcome)

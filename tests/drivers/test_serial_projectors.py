@@ -213,6 +213,32 @@ def test_epson_is_asked_nothing_until_it_has_switched_on() -> None:
     assert script.ended()
 
 
+def test_epson_on_the_way_tells_no_fault_and_still_its_power() -> None:
+    projector, script = epson_script((b"ERR?\r", b"ERR\r:"), (b"PWR?\r", b"PWR=03\r:"))
+    assert projector.faults() == ()
+    assert script.ended()
+    projector, script = epson_script(
+        (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()), (b"ERR?\r", b"ERR\r:"), (b"PWR?\r", b"PWR=01\r:")
+    )
+    projector.switch_on()
+    assert projector.faults() == ()
+    script.more(b":")
+    with pytest.raises(DeviceRefused):
+        projector.faults()
+    assert script.ended()
+
+
+def test_epson_busy_for_an_earlier_program_says_how_long_to_wait() -> None:
+    clock = SimulatedClock()
+    peer = EpsonPeer(SimulatedProjector(clock))
+    EpsonProjector(lambda: SerialPeerLink(peer), clock=clock).switch_on()
+    later = EpsonProjector(lambda: SerialPeerLink(peer), clock=clock)
+    with pytest.raises(LinkTimeout, match="for an earlier program: wait 130 s"):
+        later.power()
+    clock.sleep(30)
+    assert later.power() is Power.ON
+
+
 def test_epson_that_never_finishes_is_given_up() -> None:
     clock = SimulatedClock()
     script = Script(HELLO, (b"PWR?\r", b"PWR=04\r:"), (b"PWR ON\r", ()))
