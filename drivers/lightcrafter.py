@@ -20,9 +20,10 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from drivers.clock import Clock, SystemClock
-from drivers.errors import DeviceError, DeviceRefused, LinkError, LinkTimeout, ProtocolError
+from drivers.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 from drivers.lightcrafter_wire import (
     MODE_VIDEO,
     PATTERN_SOLID,
@@ -34,8 +35,11 @@ from drivers.lightcrafter_wire import (
     parse_colour,
     parse_reply,
 )
-from drivers.links.hid import Reports
+from drivers.links.hid import Reports, open_hid
 from drivers.presenter import BLACK, Colour
+
+if TYPE_CHECKING:
+    from usb.backend import IBackend
 
 VENDOR = 0x0451
 PRODUCTS = {"DLPC350": 0x6401, "DLPC900": 0xC900}
@@ -55,13 +59,35 @@ _SETTLED = (
 _SYSTEM_CLOCK = SystemClock()
 
 
+def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = None) -> Reports:
+    """Open the one LightCrafter on USB, of whatever kind; `serial` tells it from its like.
+
+    Raises
+    ------
+    LinkClosed
+        There is none, or libusb is not installed.
+    InputError
+        There are several.
+    DeviceRefused
+        It may not be opened, or another program holds it.
+    """
+    for controller, product in PRODUCTS.items():
+        with contextlib.suppress(LinkClosed):
+            return open_hid(VENDOR, product, name=f"LightCrafter {controller}", serial=serial, backend=backend)
+    raise LinkClosed(
+        f"no LightCrafter{f' with serial number {serial}' if serial else ''} on USB "
+        f"({VENDOR:04x}:{' or '.join(f'{product:04x}' for product in PRODUCTS.values())}); "
+        "switch it on, check its cable, and that libusb is installed"
+    )
+
+
 class LightCrafter:
     """A `drivers.presenter.Presenter`; black from the moment it opens.
 
     Parameters
     ----------
     connect
-        Opens the cable, for instance with `drivers.links.hid.open_hid`; called again after a fault.
+        Opens the cable, for instance `find_lightcrafter`; called again after a fault.
     clock
         Waits while the controller changes its mode.
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import ctypes.util
+import shutil
 import subprocess
 import sys
 import threading
@@ -30,7 +32,7 @@ PATIENCE_S = 20.0
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualScreen]:
-    with virtual_screen(tmp_path_factory.mktemp("xvfb"), "800x600") as screen:
+    with virtual_screen(tmp_path_factory.mktemp("xvfb"), "640x360") as screen:
         yield screen
 
 
@@ -89,18 +91,52 @@ def test_a_window_in_front_is_noticed(screen: FullScreen) -> None:
     try:
         glfw.show_window(notification)
         glfw.poll_events()
-        with pytest.raises(DeviceError, match=r"the screen shows .* in place of \(9, 9, 9\) in \d+ of 480000 pixels"):
+        with pytest.raises(DeviceError, match=r"the screen shows .* in place of \(9, 9, 9\) in \d+ of 230400 pixels"):
             screen.show(Colour(9, 9, 9))
     finally:
         glfw.destroy_window(notification)
     screen.show(Colour(9, 9, 9))
 
 
+def test_what_opengl_does_not_draw_is_noticed(screen: FullScreen, virtual: VirtualScreen) -> None:
+    import glfw
+
+    prototype: Any = ctypes.CFUNCTYPE
+    mask = prototype(None, *[ctypes.c_ubyte] * 4)(glfw.get_proc_address("glColorMask"))
+    screen.show(Colour(1, 2, 3))
+    mask(1, 0, 1, 1)
+    with pytest.raises(
+        DeviceError, match=r"OpenGL drew \(9, \d+, 9\) in place of \(9, 9, 9\) in 230400 of 230400 pixels"
+    ):
+        screen.show(Colour(9, 9, 9))
+    mask(1, 1, 1, 1)
+    screen.show(Colour(9, 9, 9))
+    assert plain(virtual.picture()) == Colour(9, 9, 9)
+
+
+def test_a_display_that_goes_away_is_noticed(outputs: str) -> None:
+    xrandr = shutil.which("xrandr")
+    if xrandr is None:
+        pytest.skip("xrandr is not installed (Debian: x11-xserver-utils)")
+    presenter = FullScreen("right")
+    try:
+        presenter.show(WHITE)
+        subprocess.run([xrandr, "--output", "DUMMY1", "--off"], check=True)
+        with pytest.raises(DeviceError, match=r"no longer fills display 2: DUMMY1|no 480×270 pixels at"):
+            presenter.show(Colour(9, 9, 9))
+    finally:
+        presenter.close()
+        subprocess.run([xrandr, "--output", "DUMMY1", "--mode", "480x270", "--right-of", "DUMMY0"], check=True)
+    presenter = FullScreen("right")
+    presenter.show(WHITE)
+    presenter.close()
+
+
 def test_a_window_moved_away_is_noticed(screen: FullScreen) -> None:
     import glfw
 
     glfw.set_window_monitor(glfw.get_current_context(), cast("Any", None), 10, 10, 300, 200, 0)
-    with pytest.raises(DeviceError, match="no longer fills display 1: screen 800×600"):
+    with pytest.raises(DeviceError, match="no longer fills display 1: screen 640×360"):
         screen.show(WHITE)
 
 
@@ -255,8 +291,8 @@ def test_the_screen_saver_is_held_off_where_that_can_be_asked_for(virtual: Virtu
 
 def test_what_is_not_on_the_screen_cannot_be_read(virtual: VirtualScreen) -> None:
     screen = XScreen()
-    with pytest.raises(DeviceError, match=r"no 100×100 pixels at \+750\+0 any more"):
-        screen.read(750, 0, 100, 100)
+    with pytest.raises(DeviceError, match=r"no 100×100 pixels at \+600\+0 any more"):
+        screen.read(600, 0, 100, 100)
     assert screen.read(0, 0, 100, 100).shape == (100, 100)
     screen.close()
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from drivers import lightcrafter_wire as wire
 from drivers.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
-from drivers.lightcrafter import PRODUCTS, VENDOR, LightCrafter
+from drivers.lightcrafter import PRODUCTS, VENDOR, LightCrafter, find_lightcrafter
 from drivers.lightcrafter_wire import Command, Reply, Request
 from drivers.links.hid import HidDevice, open_hid
 from drivers.presenter import BLACK, WHITE, Colour
@@ -221,6 +221,17 @@ def test_is_told_from_its_like_by_serial_number(table: Table) -> None:
     device.close()
     with pytest.raises(LinkClosed, match="closed"):
         device.read(1.0)
+
+
+@pytest.mark.parametrize("controller", sorted(PRODUCTS))
+def test_either_controller_is_found(controller: str) -> None:
+    screen, bus = Screen(), HidBus()
+    bus.plug(LightCrafterUsb(Controller(screen), PRODUCTS[controller], serial="7"))
+    presenter = LightCrafter(lambda: find_lightcrafter("7", backend=bus), SimulatedClock())
+    presenter.show(WHITE)
+    assert screen.colour == WHITE
+    with pytest.raises(LinkClosed, match=r"no LightCrafter with serial number 8 on USB \(0451:6401 or c900\)"):
+        find_lightcrafter("8", backend=bus)
 
 
 def test_the_kernel_gets_the_device_back(table: Table) -> None:
