@@ -17,7 +17,7 @@ from drivers.camera import Camera
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceFault, DeviceRefused, FormatError
 from drivers.presenter import Presenter
-from drivers.projector import Power, Projector, Severity
+from drivers.projector import PictureWitness, Power, Projector, Severity
 from drivers.rawfile import read_raw
 
 POWER_LIMIT_S = 300.0
@@ -152,7 +152,7 @@ def require_healthy(projector: Projector) -> None:
     Raises
     ------
     DeviceFault
-        It is off, muted, or reports an error.
+        It is off, muted, frozen, without a signal, or reports an error.
     """
     errors = [fault.part for fault in projector.faults() if fault.severity is Severity.ERROR]
     if errors:
@@ -162,6 +162,8 @@ def require_healthy(projector: Projector) -> None:
         raise DeviceFault(f"the projector went to {power.value} during the session; switch it on, then run again")
     if projector.muted():
         raise DeviceFault("the projector's picture is muted; release mute on its remote control, then run again")
+    if isinstance(projector, PictureWitness) and (fault := projector.picture_fault()):
+        raise DeviceFault(f"{fault}, then run again")
 
 
 def _fault(projector: Projector | None) -> str | None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 
 class Power(Enum):
@@ -88,4 +88,13 @@ class Projector(Protocol):
 
     def close(self) -> None:
         """Release the control port; a second call does nothing. The power state stays."""
+        ...
+
+
+@runtime_checkable
+class PictureWitness(Protocol):
+    """A projector that can tell, beyond `Projector`, whether its picture is the one that is sent to it."""
+
+    def picture_fault(self) -> str | None:
+        """Return why the picture does not follow the signal, or None when it does, or nobody knows."""
         ...

@@ -213,6 +213,16 @@ class PjLinkProjector:
         """Freeze the picture, or let it follow the signal again; refused unless the projector is on; class 2."""
         self._set_class_2("FREZ", wire.format_freeze(frozen))
 
+    def picture_fault(self) -> str | None:
+        """Return whether the picture is frozen or no signal arrives, as far as class 2 tells; None with class 1."""
+        if self.pjlink_class() < 2:
+            return None
+        if self.frozen():
+            return "the projector's picture is frozen; release freeze on its remote control"
+        if self.input_resolution() is NoResolution.NO_SIGNAL:
+            return "no signal arrives at the projector's input; check the cable, the input and the display's settings"
+        return None
+
     def serial_number(self) -> str:
         """Return the serial number; class 2."""
         return self._ask_class_2("SNUM")

@@ -15,16 +15,18 @@ import pytest
 from acquisition.config import LabSettings, SequenceSettings
 from acquisition.illuminations import Illumination
 from acquisition.layout import design_chart
-from acquisition.sequencer import PAUSE_S, POWER_LIMIT_S, Devices, make_ready, take_session
+from acquisition.sequencer import PAUSE_S, POWER_LIMIT_S, Devices, make_ready, require_healthy, take_session
 from acquisition.session import Session, plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.errors import DeviceError, DeviceFault, DeviceRefused, LinkTimeout
+from drivers.pjlink.projector import PjLinkProjector
+from drivers.pjlink.wire import NoResolution
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power, Severity
 from sim.bodies import BODIES
 from sim.clock import SimulatedClock
 from sim.dng import write_dng
-from sim.projector import SimulatedProjector
+from sim.projector import PjLinkPeer, SimulatedProjector, memory_link
 
 BODY = BODIES["Test"]
 EXPOSURE = ExposureSettings(100, 8.0, 0.5)
@@ -255,6 +257,21 @@ def test_a_frame_during_which_the_picture_was_muted_is_taken_again(folder: Path)
     assert take_session(lab.session, lab.devices, SETTINGS).complete
     assert lab.verdicts() == ["refused"] + ["accepted"] * 6
     assert "muted" in lab.session.frames()[0].verdict
+
+
+@pytest.mark.parametrize(("fault", "said"), [("frozen", "frozen"), ("unplugged", "no signal")])
+def test_a_picture_that_does_not_follow_is_noticed(fault: str, said: str) -> None:
+    clock = SimulatedClock()
+    beamer = SimulatedProjector(clock, power=Power.ON)
+    peer = PjLinkPeer(beamer)
+    projector = PjLinkProjector(lambda: memory_link(peer), clock=clock)
+    require_healthy(projector)
+    if fault == "frozen":
+        beamer.set_frozen(True)
+    else:
+        beamer.signal = NoResolution.NO_SIGNAL
+    with pytest.raises(DeviceFault, match=said):
+        require_healthy(projector)
 
 
 def test_a_cold_lamp_is_lit_and_given_its_minutes() -> None:
