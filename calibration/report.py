@@ -127,7 +127,8 @@ td, th {{ padding: .25rem 1.2rem .25rem 0; border-bottom: 1px solid #e3e6ea; ver
 td {{ font-variant-numeric: tabular-nums }} .note, figcaption {{ color: #5b636d; font-size: .9rem }}
 .verdict {{ font-size: 1.15rem; font-weight: 600; padding: .5rem .8rem; margin: 1rem 0; border-left: 6px solid }}
 .accept {{ border-color: #2f8f46 }} .remark {{ border-color: #d9a400 }} .refuse {{ border-color: #c8382e }}
-td.accept, td.remark, td.refuse {{ border-left: 4px solid; padding-left: .6rem; white-space: nowrap }}
+td.accept, td.remark, td.refuse {{
+  border-color: #e3e6ea; border-left: 4px solid; padding-left: .6rem; white-space: nowrap }}
 td.accept {{ border-left-color: #2f8f46 }} td.remark {{ border-left-color: #d9a400 }}
 td.refuse {{ border-left-color: #c8382e; font-weight: 600 }}
 td.number {{ white-space: nowrap }} figure {{ margin: 0 }} img {{ max-width: 100%; height: auto }}
@@ -151,20 +152,19 @@ def _verdict(verdict: Verdict) -> str:
     }[verdict.outcome]
     return (
         f"<p class='verdict {_CLASSES[verdict.outcome]}'>{said}</p><table><tr><th></th><th>figure</th><th>measured</th>"
-        f"<th>limits</th><th>why</th></tr>{rows}</table>"
+        f"<th>accepted</th><th>refused beyond</th><th>why</th></tr>{rows}</table>"
     )
 
 
 def _judged(row: Judged) -> str:
     limit, name = row.threshold, _CLASSES[row.outcome]
-    limits = f"{limit.sense} {shown(limit.accept, limit.unit)}"
-    if limit.refuse is not None:
-        limits += f"; refused beyond {shown(limit.refuse, limit.unit)}"
+    refuse = "" if limit.refuse is None else shown(limit.refuse, limit.unit)
     remedy = f". <b>{html.escape(limit.remedy)}</b>" if row.outcome != "accept" and limit.remedy else ""
     return (
         f"<tr><td class='{name}'>{name}</td><th>{html.escape(limit.title)}</th>"
         f"<td class='number'>{html.escape(shown(row.value, limit.unit))}</td>"
-        f"<td class='note'>{html.escape(limits)}</td>"
+        f"<td class='number note'>{limit.sense} {html.escape(shown(limit.accept, limit.unit))}</td>"
+        f"<td class='number note'>{html.escape(refuse)}</td>"
         f"<td class='note' title='{html.escape(limit.source, quote=True)}'>{html.escape(limit.why)}{remedy}</td></tr>"
     )
 

@@ -129,7 +129,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
         JUDGEMENT + "; 1 % between whites is usual for a warm lamp", _LAMP,
     ),
     Threshold(
-        "white_drift_deg", "Drift of white's colour", "degrees", "at most", 0.2, 2.0,
+        "white_drift_deg", "Drift of white's colour", "°", "at most", 0.2, 2.0,
         "the lamp's spectrum changes, not its brightness alone",
         JUDGEMENT + ": a tenth of a good method's error", _LAMP,
     ),
@@ -145,9 +145,10 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
     ),
     Threshold(
-        "grey_tint_deg", "Tint of the print's greys against paper", "degrees", "at most", 3.0, None,
+        "grey_tint_deg", "Tint of the print's greys against paper", "°", "at most", 6.0, None,
         "greys are not neutral; the ground truth is paper's, so methods that trust in grey are judged by another grey",
-        JUDGEMENT, "print without colour management on matte paper, or live with it",
+        JUDGEMENT + "; the simulated print, without colour management, has 4.5",
+        "print without colour management on matte paper, or live with it",
     ),
     Threshold(
         "noise_misfit", "Cells' noise about the photon-transfer curve", "share", "at most", 0.3, None,
@@ -171,12 +172,12 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "clean or flatten the print, and look for shadows on it",
     ),
     Threshold(
-        "truth_median_deg", "Ground truth, standard error, median light", "degrees", "at most", 0.1, 1.0,
+        "truth_median_deg", "Ground truth, standard error, median light", "°", "at most", 0.1, 1.0,
         "a method's error cannot be measured finer than the truth is known",
         JUDGEMENT + ": good methods are 1 to 2 degrees off", "expose longer",
     ),
     Threshold(
-        "truth_worst_deg", "Ground truth, standard error, worst light", "degrees", "at most", 0.5, 3.0,
+        "truth_worst_deg", "Ground truth, standard error, worst light", "°", "at most", 0.5, 3.0,
         "as above, for the darkest light", JUDGEMENT, "expose longer, or leave the darkest lights out",
     ),
     Threshold(

@@ -83,6 +83,8 @@ def shown(value: float, unit: str) -> str:
     """Return a figure for people: shares as per cent, three significant digits."""
     if unit == "share":
         return f"{100 * value:.3g} %"
+    if unit == "°":
+        return f"{value:.2g}°"
     return f"{value:.3g} {unit}".strip() if abs(value) < 1000 else f"{value:.0f} {unit}".strip()
 
 

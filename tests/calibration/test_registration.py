@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acquisition.layout import A_SERIES_MM, design_chart
+from benchmarks import rooms
 from calibration.registration import Displacement, fit_lens, register
 from drivers.errors import RegistrationError
 from drivers.presenter import WHITE, Colour
@@ -170,3 +171,35 @@ def test_a_displacement_without_bend_is_followed_exactly(level: float, slope_x: 
     information = np.broadcast_to(np.eye(2) * 1e4, (300, 2, 2))
     found = Displacement.over(low, high, 12.0).fitted(points, information, 1e4 * moved)
     assert found.at(points) == pytest.approx(moved, abs=1e-3)
+
+
+def test_a_mirrored_frame_is_called_mirrored(lab: Lab, tmp_path: Path) -> None:
+    top, left, height, width = lab.world.body.visible
+
+    def mirror(counts: npt.NDArray[np.uint16]) -> None:
+        seen = counts[top : top + height, left : left + width // 2 * 2]
+        # Whole blocks change places, so that every photosite keeps its colour.
+        seen[:] = seen.reshape(height, -1, 2)[:, ::-1].reshape(height, -1).copy()
+
+    with pytest.raises(RegistrationError, match="is mirrored"):
+        register(lab.mosaic(tmp_path, paint=mirror), lab.chart)
+
+
+@pytest.mark.parametrize("roll", [90.0, -90.0, 180.0, 37.0])
+def test_a_turned_camera_sees_the_same_chart(tmp_path: Path, roll: float) -> None:
+    lab = hang(2, "A6", "EOS 550D", room=Room(waviness_mm=0.5, roll_deg=roll, fill=0.55))
+    mosaic = lab.mosaic(tmp_path)
+    registration = register(mosaic, lab.chart)
+    error = registration.to_pixels(lab.chart.centres_mm) - lab.truth_px(lab.chart.centres_mm, mosaic)
+    assert np.linalg.norm(error, axis=1).max() < 0.6
+    turned = registration.framing.rotation_deg - roll
+    assert abs((turned + 180) % 360 - 180) < 5
+
+
+@pytest.mark.parametrize("seed", [101, 102, 103])
+def test_rooms_that_nothing_was_tuned_for(seed: int) -> None:
+    """More of them, on whole charts, are in `benchmarks.rooms`."""
+    case = rooms.random_case(seed)
+    error = rooms.miss(replace(case, body="EOS 550D", room=replace(case.room, blur_px=0.7)), 4, "A2")
+    assert error.max() < rooms.SILENT_PX / 2
+    assert np.sqrt((error**2).mean()) < 0.1
