@@ -34,6 +34,9 @@ from drivers.clock import Clock, SystemClock
 from drivers.errors import ConfigurationError, CropError, FormatError
 from drivers.fullscreen import FullScreen, identify_displays, list_displays
 from drivers.gphoto2_camera import Gphoto2Camera
+from drivers.jvc import PORT as JVC_PORT
+from drivers.jvc import JvcFlatField
+from drivers.lightcrafter import LightCrafter, find_lightcrafter
 from drivers.links.serial import SerialLink, list_serial_ports
 from drivers.links.tcp import TcpLink
 from drivers.links.usb import list_devices, open_usb
@@ -161,9 +164,16 @@ def _lab_projector(cable: ProjectorCable, clock: Clock) -> Projector | None:
 
 
 def _lab_presenter(light: LightSource, clock: Clock) -> Presenter:
-    if light.shown_by == "display":
-        return FullScreen(light.display, clock)
-    raise ConfigurationError(f"lab.light.shown_by = {light.shown_by!r} is not there yet; known is 'display'")
+    match light.shown_by:
+        case "display":
+            return FullScreen(light.display, clock)
+        case "lightcrafter":
+            return LightCrafter(find_lightcrafter, clock)
+        case "jvc":
+            host = _required(light.host, "lab.light.host", "the projector's address")
+            port = light.port or JVC_PORT
+            label = f"the JVC projector at {host}:{port}"
+            return JvcFlatField(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
 
 
 def _required(value: str | None, key: str, what: str) -> str:

@@ -8,8 +8,9 @@ import pytest
 
 from acquisition.config import LabSettings, parse_lab
 from acquisition.layout import design_chart
-from acquisition.rig import open_rig, simulated_body, simulated_room
+from acquisition.rig import attached_devices, open_rig, simulated_body, simulated_room
 from drivers.errors import ConfigurationError
+from sim.presenter import Screen, SimulatedPresenter
 
 HEAD = 'rig = "simulated"\nchart = "c.json"\nilluminations = "l.csv"\n'
 
@@ -50,3 +51,35 @@ def test_an_imported_session_cannot_be_taken() -> None:
     imported = LabSettings(rig="imported", chart=Path("c"), illuminations=Path("l"))
     with pytest.raises(ConfigurationError, match="other means"), open_rig(imported, design_chart(bits=1)):
         pass
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('[lab.camera]\nconnection = "ptpip"\n', "lab.camera.host is missing"),
+        ('[lab.projector]\ncontrol = "pjlink"\n', "lab.projector.host is missing"),
+        ('[lab.projector]\ncontrol = "epson"\n', "lab.projector.device is missing"),
+        ('[lab.light]\nshown_by = "jvc"\n', "lab.light.host is missing"),
+        ("[camera]\nshutter_s = 0.51\n", "whole turns"),
+    ],
+)
+def test_a_cable_that_is_not_named_is_said(text: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Whatever display this machine has stays dark.
+    monkeypatch.setattr("acquisition.rig.FullScreen", lambda display, clock: SimulatedPresenter(Screen(), clock))  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    real = parse_lab(HEAD.replace("simulated", "lab") + text, "LAB.toml")
+    with pytest.raises(ConfigurationError, match=expected), open_rig(real, design_chart(bits=1)):
+        pass
+
+
+def test_an_unknown_language_is_named_with_the_known_ones() -> None:
+    with pytest.raises(ConfigurationError, match="'pjlink', 'epson', 'benq', 'optoma' or 'nec'"):
+        parse_lab(HEAD + '[lab.projector]\ncontrol = "klingon"\n', "LAB.toml")
+
+
+def test_what_cannot_be_asked_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    kinds = {attached.kind: attached for attached in attached_devices(search_s=0)}
+    assert list(kinds) == ["cameras on USB", "serial ports", "displays"]
+    assert kinds["displays"].found == ()
+    assert kinds["displays"].trouble
