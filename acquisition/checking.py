@@ -20,7 +20,7 @@ from acquisition.rig import open_rig
 from acquisition.sequencer import Devices, make_ready
 from acquisition.session import FrameKind
 from drivers.errors import RegistrationError
-from drivers.presenter import BLACK, WHITE, Colour
+from drivers.presenter import BLACK, WHITE, Colour, SelfDoubting
 from drivers.rawfile import Mosaic, read_raw
 from drivers.storage import write_whole
 
@@ -61,6 +61,8 @@ def check_lab(settings: LabSettings, picture: Path | None) -> CheckReport:
         body = devices.camera.identity()
         name = body.model if body.model.startswith(body.maker.split()[0]) else f"{body.maker} {body.model}"
         lines.append(f"camera      {name}, serial {body.serial}")
+        if isinstance(devices.presenter, SelfDoubting):
+            lines.extend(f"picture     {warning}" for warning in devices.presenter.warnings())
         devices.camera.configure(settings.camera.exposure)
         if devices.projector is not None:
             make_ready(devices.projector, devices.clock, settings.sequence)

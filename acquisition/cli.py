@@ -150,6 +150,7 @@ def devices(
 def check(
     lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
     picture: Annotated[Path | None, typer.Option(help="Save the frame with what was found on it as PNG.")] = None,
+    identify: Annotated[bool, typer.Option(help="First show on every display its number for ten seconds.")] = False,
 ) -> None:
     """Talk to every device, find the chart, judge focus, framing and exposure; records nothing.
 
@@ -158,7 +159,12 @@ def check(
     from acquisition.checking import check_lab
     from acquisition.config import load_lab
 
-    report = check_lab(load_lab(lab), picture)
+    settings = load_lab(lab)
+    if identify:
+        from acquisition.rig import identify_displays
+
+        identify_displays(10.0)
+    report = check_lab(settings, picture)
     for line in report.lines:
         print(line)
     if report.faults:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 
 @dataclass(frozen=True)
@@ -39,4 +39,13 @@ class Presenter(Protocol):
 
     def close(self) -> None:
         """Leave the screen black and release it; a second call does nothing."""
+        ...
+
+
+@runtime_checkable
+class SelfDoubting(Protocol):
+    """A presenter that knows what may change the light behind the codes that it shows."""
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what does, or may do so, one sentence each with its remedy; empty when nothing does."""
         ...

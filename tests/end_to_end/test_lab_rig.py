@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from acquisition.chart import load_chart
+from acquisition.cli import main
 from acquisition.config import load_lab
 from acquisition.rig import sheet, simulated_body, simulated_room
 from acquisition.session import Session
@@ -32,6 +33,7 @@ from sim.clock import OPENING
 from sim.eos import SimulatedEos
 from sim.eos_bodies import EOS_BODIES
 from sim.film import WorldFilm
+from sim.presenter import SimulatedPresenter
 from sim.projector import SimulatedProjector, serve_pjlink
 from sim.ptpip_server import serve_ptpip
 from sim.pty import PseudoTerminal
@@ -118,3 +120,18 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
             other = read_raw(real.folder / theirs.file)
             np.testing.assert_array_equal(one.sensor, other.sensor)
             assert theirs.taken_at > OPENING
+
+
+def test_a_look_tells_what_may_bend_the_light(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Doubting(SimulatedPresenter):
+        def warnings(self) -> tuple[str, ...]:
+            return ("the gamma ramp is not straight: switch off night light",)
+
+    monkeypatch.setattr("acquisition.rig.SimulatedPresenter", Doubting)
+    monkeypatch.setattr(sys, "argv", ["acquire", "check", str(lab)])
+    assert main() == 0
+    told = capsys.readouterr().out
+    assert "gamma ramp is not straight" in told
+    assert "tags" in told
