@@ -100,8 +100,7 @@ def _serve_serial(device: SimulatedProjector, name: str) -> None:
     from sim.serial_projectors import PEERS
 
     with PseudoTerminal(PEERS[spoken.name](device)) as terminal:
-        print(f"{spoken.maker} projector at {terminal.path}", flush=True)
-        _until_interrupted()
+        _until_interrupted(f"{spoken.maker} projector at {terminal.path}")
 
 
 @app.command()
@@ -184,8 +183,11 @@ def _host_and_port(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def _until_interrupted() -> None:
+def _until_interrupted(announcement: str = "") -> None:
     try:
+        # Whoever reads it may interrupt at once.
+        if announcement:
+            print(announcement, flush=True)
         threading.Event().wait()
     except KeyboardInterrupt:
         print("stopped")

@@ -348,6 +348,13 @@ def test_benq_answer_that_looks_like_its_echo() -> None:
     projector.switch_on()
 
 
+def test_benq_answer_like_its_echo_without_a_prompt() -> None:
+    projector, _ = benq_script(
+        (b"\r*pow=?#\r", b"*pow=?#\r\n*POW=OFF#\r\n"), (b"\r*pow=on#\r", b"*pow=on#\r\n*pow=on#\r\n")
+    )
+    projector.switch_on()
+
+
 def test_benq_on_the_way_is_known_by_where_it_was() -> None:
     blocked = b">*pow=?#\r\n*Block item#\r\n>"
     projector, script = benq_script(
@@ -502,6 +509,26 @@ def test_nec_switches_and_mutes() -> None:
         projector.set_muted(False)
     projector.switch_off()
     assert projector.power() is Power.COOLING, "it was told to switch off, so that is what it is switching to"
+    assert script.ended()
+
+
+def test_nec_switched_off_and_on_again_warms_up() -> None:
+    projector, _ = nec_script(
+        (RUNNING, running("00 00 01 00 00 04", "FB")),
+        ("02 01 00 00 00 03", "22 01 01 40 00 64"),
+        (RUNNING, running("00 00 00 00 00 00", "F6")),
+        ("02 00 00 00 00 02", "22 00 01 40 00 63"),
+        (RUNNING, running("00 00 01 00 01 04", "FC")),
+    )
+    projector.switch_off()
+    projector.switch_on()
+    assert projector.power() is Power.WARMING
+
+
+def test_what_was_said_too_much_answers_no_later_question() -> None:
+    projector, script = epson_script((b"PWR?\r", b"PWR=01\r:PWR=04\r:"), (b"PWR?\r", b"PWR=03\r:"))
+    assert projector.power() is Power.ON
+    assert projector.power() is Power.COOLING
     assert script.ended()
 
 
