@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -70,9 +71,19 @@ def polynomial(points_mm: npt.ArrayLike, page_mm: tuple[float, float], order: in
     order
         Total order, i + j ≤ order.
     """
-    unit = 2 * np.asarray(points_mm, dtype=np.float64) / np.asarray(page_mm, dtype=np.float64) - 1
+    points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 2)
+    # Terms stand in rising order, so a lower order's basis is the beginning of a higher one's.
+    return _basis(points.tobytes(), page_mm, max(order, ORDERS[-1]))[:, : len(terms(order))]
+
+
+@lru_cache(maxsize=8)
+def _basis(points: bytes, page_mm: tuple[float, float], order: int) -> _Array:
+    """Return the basis at points (N, 2) float64, read-only; the same cells and references are asked for every frame."""
+    unit = 2 * np.frombuffer(points).reshape(-1, 2) / np.asarray(page_mm, dtype=np.float64) - 1
     x, y = (np.polynomial.legendre.legvander(unit[:, axis], order) for axis in (0, 1))
-    return np.stack([x[:, i] * y[:, j] for i, j in terms(order)], axis=1)
+    basis = np.stack([x[:, i] * y[:, j] for i, j in terms(order)], axis=1)
+    basis.setflags(write=False)
+    return basis
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +147,7 @@ class Paper:
     references
         White references used.
     spread
-        (3,) float64, robust standard deviation of the references about the field, relative to `white`.
+        (3,) float64, RMS of all references about the field, stained ones included, relative to `white`.
     """
 
     field: Field
@@ -184,8 +195,7 @@ def read_paper(
         )
     places, values = places_mm[there], seen[there]
     base = even_field(page_mm) if base is None else base
-    shape = base.at(places)
-    # Terms stand in rising order, so a lower order's basis is the beginning of a higher one's.
+    shape, shape_at_centres = base.at(places), base.at(centres_mm)
     whole = polynomial(places, page_mm, ORDERS[-1])
     factors: list[tuple[_Array, ...]] = []
     white, error, spread = np.zeros(3), np.zeros(3), np.zeros(3)
@@ -204,7 +214,7 @@ def read_paper(
         assert best is not None
         _, solution, weights = best
         local = polynomial(centres_mm, page_mm, order_of(len(solution))) @ solution
-        level = float((local * base.at(centres_mm)[:, channel]).mean())
+        level = float((local * shape_at_centres[:, channel]).mean())
         # Light too weak to have a shape of its own, or none at all.
         own = solution / level if level > 0 and local.min() > 0.05 * level else np.ones(1)
         factors.append((*base.coefficients[channel], own) if len(own) > 1 else base.coefficients[channel])
@@ -213,7 +223,8 @@ def read_paper(
         residual = flat - white[channel]
         scatter = float(np.sqrt((weights * residual**2).sum() / weights.sum()))
         error[channel] = scatter / np.sqrt(float(weights.sum()))
-        spread[channel] = scatter / max(abs(white[channel]), 1e-9)
+        # All references count here: a stain that the fit rightly ignores must still be seen.
+        spread[channel] = float(np.sqrt((residual**2).mean())) / max(abs(white[channel]), 1e-9)
     return Paper(Field(page_mm, (factors[0], factors[1], factors[2])), white, error, int(there.sum()), spread)
 
 

@@ -90,18 +90,24 @@ def gather(
     first = (row * width + column).reshape(-1, SAMPLES)
     sensor = mosaic.sensor.reshape(-1)
     samples = np.empty((*first.shape, 3), dtype=np.float32)
-    highest = np.zeros(len(first), dtype=np.uint16)
+    peak = np.zeros(first.shape, dtype=np.uint16)
     for number, channel in enumerate(CHANNELS):
         places = phases(mosaic)[channel]
         total = np.zeros(first.shape, dtype=np.float32)
         for place in places:
-            counts: npt.NDArray[np.uint16] = sensor[first + (place[0] * width + place[1])]
-            np.maximum(highest, counts.max(axis=1), out=highest)
+            counts = _taken(sensor[place[0] * width + place[1] :], first)
+            np.maximum(peak, counts, out=peak)
             total += counts
         samples[..., number] = total / len(places) - np.float32(np.mean([black[place] for place in places]))
+    highest: npt.NDArray[np.uint16] = peak.max(axis=1)
     samples[~sites.inside] = 0
     highest[~sites.inside] = 0
     return samples, highest
+
+
+def _taken(counts: npt.NDArray[np.uint16], places: npt.NDArray[np.int64]) -> npt.NDArray[np.uint16]:
+    # All places lie on the sensor; clipping only spares numpy a buffer.
+    return np.take(counts, places, mode="clip")
 
 
 def table_values(samples: npt.NDArray[np.float32], field: _Array) -> npt.NDArray[np.uint16]:
