@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import ctypes.util
 import shutil
@@ -127,9 +128,8 @@ def test_a_display_that_goes_away_is_noticed(outputs: str) -> None:
     finally:
         presenter.close()
         subprocess.run([xrandr, "--output", "DUMMY1", "--mode", "480x270", "--right-of", "DUMMY0"], check=True)
-    presenter = FullScreen("right")
-    presenter.show(WHITE)
-    presenter.close()
+    with contextlib.closing(FullScreen("right")) as presenter:
+        presenter.show(WHITE)
 
 
 def test_a_window_moved_away_is_noticed(screen: FullScreen) -> None:
@@ -184,20 +184,18 @@ def test_the_light_goes_out_with_a_process_that_is_killed(virtual: VirtualScreen
 def test_every_code_of_every_channel_arrives_without_a_cursor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with virtual_screen(tmp_path, "320x200", cursor=True) as server:
         monkeypatch.setenv("DISPLAY", server.display)
-        presenter = FullScreen()
-        for code in range(256):
-            colour = Colour(code, 255 - code, (code * 7) % 256)
-            presenter.show(colour)
-            assert plain(server.picture()) == colour
-        presenter.close()
+        with contextlib.closing(FullScreen()) as presenter:
+            for code in range(256):
+                colour = Colour(code, 255 - code, (code * 7) % 256)
+                presenter.show(colour)
+                assert plain(server.picture()) == colour
 
 
 def test_opens_again_and_again(virtual: VirtualScreen) -> None:
     for colour in (WHITE, Colour(1, 2, 3)):
-        presenter = FullScreen()
-        presenter.show(colour)
-        assert plain(virtual.picture()) == colour
-        presenter.close()
+        with contextlib.closing(FullScreen()) as presenter:
+            presenter.show(colour)
+            assert plain(virtual.picture()) == colour
 
 
 def test_lists_displays_from_left_to_right(outputs: str) -> None:

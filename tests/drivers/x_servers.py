@@ -80,9 +80,11 @@ class VirtualScreen:
 
 @contextlib.contextmanager
 def virtual_screen(folder: Path, size: str, *, cursor: bool = False) -> Generator[VirtualScreen]:
-    """Run Xvfb with one black screen of `size`, such as ``800x600``; skip where it is missing."""
-    arguments = ["-screen", "0", f"{size}x24", "-fbdir", str(folder), "-nolisten", "tcp", "-noreset", "-br"]
-    with _running("Xvfb", arguments if cursor else [*arguments, "-nocursor"], folder) as display:
+    """Run Xvfb with one screen of `size`, such as ``800x600``, black or, with a cursor, grey; skip where missing."""
+    arguments = ["-screen", "0", f"{size}x24", "-fbdir", str(folder), "-nolisten", "tcp", "-noreset"]
+    # Without -retro, a cursor appears only once some program has chosen one.
+    arguments += ["-retro"] if cursor else ["-br", "-nocursor"]
+    with _running("Xvfb", arguments, folder) as display:
         yield VirtualScreen(display, folder / "Xvfb_screen0")
 
 
