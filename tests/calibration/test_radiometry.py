@@ -133,3 +133,15 @@ def test_saturation_is_what_the_frame_shows(lab: Lab, tmp_path: Path) -> None:
 def test_black_drift_is_the_worst_position() -> None:
     assert black_drift([]) == 0
     assert black_drift([np.zeros((2, 2)), np.array([[0, 0.2], [-0.3, 0.1]])]) == pytest.approx(0.3)
+
+
+def test_a_stain_is_ignored_by_the_white_and_told_by_the_spread() -> None:
+    random = np.random.default_rng(8)
+    seen = falloff(PLACES) * 6000 + random.normal(0, 12, (len(PLACES), 3))
+    clean = read_paper(PLACES, seen, CENTRES, PAGE)
+    stained = seen.copy()
+    stained[np.linalg.norm(PLACES - (200, 150), axis=1) < 40] *= 0.8
+    found = read_paper(PLACES, stained, CENTRES, PAGE)
+    assert found.white == pytest.approx(clean.white, rel=0.003)
+    assert (clean.spread < 0.004).all()
+    assert (found.spread > 0.02).all()
