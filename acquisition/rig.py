@@ -155,6 +155,10 @@ def _lab_projector(cable: ProjectorCable, clock: Clock) -> Projector | None:
         label = f"the projector at {host}:{port}"
         return PjLinkProjector(lambda: TcpLink.connect(host, port, CONNECT_S), cable.password, label=label, clock=clock)
     spoken = language(cable.control)
+    if cable.device is None and cable.host is not None and spoken.network is not None:
+        host, port = cable.host, cable.port or spoken.tcp_port
+        label = f"the projector at {host}:{port}"
+        return spoken.network(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
     device = _required(cable.device, "lab.projector.device", "the serial port")
     return spoken.projector(
         lambda: SerialLink.open(device, cable.baud or spoken.baud, spoken.parity),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 from drivers.clock import Clock
@@ -34,21 +35,34 @@ class ProjectorFactory(Protocol):
 
 @dataclass(frozen=True)
 class Language:
-    """How a maker's projectors are spoken to; `baud` and `parity` as they leave the factory."""
+    """How a maker's projectors are spoken to; `baud` and `parity` as they leave the factory.
+
+    `network` is the driver for the same text over TCP, at `tcp_port`; None where the maker has no such thing.
+    """
 
     name: str
     maker: str
     baud: int
     parity: str
     projector: ProjectorFactory
+    tcp_port: int = 0
+    network: ProjectorFactory | None = None
 
 
 LANGUAGES: Mapping[str, Language] = {
     language.name: language
     for language in (
-        Language("benq", "BenQ", benq.BAUD, "N", benq.BenqProjector),
-        Language("epson", "Epson", epson.BAUD, "N", epson.EpsonProjector),
-        Language("nec", "NEC", nec.BAUD, "N", nec.NecProjector),
+        Language("benq", "BenQ", benq.BAUD, "N", benq.BenqProjector, benq.TCP_PORT, benq.BenqProjector),
+        Language(
+            "epson",
+            "Epson",
+            epson.BAUD,
+            "N",
+            epson.EpsonProjector,
+            epson.TCP_PORT,
+            partial(epson.EpsonProjector, network=True),
+        ),
+        Language("nec", "NEC", nec.BAUD, "N", nec.NecProjector, nec.TCP_PORT, nec.NecProjector),
         Language("optoma", "Optoma", optoma.BAUD, "N", optoma.OptomaProjector),
     )
 }

@@ -21,7 +21,7 @@ import pytest
 from acquisition.chart import load_chart
 from acquisition.cli import main
 from acquisition.config import load_lab
-from acquisition.rig import sheet, simulated_body, simulated_room
+from acquisition.rig import open_rig, sheet, simulated_body, simulated_room
 from acquisition.session import Session
 from acquisition.taking import run_session
 from drivers.clock import SystemClock
@@ -33,11 +33,11 @@ from sim.clock import OPENING
 from sim.eos import SimulatedEos
 from sim.eos_bodies import EOS_BODIES
 from sim.film import WorldFilm
-from sim.presenter import SimulatedPresenter
+from sim.presenter import Screen, SimulatedPresenter
 from sim.projector import SimulatedProjector, serve_pjlink
 from sim.ptpip_server import serve_ptpip
 from sim.pty import PseudoTerminal
-from sim.serial_projectors import PEERS
+from sim.serial_projectors import PEERS, BenqPeer, EpsonPeer, serve_network
 from sim.usb import SimulatedBus
 from sim.usb_device import PtpUsbDevice
 from sim.world import World
@@ -135,3 +135,19 @@ def test_a_look_tells_what_may_bend_the_light(
     told = capsys.readouterr().out
     assert "gamma ramp is not straight" in told
     assert "tags" in told
+
+
+@pytest.mark.parametrize("maker", ["epson", "benq"])
+def test_a_makers_language_over_the_network(lab: Path, maker: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("acquisition.rig.FullScreen", lambda display, clock: SimulatedPresenter(Screen(), clock))  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    beamer = SimulatedProjector(SystemClock(), power=Power.ON)
+    peer = partial(EpsonPeer, beamer, network=True) if maker == "epson" else partial(BenqPeer, beamer, network=True)
+    with serve_network(peer) as server:
+        host, port = server.address
+        text = lab.read_text().replace('rig = "simulated"', 'rig = "lab"')
+        text += f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\n[lab.projector]\ncontrol = "{maker}"\n'
+        lab.write_text(text + f'host = "{host}"\nport = {port}\n')
+        settings = load_lab(lab)
+        with open_rig(settings, load_chart(settings.chart)) as devices:
+            assert devices.projector is not None
+            assert devices.projector.power() is Power.ON
