@@ -1,8 +1,9 @@
 """What a table costs: `python -m benchmarks.build_lut` prints one JSON object a line for each figure; takes a minute.
 
-A short session of full-size frames of the EOS 550D (uncompressed DNG, as the simulated camera writes them) is built as
-`build-lut` builds it. Times are the least of several runs; each is given beside a plain pass over the same file, so
-that the machine's speed cancels. A CR2 costs its decoding on top: about 0.5 s of one thread.
+A short session of full-size frames of the EOS 550D is built as `build-lut` builds it, once as the uncompressed DNG that
+the simulated camera writes and once with the same counts as CR2 (lossless JPEG, as the real body). Times are the least
+of several runs; each is given beside a plain pass over the same files in the same run, so that the machine's speed
+cancels: rawpy's unpacking alone, in as many threads as the build decodes with, and dcraw, where it is installed.
 """
 
 from __future__ import annotations
@@ -10,27 +11,32 @@ from __future__ import annotations
 import hashlib
 import json
 import resource
+import shutil
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import rawpy
 
 from acquisition.framing import frame_black, strongest_plane
 from acquisition.illuminations import plan_illuminations
 from acquisition.layout import design_chart
 from acquisition.printing import drawing
 from acquisition.session import ACCEPTED, Session, plan_steps
-from calibration.build import build
+from calibration.build import THREADS, build
 from calibration.registration import register
 from calibration.sampling import gather, sites_at, table_values
 from drivers.rawfile import read_raw
 from sim.bodies import BODIES
 from sim.dng import write_dng
 from sim.world import REFERENCE_EXPOSURE, Print, Room, World
+from tests.drivers.raw_files import write_cr2
 
 RUNS = 4
 
@@ -50,8 +56,8 @@ def report(name: str, value: float, unit: str, against: str) -> None:
     print(json.dumps({"name": name, "value": float(f"{value:.3g}"), "unit": unit, "against": against}), flush=True)
 
 
-def take(folder: Path) -> tuple[Session, World]:
-    """Return a session of eleven lights, and the room it was taken in."""
+def take(folder: Path, cr2: bool = False) -> tuple[Session, World]:
+    """Return a session of eleven lights as DNG or CR2, and the room it was taken in."""
     chart = design_chart()
     picture = drawing(chart)
     world = World(Print(picture.page_mm, picture.rectangles_mm, picture.rgb), BODIES["EOS 550D"], Room())
@@ -61,8 +67,13 @@ def take(folder: Path) -> tuple[Session, World]:
     for step in plan_steps(lights, 25):
         stream = BytesIO()
         counts = world.expose(step.colour, REFERENCE_EXPOSURE, key=(step.number,))
-        write_dng(stream, counts, world.body, settings=REFERENCE_EXPOSURE, taken_at=at)
-        data, file = stream.getvalue(), f"frames/{step.stem}.dng"
+        file = f"frames/{step.stem}.{'cr2' if cr2 else 'dng'}"
+        if cr2:
+            write_cr2(folder / file, counts, "Canon EOS 550D")
+            data = (folder / file).read_bytes()
+        else:
+            write_dng(stream, counts, world.body, settings=REFERENCE_EXPOSURE, taken_at=at)
+            data = stream.getvalue()
         at += timedelta(seconds=4)
         attempt = session.begin(step, file, at)
         (folder / file).write_bytes(data)
@@ -77,6 +88,41 @@ def take(folder: Path) -> tuple[Session, World]:
             verdict=ACCEPTED,
         )
     return session, world
+
+
+def compare(session: Session, out: Path, kind: str) -> None:
+    """Build a session's table and print what a frame costs, beside unpacking and dcraw of the same files."""
+    marks: list[float] = []
+    build(session, out, lambda done, total, what: marks.append(time.perf_counter()))
+    # The first mark is set before the chart is sought, the second when the first frame is done, the last after all.
+    each = (marks[-2] - marks[1]) / (len(marks) - 3)
+    files = [session.folder / record.file for record in session.frames() if record.kind != "dark"]
+
+    def unpack_all() -> None:
+        with ThreadPoolExecutor(THREADS) as threads:
+            list(threads.map(unpack, files))
+
+    unpacking = least(unpack_all, runs=2) / len(files)
+    report(f"one frame of a build, {kind}", each, "s", f"{THREADS} threads decode")
+    report(
+        f"one frame of a build, {kind}, to unpacking", each / unpacking, "1", f"rawpy's unpack alone, {THREADS} threads"
+    )
+    dcraw = shutil.which("dcraw")
+    if dcraw is not None:
+        command = [dcraw, "-D", "-4", "-T", "-c"]
+
+        def develop() -> None:
+            for file in files[:4]:
+                subprocess.run([*command, file], stdout=subprocess.DEVNULL, check=True)
+
+        developing = least(develop, runs=1) / 4
+        report(f"one frame of a build, {kind}, to dcraw", each / developing, "1", "dcraw -D -4 -T of it alone")
+
+
+def unpack(path: Path) -> None:
+    """Read and unpack a raw file, and do nothing with it."""
+    with rawpy.imread(BytesIO(path.read_bytes())) as raw:
+        _ = raw.raw_image.shape
 
 
 def main() -> None:
@@ -104,15 +150,14 @@ def main() -> None:
         report("sample a frame", sampling, "s", "-")
         report("sample a frame, ratio", sampling / reading, "1", "reading a frame")
         report("judge a frame's light and planes", least(lambda: strongest_plane(mosaic, black)), "s", "-")
-        marks: list[float] = []
-        build(session, folder / "lut", lambda done, total, what: marks.append(time.perf_counter()))
-        # The first mark is set before the chart is sought, the last when all frames are done.
-        frames = len(marks) - 3
-        report("one frame of a build", (marks[-2] - marks[1]) / frames, "s", "two threads decode")
-        report("one frame of a build, ratio", (marks[-2] - marks[1]) / frames / reading, "1", "reading a frame alone")
+        compare(session, folder / "lut", "DNG")
         session.close()
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    report("memory at most, the simulated room included", peak, "GB", "0.35 GB of which are the room's light")
+        # Before CR2 files are written here, which takes gigabytes.
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+        report("memory at most, the simulated room included", peak, "GB", "0.35 GB of which are the room's light")
+        session, _ = take(folder / "session_cr2", cr2=True)
+        compare(session, folder / "lut_cr2", "CR2")
+        session.close()
 
 
 if __name__ == "__main__":

@@ -28,7 +28,18 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from acquisition.framing import CHANNELS, Channel, Plane, Shift, frame_black, plane_of, shift_between, strongest_plane
+from acquisition.framing import (
+    CHANNELS,
+    Channel,
+    Framing,
+    Plane,
+    Shift,
+    channel_offset_px,
+    frame_black,
+    phases,
+    plane_of,
+    shift_between,
+)
 from acquisition.session import FrameRecord, Session
 from calibration.darkness import Darkness, DarkReading, additivity, drift_gains
 from calibration.growing import Checkpoint, Growing, growing
@@ -52,8 +63,10 @@ REPORT_FILES = ("report.html", "report.json")
 CHECKPOINT_EVERY = 16
 """Frames from one checkpoint to the next: what a build that is killed has to do again."""
 
-_THREADS = 2
+THREADS = 2
 _AHEAD = 3
+_AROUND_TAG = 12
+"""Half-size pixels around a tag that its movement may need: more than `acquisition.framing` looks at."""
 
 _Array = npt.NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -229,7 +242,7 @@ class _Decoded:
     record: FrameRecord
     mosaic: Mosaic
     black: _Array
-    strongest: Plane
+    strongest: Channel
     saturation: int
 
 
@@ -636,12 +649,36 @@ def _decode(session: Session, record: FrameRecord) -> _Decoded:
         )
     mosaic = decode_raw(data, path)
     black = frame_black(mosaic)
-    return _Decoded(record, mosaic, black, strongest_plane(mosaic, black), saturation(mosaic))
+    return _Decoded(record, mosaic, black, strongest_channel(mosaic, black), saturation(mosaic))
+
+
+def strongest_channel(mosaic: Mosaic, black: _Array) -> Channel:
+    """Return the colour with the brightest paper, from every eighth block."""
+    blocks = mosaic.block_planes()[:, :, ::8, ::8]
+    levels = [
+        max(float(np.percentile(blocks[place], 98) - black[place]) for place in places)
+        for places in phases(mosaic).values()
+    ]
+    return CHANNELS[int(np.argmax(levels))]
+
+
+def tags_of(mosaic: Mosaic, channel: Channel, black: _Array, framing: Framing) -> Plane:
+    """Return one colour of a mosaic around the tags, and 0 elsewhere: all that the chart's movement is measured in."""
+    places = phases(mosaic)[channel]
+    blocks = mosaic.block_planes()
+    level = np.float32(np.mean([black[place] for place in places]))
+    values = np.zeros(blocks.shape[2:], dtype=np.float32)
+    for tag in framing.tags:
+        left, top = np.maximum(np.floor(tag.corners_px.min(axis=0)).astype(int) - _AROUND_TAG, 0)
+        right, bottom = np.ceil(tag.corners_px.max(axis=0)).astype(int) + _AROUND_TAG
+        part = np.s_[top:bottom, left:right]
+        values[part] = sum(blocks[place][part].astype(np.float32) for place in places) / np.float32(len(places)) - level
+    return Plane(channel, values, channel_offset_px(places))
 
 
 def _decoded(session: Session, records: Sequence[FrameRecord]) -> Generator[_Decoded]:
     """Yield the frames in order, a few decoded ahead."""
-    with ThreadPoolExecutor(_THREADS) as threads:
+    with ThreadPoolExecutor(THREADS) as threads:
         waiting: deque[Future[_Decoded]] = deque()
         todo = iter(records)
         try:
@@ -732,8 +769,9 @@ class _Measurement:
                 f"{self._geometry[2]}; "
                 "a session has one camera with one setting"
             )
-        channel = decoded.strongest.channel
-        shift = shift_between(self._planes[channel], self._registration.framing, decoded.strongest)
+        channel = decoded.strongest
+        seen = tags_of(mosaic, channel, decoded.black, self._registration.framing)
+        shift = shift_between(self._planes[channel], self._registration.framing, seen)
         sites, anew = self._sites, False
         # A turn or a change of distance moves the tags differently; moving the grid along would not mend it.
         turned = shift.largest_px > shift.length_px + STILL_PX
