@@ -86,13 +86,22 @@ class Served:
         return re.findall(r"^Choice: \d+ (.*)$", self.gphoto2("--get-config", setting), re.MULTILINE)
 
 
+def _environment(folder: Path) -> dict[str, str]:
+    """Return the environment for Debian's gphoto2: its settings in `folder`, and its own libraries.
+
+    python-gphoto2, once imported, points every libgphoto2 started from here at the drivers it brings along.
+    """
+    own = {name: value for name, value in os.environ.items() if name not in ("CAMLIBS", "IOLIBS")}
+    return own | {"HOME": str(folder), "LC_ALL": "C"}
+
+
 def gphoto2(path: str, folder: Path, *arguments: str) -> str:
     program = shutil.which("gphoto2")
     if program is None:
         pytest.skip("gphoto2 is not installed")
     done = subprocess.run(
         [program, "--camera", "PTP/IP Camera", "--port", path, *arguments],
-        cwd=folder, env=os.environ | {"HOME": str(folder), "LC_ALL": "C"}, capture_output=True, text=True,
+        cwd=folder, env=_environment(folder), capture_output=True, text=True,
         timeout=LIMIT_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
