@@ -13,7 +13,7 @@ from pathlib import Path
 from acquisition.config import LabSettings, SequenceSettings
 from acquisition.exposure import disagreement, measure_exposure, refusal
 from acquisition.session import ACCEPTED, REFUSED, FrameKind, Session, Step
-from drivers.camera import Camera
+from drivers.camera import Camera, Patient
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceFault, DeviceRefused, FormatError
 from drivers.presenter import Presenter
@@ -22,6 +22,8 @@ from drivers.rawfile import read_raw
 
 POWER_LIMIT_S = 300.0
 """How long a lamp may take to light; makers state up to 130 s with repeated ignition."""
+IDLE_S = 8.0
+"""Between two words to a camera in a long pause; libgphoto2 keeps bodies awake every 10 s."""
 PAUSE_S = 5.0
 """Between two looks at a projector that complains."""
 REFUSED_IN_A_ROW = 3
@@ -97,7 +99,7 @@ def _take(
     session.note(clock.now(), "start", f"{len(open_steps)} of {len(steps)} frames to take")
     devices.camera.configure(settings.camera.exposure)
     if devices.projector is not None:
-        make_ready(devices.projector, clock, settings.sequence)
+        make_ready(devices.projector, clock, settings.sequence, lambda: _idle(devices.camera))
     refused: list[str] = []
     taken = 0
     in_a_row = 0
@@ -120,8 +122,15 @@ def _take(
     return outcome
 
 
-def make_ready(projector: Projector, clock: Clock, sequence: SequenceSettings) -> None:
+def make_ready(
+    projector: Projector, clock: Clock, sequence: SequenceSettings, idle: Callable[[], None] = lambda: None
+) -> None:
     """Switch the lamp on if need be, wait until it burns steadily, and require good health.
+
+    Parameters
+    ----------
+    idle
+        Called every few seconds of the wait, for the other devices.
 
     Raises
     ------
@@ -143,7 +152,10 @@ def make_ready(projector: Projector, clock: Clock, sequence: SequenceSettings) -
         projector.set_muted(False)
     require_healthy(projector)
     if clock.monotonic() > begun:
-        clock.sleep(sequence.warm_up_s)
+        until = clock.monotonic() + sequence.warm_up_s
+        while (left := until - clock.monotonic()) > 0:
+            clock.sleep(min(left, IDLE_S))
+            idle()
 
 
 def require_healthy(projector: Projector) -> None:
@@ -176,10 +188,15 @@ def _fault(projector: Projector | None) -> str | None:
     return None
 
 
+def _idle(camera: Camera) -> None:
+    if isinstance(camera, Patient):
+        camera.idle()
+
+
 def _await_health(
     session: Session,
+    devices: Devices,
     projector: Projector,
-    clock: Clock,
     sequence: SequenceSettings,
     announce: Callable[[str], None],
 ) -> None:
@@ -190,6 +207,7 @@ def _await_health(
     DeviceFault
         It still complains after `sequence.patience_s`.
     """
+    clock = devices.clock
     complaint = _fault(projector)
     if complaint is None:
         return
@@ -200,6 +218,7 @@ def _await_health(
         if clock.monotonic() - begun >= sequence.patience_s:
             raise DeviceFault(complaint)
         clock.sleep(min(PAUSE_S, sequence.patience_s))
+        _idle(devices.camera)
     well = f"the projector is well again after {clock.monotonic() - begun:.0f} s"
     session.note(clock.now(), "resumed", well)
     announce(f"resumed: {well}")
@@ -224,7 +243,7 @@ def _take_step(
     reason: str | None = None
     for remaining in reversed(range(settings.sequence.attempts)):
         if devices.projector is not None:
-            _await_health(session, devices.projector, clock, settings.sequence, announce)
+            _await_health(session, devices, devices.projector, settings.sequence, announce)
         kept = session.kept_files(step)
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
         attempt = session.begin(step, f"frames/{stem}", clock.now())

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import BinaryIO, Protocol
+from typing import BinaryIO, Protocol, runtime_checkable
 
 
 @dataclass(frozen=True)
@@ -78,4 +78,13 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Give the camera back to its user; a second call does nothing."""
+        ...
+
+
+@runtime_checkable
+class Patient(Protocol):
+    """A camera that wants to be spoken to in long pauses: to stay awake, and to be rid of what it has to tell."""
+
+    def idle(self) -> None:
+        """Keep the camera awake and empty its queue of events; call it every few seconds of a pause."""
         ...

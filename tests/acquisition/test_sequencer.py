@@ -282,6 +282,21 @@ def test_a_cold_lamp_is_lit_and_given_its_minutes() -> None:
     assert clock.monotonic() >= 600 + projector.traits.warm_up_s
 
 
+def test_the_camera_is_spoken_to_while_the_lamp_warms_up(folder: Path) -> None:
+    lab = Lab(folder)
+    lab.projector = SimulatedProjector(lab.clock)
+    spoken: list[float] = []
+
+    class PatientCamera(ScriptedCamera):
+        def idle(self) -> None:
+            spoken.append(self.clock.monotonic())
+
+    lab.camera = PatientCamera(lab.screen, lab.clock, {})
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    assert spoken[-1] >= SETTINGS.sequence.warm_up_s
+    assert max(np.diff(spoken)) <= 10
+
+
 def test_a_warm_lamp_is_not_waited_for() -> None:
     clock = SimulatedClock()
     make_ready(SimulatedProjector(clock, power=Power.ON), clock, SequenceSettings(warm_up_s=600))
