@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated
@@ -84,8 +85,7 @@ def _serve_network(
             datagrams = served.enter_context(ProjectorDatagrams(device, udp or 0, controller))
             if udp is not None:
                 print(f"PJLink searches at {datagrams.address[0]}:{datagrams.address[1]}")
-        print(f"PJLink projector at {host}:{port}", flush=True)
-        _until_interrupted()
+        _until_interrupted(f"PJLink projector at {host}:{port}")
 
 
 def _serve_serial(device: SimulatedProjector, name: str) -> None:
@@ -152,13 +152,11 @@ def camera(
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))
         if port is not None:
             with serve_ptpip(eos, port, name=eos.body.model) as server:
-                print("PTP/IP camera {} at {}:{}".format(eos.body.model, *server.address), flush=True)
-                _until_interrupted()
+                _until_interrupted("PTP/IP camera {} at {}:{}".format(eos.body.model, *server.address))
         elif usbip is not None:
             device = PtpUsbDevice(eos, Identity(*eos.body.usb, serial=eos.serial, name=eos.body.model))
             with serve_usbip([device], usbip) as server:
-                print("USB/IP camera {} at {}:{}, bus id 1-1".format(eos.body.model, *server.address), flush=True)
-                _until_interrupted()
+                _until_interrupted("USB/IP camera {} at {}:{}, bus id 1-1".format(eos.body.model, *server.address))
 
 
 def _grey_squares() -> Print:
@@ -183,11 +181,13 @@ def _host_and_port(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def _until_interrupted(announcement: str = "") -> None:
+def _until_interrupted(announcement: str) -> None:
+    """Say where the device is, and serve until Ctrl-C or a request to end, also where a shell had them ignored."""
     try:
+        for request in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(request, signal.default_int_handler)
         # Whoever reads it may interrupt at once.
-        if announcement:
-            print(announcement, flush=True)
+        print(announcement, flush=True)
         threading.Event().wait()
     except KeyboardInterrupt:
         print("stopped")
