@@ -1,8 +1,9 @@
 """Opens what a session is taken with: the one file that knows more of devices than their contracts.
 
-`rig = "simulated"` builds the simulated lab, `rig = "replay"` puts a recorded session into the same simulated
-camera. A lab that is taken up again stands where its journal says it stood: same time, lamp burning, same pictures
-taken; so an interrupted session ends in the same bytes as an undisturbed one.
+`rig = "lab"` opens the devices that LAB.toml names, `rig = "simulated"` builds the simulated lab, `rig = "replay"` puts
+a recorded session into the same simulated camera. A simulated lab that is taken up again stands where its journal says
+it stood: same time, lamp burning, same pictures taken; so an interrupted session ends in the same bytes as an
+undisturbed one.
 """
 
 from __future__ import annotations
