@@ -15,9 +15,8 @@ threads instead.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import numba
 import numpy as np
@@ -25,7 +24,9 @@ import numpy.typing as npt
 from numba import uint32, uint64
 
 from drivers.errors import InputError
-from generator.palette import fit_picture
+from generator.compiled import compiled
+from generator.mixing import mixed_table as mixed_table
+from generator.palette import bits_of, fit_picture
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES, key_of
 
 if TYPE_CHECKING:
@@ -40,17 +41,6 @@ _PURPOSE: Final = np.uint32(SAMPLES)
 _BLOCK: Final = 1024
 _WHOLE_LIGHT: Final = 1 << 20
 """Pixels from which reading a light's samples in one go is cheaper than touching their pages at random."""
-
-_Function = TypeVar("_Function", bound=Callable[..., Any])
-
-
-def _compiled(function: _Function) -> _Function:
-    """Compile `function`, keeping the machine code on disk where a folder for it can be written."""
-    try:
-        return numba.njit(nogil=True, error_model="numpy", cache=True)(function)
-    except RuntimeError:
-        # Neither the package's folder nor the home folder is writable; compiling anew costs a second a start.
-        return numba.njit(nogil=True, error_model="numpy")(function)
 
 
 @numba.njit(inline="always")
@@ -68,7 +58,7 @@ def _words(c0: Any, c1: Any, c2: Any, c3: Any, k0: Any, k1: Any) -> Any:
     return c0, c1, c2, c3
 
 
-@_compiled
+@compiled
 def _gather(
     picture: Any, flat: Any, samples: Any, bits: Any, k0: Any, k1: Any, image: int, first_row: int, out: Any
 ) -> None:
@@ -100,20 +90,6 @@ def _gather(
                 target[i, 0] = flat[at]
                 target[i, 1] = flat[at + 1]
                 target[i, 2] = flat[at + 2]
-
-
-def bits_of(colours: int) -> int:
-    """Return the bits a channel of a table with `colours` = 8**bits colours.
-
-    Raises
-    ------
-    InputError
-        No table has that many colours.
-    """
-    for bits in range(1, 6):
-        if colours == 8**bits:
-            return bits
-    raise InputError(f"the samples are of {colours} colours, expected 8, 64, 512, 4096 or 32768")
 
 
 def draw_samples(

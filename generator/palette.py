@@ -11,10 +11,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import QualityError
+from drivers.errors import InputError, QualityError
 
 if TYPE_CHECKING:
     from calibration.lut import Provenance
+
+
+def bits_of(colours: int) -> int:
+    """Return the bits a channel of a table with `colours` = 8**bits colours.
+
+    Raises
+    ------
+    InputError
+        No table has that many colours.
+    """
+    for bits in range(1, 6):
+        if colours == 8**bits:
+            return bits
+    raise InputError(f"the samples are of {colours} colours, expected 8, 64, 512, 4096 or 32768")
 
 
 def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:

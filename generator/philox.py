@@ -27,6 +27,8 @@ LIGHTS: Final = 1
 """Purpose of the words that choose the lights of a source picture."""
 SCENES: Final = 2
 """Purpose of the words that are the pixels of a random scene."""
+MIXTURES: Final = 3
+"""Purpose of the words that shuffle the samples of mixed lights."""
 
 _WORD: Final = 0xFFFFFFFF
 

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import InputError
-from generator.kernel import bits_of, draw_samples, render
+from generator.kernel import draw_samples, render
+from generator.palette import bits_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
