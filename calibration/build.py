@@ -45,11 +45,12 @@ from calibration.darkness import Darkness, DarkReading, additivity, drift_gains
 from calibration.growing import Checkpoint, Growing, growing
 from calibration.lut import SAMPLES as SAMPLES_FILE
 from calibration.lut import Frame, Lut, LutWriter, Provenance, Unfit, frames_sha256
+from calibration.matching import MIN_BLOCK_SCORE
 from calibration.noise import PhotonTransfer, photon_transfer
 from calibration.radiometry import CLIPPED, Field, Paper, black_drift, corrections, read_paper, saturation
 from calibration.references import NAME as REFERENCES_FILE
 from calibration.references import Levels, references_csv
-from calibration.registration import MIN_BLOCK_SCORE, Registration, register
+from calibration.registration import Registration, register
 from calibration.sampling import SAMPLES, Sites, dead_samples, gather, noise_of, sites_at, table_values, uneven
 from calibration.verdict import Verdict, figures_of, judge, refusal
 from drivers.errors import FormatError, QualityError

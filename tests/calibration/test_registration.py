@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 
 from acquisition.layout import A_SERIES_MM, design_chart
 from benchmarks import rooms
-from calibration.registration import Displacement, fit_lens, register
+from calibration.displacement import Displacement
+from calibration.lens import fit_lens
+from calibration.registration import register
 from drivers.errors import RegistrationError
 from drivers.presenter import WHITE, Colour
 from drivers.rawfile import Mosaic, read_raw

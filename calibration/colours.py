@@ -1,0 +1,90 @@
+"""What the camera sees of a printed code: fitted on the frame itself, so that no print or light need be known.
+
+Counts above black, camera RGB; codes 0 … 255; millimetres on the page.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration.fitting import least_squares
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ColourModel:
+    """What camera RGB a printed code gives in one frame: a polynomial, times a smooth light over the page.
+
+    Attributes
+    ----------
+    degree
+        Of the polynomial in the three codes.
+    coefficients
+        (terms, 3) float64, counts.
+    light
+        (6, 3) float64, polynomial of second order in page coordinates −1 … 1, mean about 1.
+    page_mm
+        Width and height of the sheet.
+    """
+
+    degree: int
+    coefficients: _Array
+    light: _Array
+    page_mm: tuple[float, float]
+
+    def flat(self, rgb: npt.ArrayLike) -> _Array:
+        """Return camera RGB (N, 3), counts, of printed codes (N, 3) under even light."""
+        return _code_terms(rgb, self.degree) @ self.coefficients
+
+    def seen(self, rgb: npt.ArrayLike, points_mm: _Array) -> _Array:
+        """Return camera RGB (N, 3), counts, of printed codes at points of the page."""
+        return self.flat(rgb) * (_page_terms(points_mm, self.page_mm) @ self.light)
+
+
+def _code_terms(rgb: npt.ArrayLike, degree: int) -> _Array:
+    r, g, b = (np.asarray(rgb, dtype=np.float64) / 255).T
+    powers = [(i, j, k) for i in range(degree + 1) for j in range(degree + 1 - i) for k in range(degree + 1 - i - j)]
+    return np.column_stack([r**i * g**j * b**k for i, j, k in powers])
+
+
+def _page_terms(points_mm: _Array, page_mm: tuple[float, float]) -> _Array:
+    x, y = (2 * np.asarray(points_mm, dtype=np.float64) / page_mm - 1).T
+    return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+
+
+def fit_colours(rgb: _Array, points_mm: _Array, seen: _Array, page_mm: tuple[float, float]) -> ColourModel:
+    """Return the colour model through patches, robust against those that are covered or not where they are thought.
+
+    Parameters
+    ----------
+    rgb
+        (N, 3) printed codes.
+    points_mm
+        (N, 2) centres.
+    seen
+        (N, 3) camera RGB, counts.
+    page_mm
+        Width and height of the sheet.
+    """
+    degree = 3 if len(rgb) >= 200 else 2 if len(rgb) >= 60 else 1
+    terms, page = _code_terms(rgb, degree), _page_terms(points_mm, page_mm)
+    coefficients, light = np.zeros((terms.shape[1], 3)), np.zeros((6, 3))
+    for channel in range(3):
+        field = np.array([1.0, 0, 0, 0, 0, 0])
+        weights = np.ones(len(rgb))
+        value = seen[:, channel]
+        model = np.zeros(terms.shape[1])
+        for _ in range(6):
+            model = least_squares(terms * (page @ field)[:, None], value, weights)
+            flat = terms @ model
+            field = least_squares(page * flat[:, None], value, weights)
+            residual = np.abs(value - flat * (page @ field))
+            spread = max(1.4826 * float(np.median(residual)), 1e-9)
+            weights = np.minimum(1, 2 * spread / np.maximum(residual, 1e-12))
+        level = float((page @ field).mean())
+        coefficients[:, channel], light[:, channel] = model * level, field / level
+    return ColourModel(degree, coefficients, light, page_mm)

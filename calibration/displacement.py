@@ -1,0 +1,106 @@
+"""How a wavy sheet departs from a plane: a smooth displacement over the print, fitted to what was measured on it.
+
+Half-size pixels as a function of millimetres on the print. Source: P. H. C. Eilers and B. D. Marx, "Flexible smoothing
+with B-splines and penalties", Statistical Science 1996.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse import linalg as sparse_linalg
+
+_ROUGHNESS_PX = 0.1
+"""Second difference of the displacement between knots that is thought usual: a wave of 2 px every 30 knots."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Displacement:
+    """A smooth displacement over the print: a tensor product of uniform cubic B-splines.
+
+    Attributes
+    ----------
+    origin_mm, knot_mm
+        (2,) first knot and distance of knots in x and y.
+    coefficients
+        (rows, columns, 2) float64, half-size px (dx, dy).
+    """
+
+    origin_mm: _Array
+    knot_mm: _Array
+    coefficients: _Array
+
+    @classmethod
+    def over(cls, low_mm: _Array, high_mm: _Array, knot_mm: float) -> Displacement:
+        """Return the displacement zero over a rectangle, with knots about `knot_mm` apart."""
+        spans = np.maximum(np.ceil((high_mm - low_mm) / knot_mm), 1).astype(int)
+        return cls(low_mm, (high_mm - low_mm) / spans, np.zeros((spans[1] + 3, spans[0] + 3, 2)))
+
+    def basis(self, points_mm: npt.ArrayLike) -> sparse.csr_array:
+        """Return the (N, coefficients) matrix of the splines at points; outside, the border's cubic goes on."""
+        rows, columns = self.coefficients.shape[:2]
+        points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
+        at = (points - self.origin_mm) / self.knot_mm
+        first = np.clip(np.floor(at).astype(int), 0, (columns - 4, rows - 4))
+        weights = _cubic_weights(at - first)
+        index = ((first[:, 1, None, None] + np.arange(4)[:, None]) * columns + first[:, 0, None, None]) + np.arange(4)
+        values = weights[:, 1, :, None] * weights[:, 0, None, :]
+        row = np.repeat(np.arange(len(points)), 16)
+        shape = (len(points), rows * columns)
+        return sparse.csr_array((values.ravel(), (row, index.ravel())), shape=shape)
+
+    def at(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return the displacement (N, 2) px at points (N, 2) mm."""
+        return np.asarray(self.basis(points_mm) @ self.coefficients.reshape(-1, 2))
+
+    def fitted(self, points_mm: _Array, information: _Array, pull: _Array) -> Displacement:
+        """Return the smooth displacement most likely for measured places.
+
+        Minimises Σ ½ dᵀ A d − pullᵀ d + ½ |second differences|² / roughness².
+
+        Parameters
+        ----------
+        points_mm
+            (N, 2) where it was measured.
+        information
+            (N, 2, 2) A: inverse covariance of each measurement, px⁻²; 0 where nothing was seen.
+        pull
+            (N, 2) A times the measured displacement, px⁻¹.
+        """
+        basis = self.basis(points_mm)
+        rows, columns = self.coefficients.shape[:2]
+        blocks = [[basis.T @ sparse.diags_array(information[:, i, j]) @ basis for j in (0, 1)] for i in (0, 1)]
+        penalty = _second_differences(rows, columns) / _ROUGHNESS_PX**2
+        # A hair of ridge keeps knots that no measurement reaches solvable; 1 px⁻² counts for nothing beside a cell.
+        penalty = penalty + sparse.identity(rows * columns) * 1e-3
+        matrix = sparse.block_array([[blocks[0][0] + penalty, blocks[0][1]], [blocks[1][0], blocks[1][1] + penalty]])
+        right = np.concatenate([basis.T @ pull[:, 0], basis.T @ pull[:, 1]])
+        solution = np.asarray(sparse_linalg.spsolve(sparse.csc_array(matrix), right))
+        return replace(self, coefficients=solution.reshape(2, rows, columns).transpose(1, 2, 0))
+
+
+def _cubic_weights(t: _Array) -> _Array:
+    """Return the four uniform cubic B-spline weights (..., 4) at t in [0, 1] of a span."""
+    s = 1 - t
+    return np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3], axis=-1) / 6
+
+
+def _second_differences(rows: int, columns: int) -> sparse.csr_array:
+    """Return DᵀD of all second differences (xx, yy and twice xy) on a grid of coefficients."""
+
+    def difference(n: int, order: int) -> sparse.csr_array:
+        matrix = sparse.eye_array(n, format="csr")
+        for _ in range(order):
+            matrix = matrix[1:] - matrix[:-1]
+        return sparse.csr_array(matrix)
+
+    whole = [sparse.eye_array(n, format="csr") for n in (rows, columns)]
+    xx = sparse.kron(whole[0], difference(columns, 2))
+    yy = sparse.kron(difference(rows, 2), whole[1])
+    xy = sparse.kron(difference(rows, 1), difference(columns, 1))
+    return sparse.csr_array(xx.T @ xx + yy.T @ yy + 2 * (xy.T @ xy))
