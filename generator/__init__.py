@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from calibration.lut import Lut
     from generator.dataset import generate_dataset
     from generator.kernel import draw_samples, render
-    from generator.scene import read_picture
+    from generator.picture import read_picture
     from generator.tonemap import flash
 
 __all__ = ["draw_samples", "flash", "generate_dataset", "open_lut", "read_picture", "render"]
@@ -29,7 +29,7 @@ _HOMES = {
     "draw_samples": "generator.kernel",
     "flash": "generator.tonemap",
     "generate_dataset": "generator.dataset",
-    "read_picture": "generator.scene",
+    "read_picture": "generator.picture",
     "render": "generator.kernel",
 }
 

@@ -29,6 +29,12 @@ SCENES: Final = 2
 """Purpose of the words that are the pixels of a random scene."""
 MIXTURES: Final = 3
 """Purpose of the words that shuffle the samples of mixed lights."""
+CHROMATICITIES: Final = 4
+"""Purpose of the words that draw the chromaticities of lights from a distribution."""
+MASKS: Final = 5
+"""Purpose of the words that shape where each of a picture's lights falls."""
+CROPS: Final = 6
+"""Purpose of the words that choose where pictures are cut."""
 
 _WORD: Final = 0xFFFFFFFF
 

@@ -1,17 +1,4 @@
-"""Source pictures: any file OpenImageIO reads, or random colours, as 8-bit sRGB codes.
-
-What is done to a file's values, in this order, so that one picture always gives the same codes:
-
-    channels      the first three as R, G, B; a single one as grey; of several images in a file the first
-    depth         8-bit codes as they are; 16-bit codes v become ⌊(v + 128) / 257⌋; floating-point values are linear
-                  light, 1 = white, clipped and encoded with the sRGB curve (IEC 61966-2-1) unless the file calls itself
-                  sRGB
-    transparency  white shows through, as the paper does in a print; mixed in the values the file holds
-    orientation   turned as the file's EXIF or TIFF orientation asks
-    size          only ever made smaller, on request, by averaging areas
-
-Embedded colour profiles are not applied: codes are printed as they stand.
-"""
+"""Where source pictures come from: files, folders, or random colours."""
 
 from __future__ import annotations
 
@@ -19,24 +6,19 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from drivers.errors import FormatError, InputError
+from drivers.errors import InputError
 from generator import philox
-
-Picture = npt.NDArray[np.uint8]
+from generator.picture import LARGEST_SIDE, Picture, read_picture
 
 SUFFIXES: Final = frozenset(
     {".avif", ".bmp", ".dpx", ".exr", ".gif", ".hdr", ".heic", ".heif", ".j2k", ".jp2", ".jpe", ".jpeg", ".jpg"}
     | {".jxl", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".psd", ".rgbe", ".sgi", ".tga", ".tif", ".tiff", ".webp"}
 )
 """What a folder is searched for, in lower or upper case; a file that is named itself may end as it likes."""
-
-LARGEST_SIDE: Final = 65535
-"""Longest side of a random scene, px."""
 
 
 class Source(Protocol):
@@ -163,127 +145,3 @@ def find_pictures(places: Sequence[Path], max_side: int | None = None) -> tuple[
 def _printable(name: str) -> str:
     """Return `name` as text for a CSV file; a byte that is no text becomes its hexadecimal escape."""
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-
-
-def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
-    """Return the sRGB codes of a picture file; the head of this file says what is done to its values.
-
-    Parameters
-    ----------
-    path
-        Any file that OpenImageIO reads.
-    max_side
-        Longest side allowed, px, ≥ 1; a larger picture is made smaller by averaging areas.
-
-    Returns
-    -------
-    ndarray
-        (H, W, 3) uint8, sRGB codes.
-
-    Raises
-    ------
-    FormatError
-        The file cannot be read as a picture; the message has OpenImageIO's reason.
-    """
-    path = Path(path)
-    values, alpha, associated, linear, orientation = _read(path)
-    if linear:
-        values = np.clip(np.nan_to_num(values, nan=0.0, posinf=1.0, neginf=0.0), 0.0, None)
-    if alpha is not None:
-        opaque = alpha[..., None]
-        white = (1.0 - opaque) * (1.0 if linear else 255.0)
-        values = (values if associated else values * opaque) + white
-    if linear:
-        codes = _encode(values)
-    else:
-        # Rounding takes seconds on a large picture, and codes of 8 bits have nothing to round.
-        codes = (values if values.dtype == np.uint8 else np.rint(np.clip(values, 0, 255))).astype(np.uint8, copy=False)
-    return _shrink(_turn(codes, orientation), max_side)
-
-
-def _read(path: Path) -> tuple[npt.NDArray[Any], npt.NDArray[np.float64] | None, bool, bool, int]:
-    """Return values (H, W, 3), 0 … 255 or linear 0 … 1; alpha (H, W) 0 … 1; associated?; linear?; orientation 1 … 8."""
-    import OpenImageIO as oiio  # noqa: N813
-
-    if not path.is_file():
-        raise FormatError(f"cannot read {path}: there is no such file; name a picture")
-    wish = oiio.ImageSpec()
-    wish.attribute("oiio:UnassociatedAlpha", 1)
-    stream = oiio.ImageInput.open(str(path), wish)
-    if stream is None:
-        raise FormatError(f"cannot read {path}: {_reason(oiio.geterror())}; use another picture, or convert it to PNG")
-    try:
-        spec = stream.spec()
-        if spec.deep or spec.depth > 1 or spec.nchannels < 1:
-            raise FormatError(f"cannot read {path}: it is no flat picture; use another, or convert it to PNG")
-        space = str(spec.get_string_attribute("oiio:ColorSpace")).lower()
-        kind = spec.format.basetype
-        floating = kind in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-        linear = floating and "srgb" not in space.replace("lin_srgb", "")
-        pixels = stream.read_image("float" if floating else "uint8" if kind == oiio.UINT8 else "uint16")
-        if pixels is None or stream.has_error:
-            raise FormatError(
-                f"cannot read {path}: {_reason(stream.geterror())}; the file is damaged, use another copy"
-            )
-        alpha_channel = spec.alpha_channel
-        associated = not spec.get_int_attribute("oiio:UnassociatedAlpha", 0)
-        orientation = spec.get_int_attribute("Orientation", 1)
-    finally:
-        stream.close()
-    pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
-    alpha = None
-    if 0 < alpha_channel < spec.nchannels:
-        top = 1.0 if floating else float(np.iinfo(pixels.dtype).max)
-        alpha = np.clip(pixels[..., alpha_channel].astype(np.float64) / top, 0.0, 1.0)
-        if alpha.min() == 1.0:
-            alpha = None
-    colours = [channel for channel in range(spec.nchannels) if channel != alpha_channel]
-    if colours[:3] == [0, 1, 2]:
-        values = pixels[..., :3]
-    else:
-        values = pixels[..., colours[:3] if len(colours) >= 3 else [colours[0] if colours else 0] * 3]
-    if values.dtype == np.uint16:
-        values = ((values.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    elif floating:
-        values = values.astype(np.float64) * (1.0 if linear else 255.0)
-    return values, alpha, associated, linear, orientation
-
-
-def _reason(message: str) -> str:
-    """Return a library's message as part of our sentence."""
-    return " ".join(message.split()).rstrip(".") or "no known picture format"
-
-
-def _encode(linear: npt.NDArray[np.float64]) -> Picture:
-    """Return the sRGB codes 0 … 255 of linear light, clipped at 1 (IEC 61966-2-1)."""
-    light = np.clip(linear, 0.0, 1.0)
-    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
-    return np.rint(255 * code).astype(np.uint8)
-
-
-def _turn(picture: Picture, orientation: int) -> Picture:
-    """Return `picture` as it is meant to be seen (TIFF 6.0, tag 274 Orientation)."""
-    turned = {
-        2: lambda: picture[:, ::-1],
-        3: lambda: picture[::-1, ::-1],
-        4: lambda: picture[::-1],
-        5: lambda: picture.transpose(1, 0, 2),
-        6: lambda: picture.transpose(1, 0, 2)[:, ::-1],
-        7: lambda: picture.transpose(1, 0, 2)[::-1, ::-1],
-        8: lambda: picture.transpose(1, 0, 2)[::-1],
-    }.get(orientation)
-    return np.ascontiguousarray(turned() if turned else picture)
-
-
-def _shrink(picture: Picture, max_side: int | None) -> Picture:
-    """Return `picture` with its longest side at most `max_side` px, each pixel the mean of the area it covers."""
-    height, width = picture.shape[:2]
-    if max_side is None or max(height, width) <= max_side:
-        return picture
-    if max_side < 1:
-        raise InputError(f"the longest side is to be {max_side} px, expected 1 or more")
-    import cv2
-
-    scale = max_side / max(height, width)
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -13,7 +13,8 @@ import pytest
 import tifffile
 
 from drivers.errors import FormatError, InputError
-from generator.scene import RandomScene, find_pictures, random_scenes, read_picture
+from generator.picture import read_picture
+from generator.scene import RandomScene, find_pictures, random_scenes
 
 
 def write(path: Path, pixels: npt.NDArray[np.generic], form: str, **attributes: object) -> Path:

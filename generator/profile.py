@@ -1,0 +1,76 @@
+"""Colour profiles of source pictures: their codes become sRGB codes, or a word says why not.
+
+A chart is printed from sRGB codes, so a picture in another space, such as Adobe RGB (1998) or Display P3, has to be
+converted or its colours come out dull. LittleCMS converts, by relative colorimetry (ICC.1:2022, clause 6.3.2), in 8
+bits; a profile that moves no code by more than one is sRGB under another name and is left alone.
+"""
+
+from __future__ import annotations
+
+import io
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from PIL.ImageCms import ImageCmsTransform
+
+ASSUMED: Final = "none, taken as sRGB"
+"""What is said of a picture without a profile."""
+
+_PROBE_STEPS: Final = 9
+
+
+def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArray[np.uint8], str]:
+    """Return the sRGB codes of a picture, and what was done about its profile.
+
+    Parameters
+    ----------
+    codes
+        (H, W, 3) uint8 in the space of the profile; for a grey profile the first channel counts.
+    icc
+        The embedded profile; None where there is none.
+
+    Returns
+    -------
+    tuple
+        (H, W, 3) uint8, the same array where nothing had to be done; and a few words, such as
+        ``"Display P3, converted to sRGB"``.
+    """
+    if icc is None:
+        return codes, ASSUMED
+    transform, mode, word = _transform(icc)
+    if transform is None:
+        return codes, word
+    from PIL import Image, ImageCms
+
+    picture = Image.fromarray(codes if mode == "RGB" else np.ascontiguousarray(codes[..., 0]))
+    converted = ImageCms.applyTransform(picture, transform)
+    return np.array(converted, dtype=np.uint8), word
+
+
+@lru_cache(maxsize=16)
+def _transform(icc: bytes) -> tuple[ImageCmsTransform | None, str, str]:
+    """Return the transform of a profile or None, the mode of its pictures, and what to say."""
+    from PIL import Image, ImageCms
+
+    try:
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(icc))
+        # Clause 7.2.6: the data colour space field.
+        space = icc[16:20].decode("latin-1").strip()
+        name = " ".join(ImageCms.getProfileDescription(profile).split()) or "unnamed"
+        mode = {"RGB": "RGB", "GRAY": "L"}.get(space)
+        if mode is None:
+            return None, "RGB", f"{name} of {space} colours, not applied, taken as sRGB"
+        srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))  # pyright: ignore[reportUnknownMemberType, reportUnknownArgumentType]
+        transform = ImageCms.buildTransform(profile, srgb, mode, "RGB", ImageCms.Intent.RELATIVE_COLORIMETRIC)
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        return None, "RGB", f"damaged ({' '.join(str(error).split())}), not applied, taken as sRGB"
+    steps = np.rint(np.linspace(0, 255, 256 if mode == "L" else _PROBE_STEPS)).astype(np.uint8)
+    probe = steps[None] if mode == "L" else np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(1, -1, 3)
+    seen = np.array(ImageCms.applyTransform(Image.fromarray(probe), transform), dtype=np.int16)
+    if np.abs(seen - (probe[..., None] if mode == "L" else probe)).max() <= 1:
+        return None, mode, f"{name}, is sRGB"
+    return transform, mode, f"{name}, converted to sRGB"
