@@ -133,12 +133,20 @@ def test_pose_is_told(chart: Chart, tmp_path: Path) -> None:
     assert framing.residual_px < 0.3
 
 
-@pytest.mark.parametrize("blur", [0.4, 0.8, 1.2])
-def test_blur_is_measured(chart: Chart, tmp_path: Path, blur: float) -> None:
-    mosaic = frame_of(world_of(replace(FLAT, blur_px=blur)), tmp_path)
+@pytest.mark.parametrize(
+    ("blur", "roll_deg", "good_to"), [(0.4, 0.0, 0.02), (0.6, 1.7, 0.02), (0.9, 180.6, 0.02), (1.2, 0.0, 0.06)]
+)
+def test_blur_is_measured(chart: Chart, tmp_path: Path, blur: float, roll_deg: float, good_to: float) -> None:
+    mosaic = frame_of(world_of(replace(FLAT, blur_px=blur, roll_deg=roll_deg)), tmp_path)
     # A photosite is half a pixel wide (σ = 0.5/√12) and the two greens lie 0.25 px to either side.
     expected = float(np.sqrt(blur**2 + 0.25 / 12 + 0.25**2))
-    assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=0.1)
+    assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=good_to)
+
+
+def test_blur_of_red_lacks_the_greens_spacing(chart: Chart, tmp_path: Path) -> None:
+    mosaic = frame_of(world_of(replace(FLAT, blur_px=0.6)), tmp_path, Colour(255, 0, 0))
+    expected = float(np.sqrt(0.6**2 + 0.25 / 12))
+    assert blur_px(find_chart(mosaic, chart)) == pytest.approx(expected, abs=0.02)
 
 
 @pytest.mark.parametrize("colour", [WHITE, Colour(255, 0, 0), Colour(0, 0, 255), Colour(60, 60, 60)])
