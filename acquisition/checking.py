@@ -15,7 +15,9 @@ import numpy.typing as npt
 from acquisition.chart import Chart, load_chart
 from acquisition.config import LabSettings
 from acquisition.exposure import measure_exposure, refusal
-from acquisition.framing import MIN_MODULE_PX, Framing, Plane, blur_px, find_chart, project, strongest_plane
+from acquisition.framing import MIN_MODULE_PX, Framing, blur_px, find_chart
+from acquisition.homography import project
+from acquisition.planes import Plane, strongest_plane
 from acquisition.rig import open_rig
 from acquisition.sequencer import Devices, make_ready
 from acquisition.session import FrameKind

@@ -1,11 +1,10 @@
-"""Where the chart is in a picture: its tags found, its pose judged, its sharpness and its movement measured.
+"""Where the chart is in a picture: its tags found, its pose judged, its sharpness measured.
 
 Laws that hold inside:
 
 - One linear colour plane at a time, the strongest of the frame: a square root moves a tag's corner by a quarter pixel,
   a sum of planes under deep red or blue by a fifth.
-- Places are half-size pixels. A plane of red or blue photosites lies a quarter pixel beside the blocks' centres, and
-  `Plane.offset_px` puts its places right; green is the mean of its two photosites and lies in the middle.
+- Places are half-size pixels (`acquisition.planes`).
 - Faults of the picture are a `RegistrationError` that says what was looked for, what was found, and what helps.
 
 Knows the chart and a mosaic of counts; nothing of sessions, cells' colours or lenses (`calibration.registration`).
@@ -16,18 +15,16 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart import Chart
+from acquisition.homography import project, rms, robust_homography
+from acquisition.planes import MIN_SIGNAL, Plane, paper_level, strongest_plane
 from drivers.errors import RegistrationError
 from drivers.rawfile import Mosaic
-
-Channel = Literal["R", "G", "B"]
-CHANNELS: tuple[Channel, Channel, Channel] = ("R", "G", "B")
 
 MIN_MODULE_PX = 3.0
 """Half-size pixels a tag module must have; below, detectors fail one tag after another."""
@@ -39,75 +36,11 @@ MIN_TAGS = 2
 MIN_TAG_SHARE = 0.8
 """Share of the chart's tags that must be found."""
 
-MIN_SIGNAL = 12.0
-"""Counts above black that the brightest parts of the strongest plane must have for tags to be looked for."""
-
-MAX_SHIFT_PX = 3.0
 _CORNERS = [1, 0, 3, 2]
 """pyapriltags' corners in the order clockwise from the printed top-left."""
 
-_GAUGE_TAGS = 8
-_STEPS = 5
-
 _Float = npt.NDArray[np.float32]
 _Points = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Plane:
-    """One colour of a mosaic: `values` (H // 2, W // 2) float32, counts above black; `offset_px` (x, y).
-
-    The element [i, j] was measured at the half-size place x = j + offset_px[0], y = i + offset_px[1].
-    """
-
-    channel: Channel
-    values: _Float
-    offset_px: tuple[float, float]
-
-
-def phases(mosaic: Mosaic) -> dict[Channel, tuple[tuple[int, int], ...]]:
-    """Return which (row, column) of the 2×2 block carry each colour."""
-    found: dict[Channel, tuple[tuple[int, int], ...]] = {}
-    for channel in CHANNELS:
-        found[channel] = tuple(divmod(place, 2) for place, letter in enumerate(mosaic.pattern) if letter == channel)
-    return found
-
-
-def channel_offset_px(places: Sequence[tuple[int, int]]) -> tuple[float, float]:
-    """Return where photosites at `places` of the block lie from its centre, half-size px (x, y): 0 or ±0.25."""
-    rows, columns = np.mean(np.asarray(places, dtype=np.float64), axis=0)
-    return (float(columns) - 0.5) / 2, (float(rows) - 0.5) / 2
-
-
-def frame_black(mosaic: Mosaic) -> npt.NDArray[np.float64]:
-    """Return the black level (2, 2) float64 of each position of the block: measured in the masked border, or stated."""
-    measured = mosaic.masked_black()
-    return mosaic.black if measured is None else measured
-
-
-def plane_of(mosaic: Mosaic, channel: Channel, black: npt.NDArray[np.float64] | None = None) -> Plane:
-    """Return one colour of a mosaic above black; `black` (2, 2) counts is measured from the frame if not given."""
-    black = frame_black(mosaic) if black is None else black
-    places = phases(mosaic)[channel]
-    blocks = mosaic.block_planes()
-    level = float(np.mean([black[place] for place in places]))
-    values = blocks[places[0]].astype(np.float32)
-    for place in places[1:]:
-        values += blocks[place]
-    values /= len(places)
-    values -= level
-    return Plane(channel, values, channel_offset_px(places))
-
-
-def strongest_plane(mosaic: Mosaic, black: npt.NDArray[np.float64] | None = None) -> Plane:
-    """Return the colour with the brightest paper; `black` as in `plane_of`."""
-    black = frame_black(mosaic) if black is None else black
-    blocks = mosaic.block_planes()[:, :, ::8, ::8]
-    levels = [
-        max(float(np.percentile(blocks[place], 98) - black[place]) for place in places)
-        for places in phases(mosaic).values()
-    ]
-    return plane_of(mosaic, CHANNELS[int(np.argmax(levels))], black)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,16 +63,6 @@ class FoundTag:
 
 
 _detectors = threading.local()
-
-
-def paper_level(plane: Plane) -> float:
-    """Return how bright the brightest parts of a plane are, counts above black: means of 4×4 pixels, 99.5th percentile.
-
-    Means, so that a dark frame's noise is not taken for light.
-    """
-    height, width = plane.values.shape
-    size = (max(1, width // 4), max(1, height // 4))
-    return float(np.percentile(cv2.resize(plane.values, size, interpolation=cv2.INTER_AREA), 99.5))
 
 
 def find_tags(plane: Plane) -> tuple[FoundTag, ...]:
@@ -213,18 +136,6 @@ class Framing:
         return not self.missing
 
 
-def project(homography: npt.NDArray[np.float64], points: npt.ArrayLike) -> _Points:
-    """Return points (N, 2) mapped by a homography (3, 3)."""
-    points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
-    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
-    return mapped[:, :2] / mapped[:, 2:]
-
-
-def rms(vectors: npt.NDArray[np.float64]) -> float:
-    """Return the root of the mean squared length of vectors (..., 2)."""
-    return float(np.sqrt((vectors**2).sum() * vectors.shape[-1] / max(vectors.size, 1)))
-
-
 def find_chart(frame: Mosaic | Plane, chart: Chart, what: str = "the frame") -> Framing:
     """Return how `chart` stands in a picture.
 
@@ -260,7 +171,7 @@ def find_chart(frame: Mosaic | Plane, chart: Chart, what: str = "the frame") -> 
     chart_points = np.concatenate([expected[tag.id].corners_mm for tag in tags])
     frame_points = np.concatenate([tag.corners_px for tag in tags])
     height, width = plane.values.shape
-    homography, fits = _robust_homography(chart_points, frame_points, 0.01 * width)
+    homography, fits = robust_homography(chart_points, frame_points, 0.01 * width)
     misplaced = [tag.id for number, tag in enumerate(tags) if not fits[4 * number : 4 * number + 4].all()]
     if len(misplaced) > 0.2 * len(tags):
         raise RegistrationError(
@@ -297,36 +208,6 @@ def find_chart(frame: Mosaic | Plane, chart: Chart, what: str = "the frame") -> 
         inside=bool((corners >= -0.5).all() and (corners <= (width - 0.5, height - 0.5)).all()),
         rotation_deg=float(np.degrees(np.arctan2(*(axis[1] - axis[0])[::-1]))),
     )
-
-
-def _robust_homography(
-    chart_points: _Points, frame_points: _Points, tolerance_px: float
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    """Return the homography and which points lie within the tolerance, wide enough for distortion and waviness."""
-    homography = fit_homography(chart_points, frame_points, tolerance_px)
-    if homography is None:
-        return np.eye(3), np.zeros(len(chart_points), dtype=np.bool_)
-    good = np.asarray(np.linalg.norm(project(homography, chart_points) - frame_points, axis=1) <= tolerance_px)
-    if good.sum() >= 4:
-        refined = fit_homography(chart_points[good], frame_points[good])
-        homography = homography if refined is None else refined
-    return homography, good
-
-
-def fit_homography(points: _Points, places: _Points, tolerance: float | None = None) -> npt.NDArray[np.float64] | None:
-    """Return the homography (3, 3) through point pairs (N, 2), or None where they have none.
-
-    Parameters
-    ----------
-    points, places
-        (N, 2) float64, from and to.
-    tolerance
-        In units of `places`; if given, pairs further off are left out (RANSAC), else all count (least squares).
-    """
-    # OpenCV answers None for degenerate pairs, which becomes an array without shape.
-    method, threshold = (0, 3.0) if tolerance is None else (cv2.RANSAC, tolerance)
-    found = np.asarray(cv2.findHomography(points, places, method, threshold)[0], dtype=np.float64)
-    return found if found.shape == (3, 3) else None
 
 
 def _not_found(
@@ -426,96 +307,3 @@ def _normal_cdf(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     from scipy.special import ndtr
 
     return np.asarray(ndtr(x), dtype=np.float64)
-
-
-@dataclass(frozen=True, eq=False)
-class Shift:
-    """How far the chart moved between two frames.
-
-    Attributes
-    ----------
-    dx, dy
-        Median over the tags measured, half-size px; positive when the chart lies further right or down.
-    largest_px
-        The largest movement of a tag, so that a rotation shows.
-    tags
-        Tags that could be measured; 0 leaves the rest 0 and means unknown.
-    """
-
-    dx: float
-    dy: float
-    largest_px: float
-    tags: int
-
-    @property
-    def length_px(self) -> float:
-        """Length of the median movement, half-size px."""
-        return float(np.hypot(self.dx, self.dy))
-
-
-def shift_between(reference: Plane, framing: Framing, plane: Plane) -> Shift:
-    """Return how far the chart has moved in `plane` since `reference`, of the same channel.
-
-    Two-parameter Lucas–Kanade on tag crops (Lucas and Kanade 1981), gain and offset free, up to about 3 px: below
-    that, good to 0.005 px where paper has some hundred counts. Costs about a millisecond.
-
-    Parameters
-    ----------
-    reference
-        The plane to compare with.
-    framing
-        Where the tags are in `reference`; only tags and places are used, so its own plane may be another colour.
-    plane
-        The later plane.
-    """
-    tags = sorted(framing.tags, key=lambda tag: tag.id)
-    shifts: list[_Points] = []
-    last = len(tags) - 1
-    for number in sorted({round(last * part / (_GAUGE_TAGS - 1)) for part in range(_GAUGE_TAGS)}):
-        tag = tags[number]
-        shift = _tag_shift(reference, plane, tag)
-        if shift is not None:
-            shifts.append(shift)
-    if not shifts:
-        return Shift(0.0, 0.0, 0.0, 0)
-    table = np.array(shifts)
-    median = np.median(table, axis=0)
-    return Shift(float(median[0]), float(median[1]), float(np.linalg.norm(table, axis=1).max()), len(shifts))
-
-
-def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
-    """Return the movement (2,) of one tag, or None where it cannot be told."""
-    margin = int(np.ceil(MAX_SHIFT_PX)) + 2
-    height, width = reference.values.shape
-    corners = tag.corners_px - reference.offset_px
-    x0, y0 = np.floor(corners.min(axis=0)).astype(int) - 2
-    x1, y1 = np.ceil(corners.max(axis=0)).astype(int) + 3
-    if x0 < margin or y0 < margin or x1 > width - margin or y1 > height - margin:
-        return None
-    # Both crops are slightly smoothed, so that the gradient is one of the light and not of the noise.
-    crop = np.s_[y0 - margin : y1 + margin, x0 - margin : x1 + margin]
-    before = cv2.GaussianBlur(reference.values[crop], (0, 0), 0.7).astype(np.float64)
-    after = cv2.GaussianBlur(plane.values[crop], (0, 0), 0.7)
-    inner = np.s_[margin:-margin, margin:-margin]
-    gy, gx = (np.asarray(gradient)[inner].ravel() for gradient in np.gradient(before))
-    template = before[inner].ravel()
-    now = template
-    rows, columns = np.mgrid[margin : before.shape[0] - margin, margin : before.shape[1] - margin].astype(np.float32)
-    shift = np.zeros(2)
-    for _ in range(_STEPS):
-        moved = cv2.remap(after, columns + np.float32(shift[0]), rows + np.float32(shift[1]), cv2.INTER_CUBIC)
-        now = np.asarray(moved, dtype=np.float64).ravel()
-        # now = gain · (template + g · step) + offset, linear in (gain, offset, gain · step).
-        design = np.column_stack([template, np.ones_like(template), gx, gy])
-        solution, _, rank, _ = np.linalg.lstsq(design, now, rcond=None)
-        if rank < 4 or solution[0] <= 0:
-            return None
-        step = solution[2:] / solution[0]
-        # The crop read at x + shift shows the tag as it was at x + shift − movement.
-        shift -= np.clip(step, -1, 1)
-        if np.abs(shift).max() > MAX_SHIFT_PX + 1:
-            return None
-        if np.abs(step).max() < 1e-3:
-            break
-    correlation = np.corrcoef(now, template)[0, 1]
-    return shift if correlation > 0.5 else None

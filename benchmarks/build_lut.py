@@ -24,9 +24,9 @@ from pathlib import Path
 import numpy as np
 import rawpy
 
-from acquisition.framing import frame_black, strongest_plane
 from acquisition.illuminations import plan_illuminations
 from acquisition.layout import design_chart
+from acquisition.planes import frame_black, strongest_plane
 from acquisition.printing import drawing
 from acquisition.session import ACCEPTED, Session, plan_steps
 from calibration.build import THREADS, build

@@ -28,18 +28,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from acquisition.framing import (
-    CHANNELS,
-    Channel,
-    Framing,
-    Plane,
-    Shift,
-    channel_offset_px,
-    frame_black,
-    phases,
-    plane_of,
-    shift_between,
-)
+from acquisition.framing import Framing
+from acquisition.movement import Shift, shift_between
+from acquisition.planes import CHANNELS, Channel, Plane, channel_offset_px, frame_black, phases, plane_of
 from acquisition.session import FrameRecord, Session
 from calibration.darkness import Darkness, DarkReading, additivity, drift_gains
 from calibration.growing import Checkpoint, Growing, growing

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
-from acquisition.framing import fit_homography, project
+from acquisition.homography import fit_homography, project
 from drivers.errors import RegistrationError
 
 _Array = npt.NDArray[np.float64]

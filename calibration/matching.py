@@ -21,7 +21,8 @@ import numpy.typing as npt
 from scipy import ndimage, sparse
 
 from acquisition.chart import Chart
-from acquisition.framing import Plane, rms
+from acquisition.homography import rms
+from acquisition.planes import Plane
 from calibration.colours import ColourModel, fit_colours
 from calibration.displacement import Displacement
 from calibration.lens import Lens

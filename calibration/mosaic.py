@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing import CHANNELS, frame_black, phases
+from acquisition.planes import CHANNELS, frame_black, phases
 from drivers.rawfile import Mosaic
 
 

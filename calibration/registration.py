@@ -20,7 +20,9 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from acquisition.chart import Chart
-from acquisition.framing import CHANNELS, Framing, blur_px, find_chart, frame_black, plane_of, rms
+from acquisition.framing import Framing, blur_px, find_chart
+from acquisition.homography import rms
+from acquisition.planes import CHANNELS, frame_black, plane_of
 from calibration.colours import ColourModel
 from calibration.displacement import Displacement
 from calibration.lens import Lens, fit_lens

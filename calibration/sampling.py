@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing import CHANNELS, phases
+from acquisition.planes import CHANNELS, phases
 from drivers.rawfile import Mosaic
 
 WINDOW = 5

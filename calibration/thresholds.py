@@ -12,7 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from acquisition.framing import MIN_SIGNAL, MIN_TAG_SHARE
+from acquisition.framing import MIN_TAG_SHARE
+from acquisition.planes import MIN_SIGNAL
 from calibration.radiometry import CLIPPED, MAX_BLACK_DRIFT
 from calibration.registration import (
     MAX_BLOCK_RESIDUAL_PX,

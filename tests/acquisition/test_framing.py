@@ -14,19 +14,10 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.chart import Chart
-from acquisition.framing import (
-    CHANNELS,
-    Plane,
-    blur_px,
-    channel_offset_px,
-    find_chart,
-    find_tags,
-    phases,
-    plane_of,
-    shift_between,
-    strongest_plane,
-)
+from acquisition.framing import blur_px, find_chart, find_tags
 from acquisition.layout import A_SERIES_MM, design_chart
+from acquisition.movement import shift_between
+from acquisition.planes import CHANNELS, Plane, channel_offset_px, phases, plane_of, strongest_plane
 from acquisition.printing import drawing
 from drivers.camera import ExposureSettings
 from drivers.errors import RegistrationError

@@ -1,0 +1,51 @@
+"""A plane seen by a pinhole: points mapped by a homography, and the homography through pairs of points."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+_Points = npt.NDArray[np.float64]
+
+
+def project(homography: npt.NDArray[np.float64], points: npt.ArrayLike) -> _Points:
+    """Return points (N, 2) mapped by a homography (3, 3)."""
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    return mapped[:, :2] / mapped[:, 2:]
+
+
+def rms(vectors: npt.NDArray[np.float64]) -> float:
+    """Return the root of the mean squared length of vectors (..., 2)."""
+    return float(np.sqrt((vectors**2).sum() * vectors.shape[-1] / max(vectors.size, 1)))
+
+
+def robust_homography(
+    chart_points: _Points, frame_points: _Points, tolerance_px: float
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    """Return the homography and which points lie within the tolerance, wide enough for distortion and waviness."""
+    homography = fit_homography(chart_points, frame_points, tolerance_px)
+    if homography is None:
+        return np.eye(3), np.zeros(len(chart_points), dtype=np.bool_)
+    good = np.asarray(np.linalg.norm(project(homography, chart_points) - frame_points, axis=1) <= tolerance_px)
+    if good.sum() >= 4:
+        refined = fit_homography(chart_points[good], frame_points[good])
+        homography = homography if refined is None else refined
+    return homography, good
+
+
+def fit_homography(points: _Points, places: _Points, tolerance: float | None = None) -> npt.NDArray[np.float64] | None:
+    """Return the homography (3, 3) through point pairs (N, 2), or None where they have none.
+
+    Parameters
+    ----------
+    points, places
+        (N, 2) float64, from and to.
+    tolerance
+        In units of `places`; if given, pairs further off are left out (RANSAC), else all count (least squares).
+    """
+    # OpenCV answers None for degenerate pairs, which becomes an array without shape.
+    method, threshold = (0, 3.0) if tolerance is None else (cv2.RANSAC, tolerance)
+    found = np.asarray(cv2.findHomography(points, places, method, threshold)[0], dtype=np.float64)
+    return found if found.shape == (3, 3) else None
