@@ -1,76 +1,146 @@
-"""A 16-bit linear image as the bytes of a file, losslessly.
+"""A 16-bit linear image as the bytes of a file, losslessly, and back; the small pictures beside them.
 
-PNG (ISO/IEC 15948) is written here, without row filters: the triples of a table repeat, which the compressor sees only
-where no filter has mixed neighbours, so files are a tenth to a fifth smaller than with the usual filter. Compressing is
-most of the time that a dataset takes; `_compress` is the one place to make faster. TIFF is written uncompressed, which
-every reader can read, and is the fast choice.
+    png     16-bit RGB; read by everything, compressed; see `encoders.png`
+    tiff    16-bit RGB, uncompressed: the fastest to write and to read
+    exr     OpenEXR, 32-bit float, which holds every 16-bit number (half does not); compressed by zip
+    jxl     JPEG XL, lossless, 16 bits: the smallest
+    dng     a raw file: the Bayer mosaic of the image, two thirds of the values left out as by a sensor
+
+Every encoder lets go of the interpreter's lock, and no byte depends on the number of threads.
 """
 
 from __future__ import annotations
 
-import struct
-import zlib
-from typing import Final, Literal
+from pathlib import Path
+from typing import Final, Literal, get_args
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import InputError
+from drivers.errors import FormatError, InputError
+from generator.encoders.shot import Shot
 
-Format = Literal["png", "tiff"]
-LARGEST_CHUNK: Final = 1 << 30
-"""Bytes of compressed data in one PNG chunk; the standard allows 2³¹ − 1 (clause 5.3)."""
+__all__ = ["FORMATS", "Format", "Shot", "decode_image", "encode_image", "encode_preview", "libraries_of", "suffix_of"]
+
+Format = Literal["png", "tiff", "exr", "jxl", "dng"]
+FORMATS: Final[tuple[Format, ...]] = get_args(Format)
+
+_LIBRARIES: Final[dict[Format, tuple[str, ...]]] = {
+    "png": (),
+    "tiff": (),
+    "exr": ("isal",),
+    "jxl": ("imagecodecs",),
+    "dng": ("rawpy",),
+}
 
 
-def encode_image(image: npt.NDArray[np.uint16], form: Format = "png") -> bytes:
-    """Return `image` (H, W, 3) uint16, RGB, as the bytes of a 16-bit file.
+def suffix_of(form: Format) -> str:
+    """Return the end of the names of files of that format, ``.png``."""
+    return f".{form}"
+
+
+def libraries_of(form: Format) -> tuple[str, ...]:
+    """Return the distributions whose version may change the bytes of a file of that format; none where we write it."""
+    return _LIBRARIES[form]
+
+
+def encode_image(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> bytes:
+    """Return `image` as the bytes of a file.
+
+    Parameters
+    ----------
+    image
+        (H, W, 3) uint16, linear camera RGB.
+    form
+        The format; `dng` keeps one channel of each pixel, the others every bit.
+    shot
+        What is known of the image; written wherever the format has a place for it (not `jxl`), needed by `dng`.
 
     Raises
     ------
     InputError
-        The image is not of that shape and type, or too large for the format.
+        The image is not of that shape and type, or its size or the shot does not fit the format.
     """
     if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"the image is {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
     if form == "png":
-        return _png(image)
-    return _by_opencv(".tiff", image, [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE])
+        from generator.encoders.png import encode_png
+
+        return encode_png(image, shot)
+    if form == "tiff":
+        from generator.encoders.tiff import encode_tiff
+
+        return encode_tiff(image, shot)
+    if form == "exr":
+        from generator.encoders.exr import encode_exr
+
+        return encode_exr(image, shot)
+    if form == "jxl":
+        from generator.encoders.jxl import encode_jxl
+
+        return encode_jxl(image)
+    from generator.encoders.dng import encode_dng
+
+    return encode_dng(image, shot)
+
+
+def decode_image(data: bytes, form: Format, what: str) -> npt.NDArray[np.uint16]:
+    """Return the image that `encode_image` made a file of.
+
+    Parameters
+    ----------
+    data
+        The file's bytes.
+    form
+        Its format.
+    what
+        What messages call it, such as its path.
+
+    Returns
+    -------
+    ndarray
+        (H, W, 3) uint16, as it was encoded; of `dng` (H // 2, W // 2, 3), the half-size linear RGB of its mosaic: red,
+        the mean of both greens, rounded up, and blue of each 2×2 block.
+
+    Raises
+    ------
+    FormatError
+        The bytes are damaged or not a 16-bit RGB image of that format.
+    """
+    if form == "dng":
+        from drivers.rawfile import decode_raw
+        from generator.encoders.dng import half_size
+
+        return half_size(decode_raw(data, Path(what)).counts)
+    try:
+        image = _decoded(data, form)
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise FormatError(f"{what} cannot be read as {form}: {reason}; make it again") from error
+    if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3:
+        raise FormatError(f"{what} holds {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
+    return image
+
+
+def _decoded(data: bytes, form: Format) -> npt.NDArray[np.uint16]:
+    import imagecodecs
+
+    if form == "png":
+        return np.asarray(imagecodecs.png_decode(data))
+    if form == "tiff":
+        return np.asarray(imagecodecs.tiff_decode(data))
+    if form == "jxl":
+        return np.asarray(imagecodecs.jpegxl_decode(data, numthreads=1))
+    from generator.encoders.exr import decode_exr
+
+    return decode_exr(data)
 
 
 def encode_preview(picture: npt.NDArray[np.uint8]) -> bytes:
     """Return `picture` (H, W, 3) uint8, RGB, as the bytes of a JPEG file of quality 92."""
-    return _by_opencv(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 92])
+    import cv2
 
-
-def _png(image: npt.NDArray[np.uint16]) -> bytes:
-    height, width, _ = image.shape
-    # Every row is led by the number of its filter, 0 for none; samples are big-endian (clauses 7.2 and 9.2).
-    rows = np.zeros((height, 1 + 6 * width), np.uint8)
-    rows[:, 1:] = np.ascontiguousarray(image, dtype=">u2").view(np.uint8).reshape(height, 6 * width)
-    data = _compress(rows)
-    head = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
-    parts = [data[start : start + LARGEST_CHUNK] for start in range(0, len(data), LARGEST_CHUNK)]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        [_chunk(b"IHDR", head), *(_chunk(b"IDAT", part) for part in parts), _chunk(b"IEND", b"")]
-    )
-
-
-def _compress(rows: npt.NDArray[np.uint8]) -> bytes:
-    """Return a zlib stream of `rows`; releases the interpreter's lock."""
-    return zlib.compress(rows.data, 1)
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))
-
-
-def _by_opencv(suffix: str, image: npt.NDArray[np.uint16] | npt.NDArray[np.uint8], options: list[int]) -> bytes:
-    size = f"{image.shape[1]}x{image.shape[0]}"
-    try:
-        done, data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
-    except cv2.error as error:
-        raise InputError(f"an image of {size} px cannot be written as {suffix}: {error}") from error
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92])
     if not done:
-        raise InputError(f"an image of {size} px cannot be written as {suffix}")
+        raise InputError(f"a preview of {picture.shape[1]}x{picture.shape[0]} px cannot be written as JPEG")
     return data.tobytes()
