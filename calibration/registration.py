@@ -36,6 +36,10 @@ SAMPLE_REACH_PX = 3.25
 MIN_CELL_PX = 8.0
 """Half-size pixels a cell must have for 25 of them to lie safely inside; 8.6 already bleeds 1 % at σ = 0.7."""
 
+MAX_BLUR_PX = 1.0
+"""σ of the tags' edges up to which cells of any size are found to a few hundredths of a pixel, as `acquire check` has
+it. What such a blur mixes into the samples depends on the cells' size, and the verdict judges it as bleed."""
+
 MAX_TAG_RESIDUAL_PX = 8.0
 """RMS of the tags against homography and distortion; 2.3 is a sheet that waves by 6 mm and curls by 10."""
 
@@ -183,7 +187,7 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
             f"{what}: a cell is {cell_px:.1f} px wide, at least {MIN_CELL_PX:g} expected for 25 pixels inside it; "
             "bring the camera nearer"
         )
-    allowed = max(0.9, (cell_px / 2 - SAMPLE_REACH_PX) / 2)
+    allowed = max(MAX_BLUR_PX, (cell_px / 2 - SAMPLE_REACH_PX) / 2)
     if not blur <= allowed:
         raise RegistrationError(
             f"{what} is out of focus: edges are blurred by σ = {blur:.2f} px, at most {allowed:.2f} allowed for cells "
