@@ -10,22 +10,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from acquisition.config import LabSettings, SequenceSettings
+from acquisition.config import LabSettings
 from acquisition.exposure import disagreement, measure_exposure, refusal
+from acquisition.health import await_health, complaint_of, make_ready
 from acquisition.session import ACCEPTED, REFUSED, FrameKind, Session, Step
 from drivers.camera import Camera, Patient
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceFault, DeviceRefused, FormatError
 from drivers.presenter import Presenter
-from drivers.projector import PictureWitness, Power, Projector, Severity
+from drivers.projector import Projector
 from drivers.rawfile import read_raw
 
-POWER_LIMIT_S = 300.0
-"""How long a lamp may take to light; makers state up to 130 s with repeated ignition."""
-IDLE_S = 8.0
-"""Between two words to a camera in a long pause; libgphoto2 keeps bodies awake every 10 s."""
-PAUSE_S = 5.0
-"""Between two looks at a projector that complains."""
 REFUSED_IN_A_ROW = 3
 """Steps refused one after another that end a run: something lasting is wrong."""
 
@@ -68,7 +63,7 @@ def take_session(
     observe
         Called after each step with whether it got an accepted frame.
     announce
-        Called with a sentence when the run pauses and when it goes on.
+        Called with a sentence when the run waits, tries again, pauses and goes on.
 
     Raises
     ------
@@ -98,13 +93,18 @@ def _take(
         return Outcome(len(steps), 0, ())
     session.note(clock.now(), "start", f"{len(open_steps)} of {len(steps)} frames to take")
     devices.camera.configure(settings.camera.exposure)
+
+    def tell(what: str, sentence: str) -> None:
+        session.note(clock.now(), what, sentence)
+        announce(f"{what}: {sentence}")
+
     if devices.projector is not None:
-        make_ready(devices.projector, clock, settings.sequence, lambda: _idle(devices.camera))
+        make_ready(devices.projector, clock, settings.sequence, lambda: _idle(devices.camera), tell)
     refused: list[str] = []
     taken = 0
     in_a_row = 0
     for step in open_steps:
-        reason = _take_step(session, step, devices, settings, announce)
+        reason = _take_step(session, step, devices, settings, tell)
         observe(step, reason is None)
         if reason is None:
             taken += 1
@@ -122,106 +122,9 @@ def _take(
     return outcome
 
 
-def make_ready(
-    projector: Projector, clock: Clock, sequence: SequenceSettings, idle: Callable[[], None] = lambda: None
-) -> None:
-    """Switch the lamp on if need be, wait until it burns steadily, and require good health.
-
-    Parameters
-    ----------
-    idle
-        Called every few seconds of the wait, for the other devices.
-
-    Raises
-    ------
-    DeviceFault
-        It reports an error, or the lamp does not light within `POWER_LIMIT_S`.
-    """
-    begun = clock.monotonic()
-    switched = False
-    while (power := projector.power()) is not Power.ON:
-        if power is Power.STANDBY and not switched:
-            projector.switch_on()
-            switched = True
-        if clock.monotonic() - begun > POWER_LIMIT_S:
-            raise DeviceFault(
-                f"the projector is still in {power.value} after {POWER_LIMIT_S:g} s; look at its lamp and its display"
-            )
-        clock.sleep(1.0)
-    if projector.muted():
-        projector.set_muted(False)
-    require_healthy(projector)
-    if clock.monotonic() > begun:
-        until = clock.monotonic() + sequence.warm_up_s
-        while (left := until - clock.monotonic()) > 0:
-            clock.sleep(min(left, IDLE_S))
-            idle()
-
-
-def require_healthy(projector: Projector) -> None:
-    """Require that light leaves the projector and that it reports no error.
-
-    Raises
-    ------
-    DeviceFault
-        It is off, muted, frozen, without a signal, or reports an error.
-    """
-    errors = [fault.part for fault in projector.faults() if fault.severity is Severity.ERROR]
-    if errors:
-        raise DeviceFault(f"the projector reports an error of its {', '.join(errors)}; mend it, then run again")
-    power = projector.power()
-    if power is not Power.ON:
-        raise DeviceFault(f"the projector went to {power.value} during the session; switch it on, then run again")
-    if projector.muted():
-        raise DeviceFault("the projector's picture is muted; release mute on its remote control, then run again")
-    if isinstance(projector, PictureWitness) and (fault := projector.picture_fault()):
-        raise DeviceFault(f"{fault}, then run again")
-
-
-def _fault(projector: Projector | None) -> str | None:
-    """Return what the projector complains of now, or None."""
-    try:
-        if projector is not None:
-            require_healthy(projector)
-    except DeviceFault as fault:
-        return str(fault)
-    return None
-
-
 def _idle(camera: Camera) -> None:
     if isinstance(camera, Patient):
         camera.idle()
-
-
-def _await_health(
-    session: Session,
-    devices: Devices,
-    projector: Projector,
-    sequence: SequenceSettings,
-    announce: Callable[[str], None],
-) -> None:
-    """Pause while the projector complains; go on when it is well again.
-
-    Raises
-    ------
-    DeviceFault
-        It still complains after `sequence.patience_s`.
-    """
-    clock = devices.clock
-    complaint = _fault(projector)
-    if complaint is None:
-        return
-    session.note(clock.now(), "paused", complaint)
-    announce(f"paused: {complaint}")
-    begun = clock.monotonic()
-    while (complaint := _fault(projector)) is not None:
-        if clock.monotonic() - begun >= sequence.patience_s:
-            raise DeviceFault(complaint)
-        clock.sleep(min(PAUSE_S, sequence.patience_s))
-        _idle(devices.camera)
-    well = f"the projector is well again after {clock.monotonic() - begun:.0f} s"
-    session.note(clock.now(), "resumed", well)
-    announce(f"resumed: {well}")
 
 
 def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None:
@@ -236,14 +139,14 @@ def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None
 
 
 def _take_step(
-    session: Session, step: Step, devices: Devices, settings: LabSettings, announce: Callable[[str], None]
+    session: Session, step: Step, devices: Devices, settings: LabSettings, tell: Callable[[str, str], None]
 ) -> str | None:
     """Try a step until its frame is accepted; return None then, else the last refusal."""
     clock = devices.clock
     reason: str | None = None
     for remaining in reversed(range(settings.sequence.attempts)):
         if devices.projector is not None:
-            _await_health(session, devices, devices.projector, settings.sequence, announce)
+            await_health(devices.projector, clock, settings.sequence, lambda: _idle(devices.camera), tell)
         kept = session.kept_files(step)
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
         attempt = session.begin(step, f"frames/{stem}", clock.now())
@@ -255,8 +158,10 @@ def _take_step(
             session.fail(attempt, clock.now(), str(error))
             if remaining == 0 or isinstance(error, DeviceFault | DeviceRefused):
                 raise
+            tell("retry", f"{_name(step)}: {error}")
             continue
-        reason = judge_file(received.path, step.kind, settings) or _fault(devices.projector)
+        complaint = complaint_of(devices.projector)
+        reason = judge_file(received.path, step.kind, settings) or (None if complaint is None else str(complaint))
         session.commit(
             attempt,
             file=f"frames/{received.path.name}",

@@ -31,7 +31,7 @@ def run_session(
     observe
         Called with frames done and in all, once at the start and after each frame.
     announce
-        Called with a sentence when the run pauses and when it goes on.
+        Called with a sentence when the run waits, tries again, pauses and goes on.
 
     Raises
     ------

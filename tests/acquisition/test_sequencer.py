@@ -13,20 +13,24 @@ import numpy as np
 import pytest
 
 from acquisition.config import LabSettings, SequenceSettings
+from acquisition.health import PAUSE_S, POWER_LIMIT_S, RELIGHT_S, make_ready, require_healthy
 from acquisition.illuminations import Illumination
 from acquisition.layout import design_chart
-from acquisition.sequencer import PAUSE_S, POWER_LIMIT_S, Devices, make_ready, require_healthy, take_session
+from acquisition.sequencer import Devices, take_session
 from acquisition.session import Session, plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
-from drivers.errors import DeviceError, DeviceFault, DeviceRefused, LinkTimeout
+from drivers.errors import DeviceError, DeviceFault, DeviceRefused, LinkClosed, LinkTimeout
+from drivers.link import Link
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.pjlink.wire import NoResolution
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power, Severity
+from drivers.serial_projectors.optoma import OptomaProjector
 from sim.bodies import BODIES
 from sim.clock import SimulatedClock
 from sim.dng import write_dng
 from sim.projector import PjLinkPeer, SimulatedProjector, memory_link
+from sim.serial_projectors import OptomaPeer, SerialPeerLink
 
 BODY = BODIES["Test"]
 EXPOSURE = ExposureSettings(100, 8.0, 0.5)
@@ -221,9 +225,11 @@ class Hurried(SimulatedClock):
     def __init__(self) -> None:
         super().__init__()
         self.calls: dict[float, Callable[[], None]] = {}
+        self.slept: list[float] = []
 
     def sleep(self, seconds: float) -> None:
         super().sleep(seconds)
+        self.slept.append(seconds)
         if call := self.calls.pop(seconds, None):
             call()
 
@@ -257,6 +263,93 @@ def test_a_frame_during_which_the_picture_was_muted_is_taken_again(folder: Path)
     assert take_session(lab.session, lab.devices, SETTINGS).complete
     assert lab.verdicts() == ["refused"] + ["accepted"] * 6
     assert "muted" in lab.session.frames()[0].verdict
+
+
+class Disturbed:
+    """A lab whose projector hangs on a PJLink cable; what `disturb` does comes after the second frame."""
+
+    def __init__(self, folder: Path) -> None:
+        self.lab = Lab(folder)
+        self.lab.clock = self.clock = self.lab.camera.clock = Hurried()
+        self.beamer = SimulatedProjector(self.clock, power=Power.ON)
+        self.pulled = False
+        self.cable: Link | None = None
+        self.said: list[str] = []
+
+    def connect(self) -> Link:
+        if self.pulled:
+            raise LinkClosed("nothing listens at 127.0.0.1:4352")
+        cable = self.cable = memory_link(PjLinkPeer(self.beamer))
+        return cable
+
+    def pull(self, pulled: bool = True) -> None:
+        self.pulled = pulled
+        if self.cable is not None:
+            self.cable.close()
+
+    def run(self, disturb: Callable[[], None]) -> None:
+        def disturbing(step: object, accepted: bool) -> None:
+            if self.lab.camera.captures == 2:
+                disturb()
+
+        projector = PjLinkProjector(self.connect, clock=self.clock)
+        devices = Devices(self.lab.camera, self.lab.screen, projector, self.clock)
+        assert take_session(self.lab.session, devices, SETTINGS, disturbing, self.said.append).complete
+
+    @property
+    def words(self) -> list[str]:
+        return [sentence.split(":")[0] for sentence in self.said]
+
+
+def test_a_pulled_cable_pauses_the_run_until_it_is_back(folder: Path) -> None:
+    disturbed = Disturbed(folder)
+    disturbed.clock.calls[PAUSE_S] = lambda: disturbed.pull(False)
+    disturbed.run(disturbed.pull)
+    assert disturbed.words == ["paused", "resumed"]
+    assert "nothing listens at 127.0.0.1:4352" in disturbed.said[0]
+    assert disturbed.lab.verdicts() == ["accepted"] * 6
+
+
+def test_a_projector_that_lost_its_power_gets_its_minutes_again(folder: Path) -> None:
+    disturbed = Disturbed(folder)
+
+    def power_cut() -> None:
+        disturbed.beamer = SimulatedProjector(disturbed.clock)
+        disturbed.pull()
+        disturbed.clock.calls[PAUSE_S] = power_back
+
+    def power_back() -> None:
+        disturbed.pull(False)
+        disturbed.clock.calls[PAUSE_S] = disturbed.beamer.switch_on
+
+    disturbed.run(power_cut)
+    assert disturbed.words == ["paused", "warming up", "resumed"]
+    assert disturbed.clock.monotonic() > SETTINGS.sequence.warm_up_s
+    assert disturbed.lab.verdicts() == ["accepted"] * 6
+
+
+def test_a_projector_long_out_of_reach_may_have_lost_its_power(folder: Path) -> None:
+    disturbed = Disturbed(folder)
+
+    def wait_on() -> None:
+        if disturbed.clock.slept.count(PAUSE_S) * PAUSE_S > RELIGHT_S:
+            disturbed.pull(False)
+        else:
+            disturbed.clock.calls[PAUSE_S] = wait_on
+
+    disturbed.clock.calls[PAUSE_S] = wait_on
+    disturbed.run(disturbed.pull)
+    assert disturbed.words == ["paused", "warming up", "resumed"]
+
+
+def test_a_lost_cable_ends_the_run_when_patience_does(folder: Path) -> None:
+    disturbed = Disturbed(folder)
+    with pytest.raises(LinkClosed, match=r"nothing listens at .*; the run waited 600 s for that: then run again"):
+        disturbed.run(disturbed.pull)
+    assert len(disturbed.lab.session.frames()) == 2
+    disturbed.pull(False)
+    disturbed.run(lambda: None)
+    assert disturbed.lab.verdicts() == ["accepted"] * 6
 
 
 @pytest.mark.parametrize(("fault", "said"), [("frozen", "frozen"), ("unplugged", "no signal")])
@@ -301,6 +394,42 @@ def test_a_warm_lamp_is_not_waited_for() -> None:
     clock = SimulatedClock()
     make_ready(SimulatedProjector(clock, power=Power.ON), clock, SequenceSettings(warm_up_s=600))
     assert clock.monotonic() == 0
+
+
+def test_a_warm_lamp_is_not_waited_for_though_the_answer_takes_its_time() -> None:
+    class Slow(SimulatedProjector):
+        def power(self) -> Power:
+            self.clock.sleep(0.1)
+            return super().power()
+
+    clock = SimulatedClock()
+    make_ready(Slow(clock, power=Power.ON), clock, SequenceSettings(warm_up_s=600))
+    assert clock.monotonic() < 1
+
+
+def test_a_projector_deaf_while_its_lamp_is_struck_is_waited_for() -> None:
+    class Deaf(SimulatedProjector):
+        def power(self) -> Power:
+            if (power := super().power()) is Power.WARMING:
+                raise LinkTimeout("the projector has not answered within 5 s")
+            return power
+
+    clock = SimulatedClock()
+    projector = Deaf(clock)
+    make_ready(projector, clock, SequenceSettings(warm_up_s=600))
+    assert clock.monotonic() >= 600 + projector.traits.warm_up_s
+
+
+def test_a_projector_that_cannot_tell_its_mute_is_told() -> None:
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock, power=Power.ON)
+    device.set_muted(True)
+    make_ready(
+        OptomaProjector(lambda: SerialPeerLink(OptomaPeer(device, tells_mute=False)), clock=clock),
+        clock,
+        SequenceSettings(),
+    )
+    assert not device.muted()
 
 
 def test_a_lamp_that_never_lights_is_given_up() -> None:
