@@ -1,6 +1,6 @@
 """Machine code from Python functions: compiled for the processor at hand at the first call, kept on disk for the next.
 
-A fresh machine needs no compiler: numba brings LLVM with it (`docs/decisions/0010-the-kernel-is-compiled-by-numba.md`).
+A fresh machine needs no compiler: numba brings LLVM with it (`docs/decisions/0010-compiled-kernel.md`).
 Compiled functions hold no state and no lock and release the interpreter's.
 """
 

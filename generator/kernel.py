@@ -1,95 +1,60 @@
 """From source codes to linear camera RGB: each pixel becomes one of the table's samples of its colour.
 
-Paper, section 3.4. The choice is a pure function of (seed, image number, x, y); tiles, threads and workers cannot
-change a byte. It is fixed by the following rule, which is part of the dataset format:
+Paper, section 3.4. With n the table's bits (5 in the paper), a pixel R, G, B at (x, y) becomes
 
-    colour   ((R >> (8 - n)) << 2n) | ((G >> (8 - n)) << n) | (B >> (8 - n)), n the table's bits (5 in the paper)
-    word     word number x mod 4 of Philox4x32-10 with counter (⌊x/4⌋, y, image, 0) and the seed as key; `philox.py`
-    sample   ⌊word · S / 2³²⌋, S the samples the table has of each colour (25 in the paper)
-    pixel    samples[colour, sample]
+    samples[((R >> (8 - n)) << 2n) | ((G >> (8 - n)) << n) | (B >> (8 - n)), choice(seed, image, x, y)]
 
-The compiled loop holds no state and no lock and releases the interpreter's. It is not split by numba's own threads:
-their pool cannot be entered from two Python threads at once and does not survive a fork. Rows are split by plain
-threads instead.
+where the choice is that of `choice.py`. Here are whole images, as camera RGB and as Bayer mosaics; `planar.py` has
+crops for training and `mixing.py` several lights.
+
+Compiled loops are not split by numba's own threads: their pool cannot be entered from two Python threads at once and
+does not survive a fork. Rows are split by plain threads instead.
 """
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
-from numba import uint32, uint64
 
 from drivers.errors import InputError
+from generator.arguments import check_picture, check_place, check_samples, check_target, share
+from generator.choice import chosen, colour_of, row_keys
 from generator.compiled import compiled
-from generator.mixing import mixed_table as mixed_table
-from generator.palette import bits_of, fit_picture
-from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES, key_of
+from generator.palette import fit_picture
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
 
-_M0: Final = np.uint64(MULTIPLIERS[0])
-_M1: Final = np.uint64(MULTIPLIERS[1])
-_W0: Final = np.uint32(KEY_STEPS[0])
-_W1: Final = np.uint32(KEY_STEPS[1])
-_HALF: Final = np.uint64(32)
-_PURPOSE: Final = np.uint32(SAMPLES)
-_BLOCK: Final = 1024
 _WHOLE_LIGHT: Final = 1 << 20
 """Pixels from which reading a light's samples in one go is cheaper than touching their pages at random."""
 
-
-@numba.njit(inline="always")
-def _words(c0: Any, c1: Any, c2: Any, c3: Any, k0: Any, k1: Any) -> Any:
-    """Return the four words of Philox4x32-10, all numbers uint32."""
-    for _ in range(ROUNDS):
-        p0, p1 = uint64(c0) * _M0, uint64(c2) * _M1
-        c0, c1, c2, c3 = (
-            uint32(uint32(p1 >> _HALF) ^ c1 ^ k0),
-            uint32(p1),
-            uint32(uint32(p0 >> _HALF) ^ c3 ^ k1),
-            uint32(p0),
-        )
-        k0, k1 = uint32(k0 + _W0), uint32(k1 + _W1)
-    return c0, c1, c2, c3
+PATTERNS: Final = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
+"""The channel of each site of a 2x2 Bayer block, in reading order."""
 
 
 @compiled
-def _gather(
-    picture: Any, flat: Any, samples: Any, bits: Any, k0: Any, k1: Any, image: int, first_row: int, out: Any
-) -> None:
-    """Fill `out` from `picture`; `flat` is the light's samples as one row of uint16."""
-    shift = uint32(8 - bits)
-    high, low, count = uint32(2 * bits), uint32(bits), uint64(samples)
-    chosen = np.empty((4, _BLOCK // 4), np.uint32)
-    offset = np.empty(_BLOCK, np.uint32)
+def _gather(picture: Any, samples: Any, bits: int, seed: Any, image: int, first_row: int, out: Any) -> None:
+    count = samples.shape[1]
     for y in range(picture.shape[0]):
-        for x in range(0, picture.shape[1], _BLOCK):
-            pixels = min(_BLOCK, picture.shape[1] - x)
-            for i in range((pixels + 3) // 4):
-                a, b, c, d = _words(uint32(x // 4 + i), uint32(first_row + y), uint32(image), _PURPOSE, k0, k1)
-                chosen[0, i] = (uint64(a) * count) >> _HALF
-                chosen[1, i] = (uint64(b) * count) >> _HALF
-                chosen[2, i] = (uint64(c) * count) >> _HALF
-                chosen[3, i] = (uint64(d) * count) >> _HALF
-            source = picture[y, x : x + pixels]
-            for i in range(pixels):
-                colour = (
-                    ((uint32(source[i, 0]) >> shift) << high)
-                    | ((uint32(source[i, 1]) >> shift) << low)
-                    | (uint32(source[i, 2]) >> shift)
-                )
-                offset[i] = colour * samples
-            target = out[y, x : x + pixels]
-            for i in range(pixels):
-                at = np.intp(offset[i] + chosen[i & 3, i >> 2]) * 3
-                target[i, 0] = flat[at]
-                target[i, 1] = flat[at + 1]
-                target[i, 2] = flat[at + 2]
+        keys = row_keys(first_row + y, 0, image, seed)
+        for x in range(picture.shape[1]):
+            sample = samples[colour_of(picture[y, x], bits), chosen(x, keys, count)]
+            for channel in range(3):
+                out[y, x, channel] = sample[channel]
+
+
+@compiled
+def _gather_mosaic(
+    picture: Any, samples: Any, bits: int, seed: Any, image: int, first_row: int, pattern: Any, out: Any
+) -> None:
+    count = samples.shape[1]
+    for y in range(picture.shape[0]):
+        keys = row_keys(first_row + y, 0, image, seed)
+        for x in range(picture.shape[1]):
+            channel = pattern[2 * ((first_row + y) & 1) + (x & 1)]
+            out[y, x] = samples[colour_of(picture[y, x], bits), chosen(x, keys, count), channel]
 
 
 def draw_samples(
@@ -131,32 +96,67 @@ def draw_samples(
     InputError
         A shape, type or number is not as above.
     """
-    if samples.dtype != np.uint16 or samples.ndim != 3 or samples.shape[2] != 3 or not samples.shape[1]:
-        raise InputError(f"the samples are {samples.dtype} {samples.shape}, expected uint16 (8**bits, samples, 3)")
-    bits = bits_of(samples.shape[0])
-    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
-        raise InputError(f"the picture is {picture.dtype} {picture.shape}, expected uint8 (height, width, 3)")
-    if out is None:
-        out = np.empty(picture.shape, np.uint16)
-    elif out.dtype != np.uint16 or out.shape != picture.shape:
-        raise InputError(f"the target is {out.dtype} {out.shape}, expected uint16 {picture.shape}")
-    if not 0 <= image < 1 << 32:
-        raise InputError(f"the image number is {image}, expected 0 to 2^32 - 1")
-    k0, k1 = (np.uint32(word) for word in key_of(seed))
-    flat = np.ascontiguousarray(samples).reshape(-1)
-    # The image's number goes in as a plain integer: as uint32 the compiler's code is a third slower.
-    numbers = (np.uint32(samples.shape[1]), np.uint32(bits), k0, k1, image)
+    bits = check_samples(samples)
+    check_picture(picture)
+    target = check_target(out, picture.shape, np.uint16)
+    key = check_place(seed, image)
 
     def fill(top: int, bottom: int) -> None:
-        _gather(picture[top:bottom], flat, *numbers, first_row + top, out[top:bottom])
+        _gather(picture[top:bottom], samples, bits, key, image, first_row + top, target[top:bottom])
 
-    if threads <= 1:
-        fill(0, len(picture))
-    else:
-        edges = [len(picture) * part // threads for part in range(threads + 1)]
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(fill, edges[:-1], edges[1:]))
-    return out
+    share(fill, len(picture), threads)
+    return target
+
+
+def draw_mosaic(
+    samples: npt.NDArray[np.uint16],
+    picture: npt.NDArray[np.uint8],
+    *,
+    pattern: str = "RGGB",
+    seed: int = 0,
+    image: int = 0,
+    first_row: int = 0,
+    threads: int = 1,
+    out: npt.NDArray[np.uint16] | None = None,
+) -> npt.NDArray[np.uint16]:
+    """Return the Bayer mosaic of `picture`: of each pixel of `draw_samples` the one channel that its site has.
+
+    A table's sample is half-size RGB, its green the mean of two photosites; a mosaic's green is therefore quieter than
+    that of a raw file, by √2 where the two greens do not share their noise.
+
+    Parameters
+    ----------
+    pattern
+        Channels of the picture's first 2x2 block in reading order: RGGB, BGGR, GRBG or GBRG. It belongs to the whole
+        picture: with an odd `first_row` the first row is the pattern's second.
+    samples, picture, seed, image, first_row, threads
+        As for `draw_samples`.
+    out
+        (H, W) uint16 to fill instead of a new array.
+
+    Returns
+    -------
+    ndarray
+        (H, W) uint16, in the units of `samples`.
+
+    Raises
+    ------
+    InputError
+        A shape, type or number is not as above, or the pattern is none of these.
+    """
+    bits = check_samples(samples)
+    check_picture(picture)
+    target = check_target(out, picture.shape[:2], np.uint16)
+    key = check_place(seed, image)
+    if pattern not in PATTERNS:
+        raise InputError(f"{pattern!r} is no Bayer pattern; expected {', '.join(PATTERNS)}")
+    channels = np.array(PATTERNS[pattern])
+
+    def fill(top: int, bottom: int) -> None:
+        _gather_mosaic(picture[top:bottom], samples, bits, key, image, first_row + top, channels, target[top:bottom])
+
+    share(fill, len(picture), threads)
+    return target
 
 
 def read_light(lut: Lut, light: int, pixels: int = _WHOLE_LIGHT) -> npt.NDArray[np.uint16]:

@@ -25,10 +25,57 @@ import numpy.typing as npt
 
 from drivers.errors import InputError
 from generator import philox
+from generator.arguments import (
+    Picture,
+    Samples,
+    check_picture,
+    check_place,
+    check_tables,
+    check_target,
+    check_white,
+    share,
+)
+from generator.choice import chosen, colour_of, row_keys
 from generator.compiled import compiled
 from generator.palette import bits_of
 
-Samples = npt.NDArray[np.uint16]
+
+@compiled
+def _mix_pixels(
+    picture: Any,
+    tables: Any,
+    means: Any,
+    weights: Any,
+    bits: int,
+    white: Any,
+    seed: Any,
+    image: int,
+    first_row: int,
+    out: Any,
+) -> bool:
+    """Fill `out`; return whether every weight was a finite number ≥ 0. All arithmetic is float32, light by light."""
+    sound = True
+    count = tables.shape[2]
+    keys = np.empty((tables.shape[0], 3), np.uint32)
+    total = np.empty(3, np.float32)
+    for y in range(picture.shape[0]):
+        for light in range(tables.shape[0]):
+            keys[light] = row_keys(first_row + y, light, image, seed)
+        for x in range(picture.shape[1]):
+            colour = colour_of(picture[y, x], bits)
+            total[:] = 0
+            for light in range(tables.shape[0]):
+                weight = weights[y, x, light]
+                sound = sound and 0 <= weight < np.float32(np.inf)
+                root = np.sqrt(weight)
+                rest = weight - root
+                sample = chosen(x, keys[light], count)
+                for channel in range(3):
+                    total[channel] += root * np.float32(tables[light, colour, sample, channel])
+                    total[channel] += rest * means[light, colour, channel]
+            for channel in range(3):
+                out[y, x, channel] = np.uint16(min(max(total[channel] + np.float32(0.5), np.float32(0)), white))
+    return sound
 
 
 @compiled
@@ -52,7 +99,7 @@ def _mix_table(samples: Any, weight: float, words: Any, total: Any) -> None:
                 total[colour, i, channel] += root * samples[colour, order[i], channel] + (weight - root) * mean
 
 
-def checked_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float64]:
+def _checked_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float64]:
     """Return `weights` as (K,) float64 after looking at them.
 
     Raises
@@ -63,26 +110,6 @@ def checked_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float
     checked = np.asarray(weights, dtype=np.float64)
     if checked.shape != (lights,) or not np.isfinite(checked).all() or (checked < 0).any():
         raise InputError(f"the weights are {np.asarray(weights).tolist()}, expected {lights} finite numbers from 0")
-    return checked
-
-
-def checked_tables(tables: Samples | Sequence[Samples]) -> list[Samples]:
-    """Return the lights' samples as a list after looking at them.
-
-    Raises
-    ------
-    InputError
-        There is none, or they are not uint16 (8**bits, samples, 3), all alike.
-    """
-    checked = list(tables)
-    if not checked:
-        raise InputError("no light was given to mix; give at least one")
-    for table in checked:
-        if table.dtype != np.uint16 or table.ndim != 3 or table.shape[2] != 3 or not table.shape[1]:
-            raise InputError(f"the samples are {table.dtype} {table.shape}, expected uint16 (8**bits, samples, 3)")
-        if table.shape != checked[0].shape:
-            raise InputError(f"the lights' samples are {checked[0].shape} and {table.shape}, expected one shape")
-    bits_of(checked[0].shape[0])
     return checked
 
 
@@ -116,10 +143,9 @@ def mixed_table(
     InputError
         A shape, type or number is not as above.
     """
-    lights = checked_tables(tables)
-    checked = checked_weights(weights, len(lights))
-    if not 1 <= white_level <= 65535:
-        raise InputError(f"the white level is {white_level}, expected 1 to 65535")
+    lights = check_tables(tables)
+    checked = _checked_weights(weights, len(lights))
+    check_white(white_level)
     colours, count, _ = lights[0].shape
     total = np.zeros(lights[0].shape, np.float64)
     shuffled = False
@@ -128,10 +154,93 @@ def mixed_table(
             continue
         words = np.zeros((colours, 0), np.uint32)
         if shuffled:
+            colour: npt.NDArray[np.int64] = np.arange(colours, dtype=np.int64)[:, None]
             step: npt.NDArray[np.int64] = np.arange(count // 4 + 1, dtype=np.int64)
-            four = philox.words(seed, np.arange(colours)[:, None], step, light, philox.MIXTURES)
+            four = philox.words(seed, colour, step, light, philox.MIXTURES)
             words = np.stack(four, axis=-1).reshape(colours, -1)[:, : count - 1]
         _mix_table(samples, float(weight), words, total)
         shuffled = True
     np.clip(np.floor(total + 0.5, out=total), 0, white_level, out=total)
     return total.astype(np.uint16)
+
+
+def mix_samples(
+    tables: Samples | Sequence[Samples],
+    picture: Picture,
+    weights: npt.NDArray[np.float32],
+    *,
+    white_level: int = 65535,
+    seed: int = 0,
+    image: int = 0,
+    first_row: int = 0,
+    threads: int = 1,
+    out: npt.NDArray[np.uint16] | None = None,
+) -> npt.NDArray[np.uint16]:
+    """Return the raw linear image of `picture` under several lights, mixed in each pixel by weights of its own.
+
+    The formula stands at the head of this file. Each light's sample is drawn by the rule of `choice.py` with the
+    light's place in `tables`; where light 0 is alone with weight 1, the pixel is that of `draw_samples`.
+
+    Parameters
+    ----------
+    tables
+        (K, 8**bits, S, 3) uint16 or a sequence of K (8**bits, S, 3), linear camera RGB of the lights.
+    picture
+        (H, W, 3) uint8 sRGB codes.
+    weights
+        (H, W, K) float32 ≥ 0, or (K,) for all pixels: what each light contributes; 1 is the light as photographed.
+    white_level
+        Saturation of the sensor: larger values are cut to it.
+    seed, image, first_row, threads
+        As for `kernel.draw_samples`.
+    out
+        (H, W, 3) uint16 to fill instead of a new array.
+
+    Returns
+    -------
+    ndarray
+        (H, W, 3) uint16, computed in float32, rounded to the nearest count, halves up.
+
+    Raises
+    ------
+    InputError
+        A shape, type or number is not as above.
+    """
+    lights = check_tables(tables)
+    bits = bits_of(lights[0].shape[0])
+    check_picture(picture)
+    check_white(white_level)
+    target = check_target(out, picture.shape, np.uint16)
+    key = check_place(seed, image)
+    shape = (*picture.shape[:2], len(lights))
+    each = np.asarray(weights)
+    if each.dtype != np.float32:
+        each = _checked_weights(each, len(lights)).astype(np.float32)
+    if each.shape not in (shape, shape[2:]):
+        raise InputError(f"the weights are {each.shape}, expected {shape} or {shape[2:]}")
+    each = np.broadcast_to(each, shape)
+    stacked = np.stack(lights)
+    means = stacked.mean(axis=2, dtype=np.float64).astype(np.float32)
+    sound: list[bool] = []
+
+    def fill(top: int, bottom: int) -> None:
+        band = slice(top, bottom)
+        sound.append(
+            _mix_pixels(
+                picture[band],
+                stacked,
+                means,
+                each[band],
+                bits,
+                np.float32(white_level),
+                key,
+                image,
+                first_row + top,
+                target[band],
+            )
+        )
+
+    share(fill, len(picture), threads)
+    if not all(sound):
+        raise InputError("a weight is negative, infinite or no number; expected finite numbers from 0")
+    return target

@@ -12,6 +12,7 @@ import pytest
 from acquisition.illuminations import Illumination
 from calibration.lut import Lut, LutWriter, Provenance, Unfit, open_lut
 from drivers.presenter import Colour
+from generator import philox
 
 SAMPLES = 25
 MakeLut = Callable[..., Lut]
@@ -71,3 +72,28 @@ def make_lut(tmp_path: Path) -> MakeLut:
 def picture() -> npt.NDArray[np.uint8]:
     """Return a picture of random codes, of a size that is no multiple of anything."""
     return np.random.default_rng(5).integers(0, 256, (37, 1053, 3)).astype(np.uint8)
+
+
+Rule = Callable[..., npt.NDArray[np.int64]]
+
+
+def sample_numbers(
+    seed: int, image: int, height: int, width: int, *, first_row: int = 0, place: int = 0, count: int = SAMPLES
+) -> npt.NDArray[np.int64]:
+    """Return the sample number (H, W) of each pixel by the rule at the head of `generator/choice.py`, in numpy."""
+    y, x = np.arange(first_row, first_row + height), np.arange(width)
+    keys = [key.astype(np.uint64)[:, None] for key in philox.words(seed, y, place, image, philox.SAMPLES)[:3]]
+    word, low = np.uint64(0xFFFFFFFF), np.uint64(32)
+    h = (16 * (x // 32) + x % 16).astype(np.uint64)[None] ^ keys[0]
+    h = (h * np.uint64(0x21F0AAAD) & word) ^ keys[1]
+    h = ((h ^ (h >> np.uint64(16))) * np.uint64(0x735A2D97) & word) ^ keys[2]
+    h = (h ^ (h >> np.uint64(15))) * np.uint64(0x31848BAB) & word
+    p = h * np.uint64(count)
+    q = (p & word) * np.uint64(count)
+    return np.where(x % 32 < 16, p >> low, q >> low).astype(np.int64)
+
+
+@pytest.fixture(scope="session")
+def rule() -> Rule:
+    """Return `sample_numbers`."""
+    return sample_numbers

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,57 +12,50 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import InputError
-from generator.kernel import draw_samples, render
+from generator.kernel import PATTERNS, draw_mosaic, draw_samples, render
 from generator.palette import bits_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from calibration.lut import Lut
 
-WORD = 0xFFFFFFFF
+Rule = Callable[..., npt.NDArray[np.int64]]
 
 
-def philox(c: list[int], k: list[int]) -> list[int]:
-    """Philox4x32-10 as Salmon et al. print it, in Python integers."""
-    for _ in range(10):
-        p0, p1 = 0xD2511F53 * c[0], 0xCD9E8D57 * c[2]
-        c = [(p1 >> 32) ^ c[1] ^ k[0], p1 & WORD, (p0 >> 32) ^ c[3] ^ k[1], p0 & WORD]
-        k = [(k[0] + 0x9E3779B9) & WORD, (k[1] + 0xBB67AE85) & WORD]
-    return c
-
-
-def by_hand(samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8], seed: int, image: int) -> list[list[int]]:
-    """Return the pixels of `draw_samples` in reading order, by the rule at the head of `kernel.py`."""
+def expected(
+    rule: Rule, samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8], seed: int, image: int, **place: int
+) -> npt.NDArray[np.uint16]:
+    """Return `draw_samples` by the rules at the heads of `kernel.py` and `choice.py`, in numpy."""
     bits = {8: 1, 64: 2, 512: 3, 4096: 4, 32768: 5}[len(samples)]
-    pixels: list[list[int]] = []
-    for y, row in enumerate(picture.tolist()):
-        for x, (red, green, blue) in enumerate(row):
-            word = philox([x // 4, y, image, 0], [seed & WORD, seed >> 32])[x % 4]
-            s = 8 - bits
-            colour = (red >> s) << (2 * bits) | (green >> s) << bits | blue >> s
-            pixels.append(samples[colour, word * samples.shape[1] >> 32].tolist())
-    return pixels
+    upper = (picture >> (8 - bits)).astype(np.int64)
+    colour = (upper[..., 0] << (2 * bits)) | (upper[..., 1] << bits) | upper[..., 2]
+    return samples[colour, rule(seed, image, *colour.shape, count=samples.shape[1], **place)]
 
 
-def test_the_paper_s_table_of_32_cubed_colours_by_hand() -> None:
+def test_the_paper_s_table_of_32_cubed_colours_by_hand(rule: Rule) -> None:
     # The sample's own address as its value: any wrong colour, sample or channel shows.
     address = np.arange(32768 * 25).reshape(32768, 25)
     samples = np.stack([address >> 8, address & 0xFF, address % 65521], axis=-1).astype(np.uint16)
     picture = np.random.default_rng(3).integers(0, 256, (5, 1031, 3)).astype(np.uint8)
     seed, image = 0xFEDCBA9876543210, 0xDEADBEEF
     got = draw_samples(samples, picture, seed=seed, image=image)
-    assert got.reshape(-1, 3).tolist() == by_hand(samples, picture, seed, image)
+    np.testing.assert_array_equal(got, expected(rule, samples, picture, seed, image))
 
 
 def test_first_choices_of_seed_0_are_fixed_for_ever() -> None:
-    # Worked out with `philox` above, whose words are Random123's known answers: counter and key zero give
-    # 6627e8d5 e169c58d bc57ac4c 9b00dbd8, and 25 * 0x6627e8d5 >> 32 = 9, ...
+    # Philox's known answer for counter and key zero begins 6627e8d5 e169c58d bc57ac4c: the keys of row 0. The rest is
+    # worked out here in Python's integers.
     samples = np.zeros((8, 25, 3), np.uint16)
     samples[..., 0] = np.arange(25)
-    row = draw_samples(samples, np.zeros((1, 4, 3), np.uint8))[0, :, 0].tolist()
-    assert row == [0x6627E8D5 * 25 >> 32, 0xE169C58D * 25 >> 32, 0xBC57AC4C * 25 >> 32, 0x9B00DBD8 * 25 >> 32]
-    assert row == [9, 22, 18, 15]
+    row = draw_samples(samples, np.zeros((1, 20, 3), np.uint8))[0, :, 0].tolist()
+    by_hand: list[int] = []
+    for x in (0, 1, 2, 3):
+        h = (x ^ 0x6627E8D5) * 0x21F0AAAD % 2**32 ^ 0xE169C58D
+        h = (h ^ h >> 16) * 0x735A2D97 % 2**32 ^ 0xBC57AC4C
+        h = (h ^ h >> 15) * 0x31848BAB % 2**32
+        by_hand += [h * 25 >> 32, h * 25 % 2**32 * 25 >> 32]
+    assert row[:4] == by_hand[::2]
+    assert row[16:] == by_hand[1::2]
+    assert row == [22, 24, 3, 14, 11, 8, 22, 6, 6, 14, 3, 16, 15, 8, 2, 5, 3, 7, 7, 19]
 
 
 @settings(max_examples=30, deadline=None)
@@ -73,12 +67,14 @@ def test_first_choices_of_seed_0_are_fixed_for_ever() -> None:
     st.integers(0, 2**64 - 1),
     st.integers(0, 2**32 - 1),
 )
-def test_any_table_and_size_by_hand(bits: int, count: int, height: int, width: int, seed: int, image: int) -> None:
+def test_any_table_and_size_by_hand(
+    rule: Rule, bits: int, count: int, height: int, width: int, seed: int, image: int
+) -> None:
     rng = np.random.default_rng(seed % 1000)
     samples = rng.integers(0, 65536, (8**bits, count, 3)).astype(np.uint16)
     picture = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
     got = draw_samples(samples, picture, seed=seed, image=image)
-    assert got.reshape(-1, 3).tolist() == by_hand(samples, picture, seed, image)
+    np.testing.assert_array_equal(got, expected(rule, samples, picture, seed, image))
 
 
 def test_bands_threads_memory_order_and_a_given_target_change_nothing(
@@ -117,9 +113,9 @@ def test_every_sample_is_drawn_equally_often() -> None:
     drawn = choices(2019, 7, 3000, 4000).astype(np.int64)
     assert drawn.size == 12_000_000
     assert chi_square(drawn, 25) < LIMIT_24
-    # Along rows, columns and each of the four words of a place too.
-    for word in range(4):
-        assert chi_square(drawn[:, word::4], 25) < LIMIT_24
+    # Along rows, columns and each of the places that share words too.
+    for place in range(32):
+        assert chi_square(drawn[:, place::32], 25) < LIMIT_24
 
 
 @pytest.mark.parametrize(("down", "right"), [(0, 1), (0, 2), (0, 4), (1, 0), (1, 1), (4, 0), (0, 1024)])
@@ -195,3 +191,21 @@ def test_wrong_shapes_and_numbers_are_named(picture: npt.NDArray[np.uint8]) -> N
         draw_samples(samples, picture, seed=-1)
     with pytest.raises(InputError, match="9 colours"):
         bits_of(9)
+
+
+def test_a_mosaic_has_each_site_s_own_channel(make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]) -> None:
+    samples = make_lut().samples[1]
+    image = draw_samples(samples, picture, seed=8, image=1)
+    red, green, blue = image[..., 0], image[..., 1], image[..., 2]
+    for pattern in PATTERNS:
+        mosaic = draw_mosaic(samples, picture, pattern=pattern, seed=8, image=1, threads=2)
+        for place, name in enumerate(pattern):
+            site = np.s_[place // 2 :: 2, place % 2 :: 2]
+            np.testing.assert_array_equal(mosaic[site], {"R": red, "G": green, "B": blue}[name][site])
+        bands = [
+            draw_mosaic(samples, picture[top : top + 5], pattern=pattern, seed=8, image=1, first_row=top)
+            for top in range(0, 37, 5)
+        ]
+        np.testing.assert_array_equal(np.concatenate(bands), mosaic)
+    with pytest.raises(InputError, match="'XTRANS' is no Bayer pattern; expected RGGB"):
+        draw_mosaic(samples, picture, pattern="XTRANS")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,13 +10,13 @@ import numpy.typing as npt
 import pytest
 
 from drivers.errors import InputError
-from generator.mixing import mixed_table
+from generator.kernel import draw_samples
+from generator.mixing import mix_samples, mixed_table
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from calibration.lut import Lut
 
+Rule = Callable[..., npt.NDArray[np.int64]]
 GAIN, READ = 1.0, 6.0
 MEANS = (np.linspace(200, 4000, 512), np.linspace(3000, 100, 512))
 
@@ -90,3 +91,87 @@ def test_faults_are_named(make_lut: Callable[..., Lut]) -> None:
         mixed_table(samples[:1], [1], white_level=0)
     with pytest.raises(InputError, match="the samples are int64"):
         mixed_table([samples[0].astype(np.int64)], [1])  # pyright: ignore[reportArgumentType] - the fault under test
+
+
+def weight_maps(height: int, width: int, lights: int) -> npt.NDArray[np.float32]:
+    """Return weights (H, W, K) with places where one light is alone, where all meet and where none shines."""
+    weights = np.random.default_rng(6).uniform(0, 1.2, (height, width, lights)).astype(np.float32)
+    weights[:, :200] = 0
+    for light in range(lights):
+        weights[:, 40 * light : 40 * (light + 1), light] = 1
+    return weights
+
+
+@pytest.mark.parametrize("lights", [1, 2, 3, 4])
+def test_mixed_pixels_follow_the_formula(
+    rule: Rule, make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8], lights: int
+) -> None:
+    lut = make_lut()
+    tables = lut.samples[:lights]
+    weights = weight_maps(37, 1053, lights)
+    mixed = mix_samples(tables, picture, weights, white_level=3000, seed=5, image=9, threads=3)
+    upper = (picture >> 6).astype(np.int64)
+    colour = upper[..., 0] << 4 | upper[..., 1] << 2 | upper[..., 2]
+    total = np.zeros(picture.shape, np.float32)
+    for light in range(lights):
+        weight = weights[..., light, None]
+        root = np.sqrt(weight)
+        drawn = tables[light][colour, rule(5, 9, *colour.shape, place=light)]
+        mean = tables[light].mean(axis=1).astype(np.float32)[colour]
+        total += root * drawn.astype(np.float32)
+        total += (weight - root) * mean
+    expected = np.clip(total + np.float32(0.5), 0, 3000).astype(np.uint16)
+    np.testing.assert_array_equal(mixed, expected)
+    assert (mixed[:, 40 * lights : 200] == 0).all()
+    assert (mixed == 3000).any()
+
+
+def test_where_one_light_is_alone_its_own_samples_stand(
+    rule: Rule, make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]
+) -> None:
+    tables = make_lut().samples[:2]
+    first = mix_samples(tables, picture, np.array([1, 0], np.float32), seed=3, image=2)
+    np.testing.assert_array_equal(first, draw_samples(tables[0], picture, seed=3, image=2))
+    upper = (picture >> 6).astype(np.int64)
+    colour = upper[..., 0] << 4 | upper[..., 1] << 2 | upper[..., 2]
+    second = mix_samples(tables, picture, np.array([0, 1], np.float32), seed=3, image=2)
+    np.testing.assert_array_equal(second, tables[1][colour, rule(3, 2, *colour.shape, place=1)])
+
+
+def test_bands_and_threads_change_no_mixed_pixel(make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]) -> None:
+    tables = make_lut().samples[1:3]
+    weights = weight_maps(37, 1053, 2)
+    whole = mix_samples(tables, picture, weights, seed=4)
+    np.testing.assert_array_equal(mix_samples(list(tables), picture, weights, seed=4, threads=5), whole)
+    bands = [
+        mix_samples(tables, picture[top : top + 6], weights[top : top + 6], seed=4, first_row=top)
+        for top in range(0, 37, 6)
+    ]
+    np.testing.assert_array_equal(np.concatenate(bands), whole)
+
+
+def test_mixed_pixels_are_as_noisy_as_one_exposure(noisy: npt.NDArray[np.uint16]) -> None:
+    # One patch of 512 x 512 pixels of each of four colours, half of each light. The table's own variances are the
+    # reference; relative error of a variance of n pixels: sqrt(2 / n) = 0.0028, five of them allowed, 12 comparisons.
+    weights = np.full((512, 512, 2), 0.5, np.float32)
+    for code in (0, 3, 5, 7):
+        picture = np.full((512, 512, 3), 32 * code, np.uint8)
+        colour = code << 6 | code << 3 | code
+        mixed = mix_samples(noisy, picture, weights, seed=code).astype(np.float64)
+        table = noisy[:, colour].astype(np.float64)
+        expected = 0.5 * table.var(axis=1).sum(axis=0) + 1 / 12
+        assert np.abs(mixed.var(axis=(0, 1)) / expected - 1).max() < 5 * 0.0028
+        error = np.sqrt(expected) / 512
+        assert (np.abs(mixed.mean(axis=(0, 1)) - table.mean(axis=1).mean(axis=0)) < 5 * error).all()
+
+
+def test_faults_of_weight_maps_are_named(make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]) -> None:
+    tables = make_lut().samples[:2]
+    weights = weight_maps(37, 1053, 2)
+    with pytest.raises(InputError, match=r"the weights are \(37, 1053, 1\), expected \(37, 1053, 2\) or \(2,\)"):
+        mix_samples(tables, picture, weights[..., :1])
+    for wrong in (-0.1, float("nan"), float("inf")):
+        faulty = weights.copy()
+        faulty[36, 1052, 1] = wrong
+        with pytest.raises(InputError, match="a weight is negative, infinite or no number"):
+            mix_samples(tables, picture, faulty)

@@ -1,0 +1,115 @@
+"""Crops against the plain image that they are windows of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from drivers.errors import InputError
+from generator.kernel import draw_samples
+from generator.planar import draw_batch, draw_planar
+
+if TYPE_CHECKING:
+    from calibration.lut import Lut
+
+WHITE = 3500
+
+
+def expected(
+    image: npt.NDArray[np.uint16], window: tuple[int, int, int, int], flip: bool, gain: float
+) -> npt.NDArray[np.float32]:
+    x, y, width, height = window
+    cut = image[y : y + height, x : x + width][:, :: -1 if flip else 1]
+    return np.minimum(cut.astype(np.float32) * np.float32(gain / WHITE), np.float32(1)).transpose(2, 0, 1)
+
+
+def test_the_whole_picture_is_the_plain_image_in_planes(
+    make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]
+) -> None:
+    samples = make_lut().samples[2]
+    image = draw_samples(samples, picture, seed=6, image=4)
+    whole = (0, 0, 1053, 37)
+    got = draw_planar(samples, picture, white_level=WHITE, seed=6, image=4)
+    np.testing.assert_array_equal(got, expected(image, whole, False, 1))
+    assert got.dtype == np.float32
+    assert got.max() == 1
+    target = np.zeros((2, 3, 37, 1053), np.float32)[::2][0]
+    again = draw_planar(samples, picture, white_level=WHITE, seed=6, image=4, threads=5, out=target)
+    assert again is target
+    np.testing.assert_array_equal(target, got)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_any_window_gain_and_flip_in_a_batch(picture: npt.NDArray[np.uint8], data: st.DataObject) -> None:
+    rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
+    tables = rng.integers(0, 4096, (3, 8, 5, 3)).astype(np.uint16)
+    width, height = data.draw(st.integers(1, 90)), data.draw(st.integers(1, 12))
+    count = data.draw(st.integers(1, 5))
+    firsts = rng.integers(0, 900, count).tolist()
+    pictures = [picture[:, first:] for first in firsts]
+    windows = [
+        (int(rng.integers(0, 1054 - first - width)), int(rng.integers(0, 38 - height)), width, height)
+        for first in firsts
+    ]
+    lights, flips, gains = rng.integers(0, 3, count), rng.random(count) < 0.5, rng.uniform(0, 3, count)
+    seeds, images = rng.integers(0, 2**63, count), rng.integers(0, 2**32, count)
+    threads = data.draw(st.integers(1, 3))
+    got = draw_batch(
+        tables,
+        lights,
+        pictures,
+        windows,
+        white_level=WHITE,
+        flips=flips,
+        gains=gains,
+        seeds=seeds,
+        images=images,
+        threads=threads,
+    )
+    for i in range(count):
+        image = draw_samples(tables[lights[i]], pictures[i], seed=int(seeds[i]), image=int(images[i]))
+        np.testing.assert_array_equal(got[i], expected(image, windows[i], bool(flips[i]), float(gains[i])))
+
+
+def test_a_batch_from_a_table_on_disk_with_one_value_for_all(
+    make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]
+) -> None:
+    lut = make_lut()
+    windows = [(0, 0, 64, 32), (989, 5, 64, 32), (500, 1, 64, 32)]
+    target = np.empty((3, 3, 32, 64), np.float32)
+    got = draw_batch(
+        lut.samples, [3, 0, 1], [picture] * 3, windows, white_level=WHITE, gains=0.5, seeds=7, images=2, out=target
+    )
+    assert got is target
+    for light, window, crop in zip([3, 0, 1], windows, got, strict=True):
+        image = draw_samples(lut.samples[light], picture, seed=7, image=2)
+        np.testing.assert_array_equal(crop, expected(image, window, False, 0.5))
+
+
+def test_faults_are_named(make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8]) -> None:
+    samples = make_lut().samples
+    for window in ((-1, 0, 5, 5), (0, 0, 5, 38), (1050, 0, 4, 4), (0, 0, 0, 4)):
+        with pytest.raises(InputError, match=r"is not inside the picture of 1053x37 pixels"):
+            draw_planar(samples[0], picture, white_level=WHITE, window=window)
+        with pytest.raises(InputError, match=r"is not inside the picture of 1053x37 pixels"):
+            draw_batch(samples, [0], [picture], [window], white_level=WHITE)
+    with pytest.raises(InputError, match="the gain is -1"):
+        draw_planar(samples[0], picture, white_level=WHITE, gain=-1)
+    with pytest.raises(InputError, match="the white level is 65536"):
+        draw_planar(samples[0], picture, white_level=65536)
+    ok = (0, 0, 4, 4)
+    with pytest.raises(InputError, match="the windows of a batch differ in size"):
+        draw_batch(samples, [0, 0], [picture] * 2, [ok, (0, 0, 4, 5)], white_level=WHITE)
+    with pytest.raises(InputError, match="expected 1 from 0 to 3"):
+        draw_batch(samples, [4], [picture], [ok], white_level=WHITE)
+    with pytest.raises(InputError, match="expected one window of 4 a picture"):
+        draw_batch(samples, [0, 1], [picture], [ok, ok], white_level=WHITE)
+    with pytest.raises(InputError, match="the target is float32"):
+        draw_batch(samples, [0], [picture], [ok], white_level=WHITE, out=np.empty((1, 3, 4, 5), np.float32))
