@@ -137,8 +137,8 @@ class LightSource(_Settings):
 
     shown_by: Literal["display", "lightcrafter", "jvc"] = "display"
     """A display of this machine that the projector mirrors, or the projector itself by command."""
-    display: str | None = None
-    """Name or position of the display; acquire devices lists them."""
+    display: str | int | None = None
+    """Name, position or number of the display; acquire devices lists them."""
     host: str | None = None
     """JVC: address."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None

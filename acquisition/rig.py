@@ -160,6 +160,11 @@ def _lab_projector(cable: ProjectorCable, clock: Clock) -> Projector | None:
         host, port = cable.host, cable.port or spoken.tcp_port
         label = f"the projector at {host}:{port}"
         return spoken.network(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
+    if cable.device is None and cable.host is not None:
+        raise ConfigurationError(
+            f"LAB.toml: lab.projector.host: {spoken.maker} projectors are reached over a serial port only; "
+            "name lab.projector.device, acquire devices lists what is there"
+        )
     device = _required(cable.device, "lab.projector.device", "the serial port")
     return spoken.projector(
         lambda: SerialLink.open(device, cable.baud or spoken.baud, spoken.parity),

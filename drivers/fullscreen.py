@@ -378,8 +378,10 @@ class FullScreen:
         except self._glfw.GLFWError:
             # This display has none.
             return ""
-        for name, channel in zip(("red", "green", "blue"), ramp, strict=True):
-            values = np.asarray(channel)
+        channels = [np.asarray(channel) for channel in ramp]
+        if any(_is_noise(values) for values in channels):
+            return ""
+        for name, values in zip(("red", "green", "blue"), channels, strict=True):
             if not values.any():
                 # A server without a ramp of its own keeps zeros; a real one of zeros would be a black picture.
                 continue
@@ -394,6 +396,12 @@ class FullScreen:
             raise DeviceError(f"display {self.display} was closed; open it again")
         if threading.get_ident() != self._thread:
             raise DeviceError(f"display {self.display} belongs to the thread that opened it; use it from there")
+
+
+def _is_noise(ramp: npt.NDArray[np.float64]) -> bool:
+    """Return whether a gamma ramp goes up and down as none that somebody set: some X servers never write theirs."""
+    way = float(np.abs(np.diff(ramp)).sum())
+    return way > 2 * float(np.ptp(ramp)) and way > 0.1
 
 
 def identify_displays(seconds: float, clock: Clock = _SYSTEM_CLOCK) -> tuple[Display, ...]:

@@ -140,11 +140,13 @@ class Gphoto2Camera:
         if self._port is not None:
             ports = gp.PortInfoList()
             ports.load()
-            camera.set_port_info(ports[ports.lookup_path(self._port)])
+            with _known(f"port {self._port!r}", "such as usb:001,004 or ptpip:192.168.1.20"):
+                camera.set_port_info(ports[ports.lookup_path(self._port)])
         if self._model is not None:
-            known = gp.CameraAbilitiesList()
-            known.load()
-            camera.set_abilities(known[known.lookup_model(self._model)])
+            models = gp.CameraAbilitiesList()
+            models.load()
+            with _known(f"model {self._model!r}", "gphoto2 --list-cameras lists those it knows"):
+                camera.set_abilities(models[models.lookup_model(self._model)])
         camera.init()
         return camera
 
@@ -200,6 +202,25 @@ def library():
     return gphoto2
 
 
+@contextmanager
+def _known(what: str, remedy: str) -> Generator[None]:
+    """Tell what was looked up in vain as a mistake of the settings."""
+    gp = library()
+    try:
+        yield
+    except gp.GPhoto2Error as error:
+        raise ConfigurationError(
+            f"libgphoto2 knows no {what} ({remedy}); found: {_found()}; name one of these, or leave it out"
+        ) from error
+
+
+def _found() -> str:
+    """Return the cameras that libgphoto2 finds by itself, on USB above all."""
+    cameras = library().Camera.autodetect()
+    names = [f"{cameras.get_name(index)} at {cameras.get_value(index)}" for index in range(cameras.count())]
+    return "; ".join(names) or "no camera at all"
+
+
 def _translated(error: gphoto2.GPhoto2Error, label: str) -> DeviceError:
     gp = library()
     what = f"{label}: libgphoto2 says {error.string} ({error.code})"
@@ -211,9 +232,11 @@ def _translated(error: gphoto2.GPhoto2Error, label: str) -> DeviceError:
         case gp.GP_ERROR_CAMERA_BUSY:
             return DeviceError(f"{what}; the frame may be retaken when it is idle")
         case gp.GP_ERROR_MODEL_NOT_FOUND | gp.GP_ERROR_UNKNOWN_PORT | gp.GP_ERROR_IO_USB_FIND:
-            return LinkClosed(f"{what}; connect the camera and switch it on")
+            return LinkClosed(
+                f"{what}; found: {_found()}; connect the camera, switch it on, or name its port and model"
+            )
         case gp.GP_ERROR_IO | gp.GP_ERROR_IO_READ | gp.GP_ERROR_IO_WRITE | gp.GP_ERROR_IO_INIT:
-            return LinkClosed(f"{what}; check the cable, switch the camera off and on")
+            return LinkClosed(f"{what}; check the cable and the USB permission, switch the camera off and on")
         case _:
             return DeviceError(f"{what}; switch the camera off and on, then run again")
 

@@ -241,7 +241,10 @@ class IpTransport:
     def _greeting(self, link: Link, cutter: PacketCutter) -> Packet:
         """Return the first packet on a new connection; a device sends nothing after it unasked, save events."""
         while True:
-            packets = cutter.feed(link.read(_READ, _CONNECT_S))
+            try:
+                packets = cutter.feed(link.read(_READ, _CONNECT_S))
+            except ProtocolError as error:
+                raise ProtocolError(f"what answers in place of {self._place} speaks no PTP/IP: {error}") from error
             if packets:
                 self._events.extend(packet for packet in packets[1:] if isinstance(packet, Event))
                 return packets[0]

@@ -272,6 +272,17 @@ def test_a_bent_gamma_ramp_is_reported(outputs: str) -> None:
         presenter.close()
 
 
+def test_a_gamma_ramp_that_was_never_written_is_none(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
+    import glfw
+
+    # Some X servers give out whatever their memory held before.
+    noise = np.random.default_rng(1).random((3, 256))
+    monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor: noise)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    assert ramps(screen) == []
+    monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor: [np.linspace(1, 0, 256)] * 3)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    assert len(ramps(screen)) == 1, "inverted colours are somebody's wish"
+
+
 def ramps(presenter: FullScreen) -> list[str]:
     return [warning for warning in presenter.warnings() if "gamma" in warning]
 

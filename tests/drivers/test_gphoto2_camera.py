@@ -98,6 +98,25 @@ def test_no_camera_is_said_with_what_helps() -> None:
         Gphoto2Camera("ptpip:127.0.0.1:1:1", MODEL).identity()
 
 
+@pytest.mark.parametrize(
+    ("port", "model", "words"),
+    [
+        (None, "Nonsense 5", r"knows no model 'Nonsense 5' \(gphoto2 --list-cameras .*found: "),
+        ("nonsense", None, r"knows no port 'nonsense' \(such as usb:001,004.*found: "),
+    ],
+)
+def test_what_libgphoto2_does_not_know_is_a_mistake_of_the_settings(
+    port: str | None, model: str | None, words: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=words):
+        Gphoto2Camera(port, model).identity()
+
+
+def test_no_camera_at_all_says_what_was_found() -> None:
+    with pytest.raises(LinkError, match=r"found: .*; connect the camera"):
+        Gphoto2Camera("usb:777,777").identity()
+
+
 def test_a_missing_library_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gphoto2", None)
     with pytest.raises(ConfigurationError, match=r"croplab\[gphoto2\]"):

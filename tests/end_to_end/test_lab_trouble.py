@@ -1,0 +1,258 @@
+"""What goes wrong when a real lab is set up: `acquire check` and `acquire run` tell it in one sentence with its remedy.
+
+The devices are simulated at the ends of real cables; where a display would be needed, a presenter stands in for it.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+if sys.platform == "win32":
+    pytest.skip("Windows has no pseudo-terminals", allow_module_level=True)
+
+from acquisition.cli import main
+from drivers.clock import Clock, SystemClock
+from drivers.errors import DeviceRefused
+from drivers.fullscreen import Display, choose_display
+from drivers.links.tcp import TcpLink, TcpServer
+from drivers.links.usb import open_usb
+from drivers.pjlink.projector import PjLinkProjector
+from drivers.projector import Power
+from sim.eos import SimulatedEos
+from sim.eos_bodies import EOS_BODIES
+from sim.presenter import Screen, SimulatedPresenter
+from sim.projector import SimulatedProjector, serve_pjlink
+from sim.ptpip_server import serve_ptpip
+from sim.pty import PseudoTerminal
+from sim.serial_projectors import EpsonPeer
+from sim.usb import SimulatedBus
+from sim.usb_device import Identity, PtpUsbDevice
+from tests.contracts.camera import SeededFilm
+
+DESK = Display(1, "DP-1", 0, 0, 2560, 1440, 60)
+BEAMER = Display(2, "HDMI-1", 2560, 0, 1920, 1080, 60)
+TWIN = Display(3, "HDMI-1", 4480, 0, 1920, 1080, 60)
+
+
+@dataclass
+class Bench:
+    """A lab.toml in the making, and the devices that it will meet."""
+
+    lab: Path
+    monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str]
+    displays: tuple[Display, ...] = (DESK,)
+    bus: SimulatedBus = field(default_factory=SimulatedBus)
+
+    def plug(self, serial: str = "1") -> PtpUsbDevice:
+        """Put a camera on the bus."""
+        eos = SimulatedEos(EOS_BODIES["EOS 550D"], SeededFilm(1000), SystemClock(), serial=serial)
+        device = PtpUsbDevice(eos, Identity(*eos.body.usb, serial=serial))
+        self.bus.plug(device)
+        return device
+
+    def told(self, text: str) -> tuple[int, str]:
+        """Return the exit code and the one sentence of both commands, which are the same."""
+        self.lab.write_text(self.lab.read_text().replace('rig = "simulated"', 'rig = "lab"') + text)
+        outcomes = [self._outcome("check", str(self.lab)), self._outcome("run", str(self.lab), str(self.session))]
+        assert outcomes[0] == outcomes[1]
+        return outcomes[0]
+
+    @property
+    def session(self) -> Path:
+        return self.lab.parent / "session"
+
+    def _outcome(self, *arguments: str) -> tuple[int, str]:
+        self.monkeypatch.setattr(sys, "argv", ["acquire", *arguments])
+        code = main()
+        lines = [line for line in self.capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+        assert len(lines) == 1
+        # What was left of a time limit is never twice the same.
+        return code, re.sub(r"\b0\.0\d+ s", "0.05 s", lines[0].removeprefix("error: "))
+
+
+@pytest.fixture
+def bench(lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Bench:
+    bench = Bench(lab, monkeypatch, capsys)
+
+    def presenter(display: str | int | None, clock: Clock) -> SimulatedPresenter:
+        choose_display(bench.displays, display)
+        return SimulatedPresenter(Screen(), clock)
+
+    monkeypatch.setattr("acquisition.rig.FullScreen", presenter)
+    monkeypatch.setattr("acquisition.rig.open_usb", partial(open_usb, backend=bench.bus))
+    return bench
+
+
+@pytest.fixture
+def camera() -> Iterator[str]:
+    """Return the table of a camera that answers on the loopback."""
+    eos = SimulatedEos(EOS_BODIES["Test"], SeededFilm(1000), SystemClock(), auto_power_off_s=0)
+    with serve_ptpip(eos, 0) as server:
+        yield f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\nport = {server.address[1]}\n'
+
+
+def pjlink(port: int, password: str | None = None) -> str:
+    words = f'[lab.projector]\ncontrol = "pjlink"\nhost = "127.0.0.1"\nport = {port}\n'
+    return words + ("" if password is None else f'password = "{password}"\n')
+
+
+def free_port() -> int:
+    with TcpServer(lambda link: None) as server:
+        return server.address[1]
+
+
+def test_an_unknown_language(bench: Bench) -> None:
+    code, said = bench.told('[lab.projector]\ncontrol = "klingon"\n')
+    assert code == 2
+    assert "lab.projector.control = 'klingon'" in said
+    assert "'pjlink', 'epson', 'benq', 'optoma' or 'nec'" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('control = "pjlink"', "lab.projector.host is missing; name the projector's address"),
+        ('control = "nec"', "lab.projector.device is missing; name the serial port, acquire devices lists"),
+        ('control = "optoma"\nhost = "127.0.0.1"', "Optoma projectors are reached over a serial port only"),
+        ('control = "nec"\nbaud = 12345678901\ndevice = "{port}"', "choose another speed"),
+    ],
+)
+def test_a_cable_that_cannot_be(bench: Bench, camera: str, text: str, words: str) -> None:
+    with PseudoTerminal(EpsonPeer(SimulatedProjector(SystemClock()))) as terminal:
+        code, said = bench.told(f"{camera}[lab.projector]\n{text.format(port=terminal.path)}\n")
+    assert code == 2
+    assert words in said
+
+
+def test_a_serial_port_that_is_not_there(bench: Bench, camera: str) -> None:
+    code, said = bench.told(f'{camera}[lab.projector]\ncontrol = "benq"\ndevice = "/dev/ttyCROP9"\n')
+    assert code == 3
+    assert said.startswith("there is no serial port /dev/ttyCROP9; found: ")
+
+
+def test_another_language_than_the_projectors(bench: Bench, camera: str) -> None:
+    with PseudoTerminal(EpsonPeer(SimulatedProjector(SystemClock()))) as terminal:
+        code, said = bench.told(f'{camera}[lab.projector]\ncontrol = "optoma"\ndevice = "{terminal.path}"\n')
+    assert code == 3
+    assert "answers 'ERR" in said
+    assert "check that speed and parity are those set in the projector's menu, and the language its maker's" in said
+
+
+def test_a_port_at_which_nobody_listens(bench: Bench, camera: str) -> None:
+    code, said = bench.told(camera + pjlink(port := free_port()))
+    assert code == 3
+    assert said == (
+        f"nothing listens at 127.0.0.1:{port}; check the port, and that network control is enabled on the device"
+    )
+
+
+def test_a_port_that_answers_something_else(bench: Bench, camera: str) -> None:
+    with TcpServer(lambda link: link.write(b"SSH-2.0-OpenSSH_9.2\r", 1.0)) as server:
+        code, said = bench.told(camera + pjlink(server.address[1]))
+    assert code == 3
+    assert "SSH-2.0-OpenSSH_9.2" in said
+
+
+def test_a_projector_that_does_not_answer(bench: Bench, camera: str) -> None:
+    bench.monkeypatch.setattr("acquisition.rig.PjLinkProjector", partial(PjLinkProjector, timeout=0.05))
+
+    def say_nothing(link: TcpLink) -> None:
+        link.read(1, 60.0)
+
+    with TcpServer(say_nothing) as server:
+        code, said = bench.told(camera + pjlink(server.address[1]))
+    assert code == 3
+    assert "sent nothing for 0.05 s" in said
+    assert "check that the device is on and not busy with another controller" in said
+
+
+@pytest.mark.parametrize(("password", "verb"), [("wrong", "refuses the"), (None, "asks for a")])
+def test_a_password_that_is_wrong_or_missing(bench: Bench, camera: str, password: str | None, verb: str) -> None:
+    with serve_pjlink(SimulatedProjector(SystemClock()), 0, "right") as server:
+        port = server.address[1]
+        code, said = bench.told(camera + pjlink(port, password))
+    assert code == 3
+    assert said == f"the projector at 127.0.0.1:{port} {verb} password; give the one set for PJLink in its menu"
+
+
+def test_a_projector_that_refuses_in_standby(bench: Bench, camera: str) -> None:
+    class Stubborn(SimulatedProjector):
+        def switch_on(self) -> None:
+            raise DeviceRefused("not now")
+
+    with serve_pjlink(Stubborn(SystemClock()), 0) as server:
+        code, said = bench.told(camera + pjlink(server.address[1]))
+    assert code == 3
+    assert "answers ERR3 to POWR 1: it is warming up, cooling down or in standby; wait until" in said
+
+
+@pytest.mark.parametrize(
+    ("there", "wanted", "words"),
+    [
+        ((DESK,), '"HDMI-1"', "display 'HDMI-1' is not there"),
+        ((DESK,), "2", "display 2 is not there"),
+        ((DESK,), '"right"', "there are not two displays side by side"),
+        ((DESK, BEAMER, TWIN), '"HDMI-1"', "display 'HDMI-1': 2 fit; name one by its place, such as +1920+0"),
+    ],
+)
+def test_a_display_that_cannot_be_chosen(bench: Bench, there: tuple[Display, ...], wanted: str, words: str) -> None:
+    bench.displays = there
+    code, said = bench.told(f"[lab.light]\ndisplay = {wanted}\n")
+    assert code == 2
+    assert words in said
+    assert all(str(display) in said for display in there)
+
+
+def test_no_camera_on_usb(bench: Bench) -> None:
+    code, said = bench.told("")
+    assert code == 3
+    assert "no camera with vendor 04a9 on USB; found: none at all: switch the camera on, check cable" in said
+
+
+def test_another_camera_than_the_one_named(bench: Bench) -> None:
+    bench.plug("1")
+    code, said = bench.told('[lab.camera]\nserial = "2"\n')
+    assert code == 3
+    assert "serial number 2 on USB; found: " in said
+    assert "serial number 1)" in said
+
+
+def test_two_cameras_and_none_named(bench: Bench) -> None:
+    bench.plug("1")
+    bench.plug("2")
+    code, said = bench.told("")
+    assert code == 2
+    assert "2 cameras on USB fit: " in said
+    assert "name one by serial number or port" in said
+
+
+def test_a_camera_in_use(bench: Bench) -> None:
+    bench.bus.hold(bench.plug())
+    code, said = bench.told("")
+    assert code == 3
+    assert "is held by another program" in said
+    assert "gvfs-gphoto2-volume-monitor" in said
+
+
+def test_a_camera_without_permission(bench: Bench) -> None:
+    bench.bus.lock(bench.plug())
+    code, said = bench.told("")
+    assert code == 3
+    assert "may not be opened by this user" in said
+    assert "70-crop-cameras.rules" in said
+
+
+def test_what_answers_at_the_cameras_port_is_none(bench: Bench) -> None:
+    with serve_pjlink(SimulatedProjector(SystemClock(), power=Power.ON), 0) as server:
+        port = server.address[1]
+        code, said = bench.told(f'[lab.camera]\nconnection = "ptpip"\nhost = "127.0.0.1"\nport = {port}\n')
+    assert code == 3
+    assert f"what answers in place of the camera at 127.0.0.1:{port} speaks no PTP/IP" in said
