@@ -81,9 +81,11 @@ def generate(
 
     from calibration.lut import open_lut
     from drivers.errors import InputError
-    from generator.dataset import check_free, default_workers, generate_dataset
+    from generator.dataset import generate_dataset
+    from generator.engines import default_workers
+    from generator.workplace import require_free_place
 
-    check_free(out)
+    require_free_place(out)
     if contact_sheet is not None and contact_sheet.suffix.lower() != ".png":
         raise InputError(f"the contact sheet {contact_sheet} is to be a PNG file; let its name end in .png")
     if contact_sheet is not None and contact_sheet.exists():
@@ -106,11 +108,9 @@ def generate(
             speed = progress.tasks[0].speed
             progress.update(task, advance=1, rate=f"{speed:.1f}/s" if speed else "")
 
-        def on_skip(source: Source, reason: str) -> None:
-            progress.update(task, total=(progress.tasks[0].total or 0) - choice.lights_each)
-            progress.console.print(
-                f"passed over {source.name}: {reason}", style="yellow", markup=False, highlight=False
-            )
+        def on_skip(name: str, reason: str, images: int) -> None:
+            progress.update(task, total=(progress.tasks[0].total or 0) - images)
+            progress.console.print(f"passed over {name}: {reason}", style="yellow", markup=False, highlight=False)
 
         dataset = generate_dataset(
             table,
@@ -119,21 +119,21 @@ def generate(
             choice,
             seed=seed,
             form=format,
-            max_side=max_side,
+            reading={"max_side": max_side},
             workers=default_workers() if workers is None else workers,
             previews=preview,
             on_image=on_image,
             on_skip=on_skip,
         )
     made = dataset.description
-    print(f"{out}: {made.images} images of {len(made.sources)} pictures under {len(made.lights)} lights")
+    print(f"{out}: {made.images} images of {made.sources} pictures under {len(made.lights)} lights")
     if made.skipped:
         print(f"{len(made.skipped)} of {len(pictures)} pictures could not be read; dataset.json lists them")
-    if replaced := sum(source.replaced_pixels for source in made.sources):
-        share = 100 * replaced / sum(source.width * source.height for source in made.sources)
+    if made.replaced_pixels:
+        share = 100 * made.replaced_pixels / made.pixels
         print(
-            f"{replaced} source pixels ({share:.2g} %) are of the {len(table.provenance.unfit)} colours that the table "
-            "lists as unfit; they took the nearest fit colour"
+            f"{made.replaced_pixels} source pixels ({share:.2g} %) are of the {len(table.provenance.unfit)} colours that "
+            "the table lists as unfit; they took the nearest fit colour"
         )
     if contact_sheet is not None:
         from generator.contact import save_contact_sheet

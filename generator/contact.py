@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.storage import write_whole
-from generator.dataset import Dataset, Entry, preview_of
+from generator.dataset import Dataset
+from generator.lighting import parse_mixture
+from generator.records import Entry, Light, Triple
+from generator.shards import preview_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,9 +53,9 @@ def _even(count: int, most: int) -> list[int]:
 def _load(dataset: Dataset, entry: Entry) -> npt.NDArray[np.uint8]:
     import cv2
 
-    path = dataset.preview_path(entry)
-    if path.is_file():
-        picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR_RGB)
+    preview = dataset.read_preview(entry)
+    if preview is not None:
+        picture = cv2.imdecode(np.frombuffer(preview, np.uint8), cv2.IMREAD_COLOR_RGB)
         if picture is not None:
             return np.asarray(picture, dtype=np.uint8)
     return preview_of(dataset.read_image(entry), dataset.description.table.white_level)
@@ -68,8 +72,10 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     columns = _even(max(len(rows[name]) for name in names), max_columns)
     grid = [[rows[name][place] for place in columns if place < len(rows[name])] for name in names]
     pictures = [[_load(dataset, entry) for entry in line] for line in grid]
-    lights = {light.illumination: light for light in dataset.description.lights}
-    shared = all([entry.illumination for entry in line] == [entry.illumination for entry in grid[0]] for line in grid)
+    lights = len({light for entry in dataset.entries for light in entry.lights})
+    table_lights = {light.illumination: light for light in dataset.description.lights}
+    named = {str(number): light.label for number, light in table_lights.items()}
+    shared = all([entry.lights for entry in line] == [entry.lights for entry in grid[0]] for line in grid)
 
     # All in inches; a cell keeps the aspect of the widest picture and rows are as high as theirs need.
     cell, gap, margin, caption = 1.75, 0.12, 0.4, 0.26
@@ -85,13 +91,13 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     def put(x: float, y: float, words: str, size: float, colour: str = _INK, **style: str) -> None:
         figure.text(x / width, 1 - y / height, words, {"fontsize": size, "color": colour, "va": "baseline", **style})
 
-    def dot(x: float, y: float, codes: tuple[int, int, int]) -> None:
+    def dot(x: float, y: float, light: str) -> None:
         radius = 0.055
         axes = figure.add_axes((x / width, 1 - (y + radius) / height, 2 * radius / width, 2 * radius / height))
         axes.set_xlim(-1.15, 1.15)
         axes.set_ylim(-1.15, 1.15)
         axes.axis("off")
-        axes.add_patch(Circle((0, 0), 1, facecolor=[code / 255 for code in codes], edgecolor=_FAINT, linewidth=0.4))
+        axes.add_patch(Circle((0, 0), 1, facecolor=_colour(light, table_lights), edgecolor=_FAINT, linewidth=0.4))
 
     table = dataset.description.table
     put(margin, 0.5, table.camera, 13, weight="bold")
@@ -99,7 +105,7 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
         margin,
         0.74,
         f"{dataset.description.images} raw images of {len(rows)} pictures, "
-        f"{len(lights)} light{'s' if len(lights) > 1 else ''}, seed {dataset.description.seed}",
+        f"{lights} light{'s' if lights > 1 else ''}, seed {dataset.description.seed}",
         8,
         _FAINT,
     )
@@ -111,18 +117,32 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
             axes = figure.add_axes((left / width, 1 - (top + tall) / height, cell / width, tall / height))
             axes.imshow(picture, interpolation="lanczos", aspect="auto")
             axes.axis("off")
-            light = lights[entry.illumination]
-            if shared and row == 0:
-                dot(left, head - 0.2, light.codes)
-                put(left + 0.18, head - 0.16, light.label, 8)
-            elif not shared:
-                dot(left, top + heights[row] + 0.15, light.codes)
-                put(left + 0.18, top + heights[row] + 0.19, light.label, 7, _FAINT)
+            under_it = shared and row == 0
+            if under_it or not shared:
+                y = head - 0.2 if under_it else top + heights[row] + 0.15
+                for place, light in enumerate(entry.lights):
+                    dot(left + 0.13 * place, y, light)
+                words = _short(" and ".join(_label(light, named) for light in entry.lights), 26)
+                size, ink = (8, _INK) if under_it else (7, _FAINT)
+                put(left + 0.05 + 0.13 * len(entry.lights), y + 0.04, words, size, ink)
         under = top + heights[row] + (0.0 if shared else caption)
         put(margin, under + 0.17, _short(name), 7, _FAINT, style="italic")
         top += heights[row] + below
     put(margin, height - 0.25, "Tone mapped with the Flash operator; camera RGB, no white balance", 6.5, _FAINT)
     return figure
+
+
+def _label(light: str, named: Mapping[str, str]) -> str:
+    """Return what to call a light: as a person does, or for a mixture how many lights it is of."""
+    return named.get(light) or f"mix of {light.count('+') + 1}"
+
+
+def _colour(light: str, lights: Mapping[int, Light]) -> Triple:
+    """Return the colour that a projector would show for a light or a mixture: codes add in linear light."""
+    mixture = parse_mixture(light)
+    codes = np.array([lights[number].codes for number in mixture.lights]) / 255
+    red, green, blue = (float(part) for part in (np.asarray(mixture.weights) @ codes**2.2) ** (1 / 2.2))
+    return red, green, blue
 
 
 def _short(name: str, most: int = 60) -> str:

@@ -1,147 +1,95 @@
-"""A dataset folder: its description, its reader and its writer.
+"""A dataset: its reader, and the call that makes one.
 
-    images/NNNNNN.png    16-bit linear camera RGB in the units of the table; numbered from 000000 without holes
+    images/NNNNNN.png    linear camera RGB in the units of the table; the number is the one that was planned
     previews/NNNNNN.jpg  the same, tone mapped, at most 512 px: the look of the raw, no white balance
-    ground_truth.csv     image,source,illumination,r,g,b with r + g + b = 1, one row an image
-    gt.txt               r g b a line in image order
-    dataset.json         the table's hash, seed, options, sources with their hashes: enough to make every byte again
-    SHA256SUMS           hashes of images and previews; `sha256sum -c SHA256SUMS` verifies
+    ground_truth.csv     image,source,illumination,r,g,b with r + g + b = 1, one row a light
+    gt.txt               r g b a line in image order: the mean of the lights over the image
+    sources.csv          position,name,sha256,width,height,replaced_pixels,split
+    splits/train.txt …   names of images, where the dataset was divided
+    dataset.json         the table's hash, seed, options: enough to make every byte again
+    SHA256SUMS           hashes of all files; `sha256sum -c SHA256SUMS` verifies
 
-Images are in the order of the sources, and of each source's lights. A source that cannot be read is passed over, told
-and listed; nothing after it depends on it but the numbers of the images. No byte depends on the workers, the clock or
-the machine's paths; the encoders and decoders are the libraries', whose versions are recorded.
+Image number `position · lights_each + k` shows the source at `position` under its k-th light. A source that cannot be
+read leaves its numbers free and is listed. In the layouts `webdataset` and `parquet` the images of a shard lie together
+in `data/NNNNNN.tar` or `.parquet`, or below the name of their part. No byte depends on the workers, the clock or the
+machine's paths; the encoders and decoders are the libraries', whose versions are recorded.
 """
 
 from __future__ import annotations
 
 import csv
-import hashlib
-import importlib.metadata
 import io
-import os
-import zlib
-from collections import deque
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from functools import cached_property
+from itertools import groupby
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from drivers.errors import FormatError, InputError
-from drivers.storage import require_free, whole_folder, write_whole
-from generator.illuminant import LightChoice, ListedLights
-from generator.scene import Picture, Source
+from generator.assembly import GROUND_TRUTH, GROUND_TRUTH_COLUMNS, SOURCES, TRUTHS, NothingMadeError, assemble
+from generator.encode import Format, decode_image
+from generator.engines import check_workers, default_workers, make_shards
+from generator.illuminant import ListedLights
+from generator.layouts import read_member
+from generator.lighting import LightChoice, parse_mixture
+from generator.plan import SHARD_IMAGES, Options, Plan
+from generator.records import (
+    FORMAT,
+    SPLITS,
+    VERSION,
+    Description,
+    Entry,
+    Layout,
+    SourceRecord,
+    Split,
+    Triple,
+    shard_key,
+)
+from generator.shards import OnImage, OnSkip, preview_of
+from generator.store import Store, open_store
+from generator.workplace import DESCRIPTION, Workplace, finished, stored_identity, workplace
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
+    from generator.scene import Source
 
-FORMAT = "crop.dataset"
-VERSION = 1
-COLUMNS = ("image", "source", "illumination", "r", "g", "b")
-PREVIEW_SIDE = 512
-"""Longest side of a preview, px."""
+__all__ = [
+    "Dataset",
+    "Description",
+    "Entry",
+    "default_workers",
+    "finish_dataset",
+    "generate_dataset",
+    "make_dataset",
+    "make_share",
+    "open_dataset",
+    "preview_of",
+]
 
-ImageFormat = Literal["png", "tiff"]
-
-
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-
-class Table(_Record):
-    """The table a dataset was made from; `sha256` as `calibration.lut.Lut.sha256`."""
-
-    sha256: str
-    camera: str
-    bits: int
-    samples: int
-    white_level: int
-    software: str
-
-
-class Light(_Record):
-    """A light of the table that was used; `codes` as projected, `white` the ground truth in linear camera RGB."""
-
-    illumination: int
-    kind: str
-    cct_k: float | None
-    codes: tuple[int, int, int]
-    white: tuple[float, float, float]
-
-    @property
-    def label(self) -> str:
-        """Return what a person calls it: its temperature if a black body, else its codes."""
-        return f"{self.cct_k:.0f} K" if self.cct_k is not None else "{} {} {}".format(*self.codes)
-
-
-class SourceRecord(_Record):
-    """A source picture that was used.
-
-    Attributes
-    ----------
-    position
-        Place in the list of sources, from 0; the choice of its lights depends on it.
-    name, sha256
-        What it was called, and the hash of its file; no hash where it was made and not read.
-    width, height
-        Size of its images, px.
-    replaced_pixels
-        Pixels of colours that the table lists as unfit, which took the nearest fit colour.
-    """
-
-    position: int
-    name: str
-    sha256: str | None
-    width: int
-    height: int
-    replaced_pixels: int
-
-
-class Skipped(_Record):
-    """A source picture that could not be read."""
-
-    position: int
-    name: str
-
-
-class Description(_Record):
-    """The content of `dataset.json`.
-
-    `options` holds the image format, the largest side, and how lights were chosen.
-    """
-
-    format: Literal["crop.dataset"] = FORMAT
-    version: Literal[1] = VERSION
-    software: str
-    libraries: dict[str, str]
-    table: Table
-    seed: int
-    options: dict[str, Any]
-    images: int
-    lights: list[Light]
-    sources: list[SourceRecord]
-    skipped: list[Skipped]
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One image: its file name, its source's name, its light's number, and the ground truth (r, g, b) of sum 1."""
-
-    image: str
-    source: str
-    illumination: int
-    truth: tuple[float, float, float]
+OnDone = Callable[[int], None]
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """A dataset on disk; images are read where they are used."""
+    """A dataset on disk or in a store; images are read where they are used.
 
-    folder: Path
+    Attributes
+    ----------
+    store
+        Where its files are.
+    description
+        The content of `dataset.json`.
+    entries
+        Its images in the order of their numbers.
+    """
+
+    store: Store
     description: Description
     entries: tuple[Entry, ...]
 
@@ -151,90 +99,171 @@ class Dataset:
         Raises
         ------
         FormatError
-            The file is missing, damaged or no 16-bit RGB image.
+            The file is missing, damaged or no image of its format.
         """
-        import cv2
+        name = self._name(entry.image, entry.split, "images")
+        return decode_image(self._bytes(name), self.description.options["format"], f"{self.store.place}/{name}")
 
-        path = self.folder / "images" / entry.image
+    def read_preview(self, entry: Entry) -> bytes | None:
+        """Return the JPEG file of an image's preview, or None if the dataset has none."""
+        if not self.description.options["previews"]:
+            return None
+        ending = "jpg" if self.layout == "folder" else "preview.jpg"
+        return self._bytes(self._name(f"{PurePosixPath(entry.image).stem}.{ending}", entry.split, "previews"))
+
+    @property
+    def layout(self) -> str:
+        """How its images lie."""
+        return str(self.description.options.get("layout", "folder"))
+
+    @cached_property
+    def sources(self) -> tuple[SourceRecord, ...]:
+        """The sources that were used, in their order.
+
+        Raises
+        ------
+        FormatError
+            Their list is damaged.
+        """
+        rows: Iterable[dict[str, Any]]
+        if self.store.has(SOURCES):
+            rows = csv.DictReader(io.StringIO(self.store.get(SOURCES).decode("utf-8", "replace")))
+        else:
+            rows = json.loads(self.store.get(DESCRIPTION))["sources"]  # Version 1 had them there.
         try:
-            data = np.frombuffer(path.read_bytes(), np.uint8)
-        except OSError as error:
-            raise FormatError(f"cannot read {path}: {error.strerror}; make the dataset again") from error
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-        if image is None or image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3:
-            raise FormatError(f"{path} is no 16-bit RGB image, or damaged; make the dataset again")
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint16)
+            return tuple(
+                SourceRecord.model_validate({key: None if value == "" else value for key, value in row.items()})
+                for row in rows
+            )
+        except ValidationError as error:
+            raise FormatError(f"{self.store.place}/{SOURCES} is damaged; make the dataset again") from error
 
-    def preview_path(self, entry: Entry) -> Path:
-        """Return where the preview of an image is, if the dataset has previews."""
-        return self.folder / "previews" / f"{Path(entry.image).stem}.jpg"
+    def _name(self, file: str, split: str | None, kind: str) -> str:
+        if self.layout == "folder":
+            return f"{kind}/{file}"
+        number = int(file.partition(".")[0])
+        shard = shard_key(number // int(self.description.options["shard_images"]))
+        return f"{split or 'data'}/{shard}.{'tar' if self.layout == 'webdataset' else 'parquet'}/{file}"
+
+    def _bytes(self, name: str) -> bytes:
+        if self.layout == "folder":
+            return self.store.get(name)
+        container, _, file = name.rpartition("/")
+        return read_member(self.layout, self.store, container, file)
 
 
-def open_dataset(folder: Path) -> Dataset:
-    """Open a dataset folder; reads no image.
+def open_dataset(place: Path | str) -> Dataset:
+    """Open a dataset; reads no image.
+
+    Parameters
+    ----------
+    place
+        Its folder, or its URL in a store that fsspec knows.
 
     Raises
     ------
     FormatError
-        The folder is no dataset, of a version not known here, or its files disagree.
+        There is no dataset, it is of a version not known here, or its files disagree.
     """
-    path = folder / "dataset.json"
-    try:
-        description = Description.model_validate_json(path.read_bytes())
-        text = (folder / "ground_truth.csv").read_text(encoding="utf-8-sig")
-    except OSError as error:
+    store = open_store(place)
+    if not store.has(DESCRIPTION):
+        raise FormatError(f"{place} is no dataset: it has no {DESCRIPTION}; make one with generate")
+    description = _load_description(store)
+    entries = tuple(_entries(store, description))
+    if len(entries) != description.images:
         raise FormatError(
-            f"{folder} is no dataset: cannot read {error.filename} ({error.strerror}); make one with generate"
-        ) from error
+            f"{place}/{GROUND_TRUTH} has rows of {len(entries)} images, expected the {description.images} of "
+            f"{DESCRIPTION}; make the dataset again"
+        )
+    return Dataset(store, description, entries)
+
+
+def _load_description(store: Store) -> Description:
+    name = f"{store.place}/{DESCRIPTION}"
+    try:
+        told: dict[str, Any] = json.loads(store.get(DESCRIPTION))
+        if told["version"] == 1:
+            told = _upgraded(told)
+        return Description.model_validate(told)
     except ValidationError as error:
         first = error.errors()[0]
         raise FormatError(
-            f"{path} is no dataset's description: {'.'.join(map(str, first['loc']))}: {first['msg']}; "
-            f"this software reads {FORMAT} of version {VERSION}"
+            f"{name} is no dataset's description: {'.'.join(map(str, first['loc']))}: {first['msg']}; this software "
+            f"reads {FORMAT} of versions 1 to {VERSION}"
         ) from error
-    except UnicodeDecodeError as error:
-        raise FormatError(f"{folder / 'ground_truth.csv'} is no text; make the dataset again") from error
-    entries: list[Entry] = []
-    for number, row in enumerate(csv.DictReader(io.StringIO(text)), start=2):
+    except (ValueError, KeyError, TypeError) as error:
+        raise FormatError(f"{name} is damaged ({error}); make the dataset again") from error
+
+
+def _upgraded(told: dict[str, Any]) -> dict[str, Any]:
+    """Return a description of version 1, which listed the sources themselves, as one of version 2."""
+    sources = told["sources"]
+    counts = {
+        "sources": len(sources),
+        "pixels": sum(source["width"] * source["height"] for source in sources),
+        "replaced_pixels": sum(source["replaced_pixels"] for source in sources),
+    }
+    return told | counts | {"version": VERSION, "planned": told["images"]}
+
+
+def _entries(store: Store, description: Description) -> Iterator[Entry]:
+    """Yield the images of `ground_truth.csv`, whose rows of one image follow each other."""
+    name = f"{store.place}/{GROUND_TRUTH}"
+    part_of: dict[str, Split] = {
+        image: part
+        for part in SPLITS
+        if part in description.splits
+        for image in store.get(f"splits/{part}.txt").decode("utf-8", "replace").split()
+    }
+    truths = iter(store.get(TRUTHS).decode("utf-8", "replace").splitlines())
+    rows = csv.DictReader(io.StringIO(store.get(GROUND_TRUTH).decode("utf-8-sig", "replace")))
+    seen: set[str] = set()
+    for image, group in groupby(enumerate(rows, start=2), key=lambda numbered: numbered[1].get("image")):
+        lights: list[str] = []
+        whites: list[Triple] = []
+        source = ""
+        for number, row in group:
+            try:
+                lights.append(parse_mixture(row["illumination"]).label)
+                whites.append(_triple((row["r"], row["g"], row["b"])))
+                source = row["source"]
+            except (KeyError, TypeError, ValueError, InputError) as error:
+                raise FormatError(f"{name}, line {number}: expected {','.join(GROUND_TRUTH_COLUMNS)}") from error
         try:
-            truth = (float(row["r"]), float(row["g"]), float(row["b"]))
-            entries.append(Entry(row["image"], row["source"], int(row["illumination"]), truth))
-        except (KeyError, TypeError, ValueError) as error:
-            raise FormatError(f"{folder / 'ground_truth.csv'}, line {number}: expected {','.join(COLUMNS)}") from error
-    if len(entries) != description.images or len({entry.image for entry in entries}) != len(entries):
-        raise FormatError(
-            f"{folder / 'ground_truth.csv'} has {len(entries)} rows, expected one for each of the "
-            f"{description.images} images of dataset.json; make the dataset again"
-        )
-    return Dataset(folder, description, tuple(entries))
+            truth = _triple(next(truths, "").split())
+        except ValueError as error:
+            raise FormatError(
+                f"{store.place}/{TRUTHS}: expected three numbers for each of the {description.images} images of "
+                f"{DESCRIPTION}; make the dataset again"
+            ) from error
+        if not image or image in seen:
+            raise FormatError(f"{name}: the rows of {image!r} do not follow each other; make the dataset again")
+        seen.add(image)
+        yield Entry(image, source, tuple(lights), tuple(whites), truth, part_of.get(image))
 
 
-@dataclass(frozen=True)
-class _Read:
-    picture: Picture
-    sha256: str | None
-    replaced: int
-
-
-@dataclass(frozen=True)
-class _Written:
-    entry: Entry
-    sums: tuple[tuple[str, str], ...]
+def _triple(numbers: Sequence[str]) -> Triple:
+    red, green, blue = (float(number) for number in numbers)
+    return red, green, blue
 
 
 def generate_dataset(
     lut: Lut,
-    folder: Path,
+    out: Path | str,
     sources: Sequence[Source],
     lights: LightChoice | Sequence[int],
     *,
     seed: int = 0,
-    form: ImageFormat = "png",
-    max_side: int | None = None,
-    workers: int = 1,
+    form: Format = "png",
+    layout: Layout = "folder",
     previews: bool = True,
-    on_image: Callable[[], None] | None = None,
-    on_skip: Callable[[Source, str], None] | None = None,
+    split: tuple[float, float, float] | None = None,
+    shard_images: int = SHARD_IMAGES,
+    reading: Mapping[str, Any] | None = None,
+    engine: str = "local",
+    workers: int = 1,
+    on_image: OnImage | None = None,
+    on_skip: OnSkip | None = None,
 ) -> Dataset:
     """Make a dataset: every source picture under its lights.
 
@@ -242,229 +271,143 @@ def generate_dataset(
     ----------
     lut
         The table.
-    folder
-        Where the dataset is to be; must be free. It appears when it is complete.
+    out
+        Where the dataset is to be, a folder or a URL of a store that fsspec knows; must be free. It appears when it is
+        complete. What an earlier call with the same plan left there is gone on with.
     sources
-        The pictures; see `scene.find_pictures` and `scene.random_scenes`.
+        The pictures; see `scene`.
     lights
         Which lights fall on which picture; see `illuminant`. A sequence of numbers is the same for every picture.
     seed
         0 … 2⁶⁴ − 1; chooses the samples of every pixel.
-    form
-        File format of the images.
-    max_side
-        What the sources were made with, px; recorded only.
+    form, layout, previews, split, shard_images, reading
+        See `plan.Options`; `reading` is its `sources`.
+    engine
+        Who does the work; see `engines.parse_engine`. No byte depends on it.
     workers
-        Threads that read, render, encode and write; at most about three pictures are in memory for each.
-    previews
-        Whether to write small tone-mapped pictures beside the images.
-    on_image
-        Called after each image, from the calling thread.
-    on_skip
-        Called with each source that cannot be read, and the reason.
+        Threads, or processes of a cluster on this machine; at most about three pictures are in memory for each.
+    on_image, on_skip
+        Called after each image, and for each source that cannot be read, from the calling thread.
 
     Raises
     ------
     InputError
-        A light is not in the table, the folder is taken, or there is no source.
+        A light is not in the table, the place is taken or belongs to another plan, or there is no source.
     FormatError
         None of the sources can be read.
     StorageError
-        The disk is full, read-only or gone; nothing is left behind.
+        The disk is full, read-only or gone; the shards that are done are kept for the next call.
     """
-    from generator.palette import fit_picture
-
     choice: LightChoice = lights if isinstance(lights, LightChoice) else ListedLights(tuple(lights))
-    if not sources or not choice.lights_each:
-        raise InputError(f"{len(sources)} pictures under {choice.lights_each} lights make no image; name some of both")
-    if workers < 1:
-        raise InputError(f"{workers} workers were asked for, expected 1 or more")
-
-    def read(source: Source) -> _Read:
-        picture, replaced = fit_picture(source.read(), lut.provenance)
-        return _Read(picture, source.sha256(), replaced)
-
-    records: list[SourceRecord] = []
-    skipped: list[Skipped] = []
-    written: list[_Written] = []
-    with whole_folder(folder, "the dataset") as partial:
-        (partial / "images").mkdir()
-        if previews:
-            (partial / "previews").mkdir()
-        pool = ThreadPoolExecutor(workers)
-        pending: deque[Future[_Written]] = deque()
-        ahead: deque[Future[_Read]] = deque()
-        try:
-
-            def finish_one() -> None:
-                written.append(pending.popleft().result())
-                if on_image:
-                    on_image()
-
-            number = 0
-            for position, source in enumerate(sources):
-                while len(ahead) <= workers and position + len(ahead) < len(sources):
-                    ahead.append(pool.submit(read, sources[position + len(ahead)]))
-                try:
-                    got = ahead.popleft().result()
-                except (FormatError, OSError) as error:
-                    skipped.append(Skipped(position=position, name=source.name))
-                    if on_skip:
-                        on_skip(source, str(error))
-                    continue
-                height, width = got.picture.shape[:2]
-                records.append(
-                    SourceRecord(
-                        position=position,
-                        name=source.name,
-                        sha256=got.sha256,
-                        width=width,
-                        height=height,
-                        replaced_pixels=got.replaced,
-                    )
-                )
-                for light in choice.lights_of(position):
-                    while len(pending) >= 2 * workers:
-                        finish_one()
-                    name = f"{number:06d}"
-                    job = (lut, partial, name, source.name, got.picture, light, seed, number, form, previews)
-                    pending.append(pool.submit(_write_image, *job))
-                    number += 1
-            while pending:
-                finish_one()
-        finally:
-            pool.shutdown(cancel_futures=True)
-        if not written:
-            raise FormatError(f"none of the {len(sources)} pictures can be read; name a folder of other pictures")
-        used = sorted({image.entry.illumination for image in written})
-        description = Description(
-            software=software(),
-            libraries=libraries(),
-            table=_table_of(lut),
-            seed=seed,
-            options={"format": form, "max_side": max_side, "lights": choice.describe(), "previews": previews},
-            images=len(written),
-            lights=[_light_of(lut, light) for light in used],
-            sources=records,
-            skipped=skipped,
-        )
-        entries = tuple(image.entry for image in written)
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for entry in entries:
-            writer.writerow([entry.image, entry.source, entry.illumination, *(f"{part:.9f}" for part in entry.truth)])
-        truths = "".join("{:.9f} {:.9f} {:.9f}\n".format(*entry.truth) for entry in entries)
-        sums = "".join(f"{digest}  {name}\n" for image in written for name, digest in image.sums)
-        write_whole(partial / "ground_truth.csv", text.getvalue())
-        write_whole(partial / "gt.txt", truths)
-        write_whole(partial / "SHA256SUMS", sums)
-        write_whole(partial / "dataset.json", description.model_dump_json(indent=2) + "\n")
-    return open_dataset(folder)
+    options = Options(
+        form=form,
+        layout=layout,
+        previews=previews,
+        split=split,
+        shard_images=shard_images,
+        sources=dict(reading or {}),
+    )
+    plan = Plan(lut, sources, choice, seed, options)
+    return make_dataset(plan, out, engine=engine, workers=workers, on_image=on_image, on_skip=on_skip)
 
 
-def libraries() -> dict[str, str]:
-    """Return the versions of what decodes sources and encodes images: other versions may give other bytes."""
-    versions = {
-        name: importlib.metadata.version(name) for name in ("numpy", "OpenImageIO", "opencv-contrib-python-headless")
-    }
-    return {**versions, "zlib": zlib.ZLIB_RUNTIME_VERSION}
+def make_dataset(
+    plan: Plan,
+    out: Path | str,
+    *,
+    engine: str = "local",
+    workers: int = 1,
+    on_done: OnDone | None = None,
+    on_image: OnImage | None = None,
+    on_skip: OnSkip | None = None,
+) -> Dataset:
+    """Make the dataset of a plan, or go on with it; parameters and errors as of `generate_dataset`.
+
+    `on_done` is told how many of the planned images were there already.
+    """
+    check_workers(engine, workers)
+    identity = plan.identity()
+    if not finished(out, identity):
+        with workplace(out, identity) as place:
+            _make(plan, place, range(plan.shards), engine, workers, on_done, on_image, on_skip)
+            try:
+                assemble(place, identity)
+            except NothingMadeError:
+                place.discard()
+                raise
+    return open_dataset(out)
 
 
-def software() -> str:
-    """Return name and version of this program."""
-    return f"croplab {importlib.metadata.version('croplab')}"
-
-
-def preview_of(image: npt.NDArray[np.uint16], white_level: int, side: int = PREVIEW_SIDE) -> Picture:
-    """Return the raw look of an image: made small, then tone mapped; colours are the camera's and the light's.
+def make_share(
+    plan: Plan,
+    out: Path | str,
+    share: tuple[int, int],
+    *,
+    engine: str = "local",
+    workers: int = 1,
+    on_done: OnDone | None = None,
+    on_image: OnImage | None = None,
+    on_skip: OnSkip | None = None,
+) -> tuple[int, int]:
+    """Make one of several shares of a dataset, beside other programs that make theirs; `finish_dataset` ends it.
 
     Parameters
     ----------
-    image
-        (H, W, 3) uint16, linear camera RGB.
-    white_level
-        Value of saturation.
-    side
-        Longest side allowed, px.
+    share
+        (i, n): the shards whose number leaves i when divided by n, i from 0.
 
     Returns
     -------
-    ndarray
-        (h, w, 3) uint8.
+    tuple
+        How many shards of the whole dataset are done now, and how many there are.
     """
-    import cv2
-
-    from generator.tonemap import flash
-
-    linear = image.astype(np.float32) / np.float32(white_level)
-    height, width = image.shape[:2]
-    scale = side / max(height, width)
-    if scale < 1:
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        linear = np.asarray(cv2.resize(linear, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-    return flash(linear)
+    check_workers(engine, workers)
+    index, count = share
+    if not 0 <= index < count:
+        raise InputError(f"share {index} of {count} was asked for, expected 0 to {count - 1}")
+    with workplace(out, plan.identity(), alone=False) as place:
+        _make(plan, place, range(index, plan.shards, count), engine, workers, on_done, on_image, on_skip)
+        return len(place.done()), plan.shards
 
 
-def check_free(folder: Path) -> None:
-    """Raise an InputError if `folder` is taken, so that a command can say so before it does any work."""
-    require_free(folder, "the dataset")
+def finish_dataset(out: Path | str) -> Dataset:
+    """Make a dataset of its shards when every share is done.
+
+    Raises
+    ------
+    InputError
+        No dataset is being made there, shards are missing, or another program is at it.
+    """
+    identity = stored_identity(out)
+    if not finished(out, identity):
+        with workplace(out, identity) as place:
+            missing = sorted(set(range(identity["shards"])) - place.done())
+            if missing:
+                named = ", ".join(map(str, missing[:10])) + (" …" if len(missing) > 10 else "")
+                raise InputError(
+                    f"{len(missing)} of {identity['shards']} shards of {out} are not made yet: {named}; run their "
+                    "shares, or the command without a share, which makes all that is missing"
+                )
+            assemble(place, identity)
+    return open_dataset(out)
 
 
-def default_workers() -> int:
-    """Return the number of processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _make(
+    plan: Plan,
+    place: Workplace,
+    wanted: range,
+    engine: str,
+    workers: int,
+    on_done: OnDone | None,
+    on_image: OnImage | None,
+    on_skip: OnSkip | None,
+) -> None:
+    done = place.done()
+    missing = [shard for shard in wanted if shard not in done]
+    if on_done is not None:
+        on_done(sum(plan.images_of(shard) for shard in wanted if shard in done))
+    make_shards(engine, plan, missing, place, workers, on_image or _ignore, on_skip or _ignore)
 
 
-def _write_image(
-    lut: Lut,
-    partial: Path,
-    name: str,
-    source: str,
-    picture: Picture,
-    light: int,
-    seed: int,
-    number: int,
-    form: ImageFormat,
-    previews: bool,
-) -> _Written:
-    from generator.encode import encode_image, encode_preview
-    from generator.kernel import draw_samples, read_light
-
-    samples = read_light(lut, light, picture.shape[0] * picture.shape[1])
-    image = draw_samples(samples, picture, seed=seed, image=number)
-    sums: list[tuple[str, str]] = []
-
-    def store(path: str, data: bytes) -> None:
-        write_whole(partial / path, data)
-        sums.append((path, hashlib.sha256(data).hexdigest()))
-
-    store(f"images/{name}.{form}", encode_image(image, form))
-    if previews:
-        store(f"previews/{name}.jpg", encode_preview(preview_of(image, lut.provenance.white_level)))
-    red, green, blue = (float(part) for part in lut.ground_truth[light])
-    return _Written(Entry(f"{name}.{form}", source, light, (red, green, blue)), tuple(sums))
-
-
-def _table_of(lut: Lut) -> Table:
-    known = lut.provenance
-    return Table(
-        sha256=lut.sha256,
-        camera=known.camera,
-        bits=known.bits,
-        samples=lut.samples.shape[2],
-        white_level=known.white_level,
-        software=known.software,
-    )
-
-
-def _light_of(lut: Lut, light: int) -> Light:
-    shown = lut.illuminations[light]
-    red, green, blue = (float(part) for part in lut.white[light])
-    return Light(
-        illumination=light,
-        kind=shown.kind,
-        cct_k=shown.cct_k,
-        codes=(shown.colour.red, shown.colour.green, shown.colour.blue),
-        white=(red, green, blue),
-    )
+def _ignore(*told: object) -> None:
+    del told

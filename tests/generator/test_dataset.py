@@ -15,9 +15,8 @@ import numpy.typing as npt
 import pytest
 
 from drivers.errors import FormatError, InputError
-from generator import dataset as dataset_module
 from generator.contact import contact_sheet
-from generator.dataset import generate_dataset, open_dataset
+from generator.dataset import Dataset, Entry, generate_dataset, open_dataset
 from generator.illuminant import RandomLights
 from generator.kernel import render
 from generator.scene import find_pictures, random_scenes, read_picture
@@ -26,6 +25,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from calibration.lut import Lut
+
+
+NUMBERS = (0, 1, 2, 3, 6, 7, 8, 9)
+"""Of the images of `pictures` under two lights: the third picture leaves its two numbers free."""
 
 
 @pytest.fixture
@@ -62,15 +65,16 @@ def test_what_is_in_the_folder(make_lut: Callable[..., Lut], pictures: Path, tmp
         seed=77,
         workers=2,
         on_image=lambda: images.append(1),
-        on_skip=lambda source, reason: skipped.append((source.name, reason)),
+        on_skip=lambda name, reason, missed: skipped.append((name, f"{reason} ({missed} images)")),
     )
     assert len(images) == 8
     assert [name for name, _ in skipped] == ["broken.jpg"]
-    assert "not a JPEG file" in skipped[0][1]
+    assert "JPEG" in skipped[0][1]
+    assert skipped[0][1].endswith("(2 images)")
     with (tmp_path / "out" / "ground_truth.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert list(rows[0]) == ["image", "source", "illumination", "r", "g", "b"]
-    assert [row["image"] for row in rows] == [f"{number:06d}.png" for number in range(8)]
+    assert [row["image"] for row in rows] == [f"{number:06d}.png" for number in NUMBERS]
     assert [row["source"] for row in rows] == [
         name for name in ("a.png", "b, c.png", "more/d.png", "more/e.png") for _ in range(2)
     ]
@@ -80,27 +84,39 @@ def test_what_is_in_the_folder(make_lut: Callable[..., Lut], pictures: Path, tmp
     np.testing.assert_allclose(np.sum(truths, axis=1), 1, atol=2e-9)
     np.testing.assert_array_equal(np.loadtxt(tmp_path / "out" / "gt.txt"), truths)
     described = json.loads((tmp_path / "out" / "dataset.json").read_text())
-    assert (described["format"], described["version"], described["seed"]) == ("crop.dataset", 1, 77)
+    assert (described["format"], described["version"], described["seed"]) == ("crop.dataset", 2, 77)
     assert described["table"]["sha256"] == lut.sha256
     assert described["table"]["white_level"] == 8000
+    assert (described["planned"], described["images"], described["sources"]) == (10, 8, 4)
     assert described["skipped"] == [{"position": 2, "name": "broken.jpg"}]
+    with (tmp_path / "out" / "sources.csv").open(newline="") as stream:
+        sources = list(csv.DictReader(stream))
+    assert [(row["position"], row["name"]) for row in sources] == [
+        ("0", "a.png"),
+        ("1", "b, c.png"),
+        ("3", "more/d.png"),
+        ("4", "more/e.png"),
+    ]
     file = pictures / "b, c.png"
-    assert described["sources"][1]["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert sources[1]["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert (sources[1]["width"], sources[1]["height"]) == ("17", "31")
     assert str(tmp_path) not in (tmp_path / "out" / "dataset.json").read_text()
-    for line in (tmp_path / "out" / "SHA256SUMS").read_text().splitlines():
-        digest, name = line.split("  ")
-        assert contents(tmp_path / "out")[name] == digest
+    lines = (tmp_path / "out" / "SHA256SUMS").read_text().splitlines()
+    listed = {name: digest for digest, name in (line.split("  ") for line in lines)}
+    assert listed == {name: digest for name, digest in contents(tmp_path / "out").items() if name != "SHA256SUMS"}
     # Every image is the one that its number, source and light say, by the reader and by OpenCV alone.
     again = open_dataset(tmp_path / "out")
     assert again == made
-    for number, entry in enumerate(again.entries):
-        expected = render(lut, read_picture(pictures / entry.source), entry.illumination, seed=77, image=number)
+    for number, entry in zip(NUMBERS, again.entries, strict=True):
+        expected = render(lut, read_picture(pictures / entry.source), int(entry.illumination), seed=77, image=number)
         np.testing.assert_array_equal(again.read_image(entry), expected)
         path = tmp_path / "out" / "images" / entry.image
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         assert stored is not None
         np.testing.assert_array_equal(stored[..., ::-1], expected)
-        preview = cv2.imread(str(again.preview_path(entry)))
+        data = again.read_preview(entry)
+        assert data is not None
+        preview = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert preview is not None
         assert max(preview.shape[:2]) == min(512, max(expected.shape[:2]))
 
@@ -124,25 +140,24 @@ def test_replaced_pixels_are_counted(make_lut: Callable[..., Lut], pictures: Pat
     top = source.read() >> 6
     count = int(((top == 0).all(axis=2) | (top == 1).all(axis=2)).sum())  # colour 21 is (1, 1, 1)
     assert count > 0
-    assert made.description.sources[0].replaced_pixels == count
+    assert made.description.replaced_pixels == count
+    assert [source.replaced_pixels for source in made.sources] == [count]
+    assert made.read_preview(made.entries[0]) is None
     assert not (tmp_path / "out" / "previews").exists()
 
 
-def test_nothing_is_left_of_a_dataset_that_fails(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
+def test_nothing_is_left_of_a_dataset_that_cannot_be(
+    make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path
+) -> None:
     lut = make_lut()
     sources = find_pictures([pictures])
     before = contents(tmp_path)
-
-    def interrupt() -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        generate_dataset(lut, tmp_path / "out", sources, [0, 1], workers=3, on_image=interrupt)
     with pytest.raises(InputError, match="there is no light 9"):
         generate_dataset(lut, tmp_path / "out", sources, [0, 9], workers=2)
     with pytest.raises(FormatError, match="none of the 1 pictures can be read"):
         generate_dataset(lut, tmp_path / "out", find_pictures([pictures / "broken.jpg"]), [0])
     assert contents(tmp_path) == before
+    assert not list(tmp_path.glob(".out*"))
     assert threading.active_count() == 1
 
 
@@ -170,7 +185,7 @@ def small(make_lut: Callable[..., Lut], tmp_path: Path) -> Path:
 def test_a_damaged_dataset_is_named(small: Path, tmp_path: Path) -> None:
     opened = open_dataset(small)
     (small / "images" / opened.entries[0].image).write_bytes(b"II*")
-    with pytest.raises(FormatError, match=r"000000\.tiff is no 16-bit RGB image"):
+    with pytest.raises(FormatError, match=r"000000\.tiff cannot be read as tiff"):
         opened.read_image(opened.entries[0])
     (small / "images" / opened.entries[1].image).unlink()
     with pytest.raises(FormatError, match=r"cannot read .*000001\.tiff: No such file"):
@@ -178,16 +193,16 @@ def test_a_damaged_dataset_is_named(small: Path, tmp_path: Path) -> None:
     table = small / "ground_truth.csv"
     text = table.read_text()
     table.write_text("\n".join(text.splitlines()[:-1]))
-    with pytest.raises(FormatError, match="has 1 rows, expected one for each of the 2 images"):
+    with pytest.raises(FormatError, match="has rows of 1 images, expected the 2 of"):
         open_dataset(small)
     table.write_text(text.replace(",1,", ",one,"))
     with pytest.raises(FormatError, match=r"ground_truth\.csv, line 2: expected image,source"):
         open_dataset(small)
     path = small / "dataset.json"
-    path.write_text(path.read_text().replace('"version": 1', '"version": 2'))
-    with pytest.raises(FormatError, match=r"version: .*reads crop\.dataset of version 1"):
+    path.write_text(path.read_text().replace('"version": 2', '"version": 3'))
+    with pytest.raises(FormatError, match=r"version: .*reads crop\.dataset of versions 1 to 2"):
         open_dataset(small)
-    with pytest.raises(FormatError, match=r"is no dataset: cannot read .*; make one with generate"):
+    with pytest.raises(FormatError, match=r"is no dataset: it has no dataset\.json; make one with generate"):
         open_dataset(tmp_path / "nowhere")
 
 
@@ -195,13 +210,13 @@ def test_a_contact_sheet_shows_rows_of_sources(
     make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[str] = []
-    load = dataset_module.Dataset.read_image
+    load = Dataset.read_image
 
-    def read(self: dataset_module.Dataset, entry: dataset_module.Entry) -> npt.NDArray[np.uint16]:
+    def read(self: Dataset, entry: Entry) -> npt.NDArray[np.uint16]:
         shown.append(entry.image)
         return load(self, entry)
 
-    monkeypatch.setattr(dataset_module.Dataset, "read_image", read)
+    monkeypatch.setattr(Dataset, "read_image", read)
     made = generate_dataset(make_lut(), tmp_path / "out", random_scenes(5, 24, 16), [0, 1, 2, 3], previews=False)
     whole = contact_sheet(made)
     assert len(shown) == 20

@@ -1,0 +1,132 @@
+"""How a dataset's images lie: each in its own file, or those of a shard together in one file."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Protocol, Self
+
+from generator.plan import ShardJob
+from generator.records import FileSum, ImageRecord, Split, image_key
+from generator.store import Store
+
+
+@dataclass(frozen=True)
+class Sample:
+    """An image with all that goes with it, ready to be written.
+
+    Attributes
+    ----------
+    record
+        Its number, source and ground truth.
+    source, split
+        Its source's name, and the part of the dataset it belongs to.
+    width, height
+        px.
+    files
+        Kind (`images`, `previews`, `masks`), what follows the number in the file's name, and the bytes; the image
+        first.
+    stored
+        What is written already.
+    """
+
+    record: ImageRecord
+    source: str
+    split: Split | None
+    width: int
+    height: int
+    files: tuple[tuple[str, str, bytes], ...]
+    stored: tuple[FileSum, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """The number as it stands in names."""
+        return image_key(self.record.number)
+
+
+Fault = tuple[type[BaseException] | None, BaseException | None, TracebackType | None]
+"""What ended a block."""
+
+
+class ShardWriter(Protocol):
+    """Writes the samples of one shard, in a block; files that are still open appear only if the block ends well."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *error: *Fault) -> None: ...
+
+    def store(self, sample: Sample) -> Sample:
+        """Write what can be written by itself and return what `append` is to take; called from any thread."""
+        ...
+
+    def append(self, sample: Sample) -> None:
+        """Take the next sample, in the order of their numbers."""
+        ...
+
+    def close(self) -> list[FileSum]:
+        """Finish all files and return them in the order of their names or numbers."""
+        ...
+
+
+class FolderWriter:
+    """Each image in a file of its own: `images/000123.png`, `previews/000123.jpg`."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._files: list[FileSum] = []
+
+    def store(self, sample: Sample) -> Sample:
+        """Write the files of a sample, and let go of their bytes."""
+        sums: list[FileSum] = []
+        for kind, ending, data in sample.files:
+            name = f"{kind}/{sample.key}{ending}"
+            self._store.put(name, data)
+            sums.append(FileSum(name=name, sha256=hashlib.sha256(data).hexdigest()))
+        return replace(sample, files=(), stored=tuple(sums))
+
+    def append(self, sample: Sample) -> None:
+        """Note the files of a sample."""
+        self._files += sample.stored
+
+    def close(self) -> list[FileSum]:
+        """Return all files."""
+        return self._files
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: *Fault) -> None:
+        """Leave the files where they are: whoever makes the shard again writes the same."""
+
+
+def open_writer(job: ShardJob, store: Store) -> ShardWriter:
+    """Return the writer of a shard in the layout that its job asks for."""
+    match job.options.layout:
+        case "folder":
+            return FolderWriter(store)
+        case "webdataset":
+            from generator.webdataset import TarWriter
+
+            return TarWriter(store, job)
+        case "parquet":
+            from generator.parquet import ParquetWriter
+
+            return ParquetWriter(store, job)
+
+
+def read_member(layout: str, store: Store, container: str, file: str) -> bytes:
+    """Return the bytes of an image that lies with others in one file.
+
+    Raises
+    ------
+    FormatError
+        The file is missing or damaged, or there is no such image in it.
+    """
+    if layout == "webdataset":
+        from generator import webdataset
+
+        return webdataset.read_member(store, container, file)
+    from generator import parquet
+
+    return parquet.read_member(store, container, file)

@@ -1,0 +1,130 @@
+"""WebDataset shards: plain tar files in which what belongs to one image stands together under one number.
+
+    000123.png           the image
+    000123.json          its ground truth, source and part
+    000123.preview.jpg   its preview, where there are previews
+
+The format is POSIX.1-1988 ustar. Owner, time and mode are the same in every header, so that equal images make equal
+files. Layout of names after the WebDataset specification ("key", then everything after the first dot).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import tarfile
+from contextlib import ExitStack
+from typing import Any, BinaryIO, Final, Self, cast
+
+from drivers.errors import FormatError
+from generator.layouts import Fault, Sample
+from generator.plan import ShardJob
+from generator.records import FileSum, shard_key
+from generator.store import Store
+
+_ENDINGS: Final = {"images": "", "previews": ".preview", "masks": ".masks"}
+
+
+class Hashed(io.RawIOBase):
+    """A stream to write to in order, which hashes what passes."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._digest = hashlib.sha256()
+        self._written = 0
+
+    def writable(self) -> bool:
+        """Return True."""
+        return True
+
+    def write(self, data: Any) -> int:
+        """Write bytes."""
+        self._digest.update(data)
+        self._stream.write(data)
+        self._written += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Return how many bytes were written."""
+        return self._written
+
+    @property
+    def sha256(self) -> str:
+        """Hash of all that was written."""
+        return self._digest.hexdigest()
+
+
+def about(sample: Sample) -> dict[str, Any]:
+    """Return what is told about an image beside its pixels, as JSON holds it."""
+    record = sample.record
+    return {
+        "image": record.number,
+        "source": sample.source,
+        "split": sample.split,
+        "width": sample.width,
+        "height": sample.height,
+        "truth": list(record.truth),
+        "lights": [{"illumination": light.illumination, "truth": list(light.truth)} for light in record.lights],
+    }
+
+
+class TarWriter:
+    """Writes the images of a shard to `data/000003.tar`, or to one file for each part of the dataset."""
+
+    def __init__(self, store: Store, job: ShardJob) -> None:
+        self._store = store
+        self._shard = shard_key(job.shard)
+        self._stack = ExitStack()
+        self._open: dict[str, tuple[tarfile.TarFile, Hashed]] = {}
+
+    def store(self, sample: Sample) -> Sample:
+        """Return the sample: the files of a shard are written one after the other."""
+        return sample
+
+    def append(self, sample: Sample) -> None:
+        """Write an image and what belongs to it."""
+        name = f"{sample.split or 'data'}/{self._shard}.tar"
+        if name not in self._open:
+            hashed = Hashed(self._stack.enter_context(self._store.create(name)))
+            tar = tarfile.open(fileobj=cast("Any", hashed), mode="w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
+            self._open[name] = (tar, hashed)
+        tar = self._open[name][0]
+        text = json.dumps(about(sample), ensure_ascii=False) + "\n"
+        for kind, ending, data in (*sample.files, ("images", ".json", text.encode())):
+            header = tarfile.TarInfo(f"{sample.key}{_ENDINGS[kind]}{ending}")
+            header.size = len(data)
+            header.mode = 0o644
+            tar.addfile(header, io.BytesIO(data))
+
+    def close(self) -> list[FileSum]:
+        """Finish the files and return them."""
+        for tar, _ in self._open.values():
+            tar.close()
+        self._stack.close()
+        return [FileSum(name=name, sha256=self._open[name][1].sha256) for name in sorted(self._open)]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: *Fault) -> None:
+        self._stack.__exit__(*error)
+
+
+def read_member(store: Store, container: str, file: str) -> bytes:
+    """Return the bytes of the file called `file` in the tar file called `container`.
+
+    Raises
+    ------
+    FormatError
+        The tar file is missing or damaged, or there is no such file in it.
+    """
+    with store.open(container) as stream:
+        try:
+            with tarfile.open(fileobj=stream, mode="r:") as tar:
+                for header in tar:
+                    if header.name == file and (member := tar.extractfile(header)) is not None:
+                        return member.read()
+        except tarfile.TarError as error:
+            raise FormatError(f"{store.place}/{container} is damaged: {error}; make the dataset again") from error
+    raise FormatError(f"{store.place}/{container} holds no {file}; make the dataset again")

@@ -1,0 +1,346 @@
+"""The place where a dataset is made, so that it can be gone on with, and appears when it is complete.
+
+On a disk everything happens in the hidden folder `.OUT.partial`: `dataset/` fills with files, `plan/` holds the plan
+and the records of the shards that are done. At the end `dataset/` gets its name by one rename, then the rest is
+removed. An object store has no rename: the files lie where they stay, the notes below `OUT/.plan/`, and `dataset.json`,
+written last, makes a dataset of them.
+
+Laws that hold inside:
+
+- A place belongs to one plan. Another plan is refused, and told in what it differs.
+- Whoever makes the whole dataset holds the folder alone; those who make a share each hold it together.
+- What holds no finished shard is not worth keeping and is removed when the work fails.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Final, cast
+
+from pydantic import ValidationError
+
+from drivers.errors import FormatError, InputError
+from drivers.storage import partial_path, require_free, storage_error, sync_folder
+from generator.records import ShardRecord, shard_key
+from generator.store import LocalStore, RemoteStore, Store, is_remote, local_path, open_store
+
+DESCRIPTION: Final = "dataset.json"
+PLAN: Final = "plan.json"
+RECORDS: Final = "shards"
+_NOTES: Final = ".plan"
+_NO_LOCKS: Final = {errno.ENOLCK, errno.EBADF, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
+"""What a file system says that cannot lock a folder."""
+
+Identity = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Where a dataset is being made.
+
+    Attributes
+    ----------
+    files
+        What will be the dataset.
+    notes
+        The plan and the shards' records, which will be thrown away.
+    out
+        The dataset's place.
+    """
+
+    files: Store
+    notes: Store
+    out: str
+
+    def done(self) -> set[int]:
+        """Return the shards that are done."""
+        return {int(PurePosixPath(name).stem) for name in self.notes.names(RECORDS) if name.endswith(".json")}
+
+    def has(self, shard: int) -> bool:
+        """Return whether a shard is done."""
+        return self.notes.has(_record_name(shard))
+
+    def load(self, shard: int) -> ShardRecord:
+        """Return the record of a shard that is done.
+
+        Raises
+        ------
+        FormatError
+            There is none, or it is damaged.
+        """
+        name = _record_name(shard)
+        try:
+            return ShardRecord.model_validate_json(self.notes.get(name))
+        except ValidationError as error:
+            raise FormatError(
+                f"{self.notes.place}/{name} is damaged; remove it and run the same command again, which makes it anew"
+            ) from error
+
+    def commit(self, record: ShardRecord) -> None:
+        """Bring a shard's files to the disk, then its record: from here on it is done."""
+        self.files.settle(file.name for file in record.files)
+        name = _record_name(record.shard)
+        self.notes.put(name, record.model_dump_json().encode())
+        self.notes.settle([name])
+
+    def discard(self) -> None:
+        """Forget the shards that are done, since going on would lead to the same end."""
+        self.notes.remove(RECORDS)
+
+    def publish(self) -> None:
+        """Make a dataset of the files; all of them, the description last, are there.
+
+        Raises
+        ------
+        InputError
+            The place was taken meanwhile.
+        StorageError
+            The disk is full, read-only or gone.
+        """
+        if isinstance(self.files, LocalStore):
+            out = Path(self.out)
+            require_free(out, "the dataset")
+            self.files.sweep()
+            try:
+                self.files.root.replace(out)
+            except OSError as error:
+                raise storage_error(out, error) from error
+            sync_folder(out.parent)
+            shutil.rmtree(self.files.root.parent, ignore_errors=True)
+        else:
+            self.notes.remove("")
+
+
+def _record_name(shard: int) -> str:
+    return f"{RECORDS}/{shard_key(shard)}.json"
+
+
+def finished(out: str | Path, identity: Identity) -> bool:
+    """Return whether the dataset of this plan is complete and only its notes are left, which are removed then.
+
+    A program that is killed between the two leaves it so.
+    """
+    notes = _notes(out)
+    if not notes.has(PLAN) or not open_store(out).has(DESCRIPTION):
+        return False
+    if list(_differences(_load(notes), _plain(identity))):
+        return False
+    if isinstance(notes, LocalStore):
+        shutil.rmtree(notes.root.parent, ignore_errors=True)
+    else:
+        notes.remove("")
+    return True
+
+
+def require_free_place(out: str | Path) -> None:
+    """Raise an InputError if `out` is taken, so that a command can say so before it does any work."""
+    if _notes(out).has(PLAN):
+        return
+    if isinstance(out, str) and is_remote(out):
+        if RemoteStore(out).has(DESCRIPTION):
+            raise InputError(f"{out} already holds a dataset; name another place, or remove what is there")
+    else:
+        require_free(local_path(out), "the dataset")
+
+
+@contextmanager
+def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Generator[Workplace]:
+    """Open the place where the dataset `out` is being made, or begin one.
+
+    Parameters
+    ----------
+    out
+        Path or URL of the dataset.
+    identity
+        Of the plan; see `plan.Plan.identity`.
+    alone
+        Whether no other program may be at the same dataset.
+
+    Raises
+    ------
+    InputError
+        The place is taken, belongs to another plan, or another program is at it.
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    if isinstance(out, str) and is_remote(out):
+        yield from _remote(out, identity)
+        return
+    path = local_path(out)
+    require_free(path, "the dataset")
+    folder = partial_path(path)
+    with _held(folder, path, alone) as lock:
+        notes = LocalStore(folder / "plan")
+        place = Workplace(LocalStore(folder / "dataset"), notes, str(path))
+        try:
+            if not notes.has(PLAN):
+                _begin(folder)
+                notes.put(PLAN, _text(identity))
+                notes.settle([PLAN])
+            _require_same(notes, identity, path, f"remove {folder}")
+            if not alone:
+                lock.share()
+            yield place
+        except BaseException:
+            if alone and folder.is_dir() and not place.done():
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+
+def stored_identity(out: str | Path) -> Identity:
+    """Return the identity of the plan of a dataset that is being made.
+
+    Raises
+    ------
+    InputError
+        No dataset is being made there.
+    """
+    notes = _notes(out)
+    if not notes.has(PLAN):
+        raise InputError(f"no dataset is being made at {out}; begin one with generate")
+    return _load(notes)
+
+
+def _notes(out: str | Path) -> Store:
+    if isinstance(out, str) and is_remote(out):
+        return RemoteStore(f"{out.rstrip('/')}/{_NOTES}")
+    return LocalStore(partial_path(local_path(out)) / "plan")
+
+
+def _remote(out: str, identity: Identity) -> Generator[Workplace]:
+    files, notes = RemoteStore(out), RemoteStore(f"{out.rstrip('/')}/{_NOTES}")
+    place = Workplace(files, notes, out)
+    if files.has(DESCRIPTION):
+        raise InputError(f"{out} already holds a dataset; name another place, or remove what is there")
+    begun = notes.has(PLAN)
+    if not begun:
+        if next(files.names(), None) is not None:
+            raise InputError(f"{out} already holds something else; name another place, or remove what is there")
+        notes.put(PLAN, _text(identity))
+    _require_same(notes, identity, out, f"remove what is below {out}")
+    try:
+        yield place
+    except BaseException:
+        with contextlib.suppress(Exception):
+            if not begun and not place.done():
+                files.remove("")
+        raise
+
+
+def _begin(folder: Path) -> None:
+    """Make the folder's rooms; what lies there without a plan is a leftover from before the plan was written."""
+    try:
+        for path in folder.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+        for room in ("plan", "dataset"):
+            (folder / room).mkdir()
+    except OSError as error:
+        raise storage_error(folder, error) from error
+
+
+def _text(identity: Identity) -> bytes:
+    return (json.dumps(identity, indent=1) + "\n").encode()
+
+
+def _plain(identity: Identity) -> Any:
+    """Return an identity as it is read back."""
+    return json.loads(_text(identity))
+
+
+def _load(notes: Store) -> dict[str, Any]:
+    try:
+        loaded = json.loads(notes.get(PLAN))
+    except ValueError as error:
+        raise FormatError(f"{notes.place}/{PLAN} is damaged; remove it and all beside it, then begin anew") from error
+    return dict(loaded)
+
+
+def _require_same(notes: Store, identity: Identity, out: str | Path, remedy: str) -> None:
+    stored = _load(notes)
+    differing = list(_differences(stored, _plain(identity)))
+    if differing:
+        raise InputError(
+            f"{out} was begun with another plan ({'; '.join(differing)}); finish it as it was begun, {remedy}, or name "
+            "another place"
+        )
+
+
+def _differences(stored: Any, wanted: Any, name: str = "") -> Generator[str]:
+    """Yield in what two plans differ, each in words."""
+    if isinstance(stored, dict) and isinstance(wanted, dict):
+        one, other = cast("dict[str, Any]", stored), cast("dict[str, Any]", wanted)
+        for key in dict.fromkeys([*one, *other]):
+            yield from _differences(one.get(key), other.get(key), f"{name} {key}".strip())
+    elif stored != wanted:
+        yield f"{name} {_short(stored)}, now {_short(wanted)}"
+
+
+def _short(value: Any, most: int = 40) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= most else f"{text[:most]}…"
+
+
+class _Lock:
+    def __init__(self, handle: int) -> None:
+        self._handle = handle
+
+    def share(self) -> None:
+        """Let others in who only make a share."""
+        with contextlib.suppress(OSError):
+            fcntl.flock(self._handle, fcntl.LOCK_SH)
+
+
+@contextmanager
+def _held(folder: Path, out: Path, alone: bool) -> Generator[_Lock]:
+    """Hold the hidden folder while the block runs; made if it is not there."""
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            handle = os.open(folder, os.O_RDONLY)
+        except FileNotFoundError:
+            continue  # Another program finished between the two calls.
+        except (FileExistsError, NotADirectoryError) as error:
+            raise InputError(f"cannot write {out}: a part of that path is a file; name another place") from error
+        except OSError as error:
+            raise storage_error(out, error) from error
+        try:
+            if _locked(handle, folder, out, alone) and _is_at(handle, folder):
+                yield _Lock(handle)
+                return
+        finally:
+            os.close(handle)
+
+
+def _locked(handle: int, folder: Path, out: Path, alone: bool) -> bool:
+    """Lock the folder; a share is held together with others as soon as there is a plan. False: try again."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        if alone:
+            raise InputError(f"{out} is being made by another program; wait for it, or name another place") from error
+        fcntl.flock(handle, fcntl.LOCK_SH)
+        return (folder / "plan" / PLAN).is_file()
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+    return True
+
+
+def _is_at(handle: int, folder: Path) -> bool:
+    """Return whether the open folder is still the one of that name; another program may have finished it."""
+    try:
+        return os.path.samestat(os.fstat(handle), folder.stat())
+    except FileNotFoundError:
+        return False

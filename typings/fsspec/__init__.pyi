@@ -1,0 +1,1 @@
+from fsspec.registry import register_implementation as register_implementation
