@@ -14,6 +14,9 @@ import pytest
 if sys.platform == "win32":
     pytest.skip("Windows has no pseudo-terminals", allow_module_level=True)
 
+from benqprojector import BenQProjectorSerial
+from epson_projector import Projector
+
 from drivers.links.serial import SerialLink
 from drivers.links.tcp import TcpLink
 from drivers.projector import Power, Severity
@@ -37,10 +40,8 @@ def device() -> SimulatedProjector:
 
 @pytest.mark.filterwarnings("ignore:open_text is deprecated:DeprecationWarning")
 def test_benqprojector_drives_the_simulated_benq(device: SimulatedProjector) -> None:
-    benqprojector = pytest.importorskip("benqprojector", reason="the client benqprojector is not installed")
-
     async def talk(path: str) -> None:
-        client = benqprojector.BenQProjectorSerial(path, 115200)
+        client = BenQProjectorSerial(path, 115200)
         assert await client.connect()
         assert (client.model, client.power_status) == ("Simulated Projector", client.POWERSTATUS_OFF)
         assert await client.turn_on()
@@ -58,24 +59,20 @@ def test_benqprojector_drives_the_simulated_benq(device: SimulatedProjector) -> 
 
 
 def test_epson_projector_drives_the_simulated_epson(device: SimulatedProjector) -> None:
-    epson_projector = pytest.importorskip(
-        "epson_projector", reason="the client epson-projector, which brings a web client along, is not installed"
-    )
-
     async def talk(path: str) -> None:
-        client = epson_projector.Projector(path, type="serial")
+        client = Projector(path, type="serial")
         assert await client.get_power() == "04"
         assert await client.get_serial_number() == SERIAL_NUMBER
         assert await client.send_command("PWR ON") == ""
         client.close()
         # A command locks this client for the time that it takes on a real projector.
-        client = epson_projector.Projector(path, type="serial")
+        client = Projector(path, type="serial")
         assert await client.get_power() == "01"
         assert await client.get_property("LAMP") == "120"
         assert await client.get_property("ERR") == "00"
         assert await client.send_command("MUTE ON") == ""
         client.close()
-        client = epson_projector.Projector(path, type="serial")
+        client = Projector(path, type="serial")
         assert await client.get_property("MUTE") == "ON"
         assert await client.get_property("CMODE") is False, "refused, and the client knows it"
         client.close()
