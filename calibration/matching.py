@@ -36,6 +36,10 @@ _BLOCK_CELLS = 8
 _KNOT_CELLS = 5
 _COARSE_PER_CELL = 5
 _COLOUR_PATCHES = 5000
+_INTERPOLATION_PX = 0.28
+"""σ that cubic interpolation adds to a frame's edges: measured on edges of σ 0.4 to 0.7 px, less where they are softer.
+Without it in the template, cells are found half as well again."""
+
 _LEAST_INFORMATION = 4.0
 """px⁻²: a block that knows its place no better than half a pixel says nothing."""
 
@@ -159,7 +163,8 @@ class Matcher:
         paper = self.colours.flat(np.array([[255, 255, 255]]))[0]
         image = np.asarray(cover @ (flat - paper)) + paper
         image = image.reshape(*raster.shape, 3).astype(np.float32)
-        sigma = blur_px / self.cell_px * self._cell / raster.step_mm
+        blurred = float(np.hypot(blur_px, _INTERPOLATION_PX))
+        sigma = blurred / self.cell_px * self._cell / raster.step_mm
         return np.asarray(cv2.GaussianBlur(image, (0, 0), float(sigma[0]), sigmaY=float(sigma[1])), dtype=np.float32)
 
     def _rectified(self, raster: Raster) -> tuple[_Float, _Mask]:
