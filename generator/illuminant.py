@@ -1,66 +1,73 @@
 """Which lights fall on which source picture.
 
-Three ways: every picture under the same listed lights, each under some drawn at random, or each under the one nearest
-to a ground truth of another dataset (paper, section 4.3). A choice depends on the picture's position in the list of
-sources and on nothing else.
+Every picture under the same listed lights, each under some drawn at random from the table or from a distribution, or
+each under the light of a ground truth of another data set (paper, section 4.3), the nearest of the table or one mixed
+to match; one at a time, or several together, each in its part of the picture. A choice depends on the picture's
+position in the list of sources, and on nothing else but its seed.
 """
 
 from __future__ import annotations
 
-import csv
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import FormatError, InputError
+from drivers.errors import InputError
 from generator import philox
+from generator.distributions import Distribution
+from generator.gamut import Gamut, Match, Outside, OutsideGamutError, black_body, rgb_of
+from generator.ground_truths import load_ground_truths
+from generator.lighting import LightChoice, Lighting, Mixture, parse_mixture, plain
+from generator.options import parse_numbers
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
+    from generator.masks import MaskPlan
 
+__all__ = [
+    "DrawnLights",
+    "FollowedLights",
+    "LightChoice",
+    "ListedLights",
+    "RandomLights",
+    "TogetherLights",
+    "load_ground_truths",
+    "matched_lights",
+    "nearest_lights",
+    "parse_light",
+    "parse_lights",
+]
 
-@runtime_checkable
-class LightChoice(Protocol):
-    """Which of the table's lights fall on each source picture."""
-
-    @property
-    def lights_each(self) -> int:
-        """Lights, hence images, for each picture."""
-        ...
-
-    def lights_of(self, position: int) -> tuple[int, ...]:
-        """Return the numbers of the lights for the picture at `position` (from 0) in the list of sources."""
-        ...
-
-    def describe(self) -> dict[str, Any]:
-        """Return the choice as plain values for `dataset.json`."""
-        ...
+_BATCH: Final = 32
+_BATCHES: Final = 2048
+_LEAST_WITHIN: Final = 1e-3
+"""Share of a distribution that must lie in the gamut; with less, drawing again and again would take for ever."""
 
 
 @dataclass(frozen=True)
 class ListedLights:
-    """The same lights for every picture."""
+    """The same lights for every picture: numbers of the table's lights, or mixtures of them."""
 
-    lights: tuple[int, ...]
+    lights: tuple[int | Mixture, ...]
 
     @property
     def lights_each(self) -> int:
-        """Lights for each picture."""
+        """Images for each picture."""
         return len(self.lights)
 
-    def lights_of(self, position: int) -> tuple[int, ...]:
-        """Return the lights; `position` does not matter."""
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image; `position` does not matter."""
         del position
-        return self.lights
+        mixtures = (light if isinstance(light, Mixture) else plain(light) for light in self.lights)
+        return tuple(Lighting((mixture,)) for mixture in mixtures)
 
     def describe(self) -> dict[str, Any]:
         """Return the choice as plain values."""
-        return {"choice": "listed", "lights": list(self.lights)}
+        lights = [light.label if isinstance(light, Mixture) else light for light in self.lights]
+        return {"choice": "listed", "lights": lights}
 
 
 @dataclass(frozen=True)
@@ -79,12 +86,13 @@ class RandomLights:
 
     @property
     def lights_each(self) -> int:
-        """Lights for each picture."""
+        """Images for each picture."""
         return self.count
 
-    def lights_of(self, position: int) -> tuple[int, ...]:
-        """Return the lights of the picture at `position`."""
-        return philox.distinct(self.seed, self.count, self.total, position, philox.LIGHTS)
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image of the picture at `position`."""
+        lights = philox.distinct(self.seed, self.count, self.total, position, philox.LIGHTS)
+        return tuple(Lighting((plain(light),)) for light in lights)
 
     def describe(self) -> dict[str, Any]:
         """Return the choice as plain values."""
@@ -92,28 +100,152 @@ class RandomLights:
 
 
 @dataclass(frozen=True)
-class NearestLights:
-    """For the picture at position i the light nearest to ground truth i, starting over when the list ends.
+class FollowedLights:
+    """The lights of a list of ground truths one after another, `each` for a picture, starting over when it ends.
 
-    `lights` holds the nearest light of each ground truth, `angles` how far it is, in degrees.
+    Attributes
+    ----------
+    way
+        How a light was found for a ground truth: ``nearest`` of the table's own, or a mixture to ``match`` it.
+    matches
+        For each ground truth the light, and how far it is.
+    file
+        What their origin is called.
+    each
+        Images for each picture.
     """
 
-    lights: tuple[int, ...]
-    angles: tuple[float, ...]
+    way: Literal["nearest", "match"]
+    matches: tuple[Match, ...]
     file: str
+    each: int = 1
 
     @property
     def lights_each(self) -> int:
-        """Lights for each picture."""
-        return 1
+        """Images for each picture."""
+        return self.each
 
-    def lights_of(self, position: int) -> tuple[int, ...]:
-        """Return the light of the picture at `position`."""
-        return (self.lights[position % len(self.lights)],)
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image of the picture at `position`."""
+        first = position * self.each
+        return tuple(
+            Lighting((self.matches[number % len(self.matches)].mixture,)) for number in range(first, first + self.each)
+        )
 
     def describe(self) -> dict[str, Any]:
         """Return the choice as plain values."""
-        return {"choice": "nearest", "file": self.file, "lights": list(self.lights)}
+        return {
+            "choice": self.way,
+            "file": self.file,
+            "each": self.each,
+            "lights": [match.mixture.label for match in self.matches],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnLights:
+    """`count` lights for each picture, drawn from a distribution cut to what the table can make; purpose 4 of `philox`.
+
+    Light j of the picture at position p is the first of the draws 0, 1, 2 … that lies in the gamut, draw i made of
+    the words of place (i, j), number p.
+
+    Raises
+    ------
+    InputError
+        Fewer than one light is wanted, or hardly any of the distribution lies in the gamut.
+    """
+
+    gamut: Gamut
+    distribution: Distribution
+    count: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise InputError(f"{self.count} lights a picture were asked for, expected 1 or more")
+        within = np.mean([self._batch(trial, 0, 0)[1].mean() for trial in range(128)])
+        if within < _LEAST_WITHIN:
+            raise InputError(
+                f"{within:.1%} of the distribution lies within what {self.gamut.table} can make, expected "
+                f"{_LEAST_WITHIN:.1%} or more; choose one nearer to its lights, whose mean is "
+                "r={:.3f}, b={:.3f}".format(*self.gamut.rb.mean(axis=0))
+            )
+
+    @property
+    def lights_each(self) -> int:
+        """Images for each picture."""
+        return self.count
+
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image of the picture at `position`."""
+        return tuple(Lighting((self._light(position, light),)) for light in range(self.count))
+
+    def describe(self) -> dict[str, Any]:
+        """Return the choice as plain values."""
+        return {"choice": "drawn", "count": self.count, **self.distribution.describe()}
+
+    def _light(self, position: int, light: int) -> Mixture:
+        for batch in range(_BATCHES):
+            drawn, within = self._batch(batch, light, position)
+            if within.any():
+                return self.gamut.match(rgb_of(drawn[int(within.argmax())])).mixture
+        raise InputError(f"{_BATCH * _BATCHES} draws from the distribution all lie outside {self.gamut.table}")
+
+    def _batch(self, batch: int, light: int, position: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        places = np.arange(batch * _BATCH, (batch + 1) * _BATCH)
+        words = philox.words(self.seed, places, light, position, philox.CHROMATICITIES)
+        drawn = self.distribution.draw(words)
+        return drawn, self.gamut.contains(drawn)
+
+
+@dataclass(frozen=True)
+class TogetherLights:
+    """`together` lights of another choice at a time on one image, each where the masks let it fall.
+
+    Image i of a picture gets the lights i · together … of the other choice, and the masks of number
+    position · images + i.
+
+    Raises
+    ------
+    InputError
+        Fewer than two lights are to fall together, or the other choice has no whole number of such groups.
+    """
+
+    choice: LightChoice
+    together: int
+    masks: MaskPlan
+
+    def __post_init__(self) -> None:
+        if self.together < 2 or self.choice.lights_each % self.together:
+            raise InputError(
+                f"{self.choice.lights_each} lights for each picture cannot be shared out {self.together} to an image; "
+                "expected 2 or more to an image, and a whole number of images"
+            )
+
+    @property
+    def lights_each(self) -> int:
+        """Images for each picture."""
+        return self.choice.lights_each // self.together
+
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image of the picture at `position`."""
+        mixtures = [mixture for lighting in self.choice.lightings_of(position) for mixture in lighting.mixtures]
+        return tuple(
+            Lighting(
+                tuple(mixtures[image * self.together : (image + 1) * self.together]),
+                self.masks.maker(position * self.lights_each + image),
+            )
+            for image in range(self.lights_each)
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """Return the choice as plain values."""
+        return {
+            "choice": "together",
+            "together": self.together,
+            "masks": self.masks.describe(),
+            "lights": self.choice.describe(),
+        }
 
 
 def parse_lights(text: str, total: int) -> ListedLights:
@@ -141,7 +273,43 @@ def parse_lights(text: str, total: int) -> ListedLights:
     return ListedLights(tuple(lights))
 
 
-def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "") -> NearestLights:
+def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outside = "refuse") -> Mixture:
+    """Return the light that a text names.
+
+    ``12`` and ``12:0.25+40:0.75`` are lights of the table, ``cct=4500`` a black body in kelvin (`gamut.black_body`),
+    ``r=.3,b=.25`` a chromaticity in linear RGB of the table's camera.
+
+    Parameters
+    ----------
+    text
+        What was written.
+    lut
+        The table.
+    gamut
+        The table's gamut, if it is at hand.
+    outside
+        What to do about a chromaticity that the table cannot make.
+
+    Raises
+    ------
+    InputError
+        It names none, or one that the table cannot make.
+    """
+    if "=" not in text:
+        mixture = parse_mixture(text.strip())
+        mixture.white(lut)
+        return mixture
+    numbers = parse_numbers(
+        text, {"cct": (1.0, 1e6), "r": (0.0, 1.0), "b": (0.0, 1.0)}, "a light, cct=4500 or r=.3,b=.25"
+    )
+    if numbers.keys() == {"cct"}:
+        return black_body(lut, numbers["cct"])
+    if numbers.keys() != {"r", "b"} or numbers["r"] + numbers["b"] > 1:
+        raise InputError(f"{text!r} is no light; write cct=4500, or r=.3,b=.25 with a sum of at most 1")
+    return (gamut or Gamut.of(lut)).match(rgb_of([numbers["r"], numbers["b"]]), outside).mixture
+
+
+def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", each: int = 1) -> FollowedLights:
     """Return for each ground truth the table's light at the smallest angle; of several the lowest number.
 
     Parameters
@@ -152,71 +320,56 @@ def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "") ->
         (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length.
     file
         What to call their origin.
+    each
+        Images for each picture.
     """
     table = lut.ground_truth / np.linalg.norm(lut.ground_truth, axis=1, keepdims=True)
     wanted = truths / np.linalg.norm(truths, axis=1, keepdims=True)
     cosine = np.clip(wanted @ table.T, -1.0, 1.0)
     lights = cosine.argmax(axis=1)
     angles = np.degrees(np.arccos(cosine[np.arange(len(lights)), lights]))
-    return NearestLights(tuple(int(light) for light in lights), tuple(float(angle) for angle in angles), file)
+    matches = (Match(plain(int(light)), float(angle)) for light, angle in zip(lights, angles, strict=True))
+    return FollowedLights("nearest", tuple(matches), file, each)
 
 
-_TRIPLES = (("gt_r", "gt_g", "gt_b"), ("r", "g", "b"), ("red", "green", "blue"), ("white_r", "white_g", "white_b"))
+def matched_lights(
+    gamut: Gamut,
+    truths: npt.NDArray[np.float64],
+    file: str = "",
+    each: int = 1,
+    outside: Outside = "refuse",
+) -> FollowedLights:
+    """Return for each ground truth the mixture of the table's lights that has it; see `gamut.Gamut.match`.
 
-
-def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
-    """Return the ground truths of a file.
-
-    Either a CSV file whose head names the columns `GT_R,GT_G,GT_B` or `r,g,b` (others are ignored), or lines of three
-    numbers between blanks or commas, as in `gt.txt` and Cube+.
-
-    Returns
-    -------
-    ndarray
-        (N, 3) float64 ≥ 0, linear camera RGB, not normalised.
+    Parameters
+    ----------
+    gamut
+        What the table can make.
+    truths
+        (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length.
+    file
+        What to call their origin.
+    each
+        Images for each picture.
+    outside
+        What to do about ground truths that the table cannot make.
 
     Raises
     ------
-    FormatError
-        The file cannot be read, is empty, or a line is not three numbers ≥ 0 with a sum above 0.
+    InputError
+        The table cannot make some of them, and the nearest was not asked for.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(f"cannot read ground truths {path}: {error}; name a text file") from error
-    numbered = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
-    if not numbered:
-        raise FormatError(f"{path} is empty; expected three numbers a line")
-    columns: Sequence[int] = (0, 1, 2)
-    head = [field.strip().lower() for field in next(csv.reader([numbered[0][1]]))]
-    named = not any(_is_number(token) for token in re.split(r"[\s,;]+", numbered[0][1]))
-    if named:
-        triple = next((names for names in _TRIPLES if all(name in head for name in names)), None)
-        if triple is None:
-            raise FormatError(f"{path}, line 1: no columns GT_R,GT_G,GT_B or r,g,b; found {','.join(head)}")
-        columns = [head.index(name) for name in triple]
-    truths: list[list[float]] = []
-    for number, line in numbered[named:]:
-        fields = next(csv.reader([line])) if named else re.split(r"[\s,;]+", line.strip(",; "))
+    matches: list[Match] = []
+    lost: list[tuple[int, OutsideGamutError]] = []
+    for number, truth in enumerate(truths):
         try:
-            if not named and len(fields) != 3:
-                raise ValueError(f"expected 3 numbers, found {len(fields)}")
-            truth = [float(fields[column]) for column in columns]
-        except (ValueError, IndexError) as error:
-            raise FormatError(f"{path}, line {number}: {line!r} is no ground truth: {error}") from error
-        if not np.isfinite(truth).all() or min(truth) < 0 or sum(truth) <= 0:
-            raise FormatError(
-                f"{path}, line {number}: {line!r} is no ground truth: expected numbers from 0, sum above 0"
-            )
-        truths.append(truth)
-    if not truths:
-        raise FormatError(f"{path} holds no ground truth below its head line")
-    return np.array(truths)
-
-
-def _is_number(token: str) -> bool:
-    try:
-        float(token)
-    except ValueError:
-        return False
-    return True
+            matches.append(gamut.match(truth, outside))
+        except OutsideGamutError as error:
+            lost.append((number, error))
+    if lost:
+        number, worst = max(lost, key=lambda item: item[1].angle)
+        raise InputError(
+            f"{len(lost)} of {len(truths)} ground truths{f' of {file}' if file else ''} cannot be made; "
+            f"the farthest is number {number + 1}: {worst}"
+        ) from worst
+    return FollowedLights("match", tuple(matches), file, each)

@@ -1,0 +1,73 @@
+"""Ground truths of other data sets, read from the files that users have them in."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.errors import FormatError
+
+_TRIPLES = (("gt_r", "gt_g", "gt_b"), ("r", "g", "b"), ("red", "green", "blue"), ("white_r", "white_g", "white_b"))
+
+
+def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
+    """Return the ground truths of a file.
+
+    Either a CSV file whose head names the columns `GT_R,GT_G,GT_B` or `r,g,b` (others are ignored), or lines of three
+    numbers between blanks or commas, as in `gt.txt` and Cube+.
+
+    Returns
+    -------
+    ndarray
+        (N, 3) float64 ≥ 0, linear camera RGB, not normalised.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read, is empty, or a line is not three numbers ≥ 0 with a sum above 0.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FormatError(f"cannot read ground truths {path}: {error}; name a text file") from error
+    numbered = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
+    if not numbered:
+        raise FormatError(f"{path} is empty; expected three numbers a line")
+    columns: Sequence[int] = (0, 1, 2)
+    head = [field.strip().lower() for field in next(csv.reader([numbered[0][1]]))]
+    named = not any(_is_number(token) for token in re.split(r"[\s,;]+", numbered[0][1]))
+    if named:
+        triple = next((names for names in _TRIPLES if all(name in head for name in names)), None)
+        if triple is None:
+            raise FormatError(f"{path}, line 1: no columns GT_R,GT_G,GT_B or r,g,b; found {','.join(head)}")
+        columns = [head.index(name) for name in triple]
+    truths: list[list[float]] = []
+    for number, line in numbered[named:]:
+        fields = next(csv.reader([line])) if named else re.split(r"[\s,;]+", line.strip(",; "))
+        try:
+            if not named and len(fields) != 3:
+                raise ValueError(f"expected 3 numbers, found {len(fields)}")
+            truth = [float(fields[column]) for column in columns]
+        except (ValueError, IndexError) as error:
+            raise FormatError(f"{path}, line {number}: {line!r} is no ground truth: {error}") from error
+        if not np.isfinite(truth).all() or min(truth) < 0 or sum(truth) <= 0:
+            raise FormatError(
+                f"{path}, line {number}: {line!r} is no ground truth: expected numbers from 0, sum above 0"
+            )
+        truths.append(truth)
+    if not truths:
+        raise FormatError(f"{path} holds no ground truth below its head line")
+    return np.array(truths)
+
+
+def _is_number(token: str) -> bool:
+    try:
+        float(token)
+    except ValueError:
+        return False
+    return True

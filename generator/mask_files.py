@@ -1,0 +1,228 @@
+"""Masks and per-pixel ground truths as image files: those a user gives, and those written beside the images.
+
+A folder of masks holds one set for each image, in the order of the names, starting over when they end:
+
+    NAME_1.png … NAME_K.png    K grey masks, one a light; the numbers give the order and may begin anywhere
+    NAME_1.png … NAME_K−1.png  one fewer: masks of the second light and those after it
+    NAME.png                   one grey mask for two lights: where the second falls
+    NAME.png                   one colour picture for three lights, a channel each
+
+Full scale is weight 1; 8 or 16 bits, or float from 0 to 1; transparency does not count. A set of any size is made to
+fit the image. Weights are divided by their sum. Where K masks leave a pixel dark, the first light falls.
+
+Beside the images of a dataset lie `masks/NNNNNN_k.png`, the weight of light k = 0 … K − 1 in 16-bit grey, 65535 = 1,
+sum 65535, and `ground_truth/NNNNNN.png`, r, g, b in 16 bits with r + g + b = 65535. These masks can be given again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.errors import FormatError
+from generator.lighting import FULL, Lighting, MaskMaker
+from generator.masks import whole_parts
+
+if TYPE_CHECKING:
+    from calibration.lut import Lut
+
+SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".webp", ".pgm", ".ppm")
+"""Endings of what is taken for a mask."""
+
+_Array = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class GivenMasks:
+    """The masks of one image, from files; a `MaskMaker`."""
+
+    files: tuple[Path, ...]
+
+    def weights(self, height: int, width: int, lights: int) -> _Array:
+        """Return (height, width, lights) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel.
+
+        Raises
+        ------
+        FormatError
+            A file cannot be read, or the files are not masks of that many lights.
+        """
+        masks = [_fitted(mask, height, width) for file in self.files for mask in _read(file)]
+        names = ", ".join(file.name for file in self.files)
+        if len(masks) not in (lights, lights - 1):
+            raise FormatError(
+                f"{names} in {self.files[0].parent}: {lights} lights need {lights} masks, or {lights - 1} for those "
+                f"after the first; found {len(masks)}"
+            )
+        total = np.sum(masks, axis=0, dtype=np.float32)
+        if len(masks) == lights:
+            masks[0] = np.where(total > 0, masks[0], 1)
+            shares = np.stack(masks)
+        else:
+            over = np.maximum(total, 1)
+            shares = np.stack([np.maximum(1 - total, 0), *(mask / over for mask in masks)])
+        out = np.empty((height, width, lights), np.float32)
+        whole_parts(shares, out)
+        return out
+
+
+@dataclass(frozen=True)
+class GivenMaskPlan:
+    """Sets of mask files for one image after another, starting over when they end; a `MaskPlan`."""
+
+    folder: str
+    sets: tuple[GivenMasks, ...]
+    sha256: str
+
+    def maker(self, number: int) -> MaskMaker:
+        """Return the masks of image `number`."""
+        return self.sets[number % len(self.sets)]
+
+    def describe(self) -> dict[str, Any]:
+        """Return the plan as plain values; `sha256` is over the names and bytes of all files in their order."""
+        return {"masks": "files", "folder": self.folder, "sets": len(self.sets), "sha256": self.sha256}
+
+
+def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
+    """Return the sets of masks in a folder; the rules stand at the head of this file.
+
+    Raises
+    ------
+    FormatError
+        There is none, a file cannot be read, or a set is not of as many masks as `lights` need.
+    """
+    try:
+        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    except OSError as error:
+        raise FormatError(f"cannot list the masks of {folder}: {error.strerror}; name a folder of masks") from error
+    groups: dict[str, list[tuple[int, Path]]] = {}
+    for path in files:
+        match = re.fullmatch(r"(.+)_(\d{1,4})", path.stem)
+        name, number = (f"{match[1]}_", int(match[2])) if match else (path.stem, 0)
+        groups.setdefault(name, []).append((number, path))
+    if not groups:
+        raise FormatError(f"there is no mask in {folder}; expected images such as NAME_1.png, NAME_2.png, a light each")
+    digest = hashlib.sha256()
+    sets: list[GivenMasks] = []
+    for name in sorted(groups):
+        members = tuple(path for _, path in sorted(groups[name]))
+        for path in members:
+            digest.update(f"{path.name}\n".encode())
+            digest.update(_bytes_of(path))
+        given = GivenMasks(members)
+        given.weights(2, 2, lights)
+        sets.append(given)
+    return GivenMaskPlan(folder.name, tuple(sets), digest.hexdigest())
+
+
+def encode_maps(lut: Lut, lighting: Lighting, weights: _Array) -> list[tuple[str, str, bytes]]:
+    """Return what goes beside an image of several lights: folder, what follows the image's number, PNG file.
+
+    Parameters
+    ----------
+    lut
+        The table.
+    lighting
+        The image's light.
+    weights
+        (H, W, lights) float32 in whole 65535ths, what the image was made with.
+    """
+    whole = np.rint(weights * FULL).astype(np.uint16)
+    maps = [("masks", f"_{light}.png", _png(whole[..., light])) for light in range(whole.shape[2])]
+    truth = np.rint(lighting.ground_truth_map(lut, weights) * FULL).astype(np.uint16)
+    # Green takes what rounding leaves, so that the sum is exact.
+    truth[..., 1] = FULL - truth[..., 0] - truth[..., 2]
+    return [*maps, ("ground_truth", ".png", _png(truth))]
+
+
+def read_weights(folder: Path, stem: str, lights: int) -> _Array:
+    """Return the weights (H, W, lights) float32, sum 1, of image `stem` (such as ``000012``) of a dataset.
+
+    Raises
+    ------
+    FormatError
+        A file is missing, damaged, or not of one size with the others.
+    """
+    masks = [_read_16_bits(folder / "masks" / f"{stem}_{light}.png", 2) for light in range(lights)]
+    if len({mask.shape for mask in masks}) != 1:
+        raise FormatError(f"the masks of {stem} in {folder} differ in size; make the dataset again")
+    return np.stack(masks, axis=-1)
+
+
+def read_ground_truth_map(folder: Path, stem: str) -> _Array:
+    """Return the ground truth (H, W, 3) float32, r + g + b = 1, of every pixel of image `stem` of a dataset.
+
+    Raises
+    ------
+    FormatError
+        The file is missing or damaged.
+    """
+    return _read_16_bits(folder / "ground_truth" / f"{stem}.png", 3)
+
+
+def _read_16_bits(path: Path, dimensions: int) -> _Array:
+    image = _decoded(path)
+    if image.dtype != np.uint16 or image.ndim != dimensions:
+        raise FormatError(f"{path} is no map of 16 bits; make the dataset again")
+    return np.asarray(image / np.float32(FULL), dtype=np.float32)
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _decoded(path: Path) -> npt.NDArray[Any]:
+    """Return a picture (H, W) or (H, W, 3), RGB, of the type that the file has; transparency is left out."""
+    import cv2
+
+    data = np.frombuffer(_bytes_of(path), np.uint8)
+    image = cast("npt.NDArray[Any] | None", cv2.imdecode(data, cv2.IMREAD_UNCHANGED)) if data.size else None
+    if image is None or image.ndim not in (2, 3):
+        raise FormatError(f"{path} is no picture that can be read, or damaged; give masks as PNG or TIFF")
+    if image.ndim == 2:
+        return image
+    return image[..., 0] if image.shape[2] < 3 else image[..., 2::-1]
+
+
+def _read(path: Path) -> list[_Array]:
+    """Return the masks of a file: one if it is grey, also if its three channels are alike, else three."""
+    image = _decoded(path)
+    if image.dtype.kind == "u" and image.dtype.itemsize <= 2:
+        scaled = np.asarray(image / np.float32(np.iinfo(image.dtype).max), dtype=np.float32)
+    elif image.dtype.kind == "f" and np.isfinite(image).all():
+        scaled = np.clip(image, 0, 1).astype(np.float32)
+    else:
+        raise FormatError(f"{path} holds {image.dtype} values, or some that are no numbers; give masks of 8 or 16 bits")
+    if scaled.ndim == 2:
+        return [scaled]
+    grey = bool((scaled == scaled[..., :1]).all())
+    return [np.ascontiguousarray(scaled[..., channel]) for channel in range(1 if grey else 3)]
+
+
+def _fitted(mask: _Array, height: int, width: int) -> _Array:
+    """Return a mask at the size of the image: areas averaged where it shrinks, interpolated where it grows."""
+    import cv2
+
+    if mask.shape == (height, width):
+        return mask
+    smaller = height <= mask.shape[0] and width <= mask.shape[1]
+    way = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(mask, (width, height), interpolation=way), dtype=np.float32)
+
+
+def _png(image: npt.NDArray[np.uint16]) -> bytes:
+    import cv2
+
+    ordered = image if image.ndim == 2 else image[..., ::-1]
+    done, data = cv2.imencode(".png", np.ascontiguousarray(ordered), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not done:
+        raise FormatError(f"a map of {image.shape[1]}×{image.shape[0]} px cannot be written as PNG")
+    return data.tobytes()

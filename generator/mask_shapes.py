@@ -1,0 +1,306 @@
+"""Kinds of masks: half planes and soft edges, spots, random smooth fields, windows.
+
+A shape draws its places from an image's dice, and gives a function from places in the picture to the lights' shares.
+Pixels see +, −, ×, ÷ and √ alone; see `masks`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from generator import philox
+
+Array = npt.NDArray[np.floating[Any]]
+"""float32: what is computed from float32 arrays and Python's own numbers stays float32."""
+_STEP: Final = 64
+"""Numbers that one shape may draw."""
+_BAR: Final = 0.06
+"""Breadth of the bars between a window's panes, as a share of the window."""
+
+Shares = Callable[[Array, Array], Array]
+"""From u (1, W) and v (h, 1), shares of the longer side from the picture's centre, to the lights' shares (K, h, W)."""
+
+
+@dataclass(frozen=True)
+class Dice:
+    """Uniform random numbers of one image; `stream` keeps apart what shares it out to."""
+
+    seed: int
+    number: int
+
+    def uniform(self, stream: int, count: int = _STEP) -> npt.NDArray[np.float64]:
+        """Return `count` numbers between 0 and 1."""
+        word = philox.words(self.seed, np.arange(count), stream, self.number, philox.MASKS)[0]
+        return (word + 0.5) / (1 << 32)
+
+
+class Shape(Protocol):
+    """A kind of masks: from the dice of an image to where its lights fall."""
+
+    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float) -> Shares:
+        """Return the function that fills a picture.
+
+        Parameters
+        ----------
+        dice
+            Of this image.
+        half
+            Half the picture's width and height, shares of the longer side.
+        lights
+            How many lights fall.
+        pixel
+            Size of a pixel, a share of the longer side.
+        """
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """Return the kind and its numbers as plain values."""
+        ...
+
+
+def smoothstep(x: Array) -> Array:
+    """Return 0 below 0, 1 above 1, and 3x² − 2x³ between."""
+    x = np.minimum(np.maximum(x, 0.0), 1.0)
+    return x * x * (3.0 - x - x)
+
+
+@dataclass(frozen=True)
+class HalfPlanes:
+    """Parallel strips, one for each light: for two lights a half plane each.
+
+    Attributes
+    ----------
+    angle
+        Direction in degrees from the first light to the last, clockwise from the right; None: any.
+    width
+        Breadth of the soft edge; 0 is as sharp as pixels allow. None: any from 0.1 to 0.6.
+    """
+
+    angle: float | None = None
+    width: float | None = 0.0
+
+    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float) -> Shares:
+        """Return the function that fills a picture."""
+        drawn: list[float] = dice.uniform(0).tolist()
+        angle = math.radians(360 * drawn[0] if self.angle is None else self.angle)
+        across = (math.cos(angle), math.sin(angle))
+        width = max(0.1 + 0.5 * drawn[1] if self.width is None else self.width, pixel)
+        reach = abs(math.cos(angle)) * half[0] + abs(math.sin(angle)) * half[1]
+        edges = [reach * (2 * (edge + 0.6 * drawn[1 + edge] - 0.3) / lights - 1) for edge in range(1, lights)]
+
+        def fill(u: Array, v: Array) -> Array:
+            along = u * across[0] + v * across[1]
+            past = [smoothstep((along - edge) / width + 0.5) for edge in edges]
+            ones, zeros = np.ones_like(along), np.zeros_like(along)
+            return np.stack([one - other for one, other in zip([ones, *past], [*past, zeros], strict=True)])
+
+        return fill
+
+    def describe(self) -> dict[str, Any]:
+        """Return the kind and its numbers."""
+        return {"masks": "half-plane" if self.width == 0 else "soft-edge", "angle": self.angle, "width": self.width}
+
+
+@dataclass(frozen=True)
+class Spots:
+    """Soft discs of every light but the first.
+
+    Attributes
+    ----------
+    count
+        Discs of each light; None: any from 1 to 4.
+    radius
+        Where a disc's light has fallen to a half; None: any from 0.08 to 0.3.
+    softness
+        Breadth of the edge over the radius, up to 2.
+    """
+
+    count: int | None = None
+    radius: float | None = None
+    softness: float = 0.8
+
+    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float) -> Shares:
+        """Return the function that fills a picture."""
+        discs: list[list[tuple[float, float, float, float]]] = []
+        for light in range(1, lights):
+            drawn = dice.uniform(light)
+            count = 1 + int(4 * drawn[0]) if self.count is None else self.count
+            discs.append([])
+            for x, y, size in drawn[1 : 1 + 3 * count].reshape(-1, 3).tolist():
+                radius = 0.08 + 0.22 * size if self.radius is None else self.radius
+                place = (half[0] * (2 * x - 1), half[1] * (2 * y - 1))
+                edge = max(self.softness * radius, pixel)
+                discs[-1].append((*place, radius, edge))
+
+        def fill(u: Array, v: Array) -> Array:
+            lit: list[Array] = []
+            for light in discs:
+                dark = np.ones(np.broadcast_shapes(u.shape, v.shape), np.float32)
+                for x, y, radius, edge in light:
+                    distance = np.sqrt((u - x) * (u - x) + (v - y) * (v - y))
+                    dark *= smoothstep((distance - radius) / edge + 0.5)
+                lit.append(1 - dark)
+            return _over_the_first(lit)
+
+        return fill
+
+    def describe(self) -> dict[str, Any]:
+        """Return the kind and its numbers."""
+        return {"masks": "spots", "count": self.count, "radius": self.radius, "softness": self.softness}
+
+
+@dataclass(frozen=True)
+class SmoothFields:
+    """Lights that pass into one another: a random field for each, smoothed by cubic B-splines (I. Schoenberg, 1946).
+
+    Attributes
+    ----------
+    scale
+        Distance over which a field changes, a share of the longer side.
+    contrast
+        How much one light prevails where its field is largest.
+    """
+
+    scale: float = 0.5
+    contrast: float = 2.0
+
+    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float) -> Shares:
+        """Return the function that fills a picture."""
+        del half, pixel
+        knots = math.ceil(2 / self.scale) + 4
+        fields: list[Array] = []
+        for light in range(lights):
+            drawn = dice.uniform(light, knots * knots).reshape(knots, knots)
+            # The spline leaves 0.479 of the knots' variance in each direction, on the average.
+            fields.append((self.contrast / 0.479 * math.sqrt(12) * (drawn - 0.5)).astype(np.float32))
+
+        def fill(u: Array, v: Array) -> Array:
+            parts: list[Array] = []
+            for field in fields:
+                x = self._splined(field.T, u[0]).T
+                level = self._splined(x, v[:, 0])
+                parts.append(_growth(level))
+            return np.stack(parts)
+
+        return fill
+
+    def describe(self) -> dict[str, Any]:
+        """Return the kind and its numbers."""
+        return {"masks": "smooth", "scale": self.scale, "contrast": self.contrast}
+
+    def _splined(self, knots: Array, at: Array) -> Array:
+        """Return (n, m) for `knots` (K, m), their first index running over places `at` (n,) from −0.5 to 0.5."""
+        place = (at + 0.5) * (2 / self.scale)
+        first = np.floor(place)
+        index = first.astype(np.intp)
+        t = place - first
+        s = 1 - t
+        weights = (
+            s * s * s / 6,
+            (4 - 6 * t * t + 3 * t * t * t) / 6,
+            (4 - 6 * s * s + 3 * s * s * s) / 6,
+            t * t * t / 6,
+        )
+        total = np.zeros((len(at), knots.shape[1]), np.float32)
+        for step, weight in enumerate(weights):
+            total += weight[:, None] * knots[index + step]
+        return total
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Daylight through a window on wall or floor: panes in perspective, a window for each light but the first.
+
+    Attributes
+    ----------
+    columns, rows
+        Panes across and down; None: 2 or 3.
+    softness
+        Breadth of the half shadow, a share of the window; None: any from 0.02 to 0.1.
+    """
+
+    columns: int | None = None
+    rows: int | None = None
+    softness: float | None = None
+
+    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float) -> Shares:
+        """Return the function that fills a picture."""
+        windows = [self._window(dice.uniform(light), half, pixel) for light in range(1, lights)]
+
+        def fill(u: Array, v: Array) -> Array:
+            lit: list[Array] = []
+            for matrix, columns, rows, soft in windows:
+                x, y, w = (row[0] * u + row[1] * v + row[2] for row in matrix)
+                # Behind the vanishing line there is no window.
+                seen = w > 1e-3
+                w = np.where(seen, w, 1)
+                lit.append(_panes(x / w, columns, soft) * _panes(y / w, rows, soft) * seen)
+            return _over_the_first(lit)
+
+        return fill
+
+    def describe(self) -> dict[str, Any]:
+        """Return the kind and its numbers."""
+        return {"masks": "window", "columns": self.columns, "rows": self.rows, "softness": self.softness}
+
+    def _window(
+        self, drawn: npt.NDArray[np.float64], half: tuple[float, float], pixel: float
+    ) -> tuple[list[list[float]], int, int, float]:
+        """Return the homography (3, 3) from the picture to the window's unit square, its panes, and its softness."""
+        size = 0.45 + 0.35 * drawn[0]
+        shape = 0.7 + 0.7 * drawn[1]
+        width, height = size * math.sqrt(shape), size / math.sqrt(shape)
+        centre = np.array([half[0] * (drawn[2] - 0.5), half[1] * (drawn[3] - 0.5)])
+        slant = 0.8 * (drawn[4] - 0.5)
+        turn = math.radians(40 * (drawn[5] - 0.5))
+        corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+        # One side of the window is farther away, hence shorter.
+        far = 1 - 0.4 * drawn[6:8] * np.sign(corners[:, ::-1] * (drawn[8:10] - 0.5)).clip(0)
+        corners = corners * far * [width, height]
+        corners[:, 0] += slant * corners[:, 1]
+        rotation = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+        matrix = _homography(corners @ rotation + centre)
+        columns = self.columns or 2 + int(2 * drawn[10])
+        rows = self.rows or 2 + int(2 * drawn[11])
+        soft = 0.02 + 0.08 * float(drawn[12]) if self.softness is None else self.softness
+        return matrix.tolist(), columns, rows, max(soft, pixel / float(min(width, height)))
+
+
+def _growth(x: Array) -> Array:
+    """Return (x + √(1 + x²))², which grows from 0 to ∞ as an exponential does, but without one."""
+    root = np.sqrt(1 + x * x)
+    grown = np.where(x >= 0, root + x, 1 / (root + np.abs(x)))
+    return grown * grown
+
+
+def _homography(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the (3, 3) that takes four places (4, 2), clockwise, to the corners of the unit square."""
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    rows: list[list[float]] = []
+    for (u, v), (x, y) in zip(corners.tolist(), square.tolist(), strict=True):
+        rows += [[u, v, 1.0, 0.0, 0.0, 0.0, -u * x, -v * x], [0.0, 0.0, 0.0, u, v, 1.0, -u * y, -v * y]]
+    return np.append(np.linalg.solve(np.array(rows), square.reshape(-1)), 1.0).reshape(3, 3)
+
+
+def _panes(at: Array, count: int, soft: float) -> Array:
+    """Return the light along one side of a window at places `at`, 0 to 1 from edge to edge."""
+    total = np.zeros_like(at)
+    for pane in range(count):
+        left = pane / count + (_BAR / 2 if pane else 0.0)
+        right = (pane + 1) / count - (_BAR / 2 if pane < count - 1 else 0.0)
+        total += smoothstep((at - left) / soft + 0.5) - smoothstep((at - right) / soft + 0.5)
+    return np.minimum(np.maximum(total, 0.0), 1.0)
+
+
+def _over_the_first(lit: list[Array]) -> Array:
+    """Return the shares (K, h, W) of the first light and of those that fall over it, each 0 to 1 for itself."""
+    dark = np.ones_like(lit[0])
+    for light in lit:
+        dark *= 1 - light
+    return np.stack([dark, *lit])

@@ -1,0 +1,161 @@
+"""What light a table can make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import InputError
+from generator.gamut import (
+    TOLERANCE_DEG,
+    Gamut,
+    OutsideGamutError,
+    angles_between,
+    black_body,
+    rb_of,
+    rgb_of,
+)
+
+if TYPE_CHECKING:
+    from calibration.lut import Lut
+    from generator.lighting import Mixture
+
+PRIMARIES = np.array([[5000.0, 900.0, 300.0], [900.0, 6000.0, 1000.0], [150.0, 1100.0, 4800.0]])
+
+
+def grid(steps: int = 8) -> npt.NDArray[np.float64]:
+    """Return the whites of a triangular grid of lights, each with its brightest primary at full drive."""
+    drives = np.array([[i, steps - i - j, j] for i in range(steps + 1) for j in range(steps + 1 - i)], dtype=np.float64)
+    return drives / drives.max(axis=1, keepdims=True) @ PRIMARIES
+
+
+def made(gamut: Gamut, mixture: Mixture) -> npt.NDArray[np.float64]:
+    return np.asarray(mixture.weights) @ gamut.white[list(mixture.lights)]
+
+
+GRID = Gamut(grid())
+_drives = st.tuples(*[st.floats(0.001, 1.0)] * 3)
+
+
+@given(_drives)
+def test_any_light_within_is_matched_by_three_neighbours_at_most(drives: tuple[float, float, float]) -> None:
+    wanted = np.array(drives) @ PRIMARIES
+    match = GRID.match(wanted)
+    assert len(match.mixture.lights) <= 3
+    off = float(angles_between(made(GRID, match.mixture), wanted))
+    assert off == pytest.approx(match.angle, abs=1e-9)
+    # Three lights match exactly, but for weights in billionths.
+    assert off < (1e-6 if len(match.mixture.lights) == 3 else TOLERANCE_DEG)
+    assert sum(match.mixture.weights) == pytest.approx(1, abs=1e-12)
+    # Neighbours: no light of the mixture is farther than the farthest side of any triangle of the grid.
+    lights = GRID.white[list(match.mixture.lights)]
+    longest = angles_between(GRID.directions[GRID.edges[:, 0]], GRID.directions[GRID.edges[:, 1]]).max()
+    assert angles_between(lights[:, None], lights[None]).max() <= longest + 1e-9
+
+
+def test_the_fewest_lights_that_do() -> None:
+    one = GRID.match(3 * GRID.white[17])
+    assert (one.mixture.lights, one.mixture.weights) == ((17,), (1.0,))
+    assert one.angle < 1e-6
+    first, second = (int(light) for light in GRID.edges[20])
+    two = GRID.match(GRID.white[first] + 2 * GRID.white[second]).mixture
+    assert two.lights == (first, second)
+    np.testing.assert_allclose(two.weights, [1 / 3, 2 / 3], atol=2e-9)
+    third = GRID.triangles[11]
+    three = GRID.match(GRID.white[third].sum(axis=0)).mixture
+    assert three.lights == tuple(third)
+    np.testing.assert_allclose(three.weights, 1 / 3, atol=2e-9)
+
+
+def test_just_within_and_just_beyond_the_tolerance_of_one_light() -> None:
+    axis = np.cross(GRID.directions[17], [0.3, -0.5, 0.4])
+    axis /= np.linalg.norm(axis)
+    for share, lights in ((0.9, 1), (1.2, 2)):
+        turned = GRID.directions[17] + np.radians(share * TOLERANCE_DEG) * axis
+        assert len(GRID.match(turned).mixture.lights) >= lights
+        assert (len(GRID.match(turned).mixture.lights) == 1) == (lights == 1)
+
+
+def test_a_light_outside_is_refused_with_how_far_and_what_is_nearest() -> None:
+    wanted = rgb_of([0.9, 0.02])
+    with pytest.raises(
+        OutsideGamutError, match=r"r=0\.9000, b=0\.0200 lies .*° outside .* nearest it can is r="
+    ) as info:
+        GRID.match(wanted)
+    nearest = GRID.match(wanted, outside="nearest")
+    assert nearest.mixture == info.value.nearest
+    # By brute force: no mixture of any two lights is nearer.
+    share = np.linspace(0, 1, 401)[:, None, None, None]
+    pairs = share * GRID.directions[:, None] + (1 - share) * GRID.directions[None]
+    least = angles_between(pairs.reshape(-1, 3), wanted).min()
+    assert nearest.angle == pytest.approx(info.value.angle)
+    assert nearest.angle == pytest.approx(least, rel=1e-4)
+    assert f"{nearest.angle:.2f}°" in str(info.value)
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_what_is_contained_is_matched_and_what_is_not_is_refused(r: float, b: float) -> None:
+    if r + b > 1:
+        r, b = 1 - r, 1 - b
+    wanted = rgb_of([r, b])
+    if GRID.contains(wanted[None])[0]:
+        assert GRID.match(wanted).angle <= TOLERANCE_DEG
+    else:
+        # Nonnegative drives of the primaries are what is within; rounding and the tolerance blur the border.
+        drives = np.linalg.solve(PRIMARIES.T, wanted)
+        assert drives.min() < 1e-9
+
+
+def test_chromaticities_there_and_back() -> None:
+    rgb = np.array([[2.0, 5.0, 1.0], [0.1, 0.2, 0.7]])
+    np.testing.assert_allclose(rb_of(rgb), [[0.25, 0.125], [0.1, 0.7]])
+    np.testing.assert_allclose(rgb_of(rb_of(rgb)), rgb / rgb.sum(axis=1, keepdims=True))
+    np.testing.assert_array_equal(GRID.contains(rb_of(GRID.white * 1.0)[40:41]), [True])
+
+
+def test_lights_on_a_line_make_what_lies_between_neighbours() -> None:
+    line = Gamut(np.array([[1.0, 4.0, 3.0], [3.0, 4.0, 1.0], [2.0, 4.0, 2.0], [2.0, 4.0, 2.0]]))
+    assert len(line.triangles) == 0
+    match = line.match([1.25, 4, 2.75])
+    assert match.mixture.lights == (0, 2)
+    np.testing.assert_allclose(match.mixture.weights, [0.75, 0.25], atol=1e-9)
+    with pytest.raises(OutsideGamutError):
+        line.match([1, 3, 3])
+    assert not line.contains(np.array([[1.25, 4, 2.75]]))[0]
+
+
+@pytest.mark.parametrize("lights", [1, 2])
+def test_tables_of_one_and_two_lights(lights: int) -> None:
+    few = Gamut(PRIMARIES[:lights])
+    assert few.match(PRIMARIES[0]).mixture.lights == (0,)
+    assert few.match(PRIMARIES[:lights].sum(axis=0)).mixture.lights == tuple(range(lights))
+    assert few.match([1.0, 0.0, 0.0], "nearest").mixture.lights == (0,)
+
+
+def test_black_bodies_are_joined_by_mired(make_lut: Callable[..., Lut]) -> None:
+    # The table's black bodies are lights 1 and 3, of 3001 and 3003 K.
+    lut = make_lut(lights=5)
+    assert black_body(lut, 3001).lights == (1,)
+    assert black_body(lut, 3003).lights == (3,)
+    middle = 2 / (1 / 3001 + 1 / 3003)
+    mixture = black_body(lut, middle)
+    assert mixture.lights == (1, 3)
+    white = mixture.white(lut)
+    np.testing.assert_allclose(white / white.sum(), lut.ground_truth[[1, 3]].mean(axis=0), rtol=1e-8)
+    nearly = black_body(lut, 3001.2).white(lut)
+    assert angles_between(nearly, lut.white[1]) < angles_between(nearly, lut.white[3])
+
+
+def test_a_temperature_beyond_the_tables_is_refused(make_lut: Callable[..., Lut]) -> None:
+    lut = make_lut(lights=5)
+    for cct_k in (3000.9, 3003.1):
+        with pytest.raises(InputError, match=r"outside the black bodies .* 3001 to 3003 K"):
+            black_body(lut, cct_k)
+    with pytest.raises(InputError, match="has no black bodies"):
+        black_body(make_lut(lights=1, name="none"), 3001)
