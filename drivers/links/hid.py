@@ -5,7 +5,6 @@ Laws that hold inside:
 - Only the interrupt pipes are used, one report a transfer; a report is never cut and never joined.
 - The system's errors are translated here and nowhere else: ETIMEDOUT is `LinkTimeout`; EBUSY and EACCES are
   `DeviceRefused`; whatever else ends a transfer is `LinkClosed`.
-- The kernel's own HID driver is asked to step aside, and given the device back at the end.
 
 Source: Device Class Definition for HID 1.11, clauses 4.1 and 4.4.
 """
@@ -22,6 +21,7 @@ import usb.core
 import usb.util
 
 from drivers.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
+from drivers.links.usb_claim import Claim
 
 if TYPE_CHECKING:
     from usb.backend import IBackend
@@ -101,9 +101,7 @@ class HidDevice:
     def __init__(self, device: usb.core.Device, label: str) -> None:
         self._device = device
         self._label = label
-        self._open = True
-        self._detached = False
-        self._interface = 0
+        self._claimed = Claim(device)
         try:
             with self._transfer("does not answer"):
                 self._claim()
@@ -128,47 +126,24 @@ class HidDevice:
 
     def close(self) -> None:
         """Release the device and give it back to the kernel's driver, if there was one."""
-        if not self._open:
-            return
-        self._open = False
-        # A device that was unplugged cannot be released, and need not be.
-        with contextlib.suppress(usb.core.USBError, NotImplementedError):
-            if self._detached:
-                usb.util.release_interface(self._device, self._interface)
-                self._device.attach_kernel_driver(self._interface)
-        with contextlib.suppress(usb.core.USBError, NotImplementedError):
-            usb.util.dispose_resources(self._device)
+        self._claimed.release()
 
     def _claim(self) -> None:
-        try:
-            configuration = self._device.get_active_configuration()
-        except usb.core.USBError as error:
-            if error.errno is not None:
-                raise
-            # None is active: a device fresh from the bus on systems that leave this to us.
-            self._device.set_configuration()
-            configuration = self._device.get_active_configuration()
-        for interface in configuration:
+        for interface in self._claimed.configuration():
             ends = {
                 bool(endpoint.bEndpointAddress & 0x80): endpoint.bEndpointAddress
                 for endpoint in interface
                 if endpoint.bmAttributes & 3 == _INTERRUPT
             }
             if interface.bInterfaceClass == _HID_CLASS and len(ends) == 2:
-                self._interface = interface.bInterfaceNumber
                 self._in, self._out = ends[True], ends[False]
-                break
-        else:
-            raise ProtocolError(f"{self._label} has no HID interface with pipes both ways; it is another device")
-        with contextlib.suppress(NotImplementedError):
-            if self._device.is_kernel_driver_active(self._interface):
-                self._device.detach_kernel_driver(self._interface)
-                self._detached = True
-        usb.util.claim_interface(self._device, self._interface)
+                self._claimed.make(interface.bInterfaceNumber)
+                return
+        raise ProtocolError(f"{self._label} has no HID interface with pipes both ways; it is another device")
 
     @contextlib.contextmanager
     def _transfer(self, late: str) -> Generator[None]:
-        if not self._open:
+        if self._claimed.released:
             raise LinkClosed(f"{self._label} was closed; open it again")
         try:
             yield

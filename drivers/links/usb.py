@@ -1,4 +1,4 @@
-"""USB cables: finding still image devices on the bus and opening their pipes. The only file here that imports pyusb.
+"""USB cables: finding still image devices on the bus and opening their pipes.
 
 Laws that hold inside:
 
@@ -24,6 +24,7 @@ import usb.core
 import usb.util
 
 from drivers.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
+from drivers.links.usb_claim import Claim
 from drivers.pipes import Pipe, PipeStalled
 from drivers.ptp.container import INTERFACE_CLASS
 
@@ -118,8 +119,7 @@ class OpenUsbDevice:
     def __init__(self, device: usb.core.Device, description: UsbDevice) -> None:
         self._device = device
         self._label = str(description)
-        self._open = True
-        self._detached = False
+        self._claimed = Claim(device)
         try:
             self._claim()
         except BaseException:
@@ -183,28 +183,11 @@ class OpenUsbDevice:
 
     def close(self) -> None:
         """Release the interface and give it back to the kernel's driver, if there was one."""
-        if not self._open:
-            return
-        self._open = False
-        # A device that was unplugged cannot be released, and need not be.
-        with contextlib.suppress(usb.core.USBError, NotImplementedError):
-            if self._detached:
-                usb.util.release_interface(self._device, self._interface)
-                self._device.attach_kernel_driver(self._interface)
-        with contextlib.suppress(usb.core.USBError, NotImplementedError):
-            usb.util.dispose_resources(self._device)
+        self._claimed.release()
 
     def _claim(self) -> None:
         with self._transfer("does not answer"):
-            try:
-                configuration = self._device.get_active_configuration()
-            except usb.core.USBError as error:
-                if error.errno is not None:
-                    raise
-                # None is active: a device fresh from the bus on systems that leave this to us.
-                self._device.set_configuration()
-                configuration = self._device.get_active_configuration()
-            interface = next(found for found in configuration if _is_still_image(found))
+            interface = next(found for found in self._claimed.configuration() if _is_still_image(found))
             self._interface = interface.bInterfaceNumber
             self._addresses: dict[Pipe, int] = {}
             for endpoint in interface:
@@ -212,11 +195,7 @@ class OpenUsbDevice:
             missing = [pipe.value for pipe in Pipe if pipe not in self._addresses]
             if missing:
                 raise ProtocolError(f"{self._label} has no pipe {', '.join(missing)}; it is no PTP device")
-            with contextlib.suppress(NotImplementedError):
-                if self._device.is_kernel_driver_active(self._interface):
-                    self._device.detach_kernel_driver(self._interface)
-                    self._detached = True
-            usb.util.claim_interface(self._device, self._interface)
+            self._claimed.make(self._interface)
 
     def _note(self, endpoint: usb.core.Endpoint) -> None:
         kind = endpoint.bmAttributes & 3
@@ -235,7 +214,7 @@ class OpenUsbDevice:
 
     @contextlib.contextmanager
     def _transfer(self, late: str) -> Generator[None]:
-        if not self._open:
+        if self._claimed.released:
             raise LinkClosed(f"{self._label} was closed; open it again")
         try:
             yield
