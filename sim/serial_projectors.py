@@ -30,15 +30,12 @@ POLLING_S = 0.02
 _ON_THE_WAY = (Power.WARMING, Power.COOLING)
 
 
-class EpsonPeer:
-    """An Epson: ESC/VP21, after the handshake of ESC/VP.net if `network` says so."""
+class _Listener:
+    """What all of them have: a projector, and what was heard of a command that is not whole yet."""
 
-    def __init__(self, projector: SimulatedProjector, network: bool = False) -> None:
+    def __init__(self, projector: SimulatedProjector) -> None:
         self._projector = projector
-        self._network = network
-        self._greeted = not network
         self._heard = b""
-        self._switching_to: Power | None = None
 
     @property
     def closed(self) -> bool:
@@ -48,8 +45,22 @@ class EpsonPeer:
     def connect(self) -> bytes:
         """Forget a half-heard command."""
         self._heard = b""
-        self._greeted = not self._network
         return b""
+
+
+class EpsonPeer(_Listener):
+    """An Epson: ESC/VP21, after the handshake of ESC/VP.net if `network` says so."""
+
+    def __init__(self, projector: SimulatedProjector, network: bool = False) -> None:
+        super().__init__(projector)
+        self._network = network
+        self._greeted = not network
+        self._switching_to: Power | None = None
+
+    def connect(self) -> bytes:
+        """Forget a half-heard command, and that it has been greeted."""
+        self._greeted = not self._network
+        return super().connect()
 
     def receive(self, data: bytes) -> bytes:
         """Take the next bytes and return the answers to them, and to what has been carried out by now."""
@@ -120,23 +131,12 @@ class EpsonPeer:
         return epson.encode_reply()
 
 
-class BenqPeer:
+class BenqPeer(_Listener):
     """A BenQ: it echoes what it hears and ends with a prompt, as on a serial cable; not so if `network` says so."""
 
     def __init__(self, projector: SimulatedProjector, network: bool = False) -> None:
-        self._projector = projector
+        super().__init__(projector)
         self._network = network
-        self._heard = b""
-
-    @property
-    def closed(self) -> bool:
-        """Never: a serial cable is not hung up."""
-        return False
-
-    def connect(self) -> bytes:
-        """Forget a half-heard command."""
-        self._heard = b""
-        return b""
 
     def receive(self, data: bytes) -> bytes:
         """Take the next bytes and return the answers to the lines that they complete."""
@@ -187,7 +187,7 @@ class BenqPeer:
         return value.upper()
 
 
-class OptomaPeer:
+class OptomaPeer(_Listener):
     """An Optoma: it answers, and says unasked when its power state changes or a part fails.
 
     Parameters
@@ -199,21 +199,10 @@ class OptomaPeer:
     MODEL = "1"
 
     def __init__(self, projector: SimulatedProjector, tells_mute: bool = True) -> None:
-        self._projector = projector
+        super().__init__(projector)
         self._tells_mute = tells_mute
-        self._heard = b""
         self._told_power = projector.power()
         self._told_faults: frozenset[str] = frozenset()
-
-    @property
-    def closed(self) -> bool:
-        """Never: a serial cable is not hung up."""
-        return False
-
-    def connect(self) -> bytes:
-        """Forget a half-heard command."""
-        self._heard = b""
-        return b""
 
     def receive(self, data: bytes) -> bytes:
         """Take the next bytes and return the answers to the lines that they complete, and the news."""
@@ -263,22 +252,8 @@ class OptomaPeer:
         return optoma.Done(True)
 
 
-class NecPeer:
+class NecPeer(_Listener):
     """A NEC: a binary answer to every command; what is no command is not answered."""
-
-    def __init__(self, projector: SimulatedProjector) -> None:
-        self._projector = projector
-        self._heard = b""
-
-    @property
-    def closed(self) -> bool:
-        """Never: a serial cable is not hung up."""
-        return False
-
-    def connect(self) -> bytes:
-        """Forget a half-heard command."""
-        self._heard = b""
-        return b""
 
     def receive(self, data: bytes) -> bytes:
         """Take the next bytes and return the answers to the commands that they complete."""
