@@ -12,9 +12,12 @@ Pure functions of frozen values; nothing here knows light.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sim.wear import Fold
 
 _NEWTON_STEPS = 6
 _STEP_MM = 0.05
@@ -74,6 +77,36 @@ class Waviness:
         return total
 
 
+class Surface(Protocol):
+    """The shape of a sheet of paper."""
+
+    @property
+    def page_mm(self) -> tuple[float, float]:
+        """Width and height of the page."""
+        ...
+
+    def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the height in mm, towards the camera, of (..., 2) points on the print; they may lie off the page."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Folded:
+    """A surface with a crease."""
+
+    surface: Surface
+    fold: Fold
+
+    @property
+    def page_mm(self) -> tuple[float, float]:
+        """Width and height of the page."""
+        return self.surface.page_mm
+
+    def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the height in mm, towards the camera, of (..., 2) points on the print; they may lie off the page."""
+        return self.surface.height(points_mm) + self.fold.height(points_mm)
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """A camera in front of a print.
@@ -94,7 +127,7 @@ class View:
         k1, k2, p1, p2.
     """
 
-    surface: Waviness
+    surface: Surface
     rotation: NDArray[np.float64]
     distance_mm: float
     focal_px: float
@@ -104,7 +137,7 @@ class View:
     @classmethod
     def framed(
         cls,
-        surface: Waviness,
+        surface: Surface,
         frame_px: tuple[float, float],
         *,
         fill: float,

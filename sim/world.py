@@ -30,8 +30,9 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from sim.bodies import Body
-from sim.geometry import View, Waviness
+from sim.geometry import Folded, View, Waviness
 from sim.spectra import Lamp, print_reflectance, projector_primaries, sensitivities
+from sim.wear import Fold, Stain
 
 REFERENCE_EXPOSURE = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 """The exposure at which `Room.white_level_share` holds."""
@@ -43,6 +44,8 @@ _BLOCK_ROWS = 64
 _FINEST_MM = 1e-3
 _MOST_LINES = 6000
 _CHANNELS = "RGB"
+_SLANT = 0.36
+"""Tangent of 20°: a projector beside the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +124,11 @@ class Room:
         than of another, and frames differ from `signal` and `white` by that.
     shutter_jitter_s
         Standard deviation of the exposure time; matters with a wheel only.
+    stain_mm, stain_depth
+        Diameter of a stain somewhere on the print, 0 for none, and the share of blue light that it takes; of green it
+        takes six tenths of that, of red three. A thumb's is 25 mm across.
+    fold_mm
+        How far a crease across the print stands off its plane, 0 for none.
     """
 
     seed: int = 0
@@ -147,6 +155,9 @@ class Room:
     response_spread: float = 0.003
     wheel_hz: float = 0.0
     shutter_jitter_s: float = 0.0005
+    stain_mm: float = 0.0
+    stain_depth: float = 0.5
+    fold_mm: float = 0.0
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -154,11 +165,12 @@ class Room:
         for name in ("fill", "focal_diagonals", "white_level_share"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; more than 0 is expected")
-        for name in ("vignetting", "projector_falloff", "black_leak", "ambient"):
+        for name in ("vignetting", "projector_falloff", "black_leak", "ambient", "stain_depth"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 … below 1 is expected")
         for name in (
-            "waviness_mm", "blur_px", "response_spread", "primary_difference", "wheel_hz", "shutter_jitter_s"
+            "waviness_mm", "blur_px", "response_spread", "primary_difference", "wheel_hz", "shutter_jitter_s",
+            "stain_mm", "fold_mm",
         ):  # fmt: skip
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is expected")
@@ -175,8 +187,12 @@ class World:
         self.body = body
         self.room = room
         rows, columns = body.half_size
+        self.stain, self.fold = self._wear()
+        surface = Waviness.random(
+            room.seed, room.waviness_mm * math.hypot(*sheet.page_mm) / _A0_DIAGONAL_MM, sheet.page_mm
+        )
         self.view = View.framed(
-            Waviness.random(room.seed, room.waviness_mm * math.hypot(*sheet.page_mm) / _A0_DIAGONAL_MM, sheet.page_mm),
+            surface if self.fold is None else Folded(surface, self.fold),
             (columns, rows),
             fill=room.fill,
             focal_diagonals=room.focal_diagonals,
@@ -276,6 +292,55 @@ class World:
             (N, 3) float64, DN above black where `field` is 1, leak and ambient light included, without clipping.
         """
         return self._signals(print_reflectance(rgb)) @ self._drive(colour, settings, lamp)
+
+    def seen(
+        self,
+        rgb: ArrayLike,
+        points_mm: NDArray[np.float64],
+        colour: Colour,
+        settings: ExposureSettings,
+        lamp: float = 1.0,
+    ) -> NDArray[np.float64]:
+        """Return the true linear camera RGB of printed codes at points of the print, in the light that falls there.
+
+        Parameters
+        ----------
+        rgb
+            (N, 3) codes 0 … 255.
+        points_mm
+            (N, 2) float64.
+        colour, settings, lamp
+            As for `expose`.
+
+        Returns
+        -------
+        ndarray
+            (N, 3) float64, DN above black, without clipping: what the photosites there get where nothing is blurred,
+            stain and fold included.
+        """
+        light = self.field(points_mm) * self._drive(colour, settings, lamp)
+        return np.einsum("ncp,np->nc", self._signals(print_reflectance(rgb)), light) * self.worn(points_mm)
+
+    def worn(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what stain and fold leave of the light of a clean flat print.
+
+        Parameters
+        ----------
+        points_mm
+            (..., 2) float64.
+
+        Returns
+        -------
+        ndarray
+            (..., 3) float64 for red, green and blue of the camera; 1 where the print is clean and flat.
+        """
+        points = np.asarray(points_mm, dtype=np.float64)
+        left = np.ones((*points.shape[:-1], 3))
+        if self.stain is not None:
+            left *= self.stain.passed(points)
+        if self.fold is not None:
+            left *= self.fold.shade(points)[..., None]
+        return left
 
     def field(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the light at points of the print: lens vignetting times the projector's falloff.
@@ -378,12 +443,40 @@ class World:
             response = self._random(3, first).standard_normal((last - first, visible.width), dtype=np.float32)
             response *= np.float32(room.response_spread)
             response += np.float32(1)
+            if self.stain is not None or self.fold is not None:
+                response *= self._worn_rows(nodes, channels, first, last)
             lines, table, rows = drawing.lines, drawing.signals, out[:, first:last]
             lens, falloff = self._lens, self._falloff
             light(first, nodes, sigma, *lines, drawing.labels, table, channels, lens, falloff, response, rows)
 
         _in_blocks(visible.height, block)
         return out
+
+    def _worn_rows(
+        self, nodes: NDArray[np.float64], channels: NDArray[np.int64], first: int, last: int
+    ) -> NDArray[np.float32]:
+        """Return (rows, columns) float32: what stain and fold leave of the light on each photosite of some rows."""
+        from scipy.ndimage import map_coordinates
+
+        from sim.render import GRID_PX
+
+        row, column = np.mgrid[first:last, : self.body.visible.width]
+        at = np.stack([row, column]) / GRID_PX + 1
+        points = np.stack([map_coordinates(nodes[..., axis], at, order=1) for axis in (0, 1)], axis=-1)
+        channel = channels[row % 2, column % 2]
+        return np.take_along_axis(self.worn(points), channel[..., None], axis=-1)[..., 0].astype(np.float32)
+
+    def _wear(self) -> tuple[Stain | None, Fold | None]:
+        """Return the stain and the fold, somewhere on the sheet, clear of its edges."""
+        room, page, random = self.room, np.array(self.sheet.page_mm), self._random(5)
+        x, y = (page * random.uniform(0.25, 0.75, 2)).tolist()
+        taken = room.stain_depth * np.array([0.3, 0.6, 1.0])
+        red, green, blue = (1 - taken).tolist()
+        stain = Stain((x, y), room.stain_mm, (red, green, blue)) if room.stain_mm else None
+        along = math.radians(random.uniform(-6, 6))
+        crease = float(page[0] * random.uniform(0.3, 0.7)), float(page[1] / 2)
+        direction = math.sin(along), math.cos(along)
+        return stain, Fold(crease, direction, room.fold_mm, _SLANT) if room.fold_mm else None
 
     def _nodes(self) -> NDArray[np.float64]:
         """Return (ny, nx, 2) float64: the place on the print of every 16th photosite, one node beyond on each side."""

@@ -332,6 +332,45 @@ def test_small_sheets_wave_like_large_ones(page_mm: tuple[float, float]) -> None
     assert height / math.hypot(*page_mm) == pytest.approx(3 / math.hypot(1189, 841), rel=0.03)
 
 
+def test_a_stain_and_a_fold_are_where_the_room_tells_and_as_deep() -> None:
+    """Bare paper beside itself, worn: what is lost is what `worn` says, and nothing elsewhere."""
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    room = Room(response_spread=0, stain_mm=25, stain_depth=0.4, fold_mm=2)
+    clean, worn = (World(sheet, BODIES["Test"], it) for it in (replace(room, stain_mm=0, fold_mm=0), room))
+    assert worn.stain is not None
+    assert worn.fold is not None
+    assert clean.stain is None
+    rows, columns = BODIES["Test"].half_size
+    x, y = np.meshgrid(np.arange(20, columns - 20, 7), np.arange(20, rows - 20, 7))
+    planes = channel_planes(worn.signal(WHITE, REFERENCE_EXPOSURE))[y, x]
+    for channel, offset in enumerate((-0.25, 0, 0.25)):
+        places = worn.view.locate(np.stack([x, y], axis=-1) + offset)
+        white = np.full((places[..., 0].size, 3), 255)
+        true = worn.seen(white, places.reshape(-1, 2), WHITE, REFERENCE_EXPOSURE)[:, channel].reshape(x.shape)
+        inside = ((places > 2) & (places < np.array(sheet.page_mm) - 2)).all(axis=-1)
+        # A stain's rim is blurred by the lens, paper is not.
+        rim = np.abs(np.linalg.norm(places - worn.stain.centre_mm, axis=-1) - 12.5) < 3
+        np.testing.assert_allclose(planes[..., channel][inside & ~rim], true[inside & ~rim], rtol=2e-3)
+    middle = np.array(worn.stain.centre_mm)
+    np.testing.assert_allclose(worn.stain.passed(middle), [0.88, 0.76, 0.6], atol=1e-6)
+    away = np.array(worn.fold.at_mm) + np.array([[-6.0, 0], [6, 0], [-80, 0]])
+    left, right, flat = worn.fold.shade(away).tolist()
+    assert left - 1 == pytest.approx(1 - right, rel=0.02)
+    assert abs(left - right) > 0.02, "a jump of the light across the crease"
+    assert flat == pytest.approx(1, abs=0.003)
+
+
+def test_a_fold_bends_the_picture() -> None:
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    flat, folded = (World(sheet, BODIES["Test"], Room(fold_mm=height)) for height in (0, 3))
+    assert folded.fold is not None
+    line = np.array(folded.fold.at_mm) + np.stack([np.linspace(-60, 60, 241), np.zeros(241)], axis=-1)
+    moved = folded.project(line) - flat.project(line)
+    assert np.linalg.norm(moved, axis=1).max() > 0.2
+    bend = np.linalg.norm(np.diff(moved, 2, axis=0), axis=1)
+    assert abs(int(bend.argmax()) - 119) <= 2, "the sharpest bend is the crease"
+
+
 def test_the_camera_may_stand_upside_down() -> None:
     sheet = Print((180, 125), np.array([[30.0, 20, 60, 50]]), np.zeros((1, 3), dtype=np.uint8))
     world = World(sheet, BODIES["Test"], Room(roll_deg=180, response_spread=0))
@@ -349,6 +388,8 @@ def test_the_camera_may_stand_upside_down() -> None:
         (lambda: Room(fill=0), "fill is 0"),
         (lambda: Room(vignetting=1.0), "vignetting is 1.0"),
         (lambda: Room(blur_px=-0.5), "blur_px is -0.5"),
+        (lambda: Room(stain_mm=-1.0), "stain_mm is -1.0"),
+        (lambda: Room(stain_depth=1.0), "stain_depth is 1.0"),
         (lambda: Print((10, 10), np.zeros((2, 4)), np.zeros((1, 3), dtype=np.uint8)), r"\(1, 3\)"),
         (lambda: Print((10, 10), np.array([[5.0, 5, 4, 6]]), np.zeros((1, 3), dtype=np.uint8)), "before"),
         (lambda: replace(BODIES["Test"], pattern="RGBB"), "pattern is 'RGBB'"),

@@ -1,0 +1,85 @@
+"""What handling does to a print: a stain, and a fold.
+
+A stain is a filter on the paper, of one colour, with a soft rim. A fold is a crease that does not lie flat: the sheet
+rises towards it on both sides, so that the crease stands off the plane, and either flank is turned a little towards
+the light or away from it. Pure functions of places on the print, millimetres from its top-left corner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+RIM_MM = 1.0
+"""Over which a stain's edge fades."""
+
+ROUND_MM = 4.0
+"""Paper bends; a crease is no sharper than this."""
+
+FLANK_MM = 40.0
+"""From the crease to where the sheet lies flat again, to 1 / e."""
+
+
+@dataclass(frozen=True)
+class Stain:
+    """A round stain.
+
+    Attributes
+    ----------
+    centre_mm
+        Its middle on the print.
+    diameter_mm
+        Its size.
+    transmittance
+        Share of red, green and blue light that comes back through it, over that of clean paper.
+    """
+
+    centre_mm: tuple[float, float]
+    diameter_mm: float
+    transmittance: tuple[float, float, float]
+
+    def passed(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the share (..., 3) of red, green and blue light that comes back from points (..., 2)."""
+        away = np.linalg.norm(points_mm - np.array(self.centre_mm), axis=-1) - self.diameter_mm / 2
+        cover = 1 / (1 + np.exp(np.clip(4 * away / RIM_MM, -40, 40)))
+        return 1 - cover[..., None] * (1 - np.array(self.transmittance))
+
+
+@dataclass(frozen=True)
+class Fold:
+    """A crease across the sheet, from its upper to its lower edge.
+
+    Attributes
+    ----------
+    at_mm
+        A point of the crease.
+    along
+        Its direction, a unit vector.
+    height_mm
+        How far the crease stands off the plane, towards the camera.
+    slant
+        Change of the light with a flank's slope: the tangent of the angle under which the light falls in.
+    """
+
+    at_mm: tuple[float, float]
+    along: tuple[float, float]
+    height_mm: float
+    slant: float
+
+    def _away(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the distance (...) of points from the crease, positive on its right."""
+        x, y = np.moveaxis(points_mm - np.array(self.at_mm), -1, 0)
+        return x * self.along[1] - y * self.along[0]
+
+    def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the height (...) in mm of points (..., 2)."""
+        rounded = np.hypot(self._away(points_mm), ROUND_MM) - ROUND_MM
+        return self.height_mm * np.exp(-rounded / FLANK_MM)
+
+    def shade(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the light (...) on points (..., 2) over that on a flat sheet."""
+        away = self._away(points_mm)
+        slope = -self.height(points_mm) * away / np.hypot(away, ROUND_MM) / FLANK_MM
+        return 1 + self.slant * slope
