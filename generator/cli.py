@@ -15,6 +15,7 @@ from drivers.console import EXIT_CODES, run
 if TYPE_CHECKING:
     from calibration.lut import Lut
     from generator.illuminant import LightChoice
+    from generator.picture import Preparation
     from generator.scene import Source
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
@@ -37,8 +38,12 @@ def generate(
     lut: Annotated[Path, typer.Argument(metavar="LUT", help="Folder of the table.", show_default=False)],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to make; must not exist.", show_default=False)],
     sources: Annotated[
-        list[Path] | None,
-        typer.Option(help="A picture, or a folder that is searched with those below it; may be repeated."),
+        list[str] | None,
+        typer.Option(
+            metavar="PLACE",
+            help="A picture, or a folder that is searched with those below it, or a URL of either on a store that "
+            "fsspec knows; may be repeated.",
+        ),
     ] = None,
     random_scenes: Annotated[
         int, typer.Option(metavar="N", help="Add N pictures of uniformly random colours.", min=0)
@@ -69,6 +74,22 @@ def generate(
     max_side: Annotated[
         int | None, typer.Option(metavar="PX", help="Make larger pictures this small first.", min=1, show_default=False)
     ] = None,
+    crop: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH", help="Cut pictures to this size; smaller ones are passed over.", show_default=False
+        ),
+    ] = None,
+    cover: Annotated[
+        bool, typer.Option("--cover", help="Make pictures as small as still covers the crop before they are cut.")
+    ] = False,
+    crop_at: Annotated[
+        Literal["centre", "random"], typer.Option(help="Where to cut; random is chosen by the seed.")
+    ] = ("centre"),
+    profiles: Annotated[
+        Literal["honour", "ignore"],
+        typer.Option(help="Convert pictures with another colour profile to sRGB, or take their codes as they stand."),
+    ] = "honour",
     preview: Annotated[bool, typer.Option(help="Write tone-mapped previews.")] = True,
     contact_sheet: Annotated[
         Path | None,
@@ -83,6 +104,7 @@ def generate(
     from drivers.errors import InputError
     from generator.dataset import generate_dataset
     from generator.engines import default_workers
+    from generator.picture import Preparation
     from generator.workplace import require_free_place
 
     require_free_place(out)
@@ -91,7 +113,8 @@ def generate(
     if contact_sheet is not None and contact_sheet.exists():
         raise InputError(f"{contact_sheet} already exists; name a new file for the contact sheet, or remove it first")
     table = open_lut(lut)
-    pictures = _choose_sources(sources or [], random_scenes, size, seed, max_side)
+    preparation = Preparation(max_side, None if crop is None else _size(crop, "--crop"), cover, crop_at, profiles, seed)
+    pictures = _choose_sources(sources or [], random_scenes, size, seed, preparation)
     choice = _choose_lights(table, illuminations, random, nearest, seed)
     console = Console(stderr=True)
     with Progress(
@@ -119,7 +142,7 @@ def generate(
             choice,
             seed=seed,
             form=format,
-            reading={"max_side": max_side},
+            reading=preparation.describe(),
             workers=default_workers() if workers is None else workers,
             previews=preview,
             on_image=on_image,
@@ -132,8 +155,8 @@ def generate(
     if made.replaced_pixels:
         share = 100 * made.replaced_pixels / made.pixels
         print(
-            f"{made.replaced_pixels} source pixels ({share:.2g} %) are of the {len(table.provenance.unfit)} colours that "
-            "the table lists as unfit; they took the nearest fit colour"
+            f"{made.replaced_pixels} source pixels ({share:.2g} %) are of the {len(table.provenance.unfit)} colours "
+            "that the table lists as unfit; they took the nearest fit colour"
         )
     if contact_sheet is not None:
         from generator.contact import save_contact_sheet
@@ -143,22 +166,28 @@ def generate(
 
 
 def _choose_sources(
-    places: list[Path], random_scenes: int, size: str, seed: int, max_side: int | None
+    places: list[str], random_scenes: int, size: str, seed: int, preparation: Preparation
 ) -> tuple[Source, ...]:
-    import re
-
     from drivers.errors import InputError
     from generator import scene
 
-    found: tuple[Source, ...] = scene.find_pictures(places, max_side)
+    found: tuple[Source, ...] = scene.find_pictures(places, preparation)
     if random_scenes:
-        match = re.fullmatch(r"(\d+)[xX×](\d+)", size)
-        if not match:
-            raise InputError(f"--size is {size!r}, expected width x height such as 512x512")
-        found += scene.random_scenes(random_scenes, int(match[1]), int(match[2]), seed)
+        found += scene.random_scenes(random_scenes, *_size(size, "--size"), seed)
     if not found:
         raise InputError("there is no source picture; name some with --sources or ask for --random-scenes")
     return found
+
+
+def _size(text: str, option: str) -> tuple[int, int]:
+    import re
+
+    from drivers.errors import InputError
+
+    match = re.fullmatch(r"(\d+)[xX×](\d+)", text)
+    if not match:
+        raise InputError(f"{option} is {text!r}, expected width x height such as 512x512")
+    return int(match[1]), int(match[2])
 
 
 def _choose_lights(

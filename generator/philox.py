@@ -35,6 +35,8 @@ MASKS: Final = 5
 """Purpose of the words that shape where each of a picture's lights falls."""
 CROPS: Final = 6
 """Purpose of the words that choose where pictures are cut."""
+ITEMS: Final = 7
+"""Purpose of the words that choose what a training item shows."""
 
 _WORD: Final = 0xFFFFFFFF
 

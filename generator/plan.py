@@ -13,7 +13,8 @@ import importlib.metadata
 import json
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
@@ -278,17 +279,14 @@ def sources_sha256(sources: Sequence[Source]) -> str:
         return sources.digest()
     digest = hashlib.sha256()
     for source in sources:
-        told = {"kind": type(source).__name__, "name": source.name}
-        if is_dataclass(source):
-            values = {field.name: getattr(source, field.name) for field in fields(source)}
-            told |= {key: repr(value) for key, value in values.items() if not isinstance(value, Path)}
-        digest.update(json.dumps(told, sort_keys=True).encode() + b"\n")
+        digest.update(json.dumps(source.told(), sort_keys=True).encode() + b"\n")
     return digest.hexdigest()
 
 
+@lru_cache
 def versions(form: Format, layout: Layout) -> dict[str, str]:
     """Return the versions of what decodes sources and encodes images: other versions may give other bytes."""
-    names = ["numpy", "OpenImageIO", "opencv-contrib-python-headless"]
+    names = ["numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "simplejpeg"]
     if layout == "parquet":
         names.append("pyarrow")
     found = {name: importlib.metadata.version(name) for name in (*names, *libraries_of(form))}

@@ -59,6 +59,8 @@ class SourceRecord(_Record):
         Place in the list of sources, from 0; the choice of its lights depends on it.
     name, sha256
         What it was called, and the hash of its file; no hash where it was made and not read.
+    profile
+        What was done about its colour profile, in words; None where it was made and not read.
     width, height
         Size of its images, px.
     replaced_pixels
@@ -70,6 +72,7 @@ class SourceRecord(_Record):
     position: int
     name: str
     sha256: str | None
+    profile: str | None = None
     width: int
     height: int
     replaced_pixels: int

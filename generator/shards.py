@@ -26,6 +26,7 @@ import numpy.typing as npt
 from drivers.errors import FormatError, InputError
 from generator.layouts import Sample, ShardWriter, open_writer
 from generator.lighting import Lighting
+from generator.picture import Picture
 from generator.plan import ShardJob, light_of, split_of, versions
 from generator.records import (
     ImageRecord,
@@ -35,7 +36,7 @@ from generator.records import (
     SourceRecord,
     Triple,
 )
-from generator.scene import Picture, Source
+from generator.scene import Source
 from generator.workplace import Workplace
 
 if TYPE_CHECKING:
@@ -216,17 +217,18 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _Read:
     from generator.palette import fit_picture
 
     source: Source = job.sources[place]
-    picture, replaced = fit_picture(source.read(), lut.provenance)
-    sha256 = source.sha256()
+    scene = source.read()
+    picture, replaced = fit_picture(scene.picture, lut.provenance)
     height, width = picture.shape[:2]
     record = SourceRecord(
         position=job.position + place,
         name=source.name,
-        sha256=sha256,
+        sha256=scene.sha256,
+        profile=scene.profile,
         width=width,
         height=height,
         replaced_pixels=replaced,
-        split=split_of(job.options.split, job.seed, sha256, source.name),
+        split=split_of(job.options.split, job.seed, scene.sha256, source.name),
     )
     return _Read(picture, record)
 

@@ -19,7 +19,8 @@ from generator.contact import contact_sheet
 from generator.dataset import Dataset, Entry, generate_dataset, open_dataset
 from generator.illuminant import RandomLights
 from generator.kernel import render
-from generator.scene import find_pictures, random_scenes, read_picture
+from generator.picture import read_picture
+from generator.scene import find_pictures, random_scenes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -137,7 +138,7 @@ def test_replaced_pixels_are_counted(make_lut: Callable[..., Lut], pictures: Pat
     lut = make_lut(unfit=(0, 21))
     (source,) = find_pictures([pictures / "a.png"])
     made = generate_dataset(lut, tmp_path / "out", [source], [0], previews=False)
-    top = source.read() >> 6
+    top = source.read().picture >> 6
     count = int(((top == 0).all(axis=2) | (top == 1).all(axis=2)).sum())  # colour 21 is (1, 1, 1)
     assert count > 0
     assert made.description.replaced_pixels == count

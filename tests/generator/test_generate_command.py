@@ -56,6 +56,7 @@ def test_a_dataset_with_its_contact_sheet(generate: Generate, capsys: pytest.Cap
         "format": "png",
         "layout": "folder",
         "max_side": 30,
+        "profiles": "honour",
         "lights": {"choice": "listed", "lights": [0, 2, 3]},
         "previews": True,
         "split": None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ import pytest
 import tifffile
 
 from drivers.errors import FormatError, InputError
-from generator.picture import read_picture
+from generator.picture import Preparation, read_picture
 from generator.scene import RandomScene, find_pictures, random_scenes
+from generator.store import filesystem
 
 
 def write(path: Path, pixels: npt.NDArray[np.generic], form: str, **attributes: object) -> Path:
@@ -151,13 +153,50 @@ def test_a_missing_picture_is_named(tmp_path: Path) -> None:
 
 
 def test_folders_are_searched_in_order_of_names(tmp_path: Path) -> None:
-    for name in ("b.png", "a/z.JPG", "a.tif", "B.png", "notes.txt", ".hidden.png", ".cache/c.png", "a/b/c.exr"):
+    names = ("b.png", "a/z.JPG", "a.tif", "a-b/y.png", "B.png", "notes.txt", ".hidden.png", ".cache/c.png", "a/b/c.exr")
+    for name in names:
         (tmp_path / "in" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "in" / name).touch()
     (tmp_path / "alone.dat").touch()
-    found = find_pictures([tmp_path / "alone.dat", tmp_path / "in"], 99)
-    assert [source.name for source in found] == ["alone.dat", "B.png", "a.tif", "a/b/c.exr", "a/z.JPG", "b.png"]
-    assert {source.max_side for source in found} == {99}
+    found = find_pictures([tmp_path / "alone.dat", str(tmp_path / "in")], Preparation(max_side=99))
+    assert [source.name for source in found] == [
+        *("alone.dat", "B.png", "a-b/y.png", "a.tif", "a/b/c.exr", "a/z.JPG", "b.png")
+    ]
+    assert [source.location for source in found[2:4]] == [str(tmp_path / "in/a-b/y.png"), str(tmp_path / "in/a.tif")]
+    assert {source.preparation.max_side for source in found} == {99}
+
+
+def test_links_to_folders_are_not_followed_and_links_to_files_are(tmp_path: Path) -> None:
+    (tmp_path / "in/deep").mkdir(parents=True)
+    (tmp_path / "in/deep/a.png").touch()
+    (tmp_path / "in/again").symlink_to(tmp_path / "in")
+    (tmp_path / "in/b.png").symlink_to(tmp_path / "in/deep/a.png")
+    assert [source.name for source in find_pictures([tmp_path / "in"])] == ["b.png", "deep/a.png"]
+
+
+def test_pictures_of_a_store_are_those_of_a_folder(tmp_path: Path, colours: npt.NDArray[np.uint8]) -> None:
+    store, root = filesystem(f"memory://{tmp_path.name}")
+    local: list[Path] = []
+    for name in ("b.png", "in/a.png", ".hidden.png", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        local.append(write(tmp_path / f"{name}.png", colours, "uint8"))
+        store.pipe_file(f"{root}/{name}", local[-1].read_bytes())
+    found = find_pictures([f"memory://{tmp_path.name}"])
+    assert [source.name for source in found] == ["b.png", "in/a.png"]
+    for source in found:
+        scene = source.read()
+        np.testing.assert_array_equal(scene.picture, colours)
+        assert scene.sha256 == hashlib.sha256(local[0].read_bytes()).hexdigest()
+    (alone,) = find_pictures([f"memory://{tmp_path.name}/b.png"])
+    assert alone.name == "b.png"
+    np.testing.assert_array_equal(alone.read().picture, colours)
+    store.rm(f"{root}/b.png")
+    with pytest.raises(FormatError, match=r"cannot read memory://.*b\.png"):
+        alone.read()
+    with pytest.raises(InputError, match="holds no picture"):
+        find_pictures([f"memory://{tmp_path.name}/nothing"])
+    with pytest.raises(InputError, match="cannot reach nostore://"):
+        find_pictures(["nostore://a/b"])
 
 
 def test_places_without_pictures_are_named(tmp_path: Path) -> None:
@@ -169,7 +208,7 @@ def test_places_without_pictures_are_named(tmp_path: Path) -> None:
 
 
 def test_random_scenes_are_uniform_and_their_own() -> None:
-    first, second = (scene.read() for scene in random_scenes(2, 1001, 800, seed=9))
+    first, second = (scene.read().picture for scene in random_scenes(2, 1001, 800, seed=9))
     assert first.shape == (800, 1001, 3)
     # Chi-square with 255 degrees of freedom exceeds 370 once in a million; the seed is fixed.
     for channel in range(3):
@@ -178,7 +217,7 @@ def test_random_scenes_are_uniform_and_their_own() -> None:
         assert ((counts - expected) ** 2 / expected).sum() < 370
     assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.005
     assert abs(np.corrcoef(first[..., 0].ravel(), first[..., 1].ravel())[0, 1]) < 0.007
-    np.testing.assert_array_equal(RandomScene(1, 500, 30, 9).read(), second[:30, :500])
+    np.testing.assert_array_equal(RandomScene(1, 500, 30, 9).read().picture, second[:30, :500])
 
 
 @pytest.mark.parametrize(("count", "width", "height"), [(0, 5, 5), (1, 0, 5), (1, 5, 65536)])
