@@ -1,6 +1,7 @@
 """The simulated EOS: a PTP responder that behaves as a Canon EOS body does, with a `Film` where the sensor would be.
 
-Rules that hold inside:
+Here stand its two sides, the session, and its sleep. What it is stands in `sim.eos_state`; what it does, in
+`sim.eos_settings`, `sim.eos_files` and `sim.eos_release`. The rules of all five:
 
 - State moves with the time that is handed in, and only when somebody asks or touches the camera: what falls due in
   between happens then, in its order. With a `SimulatedClock` an initiator that waits must sleep by the same clock;
@@ -18,197 +19,28 @@ Source: a recorded EOS 60D; ISO 15740:2013 for what is standard; libgphoto2 2.5.
 from __future__ import annotations
 
 import hashlib
-import heapq
-import itertools
 import threading
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor, Future
-from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
-from enum import Enum
-from io import BytesIO
-from typing import NamedTuple
+from concurrent.futures import Executor
+from dataclasses import replace
 
-from drivers.camera import ExposureSettings
 from drivers.clock import Clock
-from drivers.errors import CropError, DeviceError, DeviceRefused, LinkClosed, ProtocolError
-from drivers.ptp import apex
-from drivers.ptp.canon import (
-    IMAGE_FORMAT_PROPERTIES,
-    AvailableFormats,
-    AvailableValues,
-    ImageFormat,
-    Notice,
-    ObjectEntry,
-    ObjectEvent,
-    PropertyChanged,
-    PropertySetting,
-    Record,
-    TransferRequest,
-    encode_events,
-    encode_object_entries,
-    number_of,
-    number_value,
-    text_value,
-)
-from drivers.ptp.codes import (
-    AeMode,
-    CameraStatus,
-    CaptureDestination,
-    DataType,
-    DriveMode,
-    EosEvent,
-    EventCode,
-    FilesystemType,
-    FocusMode,
-    ObjectFormat,
-    Operation,
-    Property,
-    ReleaseButton,
-    ResponseCode,
-    StorageType,
-)
-from drivers.ptp.datasets import (
-    DevicePropDesc,
-    EnumerationForm,
-    ObjectInfo,
-    StorageInfo,
-    Value,
-    decode_value,
-    encode_u32_array,
-    encode_value,
-)
+from drivers.errors import LinkClosed
+from drivers.ptp.canon import ImageFormat, Notice, number_of, number_value
+from drivers.ptp.codes import AeMode, EosEvent, FocusMode, Operation, Property, ReleaseButton, ResponseCode
 from drivers.ptp.messages import Event, Request, Response
-from sim.eos_bodies import FOCUS_CENTRE, FREE, LIST, MIRROR_LOCKUP, EosBody, custom_functions, focus_points
+from sim.eos_bodies import EosBody
+from sim.eos_release import EosRelease
+from sim.eos_settings import EosSettings
+from sim.eos_state import CARD, Arguments, Declined, Reply
 from sim.film import Film
 from sim.responder import Answer
 
-CARD = 0x00020001
-"""The store that is the card."""
-EMPTY_SLOT = 0x00020000
-"""What storage ids tell while there is no card."""
-DCIM = 0x90000000
-FOLDER = 0x91900000
-"""Handle of the folder 100CANON; files on the card are numbered from it, 16 apart."""
-_MEMORY = 0xA0000000
-"""Handles of objects in the camera's memory are numbered from here (assumed)."""
-_ROOT = 0xFFFFFFFF
-_ANY = 0xFFFFFFFF
-_U32 = 0xFFFFFFFF
-_MOST_SHOTS = 0x7FFFFFFF
-_BULB = 0x0C
-_TIMERS_S: dict[int, float] = {
-    DriveMode.TIMER_10_S: 10.0,
-    DriveMode.TIMER_2_S: 2.0,
-    DriveMode.TIMER_CONTINUOUS: 10.0,
-}
-_CONTINUOUS = (
-    DriveMode.CONTINUOUS,
-    DriveMode.CONTINUOUS_HIGH,
-    DriveMode.CONTINUOUS_LOW,
-    DriveMode.CONTINUOUS_SILENT,
-)
-_AUTO_ISO = 400
-"""ISO speed where the body may choose (assumed; there is no meter)."""
-_METERED_S = 1 / 60
-"""Shutter time where the body may choose (assumed; there is no meter)."""
-_METERED_APERTURE = 5.6
-"""Aperture where the body may choose (assumed; there is no meter)."""
 _SHUTDOWN_WARNING_S = 10.0
 """How long before it goes to sleep the camera says so (assumed)."""
-_TEXTS = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT)
-_FREELY_SET = (*_TEXTS, Property.EOS_CAMERA_TIME)
-_FORMATS_BY_SUFFIX = {".crw": ObjectFormat.CRW, ".cr3": ObjectFormat.CR3}
-_JPEG_SIZE = (160, 240)
 
 
-class _Refusal(Enum):
-    """Why a full press takes no picture: the response to RemoteReleaseOn, and the result of RemoteRelease."""
-
-    BUSY = (ResponseCode.DEVICE_BUSY, 0x2019)
-    NO_FOCUS = (ResponseCode.DEVICE_BUSY, 1)
-    MIRROR_LOCKUP = (ResponseCode.DEVICE_BUSY, 3)
-    MEMORY_FULL = (ResponseCode.DEVICE_BUSY, 7)
-    STORE_FULL = (ResponseCode.STORE_FULL, 7)
-    BATTERY_EMPTY = (ResponseCode.EOS_LOW_BATTERY, ResponseCode.EOS_LOW_BATTERY)
-    EXPOSURE = (ResponseCode.GENERAL_ERROR, ResponseCode.GENERAL_ERROR)
-
-    def __init__(self, response: int, result: int) -> None:
-        self.response = response
-        self.result = result
-
-
-class _Declined(Exception):
-    """Ends an operation with another response than OK."""
-
-    def __init__(self, code: int, *parameters: int) -> None:
-        super().__init__(code)
-        self.code = code
-        self.parameters = parameters
-
-
-class _Reply(NamedTuple):
-    """What an operation that was carried out answers."""
-
-    data: bytes | None = None
-    parameters: tuple[int, ...] = ()
-
-
-@dataclass
-class _Property:
-    """A property as it stands: what it is, and what it can be set to."""
-
-    value: bytes
-    kind: int
-    told: bool
-    choices: tuple[int, ...] = ()
-    formats: tuple[ImageFormat, ...] = ()
-
-
-@dataclass(frozen=True)
-class _Object:
-    """A file or folder: on the card, or in the camera's memory where `storage` is 0."""
-
-    handle: int
-    storage: int
-    format: int
-    name: str
-    taken_at: datetime
-    parent: int = 0
-    data: bytes = b""
-
-    @property
-    def entry(self) -> ObjectEntry:
-        return ObjectEntry(
-            self.handle, self.storage, self.format, len(self.data), self.name, self.parent, self.handle,
-            time=int(self.taken_at.timestamp()) & _U32,
-        )  # fmt: skip
-
-
-@dataclass
-class _Card:
-    """A memory card: its capacity in bytes, and the objects on it by handle."""
-
-    capacity: int
-    objects: dict[int, _Object] = field(default_factory=dict[int, _Object])
-
-    @property
-    def free(self) -> int:
-        return self.capacity - sum(len(item.data) for item in self.objects.values())
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """A picture under way: what the film makes of it (None where it failed) and where it goes."""
-
-    number: int
-    taken_at: datetime
-    raw: Future[bytes | None]
-    formats: ImageFormat
-    destination: int
-
-
-class SimulatedEos:
+class SimulatedEos(EosSettings, EosRelease):
     """An EOS body on a cable; a `sim.responder.Responder`.
 
     Parameters
@@ -255,56 +87,20 @@ class SimulatedEos:
         forgetful: bool = False,
         darkroom: Executor | None = None,
     ) -> None:
-        self.body = body
-        self.serial = serial
-        self._film = film
-        self._clock = clock
-        self._darkroom = darkroom
-        self._forgetful = forgetful
+        super().__init__(
+            body,
+            film,
+            clock,
+            serial=serial,
+            card_bytes=card_bytes,
+            auto_power_off_s=auto_power_off_s,
+            battery=battery,
+            shutter_count=shutter_count,
+            forgetful=forgetful,
+            darkroom=darkroom,
+        )
         self._guard = threading.RLock()
         self._operations = self._handlers(frozenset(without))
-        self._card = None if card_bytes is None else self._blank_card(card_bytes)
-        self._battery = battery
-        self._shutter_count = shutter_count
-        self._time_offset = timedelta()
-        self._initiator = "Unknown Initiator"
-        self._number = 0
-        self._handles = itertools.count(_MEMORY + 1)
-        self._mirror_lockup = False
-        self._finds_focus = True
-        self._asleep = False
-        # What a session has and loses.
-        self._session = 0
-        self._last_transaction = 0
-        self._remote_mode = 0
-        self._event_mode = 0
-        self._queue: list[Record] = []
-        self._memory: dict[int, _Object] = {}
-        self._host_bytes = 0
-        self._hints: list[Event] = []
-        self._idle_since = clock.monotonic()
-        self._warned = False
-        # What is under way: (when, order, what happens then), the earliest first.
-        self._due: list[tuple[float, int, Callable[[], None]]] = []
-        self._order = itertools.count()
-        self._unfinished = 0
-        self._focused = False
-        self._pressed_at: float | None = None
-        self._bulb_since: tuple[float, datetime] | None = None
-        self._bracket_step = 0
-        self._properties = {
-            spec.code: _Property(
-                spec.value or b"", spec.kind, spec.value is not None, tuple(spec.choices), tuple(spec.formats)
-            )
-            for spec in body.properties
-        }
-        self._properties[Property.EOS_SERIAL_NUMBER].value = text_value(serial)
-        for code in _TEXTS:
-            self._properties[code].value = text_value("")
-        if auto_power_off_s is not None:
-            self._properties[Property.EOS_AUTO_POWER_OFF].value = number_value(auto_power_off_s)
-        self._renew_destinations()
-        self._renew_exposure_lists()
 
     # The cable.
 
@@ -331,7 +127,7 @@ class SimulatedEos:
                 raise LinkClosed(f"the simulated {self.body.model} has switched itself off; wake it up")
             try:
                 reply = self._carry_out(request, data)
-            except _Declined as no:
+            except Declined as no:
                 return Answer(Response(no.code, request.transaction, no.parameters))
             return Answer(Response(ResponseCode.OK, request.transaction, reply.parameters), reply.data)
 
@@ -421,18 +217,15 @@ class SimulatedEos:
             self._record(Notice(EosEvent.STORE_REMOVED, CARD))
             self._renew_destinations()
 
-    # Time.
+    # Falling asleep.
 
     def _move(self) -> None:
-        """Let everything happen that has fallen due."""
-        now = self._clock.monotonic()
-        while self._due and self._due[0][0] <= now:
-            _, _, happen = heapq.heappop(self._due)
-            happen()
+        """Let everything happen that has fallen due, and fall asleep in the end."""
+        super()._move()
         limit = number_of(self._properties[Property.EOS_AUTO_POWER_OFF].value)
         if not self._session or not limit or self._is_busy:
             return
-        idle = now - self._idle_since
+        idle = self._clock.monotonic() - self._idle_since
         if idle >= limit:
             self._end_session()
             self._memory.clear()
@@ -441,9 +234,6 @@ class SimulatedEos:
             self._warned = True
             self._record(Notice(EosEvent.WILL_SOON_SHUT_DOWN, int(limit - idle)))
 
-    def _at(self, when: float, happen: Callable[[], None]) -> None:
-        heapq.heappush(self._due, (when, next(self._order), happen))
-
     def _touch(self) -> None:
         self._idle_since = self._clock.monotonic()
         if self._warned:
@@ -451,36 +241,32 @@ class SimulatedEos:
             limit = number_of(self._properties[Property.EOS_AUTO_POWER_OFF].value)
             self._record(Notice(EosEvent.SHUTDOWN_TIMER_UPDATED, limit))
 
-    @property
-    def _is_busy(self) -> bool:
-        return self._unfinished > 0 or self._bulb_since is not None
-
     # Operations.
 
-    def _carry_out(self, request: Request, data: bytes | None) -> _Reply:
+    def _carry_out(self, request: Request, data: bytes | None) -> Reply:
         operation = self._operations.get(request.code)
         if operation is None:
-            raise _Declined(ResponseCode.OPERATION_NOT_SUPPORTED)
+            raise Declined(ResponseCode.OPERATION_NOT_SUPPORTED)
         if request.code not in (Operation.GET_DEVICE_INFO, Operation.OPEN_SESSION):
             if not self._session:
-                raise _Declined(ResponseCode.SESSION_NOT_OPEN)
+                raise Declined(ResponseCode.SESSION_NOT_OPEN)
             self._check_transaction(request.transaction)
         elif self._session and request.code == Operation.GET_DEVICE_INFO and request.transaction:
             self._check_transaction(request.transaction)
         if request.code not in (Operation.EOS_GET_EVENT, Operation.GET_DEVICE_INFO):
             self._touch()
         one, two, three, *_ = (*request.parameters, 0, 0, 0)
-        return operation(_Arguments(one, two, three, data))
+        return operation(Arguments(one, two, three, data))
 
     def _check_transaction(self, transaction: int) -> None:
         """Refuse a number that is none or was used: one may be skipped, for a request can be lost on its way."""
         ahead = (transaction - self._last_transaction) & 0xFFFFFFFF
         if transaction in (0, 0xFFFFFFFF) or not 0 < ahead < 1 << 31:
-            raise _Declined(ResponseCode.INVALID_TRANSACTION_ID)
+            raise Declined(ResponseCode.INVALID_TRANSACTION_ID)
         self._last_transaction = transaction
 
-    def _handlers(self, without: frozenset[int]) -> dict[int, Callable[[_Arguments], _Reply]]:
-        operations: dict[int, Callable[[_Arguments], _Reply]] = {
+    def _handlers(self, without: frozenset[int]) -> dict[int, Callable[[Arguments], Reply]]:
+        operations: dict[int, Callable[[Arguments], Reply]] = {
             Operation.GET_DEVICE_INFO: self._get_device_info,
             Operation.OPEN_SESSION: self._open_session,
             Operation.CLOSE_SESSION: self._close_session,
@@ -501,12 +287,12 @@ class SimulatedEos:
             Operation.EOS_GET_OBJECT: self._get_object,
             Operation.EOS_DELETE_OBJECT: self._delete_object,
             Operation.EOS_GET_PARTIAL_OBJECT: self._get_partial_object,
-            Operation.EOS_GET_DEVICE_INFO_EX: lambda _: _Reply(self.body.info_ex.encode()),
+            Operation.EOS_GET_DEVICE_INFO_EX: lambda _: Reply(self.body.info_ex.encode()),
             Operation.EOS_GET_OBJECT_INFO_EX: self._get_object_info_ex,
             Operation.EOS_REMOTE_RELEASE: self._remote_release,
             Operation.EOS_SET_DEVICE_PROP_VALUE_EX: self._set_device_prop_value_ex,
             Operation.EOS_REQUEST_DEVICE_PROP_VALUE: self._request_device_prop_value,
-            Operation.EOS_GET_REMOTE_MODE: lambda _: _Reply(parameters=(self._remote_mode,)),
+            Operation.EOS_GET_REMOTE_MODE: lambda _: Reply(parameters=(self._remote_mode,)),
             Operation.EOS_SET_REMOTE_MODE: self._set_remote_mode,
             Operation.EOS_SET_EVENT_MODE: self._set_event_mode,
             Operation.EOS_GET_EVENT: self._get_event,
@@ -514,11 +300,11 @@ class SimulatedEos:
             Operation.EOS_CANCEL_TRANSFER: self._transfer_complete,
             Operation.EOS_RESET_TRANSFER: self._reset_transfer,
             Operation.EOS_PC_HDD_CAPACITY: self._pc_hdd_capacity,
-            Operation.EOS_SET_UI_LOCK: lambda _: _Reply(),
-            Operation.EOS_RESET_UI_LOCK: lambda _: _Reply(),
-            Operation.EOS_KEEP_DEVICE_ON: lambda _: _Reply(),
+            Operation.EOS_SET_UI_LOCK: lambda _: Reply(),
+            Operation.EOS_RESET_UI_LOCK: lambda _: Reply(),
+            Operation.EOS_KEEP_DEVICE_ON: lambda _: Reply(),
             Operation.EOS_AF_CANCEL: self._cancel_focus,
-            Operation.EOS_RESET_MIRROR_LOCKUP_STATE: lambda _: _Reply(),
+            Operation.EOS_RESET_MIRROR_LOCKUP_STATE: lambda _: Reply(),
             Operation.EOS_REMOTE_RELEASE_ON: self._remote_release_on,
             Operation.EOS_REMOTE_RELEASE_OFF: self._remote_release_off,
         }
@@ -526,24 +312,24 @@ class SimulatedEos:
 
     # Device and session.
 
-    def _get_device_info(self, _: _Arguments) -> _Reply:
+    def _get_device_info(self, _: Arguments) -> Reply:
         known = tuple(code for code in self.body.info.operations if code in self._operations)
         digits = hashlib.md5(self.serial.encode(), usedforsecurity=False).hexdigest()
-        return _Reply(replace(self.body.info, operations=known, serial_number=digits).encode())
+        return Reply(replace(self.body.info, operations=known, serial_number=digits).encode())
 
-    def _open_session(self, arguments: _Arguments) -> _Reply:
+    def _open_session(self, arguments: Arguments) -> Reply:
         if not arguments.one:
-            raise _Declined(ResponseCode.INVALID_PARAMETER)
+            raise Declined(ResponseCode.INVALID_PARAMETER)
         if self._session:
-            raise _Declined(ResponseCode.SESSION_ALREADY_OPEN, self._session)
+            raise Declined(ResponseCode.SESSION_ALREADY_OPEN, self._session)
         self._session = arguments.one
         self._last_transaction = 0
         self._touch()
-        return _Reply()
+        return Reply()
 
-    def _close_session(self, _: _Arguments) -> _Reply:
+    def _close_session(self, _: Arguments) -> Reply:
         self._end_session()
-        return _Reply()
+        return Reply()
 
     def _end_session(self) -> None:
         self._session = 0
@@ -558,39 +344,18 @@ class SimulatedEos:
         self._let_go(ReleaseButton.HALF_AND_FULL)
         self._renew_destinations()
 
-    def _set_remote_mode(self, arguments: _Arguments) -> _Reply:
+    def _set_remote_mode(self, arguments: Arguments) -> Reply:
         self._remote_mode = arguments.one
         if not self._remote_mode:
             self._let_go(ReleaseButton.HALF_AND_FULL)
-        return _Reply()
+        return Reply()
 
-    def _set_event_mode(self, arguments: _Arguments) -> _Reply:
+    def _set_event_mode(self, arguments: Arguments) -> Reply:
         self._event_mode = arguments.one
         self._queue.clear()
         if self._event_mode:
             self._tell_everything()
-        return _Reply()
-
-    def _require_remote(self) -> None:
-        # Assumed: nothing shows what a body says to whoever has not taken control of it.
-        if not self._remote_mode:
-            raise _Declined(ResponseCode.EOS_OPERATION_REFUSED)
-
-    # Events.
-
-    def _get_event(self, _: _Arguments) -> _Reply:
-        if self._bulb_since is not None and self._event_mode:
-            open_s = int(self._clock.monotonic() - self._bulb_since[0])
-            self._record(Notice(EosEvent.BULB_EXPOSURE_TIME, open_s))
-        records, self._queue = self._queue, []
-        return _Reply(encode_events(records))
-
-    def _record(self, record: Record) -> None:
-        if not self._event_mode:
-            return
-        if not self._queue:
-            self._hints.append(Event(EventCode.EOS_REQUEST_GET_EVENT))
-        self._queue.append(record)
+        return Reply()
 
     def _tell_everything(self) -> None:
         for code, known in self._properties.items():
@@ -603,533 +368,3 @@ class SimulatedEos:
         # Assumed: a frame that nobody fetched is offered to the next who listens.
         for item in self._memory.values():
             self._offer_transfer(item)
-
-    def _tell_list(self, code: int) -> None:
-        known = self._properties[code]
-        if code in IMAGE_FORMAT_PROPERTIES:
-            self._record(AvailableFormats(code, known.formats, known.kind))
-        else:
-            self._record(AvailableValues(code, known.choices, known.kind))
-
-    # Properties.
-
-    def _value(self, code: int) -> bytes:
-        """Return a property's value; some are never stored, for they follow from the camera's state."""
-        match code:
-            case Property.EOS_AVAILABLE_SHOTS:
-                return number_value(self._available_shots())
-            case Property.EOS_BATTERY_POWER:
-                return number_value(self._battery_code())
-            case Property.EOS_CAMERA_TIME:
-                return number_value(int(self._now().timestamp()) & _U32)
-            case Property.EOS_SHUTTER_COUNTER:
-                return number_value(self._shutter_count)
-            case Property.EOS_CURRENT_STORAGE:
-                return number_value(EMPTY_SLOT if self._card is None else CARD)
-            case Property.EOS_CURRENT_FOLDER:
-                return number_value(0 if self._card is None else FOLDER)
-            case _:
-                return self._properties[code].value
-
-    def _number_of(self, code: int) -> int:
-        known = self._properties.get(code)
-        return 0 if known is None else number_of(known.value)
-
-    def _tell(self, *codes: int) -> None:
-        for code in codes:
-            self._record(PropertyChanged(code, self._value(code)))
-            if code == Property.EOS_CUSTOM_FUNCTIONS and Property.EOS_MIRROR_UP_SETTING not in self._properties:
-                # Custom functions come as one record a group.
-                self._record(PropertyChanged(code, custom_functions(3, {MIRROR_LOCKUP: int(self._mirror_lockup)})))
-
-    def _change(self, code: int, value: bytes) -> None:
-        self._properties[code].value = value
-        self._tell(code)
-
-    def _offer(self, code: int, choices: tuple[int, ...]) -> None:
-        if self._properties[code].choices != choices:
-            self._properties[code].choices = choices
-            self._tell_list(code)
-
-    def _renew_exposure_lists(self) -> None:
-        mode = self._number_of(Property.EOS_AE_MODE)
-        bulb = mode == AeMode.BULB
-        timed = mode in (AeMode.MANUAL, AeMode.SHUTTER_PRIORITY)
-        shutter = () if not timed else self.body.shutter_codes
-        if mode == AeMode.SHUTTER_PRIORITY:
-            shutter = tuple(code for code in shutter if code != _BULB)
-        self._offer(Property.EOS_SHUTTER_SPEED, shutter)
-        apertured = mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB)
-        self._offer(Property.EOS_APERTURE, self.body.aperture_codes if apertured else ())
-        if bulb:
-            self._change(Property.EOS_SHUTTER_SPEED, number_value(_BULB))
-        elif shutter and self._number_of(Property.EOS_SHUTTER_SPEED) not in shutter:
-            self._change(Property.EOS_SHUTTER_SPEED, number_value(shutter[len(shutter) // 2]))
-
-    def _renew_destinations(self) -> None:
-        """Offer the destinations that there are; without remote control frames go to the card."""
-        both = (CaptureDestination.CARD, CaptureDestination.HOST, CaptureDestination.CARD_AND_HOST)
-        choices = both if self._card is not None else (CaptureDestination.HOST,)
-        self._offer(Property.EOS_CAPTURE_DESTINATION, choices)
-        if not self._session or self._number_of(Property.EOS_CAPTURE_DESTINATION) not in choices:
-            # The 60D without a card tells the card as destination all the same.
-            self._change(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.CARD))
-            self._tell(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
-
-    def _set_device_prop_value_ex(self, arguments: _Arguments) -> _Reply:
-        self._require_remote()
-        try:
-            setting = PropertySetting.decode(arguments.data or b"")
-        except ProtocolError:
-            raise _Declined(ResponseCode.INVALID_DEVICE_PROP_FORMAT) from None
-        known = self._properties.get(setting.code)
-        if known is None:
-            raise _Declined(ResponseCode.DEVICE_PROP_NOT_SUPPORTED)
-        # The recorded 60D answers 2019 to a value that its list does not hold, not 201c.
-        if self._is_busy or not self._allows(setting, known):
-            raise _Declined(ResponseCode.DEVICE_BUSY)
-        self._store(setting.code, setting.value)
-        return _Reply()
-
-    def _allows(self, setting: PropertySetting, known: _Property) -> bool:
-        try:
-            if setting.code in IMAGE_FORMAT_PROPERTIES:
-                return ImageFormat.decode(setting.value) in known.formats
-            if known.kind == LIST:
-                return number_of(setting.value) in known.choices
-        except ProtocolError:
-            raise _Declined(ResponseCode.INVALID_DEVICE_PROP_FORMAT) from None
-        return known.kind == FREE and setting.code in _FREELY_SET
-
-    def _store(self, code: int, value: bytes) -> None:
-        if code == Property.EOS_CAMERA_TIME:
-            self._time_offset = datetime.fromtimestamp(number_of(value), UTC) - self._clock.now()
-            self._tell(code)
-            return
-        if code in (Property.EOS_IMAGE_FORMAT, Property.EOS_IMAGE_FORMAT_SD):
-            self._change(Property.EOS_IMAGE_FORMAT, value)
-            self._change(Property.EOS_IMAGE_FORMAT_SD, value)
-            return
-        if code == Property.EOS_MIRROR_UP_SETTING:
-            self._mirror_lockup = bool(number_of(value))
-        if code == Property.EOS_AEB:
-            self._bracket_step = 0
-        self._change(code, value)
-        if code == Property.EOS_CAPTURE_DESTINATION:
-            self._tell(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
-
-    def _request_device_prop_value(self, arguments: _Arguments) -> _Reply:
-        if arguments.one not in self._properties:
-            raise _Declined(ResponseCode.GENERAL_ERROR)
-        self._tell(arguments.one)
-        return _Reply()
-
-    def _description(self, code: int) -> DevicePropDesc:
-        match code:
-            case Property.BATTERY_LEVEL:
-                percent = round(100 * self._battery)
-                levels = EnumerationForm((100, 75, 50, 25, 0), widened=True)
-                return DevicePropDesc(code, DataType.UINT8, False, percent, percent, levels)
-            case Property.DEVICE_FRIENDLY_NAME:
-                return DevicePropDesc(code, DataType.STRING, False, self.body.model, self.body.model)
-            case Property.PERCEIVED_DEVICE_TYPE:
-                return DevicePropDesc(code, DataType.UINT32, False, 1, 1)
-            case Property.SESSION_INITIATOR:
-                return DevicePropDesc(code, DataType.STRING, True, "Unknown Initiator", self._initiator)
-            case Property.USE_DEVICE_STAGE:
-                return DevicePropDesc(code, DataType.UINT8, False, 1, 1)
-            case _:
-                raise _Declined(ResponseCode.DEVICE_PROP_NOT_SUPPORTED)
-
-    def _get_device_prop_desc(self, arguments: _Arguments) -> _Reply:
-        return _Reply(self._description(arguments.one).encode())
-
-    def _get_device_prop_value(self, arguments: _Arguments) -> _Reply:
-        description = self._description(arguments.one)
-        return _Reply(encode_value(description.data_type, description.current))
-
-    def _set_device_prop_value(self, arguments: _Arguments) -> _Reply:
-        description = self._description(arguments.one)
-        if not description.writable:
-            raise _Declined(ResponseCode.ACCESS_DENIED)
-        try:
-            value: Value = decode_value(description.data_type, arguments.data or b"")
-        except ProtocolError:
-            raise _Declined(ResponseCode.INVALID_DEVICE_PROP_FORMAT) from None
-        self._initiator = str(value)
-        return _Reply()
-
-    def _battery_code(self) -> int:
-        return next(
-            code for least, code in ((0.88, 2), (0.63, 4), (0.38, 1), (0.1, 5), (-1, 0)) if self._battery > least
-        )
-
-    def _now(self) -> datetime:
-        return self._clock.now() + self._time_offset
-
-    # Stores and objects.
-
-    def _blank_card(self, capacity: int) -> _Card:
-        now = self._clock.now()
-        card = _Card(capacity)
-        for folder in (
-            _Object(DCIM, CARD, ObjectFormat.ASSOCIATION, "DCIM", now),
-            _Object(FOLDER, CARD, ObjectFormat.ASSOCIATION, "100CANON", now, DCIM),
-        ):
-            card.objects[folder.handle] = folder
-        return card
-
-    def _get_storage_ids(self, _: _Arguments) -> _Reply:
-        return _Reply(encode_u32_array((EMPTY_SLOT if self._card is None else CARD,)))
-
-    def _get_storage_info(self, arguments: _Arguments) -> _Reply:
-        self._require_store(arguments.one)
-        capacity, free = (0, 0) if self._card is None else (self._card.capacity, self._card.free)
-        info = StorageInfo(
-            StorageType.REMOVABLE_RAM, FilesystemType.DCF, capacity=capacity, free=free, description="SD"
-        )
-        return _Reply(info.encode())
-
-    def _require_store(self, storage: int) -> None:
-        if storage not in (EMPTY_SLOT if self._card is None else CARD, _ANY):
-            raise _Declined(ResponseCode.INVALID_STORAGE_ID)
-
-    def _on_card(self) -> dict[int, _Object]:
-        return {} if self._card is None else self._card.objects
-
-    def _children(self, parent: int) -> list[_Object]:
-        if parent not in (0, _ROOT) and parent not in self._on_card():
-            raise _Declined(ResponseCode.INVALID_OBJECT_HANDLE)
-        return [item for item in self._on_card().values() if item.parent == (0 if parent == _ROOT else parent)]
-
-    def _listed(self, arguments: _Arguments) -> list[_Object]:
-        self._require_store(arguments.one)
-        everything = arguments.three == 0
-        found = list(self._on_card().values()) if everything else self._children(arguments.three)
-        return [item for item in found if arguments.two in (0, _ANY, item.format)]
-
-    def _get_num_objects(self, arguments: _Arguments) -> _Reply:
-        return _Reply(parameters=(len(self._listed(arguments)),))
-
-    def _get_object_handles(self, arguments: _Arguments) -> _Reply:
-        return _Reply(encode_u32_array(item.handle for item in self._listed(arguments)))
-
-    def _get_object_info_ex(self, arguments: _Arguments) -> _Reply:
-        self._require_store(arguments.one)
-        return _Reply(encode_object_entries(item.entry for item in self._children(arguments.two)))
-
-    def _object(self, handle: int) -> _Object:
-        found = self._memory.get(handle) or self._on_card().get(handle)
-        if found is None:
-            raise _Declined(ResponseCode.INVALID_OBJECT_HANDLE)
-        return found
-
-    def _get_object_info(self, arguments: _Arguments) -> _Reply:
-        item = self._object(arguments.one)
-        stamp = item.taken_at.strftime("%Y%m%dT%H%M%S")
-        folder = item.format == ObjectFormat.ASSOCIATION
-        return _Reply(
-            ObjectInfo(
-                storage=item.storage, format=item.format, size=len(item.data), parent=item.parent,
-                association_type=int(folder), filename=item.name, captured_at=stamp, modified_at=stamp,
-            ).encode()
-        )  # fmt: skip
-
-    def _get_object(self, arguments: _Arguments) -> _Reply:
-        item = self._object(arguments.one)
-        if item.format == ObjectFormat.ASSOCIATION:
-            raise _Declined(ResponseCode.INVALID_OBJECT_HANDLE)
-        return _Reply(item.data)
-
-    def _get_partial_object(self, arguments: _Arguments) -> _Reply:
-        item = self._object(arguments.one)
-        if arguments.two > len(item.data):
-            raise _Declined(ResponseCode.INVALID_PARAMETER)
-        part = item.data[arguments.two : arguments.two + arguments.three]
-        return _Reply(part, (len(part),))
-
-    def _get_thumb(self, arguments: _Arguments) -> _Reply:
-        self._object(arguments.one)
-        raise _Declined(ResponseCode.NO_THUMBNAIL_PRESENT)
-
-    def _delete_object(self, arguments: _Arguments) -> _Reply:
-        item = self._object(arguments.one)
-        if item.format == ObjectFormat.ASSOCIATION:
-            raise _Declined(ResponseCode.OBJECT_WRITE_PROTECTED)
-        if item.storage:
-            del self._on_card()[item.handle]
-            self._record(Notice(EosEvent.OBJECT_REMOVED, item.handle))
-            self._tell(Property.EOS_AVAILABLE_SHOTS)
-        else:
-            del self._memory[item.handle]
-        return _Reply()
-
-    def _transfer_complete(self, arguments: _Arguments) -> _Reply:
-        if self._memory.pop(arguments.one, None) is None:
-            raise _Declined(ResponseCode.INVALID_OBJECT_HANDLE)
-        return _Reply()
-
-    def _reset_transfer(self, _: _Arguments) -> _Reply:
-        self._memory.clear()
-        return _Reply()
-
-    def _pc_hdd_capacity(self, arguments: _Arguments) -> _Reply:
-        self._host_bytes = arguments.one * arguments.two
-        self._tell(Property.EOS_AVAILABLE_SHOTS)
-        return _Reply()
-
-    def _available_shots(self) -> int:
-        destination = self._number_of(Property.EOS_CAPTURE_DESTINATION)
-        card = 0 if self._card is None else self._card.free
-        if destination == CaptureDestination.HOST:
-            free = self._host_bytes
-        elif destination == CaptureDestination.CARD_AND_HOST:
-            free = min(card, self._host_bytes)
-        else:
-            free = card
-        return min(max(free, 0) // self.body.frame_bytes, _MOST_SHOTS)
-
-    # The release.
-
-    def _remote_release_on(self, arguments: _Arguments) -> _Reply:
-        self._require_remote()
-        if not 1 <= arguments.one <= ReleaseButton.HALF_AND_FULL:
-            raise _Declined(ResponseCode.INVALID_PARAMETER)
-        if self._is_busy:
-            raise _Declined(ResponseCode.DEVICE_BUSY)
-        automatic = arguments.two == 0
-        if arguments.one & ReleaseButton.HALF and automatic:
-            self._focus()
-        if arguments.one & ReleaseButton.FULL:
-            refusal = self._full_press(automatic)
-            if refusal is not None:
-                raise _Declined(refusal.response)
-        return _Reply()
-
-    def _remote_release_off(self, arguments: _Arguments) -> _Reply:
-        self._require_remote()
-        if not 1 <= arguments.one <= ReleaseButton.HALF_AND_FULL:
-            raise _Declined(ResponseCode.INVALID_PARAMETER)
-        self._let_go(arguments.one)
-        return _Reply()
-
-    def _remote_release(self, _: _Arguments) -> _Reply:
-        self._require_remote()
-        self._focus()
-        refusal = self._full_press(automatic=True)
-        self._let_go(ReleaseButton.HALF_AND_FULL)
-        return _Reply(parameters=(0 if refusal is None else refusal.result,))
-
-    @property
-    def _has_autofocus(self) -> bool:
-        return self._number_of(Property.EOS_FOCUS_MODE) != FocusMode.MANUAL
-
-    def _focus(self) -> None:
-        if self._has_autofocus:
-            self._focused = self._finds_focus
-            self._change(Property.EOS_FOCUS_INFO, focus_points((FOCUS_CENTRE,) if self._focused else ()))
-
-    def _cancel_focus(self, _: _Arguments) -> _Reply:
-        self._focused = False
-        return _Reply()
-
-    def _full_press(self, automatic: bool) -> _Refusal | None:
-        settings = self._settings()
-        refusal = self._refusal(automatic, settings)
-        if refusal is not None:
-            return refusal
-        now = self._clock.monotonic()
-        self._pressed_at = now
-        drive = self._number_of(Property.EOS_DRIVE_MODE)
-        bracketing = self._number_of(Property.EOS_AEB)
-        if self._number_of(Property.EOS_SHUTTER_SPEED) == _BULB:
-            self._bulb_since = now, self._clock.now()
-            self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY))
-            return None
-        # A bracket comes whole, except in single drive, where each press takes one of its three.
-        whole = bracketing and (drive in _CONTINUOUS or drive in _TIMERS_S)
-        opens_at = now + _TIMERS_S.get(drive, 0.0)
-        for _ in range(3 if whole else 1):
-            opens_at = self._plan(opens_at, self._bracketed(settings, bracketing))
-        self._move()
-        return None
-
-    def _refusal(self, automatic: bool, settings: ExposureSettings) -> _Refusal | None:
-        destination = self._number_of(Property.EOS_CAPTURE_DESTINATION)
-        if self._is_busy:
-            return _Refusal.BUSY
-        if self._battery <= 0:
-            return _Refusal.BATTERY_EMPTY
-        if self._mirror_lockup:
-            return _Refusal.MIRROR_LOCKUP
-        if automatic and self._has_autofocus and not self._focused:
-            return _Refusal.NO_FOCUS
-        if destination & CaptureDestination.HOST and self._frames_waiting() >= self.body.burst:
-            return _Refusal.MEMORY_FULL
-        if not self._available_shots():
-            return _Refusal.STORE_FULL
-        if self._number_of(Property.EOS_SHUTTER_SPEED) != _BULB:
-            try:
-                self._film.accept(settings)
-            except DeviceRefused:
-                return _Refusal.EXPOSURE
-        return None
-
-    def _frames_waiting(self) -> int:
-        return len({item.name.rpartition(".")[0] for item in self._memory.values()})
-
-    def _let_go(self, button: int) -> None:
-        if button & ReleaseButton.HALF:
-            self._focused = False
-        if not button & ReleaseButton.FULL or self._pressed_at is None:
-            return
-        now = self._clock.monotonic()
-        if self._bulb_since is not None:
-            since, opened = self._bulb_since
-            self._bulb_since = None
-            settings = self._settings()
-            held = ExposureSettings(settings.iso, settings.aperture, max(now - since, 1e-3))
-            self._expose(held, opened, now)
-        elif self._number_of(Property.EOS_DRIVE_MODE) in _CONTINUOUS and not self._number_of(Property.EOS_AEB):
-            self._continue_series(now)
-        self._pressed_at = None
-        self._move()
-
-    def _continue_series(self, now: float) -> None:
-        """Take the further frames of continuous drive that the time of the press was good for."""
-        assert self._pressed_at is not None
-        settings = self._settings()
-        pace = max(1 / self.body.frames_per_s, settings.shutter_s)
-        room = min(self.body.burst - self._frames_waiting(), self._available_shots()) - 1
-        for number in range(1, min(int((now - self._pressed_at) / pace), room) + 1):
-            self._plan(self._pressed_at + number * pace, settings)
-
-    def _settings(self) -> ExposureSettings:
-        """Return the exposure that is set, in nominal values; where the body would measure, what it is assumed to."""
-        iso = self._number_of(Property.EOS_ISO_SPEED)
-        aperture = self._number_of(Property.EOS_APERTURE)
-        shutter = self._number_of(Property.EOS_SHUTTER_SPEED)
-        mode = self._number_of(Property.EOS_AE_MODE)
-        return ExposureSettings(
-            round(apex.ISO.value(iso)) if iso else _AUTO_ISO,
-            apex.APERTURE.value(aperture)
-            if aperture and mode in (AeMode.MANUAL, AeMode.APERTURE_PRIORITY, AeMode.BULB)
-            else _METERED_APERTURE,
-            apex.SHUTTER.value(shutter)
-            if shutter and shutter != _BULB and mode in (AeMode.MANUAL, AeMode.SHUTTER_PRIORITY)
-            else _METERED_S,
-        )
-
-    def _bracketed(self, settings: ExposureSettings, bracketing: int) -> ExposureSettings:
-        """Return the next of a bracket's three exposures: as set, under, over."""
-        if not bracketing:
-            return settings
-        stops = (0, -bracketing, bracketing)[self._bracket_step] / 8
-        self._bracket_step = (self._bracket_step + 1) % 3
-        return ExposureSettings(settings.iso, settings.aperture, settings.shutter_s * 2**stops)
-
-    # The shutter.
-
-    def _plan(self, opens_at: float, settings: ExposureSettings) -> float:
-        """Open the shutter at a time; return when it can open again."""
-        self._unfinished += 1
-        if self._unfinished == 1:
-            self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.BUSY))
-
-        def open_shutter() -> None:
-            late = timedelta(seconds=self._clock.monotonic() - opens_at)
-            self._unfinished -= 1
-            self._expose(settings, self._clock.now() - late, opens_at + settings.shutter_s)
-
-        self._at(opens_at, open_shutter)
-        return opens_at + max(settings.shutter_s, 1 / self.body.frames_per_s)
-
-    def _expose(self, settings: ExposureSettings, opened: datetime, closes_at: float) -> None:
-        self._unfinished += 1
-        self._shutter_count += 1
-        self._battery = max(self._battery - 1 / self.body.shots_per_charge, 0.0)
-        self._number = self._number % 9999 + 1
-        frame = _Frame(
-            self._number,
-            opened + self._time_offset,
-            self._develop(settings, opened),
-            ImageFormat.decode(self._properties[Property.EOS_IMAGE_FORMAT].value),
-            self._number_of(Property.EOS_CAPTURE_DESTINATION),
-        )
-        self._at(closes_at + self.body.write_s, lambda: self._written(frame))
-
-    def _develop(self, settings: ExposureSettings, opened: datetime) -> Future[bytes | None]:
-        def develop() -> bytes | None:
-            into = BytesIO()
-            try:
-                self._film.accept(settings)
-                self._film.expose(settings, opened, into)
-            except (DeviceError, CropError):
-                # A film that has no such picture is a camera whose frame never comes.
-                return None
-            return into.getvalue()
-
-        if self._darkroom is not None:
-            return self._darkroom.submit(develop)
-        done: Future[bytes | None] = Future()
-        done.set_result(develop())
-        return done
-
-    def _written(self, frame: _Frame) -> None:
-        """Announce a frame's files; where the film takes longer than the body would, look again soon."""
-        if not frame.raw.done():
-            self._at(self._clock.monotonic() + 0.01, lambda: self._written(frame))
-            return
-        raw = frame.raw.result()
-        self._unfinished -= 1
-        if raw is not None:
-            suffix = self._film.suffix.lower()
-            for index, file in enumerate(frame.formats.files):
-                name = f"IMG_{frame.number:04d}"
-                if file.is_raw:
-                    kind = _FORMATS_BY_SUFFIX.get(suffix, ObjectFormat.CR2)
-                    self._deliver(frame, index, f"{name}{suffix.upper()}", kind, raw)
-                else:
-                    self._deliver(frame, index, f"{name}.JPG", ObjectFormat.EXIF_JPEG, _small_jpeg(name))
-        self._tell(Property.EOS_AVAILABLE_SHOTS, Property.EOS_SHUTTER_COUNTER, Property.EOS_BATTERY_POWER)
-        if not self._is_busy:
-            self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.IDLE))
-        self._idle_since = self._clock.monotonic()
-
-    def _deliver(self, frame: _Frame, index: int, name: str, kind: int, data: bytes) -> None:
-        wide = self.body.wide_objects
-        if frame.destination != CaptureDestination.HOST and self._card is not None:
-            handle = FOLDER | frame.number << 4 | index + 1
-            item = _Object(handle, CARD, kind, name, frame.taken_at, FOLDER, data)
-            self._card.objects[handle] = item
-            self._record(ObjectEvent(EosEvent.OBJECT_ADDED_64 if wide else EosEvent.OBJECT_ADDED, item.entry))
-            self._record(Notice(EosEvent.STORAGE_INFO_CHANGED, CARD))
-        if frame.destination & CaptureDestination.HOST:
-            handle = next(self._handles)
-            self._memory[handle] = _Object(handle, 0, kind, name, frame.taken_at, data=data)
-            self._host_bytes = max(self._host_bytes - len(data), 0)
-            self._offer_transfer(self._memory[handle])
-
-    def _offer_transfer(self, item: _Object) -> None:
-        wide = self.body.wide_objects
-        request = EosEvent.REQUEST_OBJECT_TRANSFER_64 if wide else EosEvent.REQUEST_OBJECT_TRANSFER
-        self._record(TransferRequest(item.handle, item.format, len(item.data), item.name, request))
-
-
-class _Arguments(NamedTuple):
-    """What came with a request: three parameters, 0 where it had fewer, and the data phase."""
-
-    one: int
-    two: int
-    three: int
-    data: bytes | None
-
-
-def _small_jpeg(name: str) -> bytes:
-    """Return a JPEG file of a grey picture with its own name on it: what stands in for a rendered frame."""
-    import cv2
-    import numpy as np
-
-    picture = np.full((*_JPEG_SIZE, 3), 118, dtype=np.uint8)
-    picture = cv2.putText(picture, name, (20, 90), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255, 255, 255))
-    return cv2.imencode(".jpg", picture)[1].tobytes()

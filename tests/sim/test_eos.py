@@ -60,7 +60,7 @@ from drivers.ptp.datasets import (
 )
 from drivers.ptp.messages import Request
 from sim.clock import OPENING, SimulatedClock
-from sim.eos import CARD, DCIM, EMPTY_SLOT, FOLDER, SimulatedEos
+from sim.eos import SimulatedEos
 from sim.eos_bodies import (
     EOS_6D_MARK_II,
     EOS_550D,
@@ -70,6 +70,7 @@ from sim.eos_bodies import (
     TEST_BODY,
     EosBody,
 )
+from sim.eos_state import CARD, DCIM, EMPTY_SLOT, FOLDER
 from sim.ptp_memory import MemoryTransport
 from sim.responder import Answer
 
