@@ -219,7 +219,7 @@ class Crops:
         images = draw_batch(
             self._tables,
             self._rows[lights],
-            [self._pictures[place] for place in pictures.tolist()],
+            [self._pictures[place] for place in map(int, pictures)],
             windows,
             white_level=self.lut.provenance.white_level,
             flips=(mirror >> 31).astype(bool) & self.flip,
