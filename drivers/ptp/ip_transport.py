@@ -3,9 +3,7 @@
 Laws that hold inside:
 
 - Whoever waits for the device also answers its pings, at least once a second; nothing here has a thread.
-- A transaction that did not reach its response leaves the stream without a known place: until `reset`, every further
-  one is refused. Where the fault was the caller's, who could not take the data, the transaction is called off and the
-  response awaited, so that the session lives on.
+- A transaction that is called off is awaited to its response.
 - Events are kept until asked for, the newest `MAX_EVENTS` of them.
 
 Source: CIPA DC-005-2005, PTP-IP, clauses 2.2 (connections) and 2.3 (packets).
@@ -42,7 +40,7 @@ from drivers.ptp.ptpip import (
     encode,
     encode_data,
 )
-from drivers.ptp.reception import Reception
+from drivers.ptp.reception import Reception, Turns
 from drivers.ptp.transport import Transaction
 
 DATA_PIECE = 64 * 1024
@@ -134,25 +132,12 @@ class IpTransport:
         timeout: float,
     ) -> Transaction:
         """Carry out one transaction; see `drivers.ptp.transport.Transport`."""
-        if self._closed:
-            raise LinkClosed(f"the connection to {self._label} is closed; open a new one")
-        if not self._in_step:
-            raise ProtocolError(f"{self._label}: the transaction before {request} did not end; reset the connection")
-        reception = Reception(request, receive, self._label)
-        self._in_step = False
-        try:
+
+        def exchange(reception: Reception) -> Transaction:
             self._send(request, send, timeout)
-            transaction = self._receive(reception, timeout)
-        except LinkClosed:
-            self._closed = True
-            raise
-        except (LinkError, ProtocolError):
-            raise
-        except BaseException:
-            self._call_off(request.transaction)
-            raise
-        self._in_step = True
-        return transaction
+            return self._receive(reception, timeout)
+
+        return self._turns.take(Reception(request, receive, self._label), exchange, self._call_off)
 
     def events(self) -> tuple[Event, ...]:
         """Return the events that have come since the last call, and answer pings; never waits.
@@ -192,14 +177,14 @@ class IpTransport:
 
     def close(self) -> None:
         """Hang up both connections; a second call does nothing."""
-        self._closed = True
+        self._turns.closed = True
         self._event.close()
         self._command.close()
 
     def _connect(self) -> None:
         self._label = self._place
-        self._closed = True
-        self._in_step = False
+        self._turns = Turns()
+        self._turns.closed = True
         self._events.clear()
         self._packets: deque[Packet] = deque()
         self._cutter = PacketCutter()
@@ -224,8 +209,7 @@ class IpTransport:
             raise
         name = acknowledgement.name.strip()
         self._label = f"{name} ({self._place})" if name else self._place
-        self._closed = False
-        self._in_step = True
+        self._turns.closed = False
 
     def _dial_event(self) -> Link:
         """Open the second connection; devices refuse it for about 0.1 s after they acknowledged the first."""
@@ -330,13 +314,13 @@ class IpTransport:
                     case _:
                         pass
 
-    def _call_off(self, transaction: int) -> None:
-        """Cancel a transaction whose data the caller cannot take, and wait for its end so that the next can follow."""
+    def _call_off(self, transaction: int) -> bool:
+        """Cancel a transaction whose data the caller cannot take, and wait for its end; return whether it came."""
         deadline = self._clock.monotonic() + _CALL_OFF_S
         with contextlib.suppress(LinkError, ProtocolError):
             self._event.write(encode(Cancel(transaction)), _CALL_OFF_S)
             while self._clock.monotonic() < deadline:
                 packet = self._next(_CALL_OFF_S)
                 if isinstance(packet, Response) and packet.transaction == transaction:
-                    self._in_step = True
-                    return
+                    return True
+        return False

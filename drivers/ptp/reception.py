@@ -4,6 +4,9 @@ Laws that hold inside:
 
 - Nothing is kept of a data phase that the caller takes piece by piece; otherwise at most `MAX_COLLECTED` bytes are.
 - Data and response must carry the request's transaction number, and a data phase the length that it announced.
+- A transaction that did not reach its response leaves the cable without a known place: every further one is refused
+  until the cable has been reset. Where the fault was the caller's, who could not take the data, the transaction is
+  called off, so that the session lives on.
 
 Source: ISO 15740:2013, clause 9.
 """
@@ -12,18 +15,72 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.errors import ProtocolError
+from drivers.errors import LinkClosed, LinkError, ProtocolError
 from drivers.ptp.messages import Request, Response
 from drivers.ptp.transport import MAX_COLLECTED, Transaction
+
+
+class Turns:
+    """Whether a cable is open, and between two transactions."""
+
+    def __init__(self) -> None:
+        self.closed = False
+        self.in_step = True
+
+    def take(
+        self,
+        reception: Reception,
+        exchange: Callable[[Reception], Transaction],
+        call_off: Callable[[int], bool],
+    ) -> Transaction:
+        """Carry out one transaction.
+
+        Parameters
+        ----------
+        exchange
+            Sends the request, and feeds the reception until the response.
+        call_off
+            Cancels the transaction of this number; returns whether the next can follow.
+
+        Raises
+        ------
+        LinkClosed
+            The cable was closed, or is lost now.
+        ProtocolError
+            The transaction before did not end.
+        """
+        self.check_open(reception.label)
+        if not self.in_step:
+            raise ProtocolError(
+                f"{reception.label}: the transaction before {reception.request} did not end; reset the connection"
+            )
+        self.in_step = False
+        try:
+            transaction = exchange(reception)
+        except LinkClosed:
+            self.closed = True
+            raise
+        except (LinkError, ProtocolError):
+            raise
+        except BaseException:
+            self.in_step = call_off(reception.request.transaction)
+            raise
+        self.in_step = True
+        return transaction
+
+    def check_open(self, label: str) -> None:
+        """Require that the cable is open."""
+        if self.closed:
+            raise LinkClosed(f"{label} is gone, or the connection to it was closed; open it again")
 
 
 class Reception:
     """Takes what the device sends between a request and the end of its response; `label` names the device."""
 
     def __init__(self, request: Request, receive: Callable[[bytes], object] | None, label: str) -> None:
-        self._request = request
+        self.request = request
         self._receive = receive
-        self._label = label
+        self.label = label
         self._started = False
         self._announced: int | None = None
         self._taken = 0
@@ -38,7 +95,7 @@ class Reception:
         """Note that a data phase of `length` bytes begins; None where the device does not know."""
         self._check_transaction("data", transaction)
         if self._started:
-            raise ProtocolError(f"{self._label} sends a second data phase with {self._request}; reset it")
+            raise ProtocolError(f"{self.label} sends a second data phase with {self.request}; reset it")
         if self._receive is None and length is not None and length > MAX_COLLECTED:
             raise self._too_long(length)
         self._started = True
@@ -53,11 +110,11 @@ class Reception:
             They are more than were announced, or more than may be collected.
         """
         if not self._started:
-            raise ProtocolError(f"{self._label} sends data with {self._request} but never announced them; reset it")
+            raise ProtocolError(f"{self.label} sends data with {self.request} but never announced them; reset it")
         self._taken += len(piece)
         if self._announced is not None and self._taken > self._announced:
             raise ProtocolError(
-                f"{self._label} announced {self._announced} bytes with {self._request} "
+                f"{self.label} announced {self._announced} bytes with {self.request} "
                 f"and sends at least {self._taken}; reset it"
             )
         if self._receive is not None:
@@ -80,19 +137,19 @@ class Reception:
         # A device that gives up in the middle says so by its response: then the response is what counts.
         if response.ok and self._announced is not None and self._taken != self._announced:
             raise ProtocolError(
-                f"{self._label} announced {self._announced} bytes with {self._request}, sent {self._taken}, "
+                f"{self.label} announced {self._announced} bytes with {self.request}, sent {self._taken}, "
                 f"and reports success; ask again"
             )
         return Transaction(response, bytes(self._collected))
 
     def _check_transaction(self, what: str, transaction: int) -> None:
-        if transaction != self._request.transaction:
+        if transaction != self.request.transaction:
             raise ProtocolError(
-                f"{self._label} sends {what} of transaction {transaction} during {self._request}, "
-                f"which is transaction {self._request.transaction}; reset it"
+                f"{self.label} sends {what} of transaction {transaction} during {self.request}, "
+                f"which is transaction {self.request.transaction}; reset it"
             )
 
     def _too_long(self, length: int) -> ProtocolError:
         return ProtocolError(
-            f"{self._label} sends {length} bytes or more with {self._request}; at most {MAX_COLLECTED} were expected"
+            f"{self.label} sends {length} bytes or more with {self.request}; at most {MAX_COLLECTED} were expected"
         )

@@ -5,9 +5,6 @@ Laws that hold inside:
 - What is read is never less than a packet nor more than 512 KiB, and always whole packets. A device may cut its
   containers as it likes: header alone, data and response in one transfer, a zero-length packet or none.
 - A stalled pipe is cleared and the transfer tried once more; a second stall in the same transaction is an error.
-- A transaction that did not reach its response leaves the pipes without a known place: until `reset`, every further
-  one is refused. Where the fault was the caller's, who could not take the data, the transaction is cancelled, so that
-  the session lives on.
 
 Sources: USB Still Image Capture Device Definition 1.0, clauses 5 and 7; ISO 15740:2013, annex D.
 """
@@ -18,7 +15,7 @@ import contextlib
 from collections.abc import Callable
 
 from drivers.clock import Clock
-from drivers.errors import LinkClosed, LinkError, LinkTimeout, ProtocolError
+from drivers.errors import LinkError, LinkTimeout, ProtocolError
 from drivers.pipes import Pipe, PipeStalled, UsbPipes
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.container import (
@@ -34,7 +31,7 @@ from drivers.ptp.container import (
     ends_with_empty_packet,
 )
 from drivers.ptp.messages import Event, Request, Response
-from drivers.ptp.reception import Reception
+from drivers.ptp.reception import Reception, Turns
 from drivers.ptp.transport import Transaction
 
 PIECE = 512 * 1024
@@ -56,8 +53,7 @@ class UsbTransport:
     def __init__(self, pipes: UsbPipes, clock: Clock) -> None:
         self._pipes = pipes
         self._clock = clock
-        self._closed = False
-        self._in_step = True
+        self._turns = Turns()
         self._stalls = 0
         self._reader = ContainerReader(pipes.packet_size)
         self._events_reader = ContainerReader(pipes.packet_size)
@@ -76,26 +72,14 @@ class UsbTransport:
         timeout: float,
     ) -> Transaction:
         """Carry out one transaction; see `drivers.ptp.transport.Transport`."""
-        self._check_open()
-        if not self._in_step:
-            raise ProtocolError(f"{self.label}: the transaction before {request} did not end; reset it")
-        reception = Reception(request, receive, self.label)
-        self._in_step = False
-        self._stalls = 0
-        self._reader = ContainerReader(self._pipes.packet_size)
-        try:
+
+        def exchange(reception: Reception) -> Transaction:
+            self._stalls = 0
+            self._reader = ContainerReader(self._pipes.packet_size)
             self._send(request, send, timeout)
-            transaction = self._receive(reception, timeout)
-        except LinkClosed:
-            self._closed = True
-            raise
-        except (LinkError, ProtocolError):
-            raise
-        except BaseException:
-            self._cancel(request.transaction)
-            raise
-        self._in_step = True
-        return transaction
+            return self._receive(reception, timeout)
+
+        return self._turns.take(Reception(request, receive, self.label), exchange, self._cancel)
 
     def events(self) -> tuple[Event, ...]:
         """Return the events that have come since the last call.
@@ -109,7 +93,7 @@ class UsbTransport:
         ProtocolError
             It sends what is no event; what follows will be read again.
         """
-        self._check_open()
+        self._turns.check_open(self.label)
         events: list[Event] = []
         while len(events) < MAX_EVENTS:
             try:
@@ -139,7 +123,7 @@ class UsbTransport:
         LinkTimeout
             It does not come back.
         """
-        self._check_open()
+        self._turns.check_open(self.label)
         try:
             self._pipes.control_out(ControlRequest.RESET_DEVICE, b"", _CONTROL_S)
             self._await_ready()
@@ -147,16 +131,12 @@ class UsbTransport:
             self._pipes.reset_port()
         self._clean()
         self._events_reader = ContainerReader(self._pipes.packet_size)
-        self._in_step = True
+        self._turns.in_step = True
 
     def close(self) -> None:
         """Release the device; a second call does nothing."""
-        self._closed = True
+        self._turns.closed = True
         self._pipes.close()
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise LinkClosed(f"{self.label} is gone or was closed; open it again")
 
     def _send(self, request: Request, send: bytes | None, timeout: float) -> None:
         self._write(encode(request), timeout)
@@ -223,13 +203,14 @@ class UsbTransport:
         # Whole packets of the data only, so that the response never comes in the same read.
         return max(packet, min(PIECE, left // packet * packet))
 
-    def _cancel(self, transaction: int) -> None:
-        """Call off a transaction whose data the caller cannot take, so that the next can follow."""
+    def _cancel(self, transaction: int) -> bool:
+        """Call off a transaction whose data the caller cannot take; return whether the next can follow."""
         with contextlib.suppress(LinkError, ProtocolError):
             self._pipes.control_out(ControlRequest.CANCEL, encode_cancel(transaction), _CONTROL_S)
             self._await_ready()
             self._clean()
-            self._in_step = True
+            return True
+        return False
 
     def _await_ready(self) -> None:
         for _ in range(_READY_TRIES):
