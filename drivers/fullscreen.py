@@ -34,7 +34,7 @@ import numpy.typing as npt
 from drivers.clock import Clock, SystemClock
 from drivers.errors import ConfigurationError, DeviceError
 from drivers.presenter import BLACK, Colour
-from drivers.x11 import XScreen
+from drivers.x11 import XScreen, is_lost, outlive
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -192,6 +192,11 @@ class FullScreen:
         """
         self._require_usable()
         self._glfw.poll_events()
+        if self._screen is not None and is_lost(self._glfw.get_x11_display()):
+            raise DeviceError(
+                f"the X server of display {self.display} is gone: somebody logged out, or it crashed; log in, then run "
+                "again"
+            )
         if not self._is_full():
             raise DeviceError(
                 f"the window no longer fills display {self.display}; check its cable and the desktop's display "
@@ -461,6 +466,8 @@ def _running() -> Generator[ModuleType]:
                 f"no desktop to show a picture on ({error}); run this on the machine that the projector is connected "
                 "to, logged in there, with DISPLAY set on Linux"
             ) from error
+        if sys.platform == "linux":
+            outlive(glfw.get_x11_display())
     _users += 1
     try:
         yield glfw

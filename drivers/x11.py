@@ -1,12 +1,14 @@
-"""What an X server has on its screen, read as a screenshot program reads it, and a hold on its screen saver.
+"""What an X server has on its screen, read as a screenshot program reads it; a hold on its screen saver; its end.
 
 Laws that hold inside:
 
 - A connection of its own, beside that of the window: what it reads is what the server shows, whoever drew it.
-- Through libxcb, which tells errors to its caller; Xlib would end the process.
+- Through libxcb, which tells errors to its caller. Xlib, which the window needs, ends the process when its server goes;
+  `outlive` talks it out of that.
 - The hold on screen saver and power saving ends with the connection, hence with the process, however that ends.
 
-Sources: X Window System Protocol, GetImage and QueryExtension; MIT-SCREEN-SAVER extension 1.1, Suspend.
+Sources: X Window System Protocol, GetImage and QueryExtension; MIT-SCREEN-SAVER extension 1.1, Suspend; Xlib,
+XSetIOErrorHandler(3) and XSetIOErrorExitHandler(3), the latter from libX11 1.7 on.
 """
 
 from __future__ import annotations
@@ -23,6 +25,38 @@ _Z_PIXMAP = 2
 _ALL_PLANES = 0xFFFFFFFF
 _REPLY_PRESENT = 8
 """Offset of `present` in a QueryExtension reply."""
+
+
+_lost: set[int] = set()
+
+
+@ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
+def _go_on(display: int | None) -> int:
+    # The usual one writes to stderr and exits.
+    return 0
+
+
+@ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+def _note_loss(display: int | None, data: int | None) -> None:
+    _lost.add(display or 0)
+
+
+def outlive(display: int) -> None:
+    """Let the process go on when the server of an Xlib connection is gone; old libraries end it all the same."""
+    with contextlib.suppress(OSError, AttributeError):
+        xlib = ctypes.CDLL("libX11.so.6")
+        leave = xlib.XSetIOErrorExitHandler
+        leave.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
+        leave.restype = None
+        leave(display, ctypes.cast(_note_loss, ctypes.c_void_p), None)
+        xlib.XSetIOErrorHandler(_go_on)
+        # A new connection may stand where a lost one stood.
+        _lost.discard(display)
+
+
+def is_lost(display: int) -> bool:
+    """Return whether the server of an Xlib connection that was to be outlived is gone."""
+    return display in _lost
 
 
 class _Cookie(ctypes.Structure):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import ctypes.util
+import os
 import shutil
 import subprocess
 import sys
@@ -179,6 +180,35 @@ def test_the_light_goes_out_with_a_process_that_is_killed(virtual: VirtualScreen
     deadline = time.monotonic() + PATIENCE_S
     while plain(virtual.picture()) != BLACK:
         assert time.monotonic() < deadline, "the window is still there"
+
+
+def test_a_server_that_ends_does_not_end_us(tmp_path: Path) -> None:
+    program = (
+        "from drivers.errors import DeviceError; from drivers.fullscreen import FullScreen\n"
+        "from drivers.presenter import WHITE\n"
+        "screen = FullScreen(); screen.show(WHITE); print('lit', flush=True); input()\n"
+        "for _ in range(2):\n"
+        "    try: screen.show(WHITE)\n"
+        "    except DeviceError as error: print(error, flush=True)\n"
+        "screen.close()"
+    )
+    with contextlib.ExitStack() as served:
+        server = served.enter_context(virtual_screen(tmp_path, "320x200"))
+        process = served.enter_context(
+            subprocess.Popen(
+                [sys.executable, "-c", program],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                env={**os.environ, "DISPLAY": server.display},
+            )
+        )
+        assert process.stdout is not None
+        assert process.stdout.readline() == "lit\n"
+        server.end()
+        said, _ = process.communicate("\n", timeout=PATIENCE_S)
+    assert process.returncode == 0
+    assert said.count("the X server of display 1: screen 320×200 at +0+0, 0 Hz is gone: somebody logged out") == 2
 
 
 def test_every_code_of_every_channel_arrives_without_a_cursor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

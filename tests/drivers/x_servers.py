@@ -66,6 +66,12 @@ class VirtualScreen:
 
     display: str
     memory: Path
+    process: subprocess.Popen[bytes]
+
+    def end(self) -> None:
+        """Let the server crash."""
+        self.process.kill()
+        self.process.wait()
 
     def picture(self) -> Picture:
         """Return what the server has in its frame buffer."""
@@ -84,8 +90,8 @@ def virtual_screen(folder: Path, size: str, *, cursor: bool = False) -> Generato
     arguments = ["-screen", "0", f"{size}x24", "-fbdir", str(folder), "-nolisten", "tcp", "-noreset"]
     # Without -retro, a cursor appears only once some program has chosen one.
     arguments += ["-retro"] if cursor else ["-br", "-nocursor"]
-    with _running("Xvfb", arguments, folder) as display:
-        yield VirtualScreen(display, folder / "Xvfb_screen0")
+    with _running("Xvfb", arguments, folder) as (display, process):
+        yield VirtualScreen(display, folder / "Xvfb_screen0", process)
 
 
 @contextlib.contextmanager
@@ -95,7 +101,7 @@ def two_outputs(folder: Path) -> Generator[str]:
     settings.write_text(_SETTINGS)
     log = folder / "xorg.log"
     arguments = ["-config", str(settings), "-logfile", str(log), "-noreset", "-nolisten", "tcp", "-novtswitch"]
-    with _running("Xorg", [*arguments, "-sharevts", "vt7"], folder) as display:
+    with _running("Xorg", [*arguments, "-sharevts", "vt7"], folder) as (display, _):
         yield display
 
 
@@ -126,7 +132,7 @@ def _exactly(server: socket.socket, size: int) -> bytes:
 
 
 @contextlib.contextmanager
-def _running(server: str, arguments: list[str], folder: Path) -> Generator[str]:
+def _running(server: str, arguments: list[str], folder: Path) -> Generator[tuple[str, subprocess.Popen[bytes]]]:
     if sys.platform != "linux":
         pytest.skip("the window is an X window on Linux only")
     program = shutil.which(server)
@@ -148,7 +154,7 @@ def _running(server: str, arguments: list[str], folder: Path) -> Generator[str]:
         number = process.stdout.readline().decode().strip()
         if not number:
             pytest.skip(f"{server} does not start here: {(folder / f'{server}.err').read_text()[-300:]}")
-        yield f":{number}"
+        yield f":{number}", process
     finally:
         process.terminate()
         process.communicate()
