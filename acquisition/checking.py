@@ -6,6 +6,7 @@ Takes one frame under white and one under black into a temporary folder and keep
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,11 +17,13 @@ from acquisition.chart import Chart, load_chart
 from acquisition.config import LabSettings
 from acquisition.exposure import measure_exposure, refusal
 from acquisition.framing import MIN_MODULE_PX, Framing, blur_px, find_chart
+from acquisition.health import make_ready
 from acquisition.homography import project
 from acquisition.planes import Plane, strongest_plane
 from acquisition.rig import open_rig
-from acquisition.sequencer import Devices, make_ready
+from acquisition.sequencer import Devices
 from acquisition.session import FrameKind
+from drivers.camera import keep_awake
 from drivers.errors import RegistrationError
 from drivers.presenter import BLACK, WHITE, Colour, SelfDoubting
 from drivers.rawfile import Mosaic, read_raw
@@ -43,13 +46,17 @@ class CheckReport:
     faults: tuple[str, ...]
 
 
-def check_lab(settings: LabSettings, picture: Path | None) -> CheckReport:
+def check_lab(
+    settings: LabSettings, picture: Path | None, announce: Callable[[str], None] = lambda sentence: None
+) -> CheckReport:
     """Look through the rig that the settings name; record nothing.
 
     Parameters
     ----------
     picture
         Where to draw what was found on the white frame, PNG; None for nowhere.
+    announce
+        Called with a sentence when a long wait begins.
 
     Raises
     ------
@@ -67,7 +74,13 @@ def check_lab(settings: LabSettings, picture: Path | None) -> CheckReport:
             lines.extend(f"picture     {warning}" for warning in devices.presenter.warnings())
         devices.camera.configure(settings.camera.exposure)
         if devices.projector is not None:
-            make_ready(devices.projector, devices.clock, settings.sequence)
+            make_ready(
+                devices.projector,
+                devices.clock,
+                settings.sequence,
+                lambda: keep_awake(devices.camera),
+                lambda what, sentence: announce(f"{what}: {sentence}"),
+            )
             beamer = devices.projector.identity()
             hours = ", ".join(f"{lamp.hours} h" for lamp in devices.projector.lamps()) or "no lamp"
             lines.append(f"projector   {beamer.maker} {beamer.model} {beamer.name}, {hours}")

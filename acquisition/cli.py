@@ -164,7 +164,7 @@ def check(
         from acquisition.rig import identify_displays
 
         identify_displays(10.0)
-    report = check_lab(settings, picture)
+    report = check_lab(settings, picture, lambda sentence: print(sentence, file=sys.stderr))
     for line in report.lines:
         print(line)
     if report.faults:

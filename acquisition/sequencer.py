@@ -14,7 +14,7 @@ from acquisition.config import LabSettings
 from acquisition.exposure import disagreement, measure_exposure, refusal
 from acquisition.health import await_health, complaint_of, make_ready
 from acquisition.session import ACCEPTED, REFUSED, FrameKind, Session, Step
-from drivers.camera import Camera, Patient
+from drivers.camera import Camera, keep_awake
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceFault, DeviceRefused, FormatError
 from drivers.presenter import Presenter
@@ -99,7 +99,7 @@ def _take(
         announce(f"{what}: {sentence}")
 
     if devices.projector is not None:
-        make_ready(devices.projector, clock, settings.sequence, lambda: _idle(devices.camera), tell)
+        make_ready(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), tell)
     refused: list[str] = []
     taken = 0
     in_a_row = 0
@@ -122,11 +122,6 @@ def _take(
     return outcome
 
 
-def _idle(camera: Camera) -> None:
-    if isinstance(camera, Patient):
-        camera.idle()
-
-
 def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None:
     """Decode a raw file and return why it cannot be used, or None when it can."""
     try:
@@ -146,7 +141,7 @@ def _take_step(
     reason: str | None = None
     for remaining in reversed(range(settings.sequence.attempts)):
         if devices.projector is not None:
-            await_health(devices.projector, clock, settings.sequence, lambda: _idle(devices.camera), tell)
+            await_health(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), tell)
         kept = session.kept_files(step)
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
         attempt = session.begin(step, f"frames/{stem}", clock.now())

@@ -88,3 +88,9 @@ class Patient(Protocol):
     def idle(self) -> None:
         """Keep the camera awake and empty its queue of events; call it every few seconds of a pause."""
         ...
+
+
+def keep_awake(camera: Camera) -> None:
+    """Speak to a camera that wants it; to be called every few seconds of a pause."""
+    if isinstance(camera, Patient):
+        camera.idle()

@@ -132,9 +132,10 @@ def test_a_look_tells_what_may_bend_the_light(
     monkeypatch.setattr("acquisition.rig.SimulatedPresenter", Doubting)
     monkeypatch.setattr(sys, "argv", ["acquire", "check", str(lab)])
     assert main() == 0
-    told = capsys.readouterr().out
-    assert "gamma ramp is not straight" in told
-    assert "tags" in told
+    told = capsys.readouterr()
+    assert "gamma ramp is not straight" in told.out
+    assert "tags" in told.out
+    assert "warming up: the lamp was just lit and gets 1200 s" in told.err
 
 
 @pytest.mark.parametrize("maker", ["epson", "benq"])
