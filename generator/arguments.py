@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,11 @@ from generator.philox import key_of
 
 Samples = npt.NDArray[np.uint16]
 Picture = npt.NDArray[np.uint8]
+
+_PAGE: Final = 4096
+"""The smallest unit of memory protection on the processors we know; larger pages are whole multiples."""
+_OFFSETS: Final = 0xFFFFFFFF
+"""Compiled code counts bytes of a light's samples in 32 bits."""
 
 
 def check_samples(samples: Samples) -> int:
@@ -27,6 +32,8 @@ def check_samples(samples: Samples) -> int:
     """
     if samples.dtype != np.uint16 or samples.ndim != 3 or samples.shape[2] != 3 or not samples.shape[1]:
         raise InputError(f"the samples are {samples.dtype} {samples.shape}, expected uint16 (8**bits, samples, 3)")
+    if samples.nbytes > _OFFSETS:
+        raise InputError(f"the samples of a light take {samples.nbytes} bytes, expected at most {_OFFSETS}")
     return bits_of(samples.shape[0])
 
 
@@ -101,6 +108,38 @@ def check_white(white_level: int) -> None:
     """
     if not 1 <= white_level <= 65535:
         raise InputError(f"the white level is {white_level}, expected 1 to 65535")
+
+
+def packed(picture: Picture) -> Picture:
+    """Return `picture` with the bytes of each row in one piece, itself where they are."""
+    return picture if picture.strides[1:] == (3, 1) else np.ascontiguousarray(picture)
+
+
+def readable(samples: Samples) -> Samples:
+    """Return samples in one piece, behind which two more bytes can be read: themselves where possible.
+
+    Samples are fetched eight bytes at a time. The two bytes behind an array can be read wherever they are on the page
+    of its last byte, be they anyone's; where they are not, the samples are copied.
+    """
+    last = samples.ctypes.data + samples.nbytes - 1
+    if samples.flags.c_contiguous and last // _PAGE == (last + 2) // _PAGE:
+        return samples
+    roomy = np.empty(samples.size + 1, np.uint16)
+    roomy[:-1] = samples.reshape(-1)
+    return roomy[:-1].reshape(samples.shape)
+
+
+def writable(target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
+    """Return `target` if the pixels of its rows lie in one piece, else an array of its shape to be `delivered`."""
+    piece = (6, 2) if target.ndim == 3 else (2,)
+    return target if target.strides[1:] == piece else np.empty(target.shape, target.dtype)
+
+
+def delivered(work: npt.NDArray[np.uint16], target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
+    """Return `target` with the content of `work`, which is itself or came from `writable`."""
+    if work is not target:
+        target[...] = work
+    return target
 
 
 def share(fill: Callable[[int, int], object], count: int, threads: int) -> None:

@@ -4,9 +4,9 @@ Tiles, threads and workers cannot change a choice. The rule is part of the datas
 (`docs/decisions/0010-compiled-kernel.md` says why it is this one); all arithmetic is modulo 2³² but for p and q:
 
     keys     k0, k1, k2: the first words of Philox4x32-10 with counter (y, place, image, 0) and the seed as key
-    word     i = 16 ⌊x/32⌋ + x mod 16,  h = (i ⊕ k0) · 0x21F0AAAD ⊕ k1,  h = (h ⊕ ⌊h/2¹⁶⌋) · 0x735A2D97 ⊕ k2,
+    word     i = 8 ⌊x/16⌋ + x mod 8,  h = (i ⊕ k0) · 0x21F0AAAD ⊕ k1,  h = (h ⊕ ⌊h/2¹⁶⌋) · 0x735A2D97 ⊕ k2,
              h = (h ⊕ ⌊h/2¹⁵⌋) · 0x31848BAB
-    sample   p = h S and q = (p mod 2³²) S, S the samples of a colour; ⌊p/2³²⌋ where x mod 32 < 16, else ⌊q/2³²⌋
+    sample   p = h S and q = (p mod 2³²) S, S the samples of a colour; ⌊p/2³²⌋ where x mod 16 < 8, else ⌊q/2³²⌋
 
 `place` is 0 but where lights are mixed per pixel: there it is the light's place among them. Rows are keyed by 96 random
 bits, so rows, images, seeds and places are as independent as Philox makes them. Within a row three keyed rounds of
@@ -27,10 +27,15 @@ import numpy as np
 from numba import uint32, uint64
 
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES
+from generator.vector import GROUP, LANES, choose, copy1
 
-M0: Final = np.uint32(0x21F0AAAD)
-M1: Final = np.uint32(0x735A2D97)
-M2: Final = np.uint32(0x31848BAB)
+AHEAD: Final = 2
+"""Groups of pixels whose offsets are chosen before the first one's samples are fetched."""
+OFFSETS: Final = 4 * GROUP
+"""Bytes of a group's offsets."""
+SCRATCH: Final = 64 + 4 * OFFSETS
+"""Bytes of scratch memory a thread needs: a row's last pixels, and four groups' offsets."""
+
 _P0: Final = np.uint64(MULTIPLIERS[0])
 _P1: Final = np.uint64(MULTIPLIERS[1])
 _W0: Final = np.uint32(KEY_STEPS[0])
@@ -40,9 +45,8 @@ _PURPOSE: Final = np.uint32(SAMPLES)
 
 
 @numba.njit(inline="always")
-def row_keys(y: Any, place: Any, image: Any, seed: Any) -> Any:
-    """Return the three keys (uint32) of row `y`; `seed` is uint64."""
-    c0, c1, c2, c3 = uint32(y), uint32(place), uint32(image), _PURPOSE
+def four_words(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
+    """Return the four words of Philox4x32-10; words and counter are uint32, `seed` is uint64."""
     k0, k1 = uint32(seed), uint32(seed >> _HALF)
     for _ in range(ROUNDS):
         p0, p1 = uint64(c0) * _P0, uint64(c2) * _P1
@@ -53,28 +57,38 @@ def row_keys(y: Any, place: Any, image: Any, seed: Any) -> Any:
             uint32(p0),
         )
         k0, k1 = uint32(k0 + _W0), uint32(k1 + _W1)
-    return c0, c1, c2
+    return c0, c1, c2, c3
 
 
 @numba.njit(inline="always")
-def chosen(x: Any, keys: Any, count: Any) -> Any:
-    """Return the sample of column `x` in a row of these keys; `count` samples to choose from."""
-    h = uint32(uint32(((x >> 5) << 4) | (x & 15)) ^ keys[0])
-    h = uint32(uint32(h * M0) ^ keys[1])
-    h = uint32(uint32(uint32(h ^ (h >> uint32(16))) * M1) ^ keys[2])
-    h = uint32(uint32(h ^ (h >> uint32(15))) * M2)
-    p = uint64(h) * uint64(count)
-    if x & 16:
-        p = uint64(uint32(p)) * uint64(count)
-    return np.int64(p >> _HALF)
+def row_keys(y: Any, place: Any, image: Any, seed: Any) -> Any:
+    """Return the three keys (uint32) of row `y`; `seed` is uint64."""
+    k0, k1, k2, _ = four_words(uint32(y), uint32(place), uint32(image), _PURPOSE, seed)
+    return k0, k1, k2
 
 
 @numba.njit(inline="always")
-def colour_of(pixel: Any, bits: Any) -> Any:
-    """Return the colour index of an 8-bit pixel: the upper `bits` of red, green, blue, red first."""
-    shift = 8 - bits
-    return (
-        (np.int64(pixel[0] >> shift) << (2 * bits))
-        | (np.int64(pixel[1] >> shift) << bits)
-        | np.int64(pixel[2] >> shift)
-    )
+def slot(scratch: int, group: int) -> int:
+    """Return where in a thread's scratch memory the offsets of `group` stand until they are used."""
+    return scratch + 64 + OFFSETS * (group & 3)
+
+
+@numba.njit(inline="always")
+def group_of(row: int, width: int, group: int, scratch: int) -> int:
+    """Return where the pixels from x = 16 `group` on can be read; `row` is the address of a row's first pixel.
+
+    Of a group that reaches beyond the row only the pixels in the row are copied to scratch memory.
+    """
+    source = row + 3 * GROUP * group
+    if GROUP * (group + 1) > width:
+        for i in range(3 * (width - GROUP * group)):
+            copy1(source + i, scratch + i)
+        source = scratch
+    return source
+
+
+@numba.njit(inline="always")
+def choose_group(row: int, width: int, group: int, keys: Any, count: Any, bits: Any, scratch: int, target: int) -> None:
+    """Write the offsets of a row's pixels from x = 16 `group` on."""
+    source = group_of(row, width, group, scratch)
+    choose(source, uint32(LANES * group), keys[0], keys[1], keys[2], count, bits, target)

@@ -19,10 +19,21 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import InputError
-from generator.arguments import check_picture, check_place, check_samples, check_target, share
-from generator.choice import chosen, colour_of, row_keys
+from generator.arguments import (
+    check_picture,
+    check_place,
+    check_samples,
+    check_target,
+    delivered,
+    packed,
+    readable,
+    share,
+    writable,
+)
+from generator.choice import AHEAD, SCRATCH, choose_group, row_keys, slot
 from generator.compiled import compiled
 from generator.palette import fit_picture
+from generator.vector import GROUP, SAMPLE_BYTES, copy2, copy6, copy8, offset_at
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
@@ -35,26 +46,81 @@ PATTERNS: Final = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2,
 
 
 @compiled
-def _gather(picture: Any, samples: Any, bits: int, seed: Any, image: int, first_row: int, out: Any) -> None:
-    count = samples.shape[1]
-    for y in range(picture.shape[0]):
+def _gather(
+    picture: int,
+    pitch: int,
+    width: int,
+    rows: int,
+    samples: int,
+    count: Any,
+    bits: Any,
+    seed: Any,
+    image: int,
+    first_row: int,
+    target: int,
+    target_pitch: int,
+    scratch: int,
+) -> None:
+    """Fill rows of 3-channel pixels; numbers are addresses, and bytes from row to row.
+
+    Offsets are chosen two groups ahead of the samples they lead to, so that the processor multiplies while it waits.
+    """
+    groups = (width + GROUP - 1) // GROUP
+    for y in range(rows):
         keys = row_keys(first_row + y, 0, image, seed)
-        for x in range(picture.shape[1]):
-            sample = samples[colour_of(picture[y, x], bits), chosen(x, keys, count)]
-            for channel in range(3):
-                out[y, x, channel] = sample[channel]
+        for group in range(groups + AHEAD):
+            if group < groups:
+                choose_group(picture + y * pitch, width, group, keys, count, bits, scratch, slot(scratch, group))
+            done = group - AHEAD
+            if done < 0:
+                continue
+            offsets, to = slot(scratch, done), target + y * target_pitch + SAMPLE_BYTES * GROUP * done
+            if done < groups - 1:
+                # Each copy's last two bytes are the next one's first two.
+                for i in range(GROUP):
+                    copy8(samples + offset_at(offsets + 4 * i), to + SAMPLE_BYTES * i)
+            else:
+                for i in range(width - GROUP * done):
+                    copy6(samples + offset_at(offsets + 4 * i), to + SAMPLE_BYTES * i)
 
 
 @compiled
 def _gather_mosaic(
-    picture: Any, samples: Any, bits: int, seed: Any, image: int, first_row: int, pattern: Any, out: Any
+    picture: int,
+    pitch: int,
+    width: int,
+    rows: int,
+    samples: int,
+    count: Any,
+    bits: Any,
+    seed: Any,
+    image: int,
+    first_row: int,
+    target: int,
+    target_pitch: int,
+    pattern: int,
+    scratch: int,
 ) -> None:
-    count = samples.shape[1]
-    for y in range(picture.shape[0]):
+    """Fill rows of a mosaic; the pattern's four channels are two bits each."""
+    groups = (width + GROUP - 1) // GROUP
+    for y in range(rows):
         keys = row_keys(first_row + y, 0, image, seed)
-        for x in range(picture.shape[1]):
-            channel = pattern[2 * ((first_row + y) & 1) + (x & 1)]
-            out[y, x] = samples[colour_of(picture[y, x], bits), chosen(x, keys, count), channel]
+        channels = pattern >> (4 * ((first_row + y) & 1))
+        even, odd = samples + 2 * (channels & 3), samples + 2 * (channels >> 2 & 3)
+        for group in range(groups + AHEAD):
+            if group < groups:
+                choose_group(picture + y * pitch, width, group, keys, count, bits, scratch, slot(scratch, group))
+            done = group - AHEAD
+            if done < 0:
+                continue
+            offsets, to = slot(scratch, done), target + y * target_pitch + 2 * GROUP * done
+            if done < groups - 1:
+                for i in range(0, GROUP, 2):
+                    copy2(even + offset_at(offsets + 4 * i), to + 2 * i)
+                    copy2(odd + offset_at(offsets + 4 * i + 4), to + 2 * i + 2)
+            else:
+                for i in range(width - GROUP * done):
+                    copy2((odd if i & 1 else even) + offset_at(offsets + 4 * i), to + 2 * i)
 
 
 def draw_samples(
@@ -100,12 +166,28 @@ def draw_samples(
     check_picture(picture)
     target = check_target(out, picture.shape, np.uint16)
     key = check_place(seed, image)
+    source, table, work = packed(picture), readable(samples), writable(target)
 
     def fill(top: int, bottom: int) -> None:
-        _gather(picture[top:bottom], samples, bits, key, image, first_row + top, target[top:bottom])
+        scratch = np.empty(SCRATCH, np.uint8)
+        _gather(
+            source[top:].ctypes.data,
+            source.strides[0],
+            source.shape[1],
+            bottom - top,
+            table.ctypes.data,
+            np.uint32(samples.shape[1]),
+            np.uint32(bits),
+            key,
+            image,
+            first_row + top,
+            work[top:].ctypes.data,
+            work.strides[0],
+            scratch.ctypes.data,
+        )
 
     share(fill, len(picture), threads)
-    return target
+    return delivered(work, target)
 
 
 def draw_mosaic(
@@ -150,13 +232,30 @@ def draw_mosaic(
     key = check_place(seed, image)
     if pattern not in PATTERNS:
         raise InputError(f"{pattern!r} is no Bayer pattern; expected {', '.join(PATTERNS)}")
-    channels = np.array(PATTERNS[pattern])
+    channels = sum(channel << 2 * place for place, channel in enumerate(PATTERNS[pattern]))
+    source, table, work = packed(picture), readable(samples), writable(target)
 
     def fill(top: int, bottom: int) -> None:
-        _gather_mosaic(picture[top:bottom], samples, bits, key, image, first_row + top, channels, target[top:bottom])
+        scratch = np.empty(SCRATCH, np.uint8)
+        _gather_mosaic(
+            source[top:].ctypes.data,
+            source.strides[0],
+            source.shape[1],
+            bottom - top,
+            table.ctypes.data,
+            np.uint32(samples.shape[1]),
+            np.uint32(bits),
+            key,
+            image,
+            first_row + top,
+            work[top:].ctypes.data,
+            work.strides[0],
+            channels,
+            scratch.ctypes.data,
+        )
 
     share(fill, len(picture), threads)
-    return target
+    return delivered(work, target)
 
 
 def read_light(lut: Lut, light: int, pixels: int = _WHOLE_LIGHT) -> npt.NDArray[np.uint16]:

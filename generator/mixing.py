@@ -18,7 +18,7 @@ one brightness); samples clipped by the sensor stay clipped before they are mixe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -33,63 +33,42 @@ from generator.arguments import (
     check_tables,
     check_target,
     check_white,
+    packed,
+    readable,
     share,
 )
-from generator.choice import chosen, colour_of, row_keys
+from generator.choice import OFFSETS, choose_group, four_words, group_of, row_keys
 from generator.compiled import compiled
 from generator.palette import bits_of
+from generator.vector import GROUP, LANES, MEAN_BYTES, SAMPLE_BYTES, SUM_BYTES, add_light8, name_colours, round8
+
+MIXTURES: Final = np.uint32(philox.MIXTURES)
+STRETCH: Final = 512
+"""Pixels of a row whose offsets are chosen before their samples are fetched, a whole number of groups."""
+ROOM: Final = OFFSETS * (STRETCH // GROUP + 1)
+"""Bytes of a stretch's offsets; the last one of a row may be longer by up to seven pixels."""
 
 
 @compiled
-def _mix_pixels(
-    picture: Any,
-    tables: Any,
-    means: Any,
-    weights: Any,
-    bits: int,
-    white: Any,
-    seed: Any,
-    image: int,
-    first_row: int,
-    out: Any,
-) -> bool:
-    """Fill `out`; return whether every weight was a finite number ≥ 0. All arithmetic is float32, light by light."""
-    sound = True
-    count = tables.shape[2]
-    keys = np.empty((tables.shape[0], 3), np.uint32)
-    total = np.empty(3, np.float32)
-    for y in range(picture.shape[0]):
-        for light in range(tables.shape[0]):
-            keys[light] = row_keys(first_row + y, light, image, seed)
-        for x in range(picture.shape[1]):
-            colour = colour_of(picture[y, x], bits)
-            total[:] = 0
-            for light in range(tables.shape[0]):
-                weight = weights[y, x, light]
-                sound = sound and 0 <= weight < np.float32(np.inf)
-                root = np.sqrt(weight)
-                rest = weight - root
-                sample = chosen(x, keys[light], count)
-                for channel in range(3):
-                    total[channel] += root * np.float32(tables[light, colour, sample, channel])
-                    total[channel] += rest * means[light, colour, channel]
-            for channel in range(3):
-                out[y, x, channel] = np.uint16(min(max(total[channel] + np.float32(0.5), np.float32(0)), white))
-    return sound
-
-
-@compiled
-def _mix_table(samples: Any, weight: float, words: Any, total: Any) -> None:
-    """Add one light to `total` (C, S, 3) float64; sample i of each colour takes the place its shuffle gives it."""
+def _mix_table(samples: Any, weight: float, seed: Any, place: int, shuffled: bool, total: Any) -> None:
+    """Add one light to `total` (C, S, 3) float64, each colour's samples in the order of a shuffle of its own."""
     colours, count = samples.shape[0], samples.shape[1]
     root = np.sqrt(weight)
     order = np.empty(count, np.int64)
+    for i in range(count):
+        order[i] = i
+    words = np.empty(count + 3, np.uint32)
     for colour in range(colours):
-        for i in range(count):
-            order[i] = i
-        for i in range(words.shape[1]):
-            j = i + ((np.uint64(words[colour, i]) * np.uint64(count - i)) >> np.uint64(32))
-            order[i], order[j] = order[j], order[i]
+        if shuffled:
+            for i in range(0, count, 4):
+                words[i], words[i + 1], words[i + 2], words[i + 3] = four_words(
+                    np.uint32(colour), np.uint32(i // 4), np.uint32(place), MIXTURES, seed
+                )
+            for i in range(count):
+                order[i] = i
+            for i in range(count - 1):
+                j = i + np.int64((np.uint64(words[i]) * np.uint64(count - i)) >> np.uint64(32))
+                order[i], order[j] = order[j], order[i]
         for channel in range(3):
             mean = 0.0
             for i in range(count):
@@ -97,6 +76,88 @@ def _mix_table(samples: Any, weight: float, words: Any, total: Any) -> None:
             mean /= count
             for i in range(count):
                 total[colour, i, channel] += root * samples[colour, order[i], channel] + (weight - root) * mean
+
+
+@compiled
+def _round_table(total: Any, white: float, out: Any) -> None:
+    for colour in range(total.shape[0]):
+        for i in range(total.shape[1]):
+            for channel in range(3):
+                out[colour, i, channel] = np.uint16(min(max(total[colour, i, channel] + 0.5, 0.0), white))
+
+
+@compiled
+def _fill_means(samples: Any, means: Any) -> None:
+    """Fill the first three of `means` (C, 4) float32."""
+    count = samples.shape[1]
+    for colour in range(samples.shape[0]):
+        for channel in range(3):
+            total = 0
+            for i in range(count):
+                total += np.int64(samples[colour, i, channel])
+            means[colour, channel] = np.float32(total / count)
+
+
+@compiled
+def _mix_pixels(
+    picture: int,
+    pitch: int,
+    width: int,
+    rows: int,
+    tables: Any,
+    means: int,
+    count: Any,
+    bits: Any,
+    weights: int,
+    weight_steps: Any,
+    white: Any,
+    seed: Any,
+    image: int,
+    first_row: int,
+    target: int,
+    target_pitch: int,
+    scratch: int,
+) -> None:
+    """Fill rows of at least eight pixels. `weight_steps` are the bytes from row to row, pixel to pixel, light to light.
+
+    A stretch of a row at a time: offsets of all lights first, then eight pixels of all lights. In scratch memory stand
+    a row's last pixels, the sums, the colours' offsets and each light's.
+    """
+    lights = len(tables)
+    sums, colours = scratch + 64, scratch + 64 + SUM_BYTES
+    mean_bytes = MEAN_BYTES << (3 * np.int64(bits))
+    for y in range(rows):
+        start = 0
+        while start < width:
+            # What is left after a stretch must not be fewer than eight pixels.
+            end = width if width - start < STRETCH + LANES else start + STRETCH
+            for group in range(start // GROUP, (end + GROUP - 1) // GROUP):
+                to = colours + OFFSETS * (group - start // GROUP)
+                name_colours(group_of(picture + y * pitch, width, group, scratch), bits, to)
+            for light in range(lights):
+                keys = row_keys(first_row + y, light, image, seed)
+                for group in range(start // GROUP, (end + GROUP - 1) // GROUP):
+                    to = colours + ROOM * (light + 1) + OFFSETS * (group - start // GROUP)
+                    choose_group(picture + y * pitch, width, group, keys, count, bits, scratch, to)
+            x = start
+            while x < end:
+                x = min(x, end - LANES)
+                place = 4 * (x - start)
+                for light in range(lights):
+                    weight = weights + y * weight_steps[0] + x * weight_steps[1] + light * weight_steps[2]
+                    offsets = colours + ROOM * (light + 1) + place
+                    add_light8(
+                        tables[light],
+                        offsets,
+                        means + light * mean_bytes,
+                        colours + place,
+                        weight,
+                        weight_steps[1],
+                        sums,
+                    )
+                round8(sums, white, target + y * target_pitch + SAMPLE_BYTES * x)
+                x += LANES
+            start = end
 
 
 def _checked_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float64]:
@@ -146,22 +207,16 @@ def mixed_table(
     lights = check_tables(tables)
     checked = _checked_weights(weights, len(lights))
     check_white(white_level)
-    colours, count, _ = lights[0].shape
+    key = check_place(seed, 0)
     total = np.zeros(lights[0].shape, np.float64)
     shuffled = False
-    for light, (samples, weight) in enumerate(zip(lights, checked, strict=True)):
-        if weight == 0:
-            continue
-        words = np.zeros((colours, 0), np.uint32)
-        if shuffled:
-            colour: npt.NDArray[np.int64] = np.arange(colours, dtype=np.int64)[:, None]
-            step: npt.NDArray[np.int64] = np.arange(count // 4 + 1, dtype=np.int64)
-            four = philox.words(seed, colour, step, light, philox.MIXTURES)
-            words = np.stack(four, axis=-1).reshape(colours, -1)[:, : count - 1]
-        _mix_table(samples, float(weight), words, total)
-        shuffled = True
-    np.clip(np.floor(total + 0.5, out=total), 0, white_level, out=total)
-    return total.astype(np.uint16)
+    for place, (samples, weight) in enumerate(zip(lights, checked, strict=True)):
+        if weight > 0:
+            _mix_table(np.asarray(samples), float(weight), key, place, shuffled, total)
+            shuffled = True
+    out = np.empty(total.shape, np.uint16)
+    _round_table(total, float(white_level), out)
+    return out
 
 
 def mix_samples(
@@ -218,29 +273,46 @@ def mix_samples(
         each = _checked_weights(each, len(lights)).astype(np.float32)
     if each.shape not in (shape, shape[2:]):
         raise InputError(f"the weights are {each.shape}, expected {shape} or {shape[2:]}")
-    each = np.broadcast_to(each, shape)
-    stacked = np.stack(lights)
-    means = stacked.mean(axis=2, dtype=np.float64).astype(np.float32)
-    sound: list[bool] = []
+    source, each = packed(picture), np.broadcast_to(each, shape)
+    if picture.shape[1] < LANES:
+        source = np.pad(source, ((0, 0), (0, LANES), (0, 0)))
+        each = np.pad(each, ((0, 0), (0, LANES), (0, 0)))
+    work = target
+    if source.shape != picture.shape or target.strides[1:] != (6, 2):
+        work = np.empty(source.shape, np.uint16)
+    pieces = [readable(samples) for samples in lights]
+    addresses = np.array([piece.ctypes.data for piece in pieces])
+    means = np.zeros((len(lights), len(lights[0]), MEAN_BYTES // 4), np.float32)
+    for samples, mean in zip(pieces, means, strict=True):
+        _fill_means(np.asarray(samples), mean)
+    faults: list[bool] = []
 
     def fill(top: int, bottom: int) -> None:
-        band = slice(top, bottom)
-        sound.append(
-            _mix_pixels(
-                picture[band],
-                stacked,
-                means,
-                each[band],
-                bits,
-                np.float32(white_level),
-                key,
-                image,
-                first_row + top,
-                target[band],
-            )
+        scratch = np.zeros(64 + SUM_BYTES + ROOM * (1 + len(lights)), np.uint8)
+        _mix_pixels(
+            source[top:].ctypes.data,
+            source.strides[0],
+            source.shape[1],
+            bottom - top,
+            addresses,
+            means.ctypes.data,
+            np.uint32(lights[0].shape[1]),
+            np.uint32(bits),
+            each[top:].ctypes.data,
+            np.array(each.strides),
+            np.float32(white_level),
+            key,
+            image,
+            first_row + top,
+            work[top:].ctypes.data,
+            work.strides[0],
+            scratch.ctypes.data,
         )
+        faults.append(bool(scratch[64 : 64 + SUM_BYTES].any()))
 
     share(fill, len(picture), threads)
-    if not all(sound):
+    if any(faults):
         raise InputError("a weight is negative, infinite or no number; expected finite numbers from 0")
+    if work is not target:
+        target[...] = work[:, : target.shape[1]]
     return target

@@ -11,6 +11,7 @@ A gain is digital: it scales signal and noise alike, and saturated pixels darken
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,31 +20,77 @@ import numpy.typing as npt
 from drivers.errors import InputError
 from generator.arguments import (
     check_picture,
-    check_place,
     check_samples,
     check_target,
     check_white,
+    packed,
+    readable,
     share,
 )
-from generator.choice import chosen, colour_of, row_keys
+from generator.choice import OFFSETS, choose_group, row_keys
 from generator.compiled import compiled
+from generator.vector import GROUP, LANES, offset_at, plane1, planes8, prefetch
 
 Window = tuple[int, int, int, int]
 
 
 @compiled
 def _crop(
-    picture: Any, samples: Any, bits: int, seed: Any, image: int, x0: int, y0: int, flip: bool, scale: Any, out: Any
+    plan: Any,
+    seeds: Any,
+    scales: Any,
+    tables: int,
+    light_bytes: int,
+    last: int,
+    count: Any,
+    bits: Any,
+    width: int,
+    height: int,
+    target: int,
+    pitches: Any,
+    first: int,
+    end: int,
+    scratch: int,
 ) -> None:
-    count = samples.shape[1]
-    width = out.shape[2]
-    for y in range(out.shape[1]):
-        keys = row_keys(y0 + y, 0, image, seed)
-        for x in range(width):
-            sample = samples[colour_of(picture[y0 + y, x0 + x], bits), chosen(x0 + x, keys, count)]
-            to = width - 1 - x if flip else x
-            for channel in range(3):
-                out[channel, y, to] = min(np.float32(sample[channel]) * scale, np.float32(1))
+    """Fill the items `first` to `end` of a batch.
+
+    The offsets of a row are chosen, and their samples asked for, before the row above is fetched: the samples may lie
+    in memory nobody has touched for long. `last` stands in for the table's last light; `arguments.readable`.
+    """
+    row_bytes = OFFSETS * (width // GROUP + 2)
+    for item in range(first, end):
+        light, picture, pitch, picture_width, x0, y0, flip, image, lights = plan[item]
+        samples = last if light == lights - 1 else tables + light * light_bytes
+        scale = scales[item]
+        low, high = x0 // GROUP, (x0 + width - 1) // GROUP
+        step = -4 if flip else 4
+        for y in range(height + 1):
+            if y < height:
+                keys = row_keys(y0 + y, 0, image, seeds[item])
+                chosen = scratch + 64 + row_bytes * (y & 1)
+                for group in range(low, high + 1):
+                    to = chosen + OFFSETS * (group - low)
+                    choose_group(picture + y * pitch, picture_width, group, keys, count, bits, scratch, to)
+                    for i in range(GROUP):
+                        prefetch(samples + offset_at(to + 4 * i))
+            if y == 0:
+                continue
+            offsets = scratch + 64 + row_bytes * ((y - 1) & 1) + 4 * (x0 - GROUP * low)
+            if flip:
+                offsets += 4 * (width - 1)
+            red = target + item * pitches[0] + (y - 1) * pitches[2]
+            green, blue = red + pitches[1], red + 2 * pitches[1]
+            for start in range(0, width, LANES):
+                if width < LANES:
+                    for x in range(width):
+                        sample = samples + offset_at(offsets + step * x)
+                        plane1(sample, scale, red + 4 * x)
+                        plane1(sample + 2, scale, green + 4 * x)
+                        plane1(sample + 4, scale, blue + 4 * x)
+                else:
+                    # The last eight may be some of the ones before again.
+                    x = min(start, width - LANES)
+                    planes8(samples, offsets + step * x, step, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
 
 
 def _checked_window(window: Sequence[int], picture: npt.NDArray[np.uint8]) -> Window:
@@ -54,12 +101,6 @@ def _checked_window(window: Sequence[int], picture: npt.NDArray[np.uint8]) -> Wi
             f"{picture.shape[1]}x{picture.shape[0]} pixels"
         )
     return x0, y0, width, height
-
-
-def _checked_gain(gain: float) -> float:
-    if not 0 <= gain < float("inf"):
-        raise InputError(f"the gain is {gain}, expected a finite number from 0")
-    return gain
 
 
 def draw_planar(
@@ -108,19 +149,31 @@ def draw_planar(
     InputError
         A shape, type or number is not as above, or the window is not inside the picture.
     """
-    bits = check_samples(samples)
+    check_samples(samples)
     check_picture(picture)
-    check_white(white_level)
     whole = (0, 0, picture.shape[1], picture.shape[0])
     x0, y0, width, height = whole if window is None else _checked_window(window, picture)
     target = check_target(out, (3, height, width), np.float32)
-    key = check_place(seed, image)
-    scale = np.float32(_checked_gain(gain) / white_level)
+    parts = max(1, min(threads, height))
+    edges = [height * part // parts for part in range(parts + 1)]
+    pieces = [target[:, top:bottom] for top, bottom in pairwise(edges)]
 
-    def fill(top: int, bottom: int) -> None:
-        _crop(picture, samples, bits, key, image, x0, y0 + top, flip, scale, target[:, top:bottom])
+    def fill(first: int, end: int) -> None:
+        for top, piece in zip(edges[first:end], pieces[first:end], strict=True):
+            draw_batch(
+                samples[None],
+                [0],
+                [picture],
+                [(x0, y0 + top, width, piece.shape[1])],
+                white_level=white_level,
+                flips=flip,
+                gains=gain,
+                seeds=seed,
+                images=image,
+                out=piece[None],
+            )
 
-    share(fill, height, threads)
+    share(fill, parts, parts)
     return target
 
 
@@ -174,34 +227,68 @@ def draw_batch(
     """
     if tables.ndim != 4 or not len(tables):
         raise InputError(f"the tables are {tables.shape}, expected (lights, 8**bits, samples, 3)")
-    check_samples(tables[0])
+    bits = check_samples(tables[0])
     check_white(white_level)
     count = len(pictures)
     frames = np.asarray(windows, dtype=np.int64)
     if frames.shape != (count, 4) or not count:
         raise InputError(f"{count} pictures and windows {frames.shape} were given, expected one window of 4 a picture")
+    width, height = int(frames[0, 2]), int(frames[0, 3])
     if (frames[:, 2:] != frames[0, 2:]).any():
         raise InputError("the windows of a batch differ in size; give all one width and height")
     numbers = np.asarray(lights, dtype=np.int64)
     if numbers.shape != (count,) or numbers.min() < 0 or numbers.max() >= len(tables):
         raise InputError(f"lights {numbers.tolist()} were given, expected {count} from 0 to {len(tables) - 1}")
-    target = check_target(out, (count, 3, int(frames[0, 3]), int(frames[0, 2])), np.float32)
-    flipped, gained = np.broadcast_to(flips, count), np.broadcast_to(gains, count)
-    seeded, imaged = np.broadcast_to(seeds, count), np.broadcast_to(images, count)
+    gained = np.broadcast_to(np.asarray(gains, dtype=np.float64), count)
+    if not (np.isfinite(gained) & (gained >= 0)).all():
+        raise InputError(f"the gain is {gained.min()}, expected a finite number from 0")
+    seeded, imaged = _whole(seeds, count, 64, "seed"), _whole(images, count, 32, "image number")
+    target = check_target(out, (count, 3, height, width), np.float32)
+    work = target if target.strides[3] == 4 or width == 1 else np.empty(target.shape, np.float32)
+    if not tables[0].flags.c_contiguous:
+        tables = np.ascontiguousarray(tables)
+    last = readable(tables[-1])
+    sources: list[npt.NDArray[np.uint8]] = []
+    plan = np.empty((count, 9), np.int64)
+    plan[:, 0], plan[:, 4:6], plan[:, 7], plan[:, 8] = numbers, frames[:, :2], imaged, len(tables)
+    plan[:, 6] = np.broadcast_to(flips, count)
+    for item, picture in enumerate(pictures):
+        check_picture(picture)
+        _, y0, _, _ = _checked_window(frames[item], picture)
+        source = packed(picture)
+        sources.append(source)
+        plan[item, 1:4] = source.ctypes.data + y0 * source.strides[0], source.strides[0], source.shape[1]
+    scales = (gained / white_level).astype(np.float32)
 
     def fill(first: int, end: int) -> None:
-        for i in range(first, end):
-            draw_planar(
-                tables[numbers[i]],
-                pictures[i],
-                white_level=white_level,
-                window=(int(frames[i, 0]), int(frames[i, 1]), int(frames[i, 2]), int(frames[i, 3])),
-                flip=bool(flipped[i]),
-                gain=float(gained[i]),
-                seed=int(seeded[i]),
-                image=int(imaged[i]),
-                out=target[i],
-            )
+        scratch = np.empty(64 + 2 * OFFSETS * (width // GROUP + 2), np.uint8)
+        _crop(
+            plan,
+            seeded,
+            scales,
+            tables.ctypes.data,
+            tables.strides[0],
+            last.ctypes.data,
+            np.uint32(tables.shape[2]),
+            np.uint32(bits),
+            width,
+            height,
+            work.ctypes.data,
+            np.array(work.strides[:3]),
+            first,
+            end,
+            scratch.ctypes.data,
+        )
 
     share(fill, count, threads)
+    if work is not target:
+        target[...] = work
     return target
+
+
+def _whole(numbers: npt.ArrayLike, count: int, bits: int, name: str) -> npt.NDArray[np.uint64]:
+    """Return `count` whole numbers 0 … 2**bits − 1, one for all repeated."""
+    values = [int(number) for number in np.broadcast_to(np.asarray(numbers, dtype=object), count)]
+    if min(values) < 0 or max(values) >= 1 << bits:
+        raise InputError(f"a {name} is {min(values)} or {max(values)}, expected 0 to 2^{bits} - 1")
+    return np.array(values, np.uint64)

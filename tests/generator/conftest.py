@@ -84,13 +84,13 @@ def sample_numbers(
     y, x = np.arange(first_row, first_row + height), np.arange(width)
     keys = [key.astype(np.uint64)[:, None] for key in philox.words(seed, y, place, image, philox.SAMPLES)[:3]]
     word, low = np.uint64(0xFFFFFFFF), np.uint64(32)
-    h = (16 * (x // 32) + x % 16).astype(np.uint64)[None] ^ keys[0]
+    h = (8 * (x // 16) + x % 8).astype(np.uint64)[None] ^ keys[0]
     h = (h * np.uint64(0x21F0AAAD) & word) ^ keys[1]
     h = ((h ^ (h >> np.uint64(16))) * np.uint64(0x735A2D97) & word) ^ keys[2]
     h = (h ^ (h >> np.uint64(15))) * np.uint64(0x31848BAB) & word
     p = h * np.uint64(count)
     q = (p & word) * np.uint64(count)
-    return np.where(x % 32 < 16, p >> low, q >> low).astype(np.int64)
+    return np.where(x % 16 < 8, p >> low, q >> low).astype(np.int64)
 
 
 @pytest.fixture(scope="session")

@@ -46,7 +46,7 @@ def test_first_choices_of_seed_0_are_fixed_for_ever() -> None:
     # worked out here in Python's integers.
     samples = np.zeros((8, 25, 3), np.uint16)
     samples[..., 0] = np.arange(25)
-    row = draw_samples(samples, np.zeros((1, 20, 3), np.uint8))[0, :, 0].tolist()
+    row = draw_samples(samples, np.zeros((1, 12, 3), np.uint8))[0, :, 0].tolist()
     by_hand: list[int] = []
     for x in (0, 1, 2, 3):
         h = (x ^ 0x6627E8D5) * 0x21F0AAAD % 2**32 ^ 0xE169C58D
@@ -54,8 +54,8 @@ def test_first_choices_of_seed_0_are_fixed_for_ever() -> None:
         h = (h ^ h >> 15) * 0x31848BAB % 2**32
         by_hand += [h * 25 >> 32, h * 25 % 2**32 * 25 >> 32]
     assert row[:4] == by_hand[::2]
-    assert row[16:] == by_hand[1::2]
-    assert row == [22, 24, 3, 14, 11, 8, 22, 6, 6, 14, 3, 16, 15, 8, 2, 5, 3, 7, 7, 19]
+    assert row[8:] == by_hand[1::2]
+    assert row == [22, 24, 3, 14, 11, 8, 22, 6, 3, 7, 7, 19]
 
 
 @settings(max_examples=30, deadline=None)
@@ -114,8 +114,8 @@ def test_every_sample_is_drawn_equally_often() -> None:
     assert drawn.size == 12_000_000
     assert chi_square(drawn, 25) < LIMIT_24
     # Along rows, columns and each of the places that share words too.
-    for place in range(32):
-        assert chi_square(drawn[:, place::32], 25) < LIMIT_24
+    for place in range(16):
+        assert chi_square(drawn[:, place::16], 25) < LIMIT_24
 
 
 @pytest.mark.parametrize(("down", "right"), [(0, 1), (0, 2), (0, 4), (1, 0), (1, 1), (4, 0), (0, 1024)])

@@ -52,13 +52,14 @@ def test_any_window_gain_and_flip_in_a_batch(picture: npt.NDArray[np.uint8], dat
     tables = rng.integers(0, 4096, (3, 8, 5, 3)).astype(np.uint16)
     width, height = data.draw(st.integers(1, 90)), data.draw(st.integers(1, 12))
     count = data.draw(st.integers(1, 5))
-    firsts = rng.integers(0, 900, count).tolist()
+    firsts = [int(first) for first in rng.integers(0, 900, count)]
     pictures = [picture[:, first:] for first in firsts]
     windows = [
         (int(rng.integers(0, 1054 - first - width)), int(rng.integers(0, 38 - height)), width, height)
         for first in firsts
     ]
-    lights, flips, gains = rng.integers(0, 3, count), rng.random(count) < 0.5, rng.uniform(0, 3, count)
+    lights: npt.NDArray[np.int64] = rng.integers(0, 3, count)
+    flips, gains = rng.random(count) < 0.5, rng.uniform(0, 3, count)
     seeds, images = rng.integers(0, 2**63, count), rng.integers(0, 2**32, count)
     threads = data.draw(st.integers(1, 3))
     got = draw_batch(
@@ -74,7 +75,7 @@ def test_any_window_gain_and_flip_in_a_batch(picture: npt.NDArray[np.uint8], dat
         threads=threads,
     )
     for i in range(count):
-        image = draw_samples(tables[lights[i]], pictures[i], seed=int(seeds[i]), image=int(images[i]))
+        image = draw_samples(tables[int(lights[i])], pictures[i], seed=int(seeds[i]), image=int(images[i]))
         np.testing.assert_array_equal(got[i], expected(image, windows[i], bool(flips[i]), float(gains[i])))
 
 
