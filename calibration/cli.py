@@ -15,7 +15,7 @@ from drivers.errors import FormatError, InputError
 
 if TYPE_CHECKING:
     from acquisition.session import Session
-    from calibration.build import BuildResult, Growth
+    from calibration.result import BuildResult, Growth
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -114,7 +114,7 @@ def _make(session: Path | None, lut: Path | None, check: bool, append: bool) -> 
             result = judge(opened)
         else:
             result = _build(opened, lut, append)
-    from calibration.build import Growth
+    from calibration.result import Growth
 
     if isinstance(result, Growth):
         print(
@@ -153,7 +153,7 @@ def _verify(folder: Path, session: Path | None) -> None:
         faults = damage(lut, lambda done, total: told(done, total, "reading the samples"))
     if session is not None:
         from acquisition.session import Session
-        from calibration.build import lost_frames
+        from calibration.frames import lost_frames
 
         with Session.open(session) as opened, _bar("reading the frames") as told:
             faults += lost_frames(lut, opened, told)

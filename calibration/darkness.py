@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.illuminations import Illumination
+from acquisition.session import FrameRecord
 
 HOT_COUNTS = 32.0
 """Counts above its patch from which a sample is hot: the signal of the darkest cells that are of use, about 30."""
@@ -32,8 +34,8 @@ class Darkness:
 
     Attributes
     ----------
-    files, sha256
-        Dark frames read, with the hashes of their files.
+    files
+        Dark frames read.
     light
         (3,) float64 counts above black on bare paper, field divided out: leak and ambient light, the median of the
         frames; NaN without dark frames.
@@ -48,7 +50,6 @@ class Darkness:
     """
 
     files: tuple[str, ...] = ()
-    sha256: tuple[str, ...] = ()
     light: _Array = field(default_factory=lambda: np.full(3, np.nan))
     error: _Array = field(default_factory=lambda: np.full(3, np.nan))
     blacks: tuple[_Array, ...] = ()
@@ -56,74 +57,131 @@ class Darkness:
     hottest: _Array = field(default_factory=lambda: np.zeros(0))
 
 
-class DarkReading:
-    """Reads dark frames one by one."""
+@dataclass(frozen=True, eq=False)
+class DarkFigures:
+    """What was measured on one dark frame.
 
-    def __init__(self) -> None:
-        self._files: list[str] = []
-        self._sha256: list[str] = []
-        self._lights: list[_Array] = []
-        self._errors: list[_Array] = []
-        self._blacks: list[_Array] = []
-        self._noises: list[_Array] = []
-        self._aside: npt.NDArray[np.float32] | None = None
+    Attributes
+    ----------
+    record
+        The frame.
+    black
+        (2, 2) float64 counts.
+    light, error
+        (3,) float64 counts above black on bare paper, field divided out, and their standard error.
+    noise
+        (3,) float64 counts, standard deviation of a sample.
+    """
 
-    def add(
-        self,
-        file: str,
-        sha256: str,
-        black: _Array,
-        cells: npt.NDArray[np.float32],
-        paper: npt.NDArray[np.float32],
-        shape: _Array,
-    ) -> None:
-        """Read a frame.
+    record: FrameRecord
+    black: _Array
+    light: _Array
+    error: _Array
+    noise: _Array
 
-        Parameters
-        ----------
-        file, sha256
-            The frame.
-        black
-            (2, 2) counts.
-        cells
-            (C, 25, 3) float32 samples of the cells, counts above black.
-        paper
-            (N, 25, 3) float32 samples of the white references that lie in the frame.
-        shape
-            (N, 3) field at these references.
+    def told(self) -> dict[str, Any]:
+        """Return the figures as JSON holds them; `recall` makes them again to the last bit."""
+        return {name: getattr(self, name).tolist() for name in ("black", "light", "error", "noise")}
+
+    @staticmethod
+    def recall(record: FrameRecord, told: dict[str, Any]) -> DarkFigures:
+        """Return the figures of a frame from what `told` returned."""
+        return DarkFigures(record, *(np.array(told[name]) for name in ("black", "light", "error", "noise")))
+
+
+def read_dark(
+    record: FrameRecord,
+    black: _Array,
+    cells: npt.NDArray[np.float32],
+    paper: npt.NDArray[np.float32],
+    shape: _Array,
+) -> tuple[DarkFigures, npt.NDArray[np.int16]]:
+    """Return what a dark frame says, and how far each sample (C, S, 3) stands above its cell, whole counts.
+
+    Parameters
+    ----------
+    record
+        The frame.
+    black
+        (2, 2) counts.
+    cells
+        (C, S, 3) float32 samples of the cells, counts above black.
+    paper
+        (N, S, 3) float32 samples of the white references that lie in the frame.
+    shape
+        (N, 3) field at these references.
+    """
+    flat: _Array = paper.mean(axis=1, dtype=np.float64) / shape
+    count = max(len(flat), 1)
+    middle: _Array = np.asarray(np.median(flat, axis=0), dtype=np.float64)
+    # The median of normal values has a standard error 1.25 times that of the mean.
+    spread: _Array = 1.4826 * np.median(np.abs(flat - middle), axis=0)
+    aside: npt.NDArray[np.float32] = cells - np.median(cells, axis=1, keepdims=True)
+    # A seventh of the cells tells the noise well enough; about the median of 25 it is read 2 % low.
+    noise: _Array = (1 + 0.5 / cells.shape[1]) * 1.4826 * np.median(np.abs(aside[::7]), axis=(0, 1))
+    figures = DarkFigures(record, black, middle, 1.2533 * spread / np.sqrt(count), noise)
+    return figures, np.clip(np.rint(aside), -32768, 32767).astype(np.int16)
+
+
+class HotSamples:
+    """Remembers, over dark frames, which samples stand out of their cells in every one of them.
+
+    Parameters
+    ----------
+    cells, samples
+        C cells of S samples.
+    """
+
+    def __init__(self, cells: int, samples: int) -> None:
+        self._shape = cells, samples, 3
+        self._least: npt.NDArray[np.int16] = np.full(self._shape, 32767, dtype=np.int16)
+        self._past = np.zeros(cells)
+
+    def add(self, aside: npt.NDArray[np.int16]) -> None:
+        """Take a frame in; `aside` as `read_dark` returned it."""
+        np.minimum(self._least, aside, out=self._least)
+
+    def move(self, noise: _Array) -> None:
+        """Begin anew, since cells lie on other photosites from now on; what was hot so far stays hot."""
+        self._past = self.hottest(noise)
+        self._least = np.full(self._shape, 32767, dtype=np.int16)
+
+    def hottest(self, noise: _Array) -> _Array:
+        """Return how far the hottest sample of each cell (C,) stands out in every frame, 0 where it does not.
+
+        `noise` (3,) is a sample's.
         """
-        self._files.append(file)
-        self._sha256.append(sha256)
-        self._blacks.append(black)
-        flat: _Array = paper.mean(axis=1, dtype=np.float64) / shape
-        count = max(len(flat), 1)
-        middle: _Array = np.asarray(np.median(flat, axis=0), dtype=np.float64)
-        self._lights.append(middle)
-        # The median of normal values has a standard error 1.25 times that of the mean.
-        spread: _Array = 1.4826 * np.median(np.abs(flat - middle), axis=0)
-        self._errors.append(1.2533 * spread / np.sqrt(count))
-        aside: npt.NDArray[np.float32] = cells - np.median(cells, axis=1, keepdims=True)
-        # A seventh of the cells tells the noise well enough; about the median of 25 it is read 2 % low.
-        noise: _Array = 1.02 * 1.4826 * np.median(np.abs(aside[::7]), axis=(0, 1))
-        self._noises.append(noise)
-        self._aside = aside if self._aside is None else np.minimum(self._aside, aside)
-
-    def result(self) -> Darkness:
-        """Return what the frames read so far say."""
-        if self._aside is None:
-            return Darkness()
-        noise = np.median(self._noises, axis=0)
         hot = np.maximum(HOT_COUNTS, HOT_SIGMA * noise)
-        hottest = np.where(self._aside > hot, self._aside, 0).max(axis=(1, 2)).astype(np.float64)
-        return Darkness(
-            tuple(self._files),
-            tuple(self._sha256),
-            np.median(self._lights, axis=0),
-            np.median(self._errors, axis=0) / np.sqrt(len(self._errors)),
-            tuple(self._blacks),
-            noise,
-            hottest,
-        )
+        seen = (self._least > hot) & (self._least < 32767)
+        return np.maximum(np.where(seen, self._least, 0).max(axis=(1, 2)).astype(np.float64), self._past)
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """Return all that is remembered."""
+        return {"dark_least": self._least, "dark_past": self._past}
+
+    def restore(self, state: dict[str, npt.NDArray[Any]]) -> None:
+        """Go on from what `state` returned."""
+        self._least, self._past = state["dark_least"].copy(), state["dark_past"]
+
+
+def usual_noise(frames: Sequence[DarkFigures]) -> _Array:
+    """Return the noise (3,) of a sample, the median of dark frames; NaN without one."""
+    return np.asarray(np.median([dark.noise for dark in frames], axis=0)) if frames else np.full(3, np.nan)
+
+
+def darkness(frames: Sequence[DarkFigures], hot: HotSamples) -> Darkness:
+    """Return what dark frames say together."""
+    if not frames:
+        return Darkness()
+    noise = usual_noise(frames)
+    return Darkness(
+        tuple(dark.record.file for dark in frames),
+        np.median([dark.light for dark in frames], axis=0),
+        np.median([dark.error for dark in frames], axis=0) / np.sqrt(len(frames)),
+        tuple(dark.black for dark in frames),
+        noise,
+        hot.hottest(noise),
+    )
 
 
 def additivity(

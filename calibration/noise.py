@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-NOISY = 3.5
-"""Variance of a cell over the model's from which it is listed. Of 25 normal values it is passed by one in 10⁸."""
+from calibration.sampling import median_of_variance
+
+NOISY = 1e-8
+"""Chance that noise alone lists a cell: a variance 3.5 times the model's for 25 samples."""
 
 _BINS = 48
 _Array = npt.NDArray[np.float64]
@@ -35,6 +37,8 @@ class PhotonTransfer:
         (3,) float64, RMS of the bins' variances about the curve, relative.
     ratio
         (N,) float64, each cell's variance over the model's, the largest of its channels.
+    allowed
+        The ratio from which a cell is noisier than its level explains.
     """
 
     gain_e: _Array
@@ -42,14 +46,15 @@ class PhotonTransfer:
     response: _Array
     misfit: _Array
     ratio: _Array
+    allowed: float
 
     @property
     def noisy(self) -> npt.NDArray[np.bool_]:
         """(N,) whether a cell's noise deviates."""
-        return self.ratio > NOISY
+        return self.ratio > self.allowed
 
 
-def photon_transfer(level: _Array, variance: _Array, frames: int = 1) -> PhotonTransfer:
+def photon_transfer(level: _Array, variance: _Array, samples: int = 25) -> PhotonTransfer:
     """Return the curve through cells.
 
     Parameters
@@ -57,14 +62,14 @@ def photon_transfer(level: _Array, variance: _Array, frames: int = 1) -> PhotonT
     level
         (N, 3) mean of each cell, counts above black.
     variance
-        (N, 3) variance of one sample of each, the mean of one or more frames.
-    frames
-        How many.
+        (N, 3) variance of one sample of each.
+    samples
+        Samples of each cell.
     """
     from scipy.optimize import nnls
+    from scipy.stats import chi2
 
-    # The median of a variance of 25 normal values over its mean (chi-square, 24 degrees of freedom a frame).
-    median = (1 - 2 / (9 * 24 * frames)) ** 3
+    median = median_of_variance(samples - 1)
     terms, misfit = np.zeros((3, 3)), np.zeros(3)
     ratio = np.zeros(len(level))
     for channel in range(3):
@@ -80,6 +85,7 @@ def photon_transfer(level: _Array, variance: _Array, frames: int = 1) -> PhotonT
         here = np.maximum(level[:, channel], 0)
         model = terms[0, channel] + terms[1, channel] * here + terms[2, channel] * here**2
         ratio = np.maximum(ratio, variance[:, channel] / np.maximum(model, 1e-9))
+    allowed = float(chi2.isf(NOISY, samples - 1)) / (samples - 1)
     with np.errstate(divide="ignore"):
         gain = np.where(terms[1] > 0, 1 / terms[1], np.inf)
-    return PhotonTransfer(gain, np.sqrt(terms[0]), np.sqrt(terms[2]), misfit, ratio)
+    return PhotonTransfer(gain, np.sqrt(terms[0]), np.sqrt(terms[2]), misfit, ratio, allowed)

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration.fitting import least_squares
 from drivers.errors import QualityError
 from drivers.rawfile import Mosaic
 
@@ -35,6 +34,7 @@ ORDERS = (0, 1, 2, 3, 4, 5, 6)
 MIN_REFERENCES = 6
 _PLATEAU = 64
 _ROUNDS = 4
+_LEAST_FIELD = 0.05
 
 _Array = npt.NDArray[np.float64]
 
@@ -108,7 +108,7 @@ class Field:
         for channel, factors in enumerate(self.coefficients):
             for factor in factors:
                 shape[:, channel] *= polynomial(points, self.page_mm, order_of(len(factor))) @ factor
-        return np.maximum(shape, 0.05)
+        return np.maximum(shape, _LEAST_FIELD)
 
     def orders(self) -> tuple[int, ...]:
         """Return the total order of each channel's last factor: what the frame itself could tell."""
@@ -157,87 +157,99 @@ class Paper:
     spread: _Array
 
 
-def read_paper(
-    places_mm: _Array,
-    seen: _Array,
-    centres_mm: _Array,
-    page_mm: tuple[float, float],
-    base: Field | None = None,
-    what: str = "the frame",
-) -> Paper:
-    """Return the field and the white of a frame.
+class PaperReader:
+    """Reads field and white of frames in which paper is seen at the same places; threads may share one.
 
     Parameters
     ----------
     places_mm
         (N, 2) white references on the print.
-    seen
-        (N, 3) their mean counts above black; NaN where one cannot be used.
     centres_mm
         (C, 2) the chart's cells, over which the field's mean is 1.
     page_mm
         Width and height of the page.
     base
-        The shape of a brighter frame, to which this frame adds what it can tell; none for the brightest itself.
-    what
-        The frame's name for messages.
-
-    Raises
-    ------
-    QualityError
-        Fewer than six references can be used.
+        The shape of a brighter frame, to which other frames add what they can tell; none for the brightest itself.
     """
-    there = np.isfinite(seen).all(axis=1)
-    if there.sum() < MIN_REFERENCES:
-        raise QualityError(
-            f"{what}: {int(there.sum())} white references can be used, at least {MIN_REFERENCES} expected; uncover the "
-            "chart, bring all of it into the picture, and expose so that bare paper stays below saturation"
-        )
-    places, values = places_mm[there], seen[there]
-    base = even_field(page_mm) if base is None else base
-    shape, shape_at_centres = base.at(places), base.at(centres_mm)
-    whole = polynomial(places, page_mm, ORDERS[-1])
-    factors: list[tuple[_Array, ...]] = []
-    white, error, spread = np.zeros(3), np.zeros(3), np.zeros(3)
-    for channel in range(3):
-        known = shape[:, channel]
-        best: tuple[float, _Array, _Array] | None = None
-        for order in ORDERS:
-            basis = whole[:, : len(terms(order))]
-            if 3 * basis.shape[1] > len(places):
-                break
-            solution, weights, residual = _robust_fit(basis * known[:, None], values[:, channel])
-            variance = float((weights * residual**2).sum() / weights.sum())
-            criterion = len(places) * np.log(max(variance, 1e-12)) + basis.shape[1] * np.log(len(places))
-            if best is None or criterion < best[0]:
-                best = (criterion, solution, weights)
-        assert best is not None
-        _, solution, weights = best
-        local = polynomial(centres_mm, page_mm, order_of(len(solution))) @ solution
-        level = float((local * shape_at_centres[:, channel]).mean())
-        # Light too weak to have a shape of its own, or none at all.
-        own = solution / level if level > 0 and local.min() > 0.05 * level else np.ones(1)
-        factors.append((*base.coefficients[channel], own) if len(own) > 1 else base.coefficients[channel])
-        flat = values[:, channel] / (known * (whole[:, : len(own)] @ own))
-        white[channel] = float((weights * flat).sum() / weights.sum())
-        residual = flat - white[channel]
-        scatter = float(np.sqrt((weights * residual**2).sum() / weights.sum()))
-        error[channel] = scatter / np.sqrt(float(weights.sum()))
-        # All references count here: a stain that the fit rightly ignores must still be seen.
-        spread[channel] = float(np.sqrt((residual**2).mean())) / max(abs(white[channel]), 1e-9)
-    return Paper(Field(page_mm, (factors[0], factors[1], factors[2])), white, error, int(there.sum()), spread)
+
+    def __init__(
+        self, places_mm: _Array, centres_mm: _Array, page_mm: tuple[float, float], base: Field | None = None
+    ) -> None:
+        self.base = even_field(page_mm) if base is None else base
+        self._page_mm = page_mm
+        self._at_places, self._base_at_places = polynomial(places_mm, page_mm, ORDERS[-1]), self.base.at(places_mm)
+        self._base_at_centres = self.base.at(centres_mm)
+        # Term by term, so that the compiled loop runs along the cells.
+        self._at_centres = np.ascontiguousarray(polynomial(centres_mm, page_mm, ORDERS[-1]).T)
+
+    def read(self, seen: _Array, what: str = "the frame") -> tuple[Paper, _Array]:
+        """Return what a frame's paper says, and the frame's field (C, 3) at the cells' centres.
+
+        Parameters
+        ----------
+        seen
+            (N, 3) the references' mean counts above black; NaN where one cannot be used.
+        what
+            The frame's name for messages.
+
+        Raises
+        ------
+        QualityError
+            Fewer than six references can be used.
+        """
+        from calibration import loops
+
+        there = np.isfinite(seen).all(axis=1)
+        if there.sum() < MIN_REFERENCES:
+            raise QualityError(
+                f"{what}: {int(there.sum())} white references can be used, at least {MIN_REFERENCES} expected; uncover "
+                "the chart, bring all of it into the picture, and expose so that bare paper stays below saturation"
+            )
+        basis, values, known = self._at_places[there], seen[there], self._base_at_places[there]
+        fits = [_best_fit(basis, known[:, channel], values[:, channel]) for channel in range(3)]
+        solutions = np.zeros((3, basis.shape[1]))
+        for channel, (solution, _) in enumerate(fits):
+            solutions[channel, : len(solution)] = solution
+        local = np.empty((3, self._at_centres.shape[1]))
+        loops.combined(self._at_centres, solutions, local)
+        factors: list[tuple[_Array, ...]] = []
+        shape = self._base_at_centres.copy()
+        white, error, spread = np.zeros(3), np.zeros(3), np.zeros(3)
+        for channel, (solution, weights) in enumerate(fits):
+            base = self.base.coefficients[channel]
+            level = float((local[channel] * self._base_at_centres[:, channel]).mean())
+            # Light too weak to have a shape of its own, or none at all.
+            own = solution / level if level > 0 and local[channel].min() > 0.05 * level else np.ones(1)
+            if len(own) > 1:
+                shape[:, channel] *= local[channel] / level
+            factors.append((*base, own) if len(own) > 1 else base)
+            flat = values[:, channel] / (known[:, channel] * (basis[:, : len(own)] @ own))
+            white[channel] = float((weights * flat).sum() / weights.sum())
+            residual = flat - white[channel]
+            scatter = float(np.sqrt((weights * residual**2).sum() / weights.sum()))
+            error[channel] = scatter / np.sqrt(float(weights.sum()))
+            # All references count here: a stain that the fit rightly ignores must still be seen.
+            spread[channel] = float(np.sqrt((residual**2).mean())) / max(abs(white[channel]), 1e-9)
+        field = Field(self._page_mm, (factors[0], factors[1], factors[2]))
+        return Paper(field, white, error, int(there.sum()), spread), np.maximum(shape, _LEAST_FIELD)
 
 
-def _robust_fit(design: _Array, values: _Array) -> tuple[_Array, _Array, _Array]:
-    """Return solution, weights and residuals of a least-squares fit without what lies far off (Tukey's biweight)."""
-    weights = np.ones(len(values))
-    solution, residual = np.zeros(design.shape[1]), values
-    for _ in range(_ROUNDS):
-        solution = least_squares(design, values, weights)
-        residual = values - design @ solution
-        scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-9
-        weights = np.maximum(1 - (residual / (6 * scale)) ** 2, 0) ** 2
-    return solution, weights, residual
+def _best_fit(basis: _Array, known: _Array, values: _Array) -> tuple[_Array, _Array]:
+    """Return solution (terms,) and weights (N,) of the order that says most with least (BIC), shape `known` given."""
+    from calibration import loops
+
+    best: tuple[float, _Array, _Array] | None = None
+    for order in ORDERS:
+        count = len(terms(order))
+        if 3 * count > len(values):
+            break
+        solution, weights, residual = loops.robust_fit(basis[:, :count] * known[:, None], values, _ROUNDS)
+        variance = float((weights * residual**2).sum() / weights.sum())
+        criterion = len(values) * np.log(max(variance, 1e-12)) + count * np.log(len(values))
+        if best is None or criterion < best[0]:
+            best = (criterion, solution, weights)
+    assert best is not None
+    return best[1], best[2]
 
 
 def black_drift(blacks: Sequence[_Array]) -> float:

@@ -24,10 +24,10 @@ import numpy.typing as npt
 from acquisition.chart import Chart
 from acquisition.illuminations import decode_srgb
 from acquisition.session import Session
-from calibration.build import BuildResult
 from calibration.mosaic import half_size
 from calibration.radiometry import MAX_BLACK_DRIFT
 from calibration.registration import Registration
+from calibration.result import BuildResult
 from calibration.sampling import WINDOW, noise_of
 from calibration.verdict import Judged, Verdict, grey_tints_deg, report_json, shown
 from drivers.rawfile import read_raw

@@ -21,7 +21,7 @@ from calibration.references import tint_deg
 from calibration.thresholds import THRESHOLDS, Threshold
 
 if TYPE_CHECKING:
-    from calibration.build import BuildResult
+    from calibration.result import BuildResult
 
 FORMAT = "crop.report"
 VERSION = 1

@@ -196,8 +196,8 @@ def decode_raw(data: bytes, path: Path) -> Mosaic:
 
     with _libraw_silenced():
         try:
-            with rawpy.imread(io.BytesIO(data)) as raw:
-                return _mosaic(path, raw, data, directories)
+            # Not closed: the mosaic's counts lie in LibRaw's memory, which is freed with the last view of it.
+            return _mosaic(path, rawpy.imread(io.BytesIO(data)), data, directories)
         except (rawpy.LibRawError, rawpy.NotSupportedError) as error:
             raise _unreadable(path, f"LibRaw says {_reason(error)}") from error
         except (MemoryError, NotImplementedError, RuntimeError, ValueError) as error:
@@ -211,7 +211,10 @@ def _mosaic(path: Path, raw: RawPy, data: bytes, directories: list[Directory]) -
     if raw.raw_type is not rawpy.RawType.Flat or pattern is None or pattern.shape != (2, 2):
         raise _not_bayer(path, "its pixels do not follow a 2×2 pattern of colour filters")
     sizes = raw.sizes
-    sensor = np.array(raw.raw_image, dtype=np.uint16)
+    sensor = raw.raw_image
+    # A view that kept LibRaw's object alive no longer would show freed memory.
+    if sensor.base is not raw or sensor.dtype != np.uint16:
+        sensor = np.array(sensor, dtype=np.uint16)
     sensor.setflags(write=False)
     camera = _camera_name(data, directories)
     framed = Area(sizes.top_margin, sizes.left_margin, sizes.height, sizes.width)

@@ -15,10 +15,12 @@ import pytest
 from acquisition.chart import Chart
 from acquisition.layout import A_SERIES_MM, design_chart
 from acquisition.session import Session, Step, plan_steps
-from calibration.build import BuildResult, build, check, session_sha256
+from calibration.build import build, check
 from calibration.cli import main
+from calibration.frames import session_sha256
 from calibration.lut import Lut, open_lut
 from calibration.report import summary, write_report
+from calibration.result import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.errors import FormatError, InputError, QualityError, RegistrationError
 from drivers.presenter import BLACK, WHITE

@@ -17,9 +17,11 @@ import pytest
 
 import calibration.build as building
 from acquisition.session import Session, Step
-from calibration.build import BuildResult, Growth, append, build, lost_frames
+from calibration.build import append, build
+from calibration.frames import lost_frames
 from calibration.growing import CHECKPOINT, Checkpoint, growing
 from calibration.lut import damage, open_lut
+from calibration.result import BuildResult, Growth
 from drivers.errors import FormatError, InputError
 from sim.world import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
@@ -151,8 +153,8 @@ def growing_session(session: Session, tmp_path: Path) -> Generator[Session]:
 
 
 def show(session: Session, frames: int) -> None:
-    """Let the first `frames` light and white frames of a session have come."""
-    rows = [record.file for record in session.frames() if record.kind != "dark"]
+    """Let the first `frames` frames of a session have come."""
+    rows = [record.file for record in session.frames()]
     changes: list[tuple[str, ...]] = [
         ("accepted" if number < frames else "refused", file) for number, file in enumerate(rows)
     ]
@@ -166,10 +168,10 @@ def alter(session: Session, change: str, rows: list[tuple[str, ...]]) -> None:
 
 def test_a_table_follows_its_session(growing_session: Session, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
     session, out = growing_session, tmp_path / "lut"
-    every = sum(record.kind != "dark" for record in session.frames())
+    every = len(session.frames())
     lights = len(session.illuminations)
     seen: list[tuple[int, int]] = []
-    for frames in (1, 5, 5, every - 2):
+    for frames in (1, 5, 5, every - 3):
         show(session, frames)
         grown = append(session, out)
         assert isinstance(grown, Growth)
@@ -177,7 +179,7 @@ def test_a_table_follows_its_session(growing_session: Session, undisturbed: dict
         assert not out.exists()
         with pytest.raises(FormatError, match="in the making"):
             open_lut(out)
-    assert seen == [(0, 1), (3, 4), (3, 0), (lights - 1, every - 7)]
+    assert seen == [(0, 1), (3, 4), (3, 0), (lights - 1, every - 8)]
     with pytest.raises(FormatError, match=r"1 of \d+ lights have no accepted frame.*--append"):
         build(session, out)
     show(session, every)

@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 
 from calibration.radiometry import (
     Field,
+    Paper,
+    PaperReader,
     black_drift,
     corrections,
     even_field,
     order_of,
     polynomial,
-    read_paper,
     saturation,
     terms,
 )
@@ -30,6 +31,10 @@ PAGE = (400.0, 300.0)
 RANDOM = np.random.default_rng(3)
 PLACES = RANDOM.random((400, 2)) * PAGE
 CENTRES = RANDOM.random((1000, 2)) * PAGE
+
+
+def read_paper(seen: npt.NDArray[np.float64], base: Field | None = None) -> Paper:
+    return PaperReader(PLACES, CENTRES, PAGE, base).read(seen)[0]
 
 
 def falloff(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -46,7 +51,7 @@ def test_terms_and_orders_agree(order: int) -> None:
 
 def test_the_field_is_found_and_its_mean_over_the_cells_is_one() -> None:
     level = np.array([3000.0, 8000.0, 5000.0])
-    paper = read_paper(PLACES, falloff(PLACES) * level, CENTRES, PAGE)
+    paper = read_paper(falloff(PLACES) * level)
     assert paper.field.at(CENTRES).mean(axis=0) == pytest.approx(1, abs=1e-6)
     expected = falloff(CENTRES) / falloff(CENTRES).mean(axis=0)
     # Corners that no reference reaches are extrapolated.
@@ -61,8 +66,8 @@ def test_noise_is_not_taken_for_shape(seed: int, level: float) -> None:
     random = np.random.default_rng(seed)
     noise = np.sqrt(level / 1.8 + 36) / 5
     seen = level * falloff(PLACES) + random.normal(0, noise, (len(PLACES), 3))
-    base = read_paper(PLACES, 9000 * falloff(PLACES), CENTRES, PAGE).field
-    paper = read_paper(PLACES, seen, CENTRES, PAGE, base)
+    base = read_paper(9000 * falloff(PLACES)).field
+    paper = read_paper(seen, base)
     true = level * falloff(CENTRES).mean(axis=0)
     assert (np.abs(paper.white - true) < 6 * paper.error + 1e-3 * true).all()
     assert paper.error == pytest.approx(np.full(3, noise / 20), rel=0.35)
@@ -74,29 +79,29 @@ def test_references_that_are_covered_or_dirty_do_not_count() -> None:
     seen = 5000 * falloff(PLACES)
     seen[:30] *= 0.5
     seen[30:40] = np.nan
-    paper = read_paper(PLACES, seen, CENTRES, PAGE)
+    paper = read_paper(seen)
     assert paper.references == 390
     assert paper.white == pytest.approx(5000 * falloff(CENTRES).mean(axis=0), rel=0.002)
 
 
 def test_a_channel_without_light_has_the_shape_of_a_brighter_frame() -> None:
-    base = read_paper(PLACES, 9000 * falloff(PLACES), CENTRES, PAGE).field
+    base = read_paper(9000 * falloff(PLACES)).field
     seen = np.random.default_rng(0).normal(0, 1, (len(PLACES), 3))
-    field = read_paper(PLACES, seen, CENTRES, PAGE, base).field
+    field = read_paper(seen, base).field
     assert field.at(CENTRES) == pytest.approx(base.at(CENTRES), rel=0.02)
     assert (field.at(CENTRES) > 0).all()
 
 
 def test_too_few_references_are_refused() -> None:
     with pytest.raises(QualityError, match="5 white references can be used, at least 6 expected"):
-        read_paper(PLACES[:5], np.ones((5, 3)), CENTRES, PAGE)
+        PaperReader(PLACES[:5], CENTRES, PAGE).read(np.ones((5, 3)))
 
 
 def test_the_table_says_enough_to_undo_the_field() -> None:
     """Evaluated by the words of `lut.json`, with NumPy's Legendre series and nothing of ours."""
-    base = read_paper(PLACES, 9000 * falloff(PLACES), CENTRES, PAGE).field
+    base = read_paper(9000 * falloff(PLACES)).field
     tilted = falloff(PLACES) * (1 + 0.05 * (2 * PLACES[:, :1] / PAGE[0] - 1))
-    field = read_paper(PLACES, 9000 * tilted, CENTRES, PAGE, base).field
+    field = read_paper(9000 * tilted, base).field
     told = next(c for c in corrections(PAGE, np.zeros((1, 2, 2)), 13584, [field]) if c["name"] == "field")
     u, v = (2 * CENTRES / PAGE - 1).T
     for channel in range(3):
@@ -138,10 +143,10 @@ def test_black_drift_is_the_worst_position() -> None:
 def test_a_stain_is_ignored_by_the_white_and_told_by_the_spread() -> None:
     random = np.random.default_rng(8)
     seen = falloff(PLACES) * 6000 + random.normal(0, 12, (len(PLACES), 3))
-    clean = read_paper(PLACES, seen, CENTRES, PAGE)
+    clean = read_paper(seen)
     stained = seen.copy()
     stained[np.linalg.norm(PLACES - (200, 150), axis=1) < 40] *= 0.8
-    found = read_paper(PLACES, stained, CENTRES, PAGE)
+    found = read_paper(stained)
     assert found.white == pytest.approx(clean.white, rel=0.003)
     assert (clean.spread < 0.004).all()
     assert (found.spread > 0.02).all()

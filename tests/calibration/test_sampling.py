@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.mosaic import half_size
-from calibration.sampling import gather, noise_of, sites_at, table_values, uneven
+from calibration.sampling import gather, gather_values, noise_of, sites_at, table_values, uneven
 from tests.calibration.lab import Lab
 
 
@@ -49,6 +49,26 @@ def test_the_table_rounds_and_clips_at_zero() -> None:
     assert values[1, 0].tolist() == [125, 200, 240]
 
 
+@pytest.mark.parametrize("window", [3, 5, 7])
+def test_one_pass_and_two_give_the_same_values(lab: Lab, tmp_path: Path, window: int) -> None:
+    mosaic = lab.mosaic(tmp_path)
+    black = np.array([[2048.25, 2047.5], [2049.0, 2048.0]])
+    random = np.random.default_rng(3)
+    height, width = half_size(mosaic, black).shape[:2]
+    sites = sites_at(random.random((300, 2)) * (width - 1, height - 1), (height, width), window)
+    field, dark = random.uniform(0.7, 1.3, (300, 3)), random.uniform(0, 40, (300, 3)).astype(np.float32)
+    samples, highest = gather(mosaic, black, sites)
+    assert samples.shape == (300, window**2, 3)
+    values, highest_too = gather_values(mosaic, black, sites, field, dark)
+    inside = sites.inside
+    assert np.array_equal(values[inside], table_values(samples, field, dark)[inside])
+    assert not values[~inside].any()
+    assert np.array_equal(highest, highest_too)
+    # By NumPy alone, in double precision: equal but where a value lies on the edge between two counts.
+    plain = np.rint((samples[inside].astype(np.float64) - dark[inside, None]) / field[inside, None])
+    assert np.abs(values[inside] - np.clip(plain, 0, None)).max() <= 1
+
+
 def patches(level: float, sigma: float, count: int = 3000) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     return np.random.default_rng(2).normal(level, sigma, (count, 25, 3))
 
@@ -74,6 +94,16 @@ def test_less_than_a_percent_is_let_be() -> None:
     rim[1:-1, 1:-1] = False
     samples[:, rim.ravel()] += 70
     assert not uneven(samples, np.full((len(samples), 3), 1.0)).any()
+
+
+@pytest.mark.parametrize("window", [3, 7, 9])
+def test_a_rim_is_found_in_other_windows(window: int) -> None:
+    """Noise of 0.4 %, a rim 8 % brighter: beyond 5 σ even of the single inner pixel of 3×3."""
+    samples = np.random.default_rng(6).normal(8000, 30, (3000, window**2, 3))
+    rim = np.ones((window, window), dtype=bool)
+    rim[1:-1, 1:-1] = False
+    samples[7, rim.ravel(), 1] += 640
+    assert np.flatnonzero(uneven(samples, noise_of(samples))).tolist() == [7]
 
 
 def test_noise_is_known_as_a_function_of_the_level() -> None:

@@ -1,0 +1,327 @@
+"""What one frame says: how the chart has moved, its paper and greys, its samples.
+
+Laws that hold inside:
+
+- A frame is measured with what holds for its stretch, the time between two bumps, and nothing else, so that frames can
+  be measured in any order and by any thread.
+- The chart must lie where it was registered: a movement up to a tenth of a pixel is let be, up to half a pixel the
+  grid is moved along, and beyond it the frame is registered anew and begins a stretch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.chart import Chart
+from acquisition.framing import Framing
+from acquisition.movement import Shift, shift_between
+from acquisition.planes import CHANNELS, Channel, Plane, channel_offset_px, phases
+from acquisition.session import FrameRecord
+from calibration.darkness import DarkFigures, read_dark
+from calibration.frames import Decoded
+from calibration.noise import PhotonTransfer, photon_transfer
+from calibration.radiometry import CLIPPED, Field, Paper, PaperReader
+from calibration.references import Levels
+from calibration.registration import Registration, register
+from calibration.sampling import WINDOW, Sites, gather, gather_values, noise_of, sites_at, table_values
+from drivers.errors import FormatError
+from drivers.rawfile import Mosaic
+
+STILL_PX = 0.1
+BUMP_PX = 0.5
+_AROUND_TAG = 12
+"""Half-size pixels around a tag that its movement may need: more than `acquisition.framing` looks at."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFigures:
+    """What was measured on one frame.
+
+    Attributes
+    ----------
+    record
+        The frame.
+    black
+        (2, 2) float64 counts, black level of each position of the block.
+    channel
+        The colour in which the chart's movement was measured.
+    shift
+        Movement against the frame registered last.
+    registered
+        Whether this frame was registered anew.
+    paper
+        Field and white.
+    greys, grey_errors
+        (G, 3) float64 counts above black of each level of grey, field divided out, and their standard errors.
+    """
+
+    record: FrameRecord
+    black: _Array
+    channel: Channel
+    shift: Shift
+    registered: bool
+    paper: Paper
+    greys: _Array = field(default_factory=lambda: np.zeros((0, 3)))
+    grey_errors: _Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def told(self) -> dict[str, Any]:
+        """Return the figures as JSON holds them; `recall` makes them again to the last bit."""
+        return {
+            "black": self.black.tolist(),
+            "channel": self.channel,
+            "shift": [self.shift.dx, self.shift.dy, self.shift.largest_px, self.shift.tags],
+            "registered": self.registered,
+            "field": [[factor.tolist() for factor in factors] for factors in self.paper.field.coefficients],
+            "white": self.paper.white.tolist(),
+            "error": self.paper.error.tolist(),
+            "references": self.paper.references,
+            "spread": self.paper.spread.tolist(),
+            "greys": self.greys.tolist(),
+            "grey_errors": self.grey_errors.tolist(),
+        }
+
+    @staticmethod
+    def recall(record: FrameRecord, page_mm: tuple[float, float], told: dict[str, Any]) -> FrameFigures:
+        """Return the figures of a frame from what `told` returned."""
+        red, green, blue = (tuple(np.array(factor) for factor in factors) for factors in told["field"])
+        field = Field(page_mm, (red, green, blue))
+        white, error, spread = (np.array(told[name]) for name in ("white", "error", "spread"))
+        return FrameFigures(
+            record,
+            np.array(told["black"]),
+            told["channel"],
+            Shift(*told["shift"]),
+            told["registered"],
+            Paper(field, white, error, told["references"], spread),
+            *(np.array(told[name]).reshape(-1, 3) for name in ("greys", "grey_errors")),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """What holds from one bump to the next.
+
+    Attributes
+    ----------
+    file
+        The frame that was registered.
+    registration
+        Of that frame.
+    cells
+        Where the cells are sampled, in the order of colour indices.
+    references
+        Where the references are sampled, the white ones first.
+    planes
+        The frame around its tags, to compare others with.
+    """
+
+    file: str
+    registration: Registration
+    cells: Sites
+    references: Sites
+    planes: dict[Channel, Plane]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A light or white frame as measured.
+
+    Attributes
+    ----------
+    figures
+        For the report, the ground truth and the field.
+    stretch
+        What it was measured with.
+    saturation
+        Raw count of saturation, as far as this frame tells.
+    values
+        (C, S, 3) uint16, the table's samples.
+    highest
+        (C,) uint16, the highest raw count of each cell.
+    inside
+        (C,) bool, whether all pixels of a cell lie in the frame.
+    samples, noise
+        (C, S, 3) float32 counts above black and (C, 3) float64 their noise; None where they were not asked for.
+    """
+
+    figures: FrameFigures
+    stretch: Stretch
+    saturation: int
+    values: npt.NDArray[np.uint16]
+    highest: npt.NDArray[np.uint16]
+    inside: npt.NDArray[np.bool_]
+    samples: npt.NDArray[np.float32] | None
+    noise: _Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredDark:
+    """A dark frame as measured: its figures, with what, and how far samples (C, S, 3) stand above their cells."""
+
+    figures: DarkFigures
+    stretch: Stretch
+    aside: npt.NDArray[np.int16]
+
+
+def tags_of(mosaic: Mosaic, channel: Channel, black: _Array, framing: Framing) -> Plane:
+    """Return one colour of a mosaic around the tags, and 0 elsewhere: all that the chart's movement is measured in."""
+    places = phases(mosaic)[channel]
+    blocks = mosaic.block_planes()
+    level = np.float32(np.mean([black[place] for place in places]))
+    values = np.zeros(blocks.shape[2:], dtype=np.float32)
+    for tag in framing.tags:
+        left, top = np.maximum(np.floor(tag.corners_px.min(axis=0)).astype(int) - _AROUND_TAG, 0)
+        right, bottom = np.ceil(tag.corners_px.max(axis=0)).astype(int) + _AROUND_TAG
+        part = np.s_[top:bottom, left:right]
+        values[part] = sum(blocks[place][part].astype(np.float32) for place in places) / np.float32(len(places)) - level
+    return Plane(channel, values, channel_offset_px(places))
+
+
+class Measurement:
+    """Measures the frames of a session; it does not change, so threads may share it.
+
+    Parameters
+    ----------
+    chart
+        The chart of the session.
+    first
+        The frame that is registered first: its light's shape is the base of all others'.
+    window
+        Pixels along the side of a cell's window.
+    """
+
+    def __init__(self, chart: Chart, first: Decoded, window: int = WINDOW) -> None:
+        self._chart, self._window = chart, window
+        whites = [reference for reference in chart.references if reference.is_white]
+        greys = [reference for reference in chart.references if not reference.is_white]
+        self.levels = Levels.of(greys)
+        self._white_mm = np.array([reference.centre_mm for reference in whites]).reshape(-1, 2)
+        self._grey_mm = np.array([reference.centre_mm for reference in greys]).reshape(-1, 2)
+        # The table is ordered by colour index, the chart by its own order.
+        self.cells_mm = chart.centres_mm[chart.cell_of_colour]
+        self._shape = first.mosaic.block_planes().shape[2:]
+        self._geometry = first.mosaic.visible, first.mosaic.sensor.shape, first.mosaic.pattern
+        self._first_file = first.record.file
+        self.first = self.register(first)
+        samples, highest = gather(first.mosaic, first.black, self.first.references)
+        seen = _means(samples, highest, self.first.references, first.saturation)[: len(whites)]
+        base = PaperReader(self._white_mm, self.cells_mm, chart.page_mm).read(seen, first.record.file)[0].field
+        self._paper = PaperReader(self._white_mm, self.cells_mm, chart.page_mm, base)
+        self._base_at_whites = base.at(self._white_mm)
+        cells = gather(first.mosaic, first.black, self.first.cells)[0].astype(np.float64)
+        self.transfer: PhotonTransfer = photon_transfer(cells.mean(axis=1), cells.var(axis=1, ddof=1), window**2)
+
+    def register(self, decoded: Decoded) -> Stretch:
+        """Find the chart in a frame, which begins a stretch."""
+        registration = register(decoded.mosaic, self._chart, decoded.record.file)
+        cells, references = self._sites(registration)
+        planes: dict[Channel, Plane] = {
+            channel: tags_of(decoded.mosaic, channel, decoded.black, registration.framing) for channel in CHANNELS
+        }
+        return Stretch(decoded.record.file, registration, cells, references, planes)
+
+    def _sites(self, registration: Registration) -> tuple[Sites, Sites]:
+        """Return the sites of the cells and of the references."""
+        height, width = self._shape
+        groups = self.cells_mm, np.concatenate([self._white_mm, self._grey_mm])
+        cells, references = (
+            sites_at(registration.to_pixels(places), (height, width), self._window) for places in groups
+        )
+        return cells, references
+
+    def measure(self, decoded: Decoded, stretch: Stretch, even: bool) -> Measured | Shift:
+        """Return what a frame says; its movement alone, if that is such that it has to be registered anew.
+
+        Parameters
+        ----------
+        decoded
+            A light or white frame.
+        stretch
+            What holds for it.
+        even
+            Whether its samples are wanted, for what is learnt from frames of even light.
+
+        Raises
+        ------
+        FormatError
+            The sensor is not that of the first frame.
+        QualityError
+            The white references cannot be used.
+        """
+        self._require_geometry(decoded)
+        channel, framing = decoded.strongest, stretch.registration.framing
+        shift = shift_between(
+            stretch.planes[channel], framing, tags_of(decoded.mosaic, channel, decoded.black, framing)
+        )
+        # A turn or a change of distance moves the tags differently; moving the grid along would not mend it.
+        turned = shift.largest_px > shift.length_px + STILL_PX
+        if shift.tags == 0 or shift.length_px > BUMP_PX or turned:
+            return shift
+        cells, references = stretch.cells, stretch.references
+        if shift.length_px > STILL_PX:
+            cells, references = self._sites(stretch.registration.shifted(shift.dx, shift.dy))
+        return self._measured(decoded, stretch, cells, references, shift, even)
+
+    def measure_first(self, decoded: Decoded, stretch: Stretch, shift: Shift, even: bool) -> Measured:
+        """Return what the frame says that has begun a stretch, `shift` after the one before; else as `measure`."""
+        return self._measured(decoded, stretch, stretch.cells, stretch.references, shift, even, registered=True)
+
+    def measure_dark(self, decoded: Decoded, stretch: Stretch) -> MeasuredDark:
+        """Return what a dark frame says; no tag is seen in it, so the chart is taken to lie where it did."""
+        self._require_geometry(decoded)
+        cells, _ = gather(decoded.mosaic, decoded.black, stretch.cells)
+        references, _ = gather(decoded.mosaic, decoded.black, stretch.references)
+        whites = np.flatnonzero(stretch.references.inside[: len(self._white_mm)])
+        figures, aside = read_dark(
+            decoded.record, decoded.black, cells, references[whites], self._base_at_whites[whites]
+        )
+        return MeasuredDark(figures, stretch, aside)
+
+    def _require_geometry(self, decoded: Decoded) -> None:
+        mosaic = decoded.mosaic
+        if (mosaic.visible, mosaic.sensor.shape, mosaic.pattern) != self._geometry:
+            raise FormatError(
+                f"{decoded.record.file}: the sensor has {mosaic.sensor.shape[1]}×{mosaic.sensor.shape[0]} photosites "
+                f"{mosaic.pattern}, that of {self._first_file} {self._geometry[1][1]}×{self._geometry[1][0]} "
+                f"{self._geometry[2]}; "
+                "a session has one camera with one setting"
+            )
+
+    def _measured(
+        self,
+        decoded: Decoded,
+        stretch: Stretch,
+        cells: Sites,
+        references: Sites,
+        shift: Shift,
+        even: bool,
+        registered: bool = False,
+    ) -> Measured:
+        samples, highest = gather(decoded.mosaic, decoded.black, references)
+        seen = _means(samples, highest, references, decoded.saturation)
+        whites = len(self._white_mm)
+        paper, shape = self._paper.read(seen[:whites], decoded.record.file)
+        greys, grey_errors = self.levels.read(seen[whites:], paper.field.at(self._grey_mm))
+        figures = FrameFigures(
+            decoded.record, decoded.black, decoded.strongest, shift, registered, paper, greys, grey_errors
+        )
+        if even:
+            kept, highest = gather(decoded.mosaic, decoded.black, cells)
+            values, noise = table_values(kept, shape), noise_of(kept)
+        else:
+            values, highest = gather_values(decoded.mosaic, decoded.black, cells, shape)
+            kept = noise = None
+        return Measured(figures, stretch, decoded.saturation, values, highest, cells.inside, kept, noise)
+
+
+def _means(samples: npt.NDArray[np.float32], highest: npt.NDArray[np.uint16], sites: Sites, saturation: int) -> _Array:
+    """Return the mean counts (N, 3) of patches, NaN where one is cut off or clipped."""
+    seen = samples.mean(axis=1, dtype=np.float64)
+    seen[~(sites.inside & (highest < CLIPPED * saturation))] = np.nan
+    return seen
