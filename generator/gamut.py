@@ -132,8 +132,13 @@ class Gamut:
         ------
         OutsideGamutError
             No mixture makes it, and the nearest was not asked for.
+        InputError
+            It is no light.
         """
-        target = _unit(np.asarray(wanted, dtype=np.float64))
+        light = np.asarray(wanted, dtype=np.float64)
+        if light.shape != (3,) or not np.isfinite(light).all() or light.min() < 0 or light.max() <= 0:
+            raise InputError(f"{light.tolist()} is no light: expected three numbers from 0, one above 0")
+        target = _unit(light)
         nearest = self._nearest_light(target)
         if nearest.angle <= TOLERANCE_DEG:
             return nearest
@@ -184,19 +189,25 @@ class Gamut:
         inverses[~flat] = np.linalg.inv(corners[~flat])
         return inverses
 
+    @cached_property
+    def _cosines(self) -> _Array:
+        """(E,) float64, of the angles between neighbours."""
+        return (self.directions[self.edges[:, 0]] * self.directions[self.edges[:, 1]]).sum(axis=1)
+
     def _nearest_light(self, target: _Array) -> Match:
         light = int((self.directions @ target).argmax())
         return Match(mixture_of({light: 1.0}), float(angles_between(self.white[light], target)))
 
     def _pairs(self, target: _Array) -> tuple[npt.NDArray[np.int64], _Array, _Array]:
         """Return the pairs between whose lights the target's foot falls, their shares, and the angles in degrees."""
-        u, v = self.directions[self.edges[:, 0]], self.directions[self.edges[:, 1]]
-        cosine, at_u, at_v = (u * v).sum(axis=1), u @ target, v @ target
+        at_u, at_v = (self.directions @ target)[self.edges.T]
+        cosine = self._cosines
         area = np.maximum(1 - cosine**2, 1e-30)
         shares = np.stack([at_u - cosine * at_v, at_v - cosine * at_u], axis=1) / area[:, None]
         between = (shares > 0).all(axis=1)
-        foot = shares[between, :1] * u[between] + shares[between, 1:] * v[between]
-        return self.edges[between], shares[between], angles_between(foot, target)
+        # The foot is as long as the cosine of the angle; what foot and target have in common is the square of that.
+        common = (shares[:, 0] * at_u + shares[:, 1] * at_v)[between]
+        return self.edges[between], shares[between], np.degrees(np.arccos(np.sqrt(np.minimum(common, 1))))
 
     def _found(self, lights: npt.NDArray[np.int64], shares: _Array, target: _Array) -> Match:
         """Return the match of `shares` of the directions of `lights`."""

@@ -187,6 +187,20 @@ class Lighting:
         """Return the ground truth of each light, (lights, 3) float64, linear camera RGB, not normalised."""
         return np.array([mixture.white(lut) for mixture in self.mixtures])
 
+    def overall(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+        """Return the light that falls on the picture on the average, (3,) float64, linear camera RGB, not normalised.
+
+        The one ground truth of an image of several lights, for methods that know of one only.
+
+        Parameters
+        ----------
+        lut
+            The table.
+        weights
+            (H, W, lights) float32 ≥ 0, as `weights_of` returns them.
+        """
+        return np.asarray(weights.mean(axis=(0, 1), dtype=np.float64)) @ self.whites(lut)
+
     def ground_truth_map(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Return the ground truth of each pixel.
 

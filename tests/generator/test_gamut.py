@@ -112,6 +112,12 @@ def test_what_is_contained_is_matched_and_what_is_not_is_refused(r: float, b: fl
         assert drives.min() < 1e-9
 
 
+@pytest.mark.parametrize("wanted", [[0.0, 0, 0], [1, -1, 1], [1, 2], [np.nan, 1, 1], [[1, 2, 3]]])
+def test_what_is_no_light_is_refused(wanted: list[float]) -> None:
+    with pytest.raises(InputError, match="is no light: expected three numbers from 0"):
+        GRID.match(wanted)
+
+
 def test_chromaticities_there_and_back() -> None:
     rgb = np.array([[2.0, 5.0, 1.0], [0.1, 0.2, 0.7]])
     np.testing.assert_allclose(rb_of(rgb), [[0.25, 0.125], [0.1, 0.7]])

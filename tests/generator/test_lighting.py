@@ -89,6 +89,8 @@ def test_ground_truth_of_every_pixel(make_lut: Callable[..., Lut]) -> None:
     other = lut.white[1] / 2 + lut.white[2] / 2
     np.testing.assert_allclose(truth[:, :2], np.broadcast_to(lut.ground_truth[0], (2, 2, 3)), rtol=1e-6)
     np.testing.assert_allclose(truth[:, 2:], np.broadcast_to(other / other.sum(), (2, 2, 3)), rtol=1e-6)
+    overall = lighting.overall(lut, weights)
+    np.testing.assert_allclose(overall, (lut.white[0] + other) / 2, rtol=1e-6)
     even = lighting.ground_truth_map(lut, np.full((1, 1, 2), 0.5, np.float32))[0, 0]
     both = lut.white[0] + other
     np.testing.assert_allclose(even, both / both.sum(), rtol=1e-6)
