@@ -95,11 +95,12 @@ class XScreen:
         for _ in range(number.value):
             self._xcb.xcb_screen_next(ctypes.byref(screens))
         self._root: int = screens.data[0]
+        self._seen: npt.NDArray[np.uint32] = np.empty((0, 0), np.uint32)
         self.stays_awake = self._suspend_saver()
         """Whether screen saver and power saving are held off while this is open."""
 
     def read(self, x: int, y: int, width: int, height: int) -> npt.NDArray[np.uint32]:
-        """Return what the server shows there, (height, width) uint32, 0xRRGGBB.
+        """Return what the server shows there, (height, width) uint32, 0xRRGGBB; the next call writes over it.
 
         Raises
         ------
@@ -125,7 +126,10 @@ class XScreen:
             if depth not in (24, 32) or size != 4 * width * height:
                 raise DeviceError(f"the X screen has a depth of {depth} bits; set 24, so that codes arrive as they are")
             raw = (ctypes.c_uint8 * size).from_address(self._xcb.xcb_get_image_data(reply))
-            return np.frombuffer(memoryview(raw), dtype="<u4").reshape(height, width) & np.uint32(0xFFFFFF)
+            if self._seen.shape != (height, width):
+                self._seen = np.empty((height, width), np.uint32)
+            pixels = np.frombuffer(memoryview(raw), dtype="<u4").reshape(height, width)
+            return np.bitwise_and(pixels, np.uint32(0xFFFFFF), out=self._seen)
         finally:
             self._libc.free(reply)
 
