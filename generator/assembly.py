@@ -35,7 +35,7 @@ from generator.workplace import DESCRIPTION, Workplace
 GROUND_TRUTH = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS = ("image", "source", "illumination", "r", "g", "b")
 SOURCES = "sources.csv"
-SOURCE_COLUMNS = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split")
+SOURCE_COLUMNS = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile")
 TRUTHS = "gt.txt"
 SUMS = "SHA256SUMS"
 CARD = "README.md"
@@ -189,7 +189,7 @@ def _row(fields: Iterable[object]) -> str:
 
 def _source_row(source: SourceRecord) -> str:
     known = (source.position, source.name, source.sha256 or "", source.width, source.height, source.replaced_pixels)
-    return _row((*known, source.split or ""))
+    return _row((*known, source.split or "", source.profile or ""))
 
 
 def _image_rows(name: str, source: str, image: ImageRecord) -> str:

@@ -1,10 +1,11 @@
 """A dataset: its reader, and the call that makes one.
 
     images/NNNNNN.png    linear camera RGB in the units of the table; the number is the one that was planned
+    masks/, ground_truth/  where several lights fall on an image; see `mask_files`
     previews/NNNNNN.jpg  the same, tone mapped, at most 512 px: the look of the raw, no white balance
     ground_truth.csv     image,source,illumination,r,g,b with r + g + b = 1, one row a light
     gt.txt               r g b a line in image order: the mean of the lights over the image
-    sources.csv          position,name,sha256,width,height,replaced_pixels,split
+    sources.csv          position,name,sha256,width,height,replaced_pixels,split,profile
     splits/train.txt …   names of images, where the dataset was divided
     dataset.json         the table's hash, seed, options: enough to make every byte again
     SHA256SUMS           hashes of all files; `sha256sum -c SHA256SUMS` verifies

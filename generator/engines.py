@@ -13,6 +13,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Final
 
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 ATTEMPTS: Final = 5
 """How often a shard is handed out again after it was on several workers when they died."""
+
+CONNECT_S: Final = 10.0
+"""How long a scheduler may take to answer, s."""
 
 _Event = Callable[[], None]
 
@@ -181,8 +185,8 @@ def _by_dask(
 
         # A few tasks a thread are handed out at a time: a plan may have more of them than memory has room for.
         at_once = max(4, 3 * sum(client.nthreads().values()))
-        running = {submit(shard): shard for shard, _ in zip(waiting, range(at_once), strict=False)}
-        futures = as_completed(list(running))
+        running = {submit(shard): shard for shard in islice(waiting, at_once)}
+        futures = as_completed(list(running), loop=client.loop)
         for future in futures:
             shard = running.pop(future)
             try:
@@ -226,7 +230,7 @@ def _client(address: str, workers: int) -> Generator[distributed.Client]:
 
     if address:
         try:
-            client = Client(address, timeout=10, set_as_default=False)
+            client = Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, TimeoutError) as error:
             raise InputError(
                 f"no Dask scheduler answers at {address.removeprefix('tcp://')}: {error}; start one with "
@@ -241,7 +245,7 @@ def _client(address: str, workers: int) -> Generator[distributed.Client]:
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",
             memory_limit=None,
             silence_logs=logging.CRITICAL,
         ) as cluster,

@@ -6,6 +6,7 @@
     number, source, split, width, height
     truth     [r, g, b] of sum 1, the mean of the lights over the image
     lights    list of illumination and truth
+    masks, ground_truth   where several lights fall on an image: as images of 16 bits, not decoded by themselves either
 
 Needs pyarrow, the extra `parquet`.
 """
@@ -32,6 +33,9 @@ _GROUP_BYTES: Final = 4 << 20
 """Bytes from which a group of rows is written: what a reader has to read to get at one image."""
 _GROUP_ROWS: Final = 64
 
+_COLUMNS: Final = {"images": "image", "previews": "preview", "ground_truth": "ground_truth"}
+
+_FILE = {"decode": False, "_type": "Image"}
 _STRING = {"dtype": "string", "_type": "Value"}
 _INT = {"dtype": "int64", "_type": "Value"}
 _TRUTH = {"feature": {"dtype": "float64", "_type": "Value"}, "length": 3, "_type": "List"}
@@ -49,14 +53,14 @@ def require_pyarrow() -> None:
         raise InputError("the layout parquet needs pyarrow; install it with: pip install croplab[parquet]")
 
 
-def schema(previews: bool) -> pa.Schema:
+def schema(previews: bool, maps: bool) -> pa.Schema:
     """Return the columns, and in their metadata the features as `datasets` reads them."""
     import pyarrow as pa
 
     file = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
     truth = pa.list_(pa.float64(), 3)
     columns: list[tuple[str, pa.DataType, Any]] = [
-        ("image", file, {"decode": False, "_type": "Image"}),
+        ("image", file, _FILE),
         ("preview", file, {"_type": "Image"}),
         ("number", pa.int64(), _INT),
         ("source", pa.string(), _STRING),
@@ -69,8 +73,11 @@ def schema(previews: bool) -> pa.Schema:
             pa.list_(pa.struct([("illumination", pa.string()), ("truth", truth)])),
             {"feature": {"illumination": _STRING, "truth": _TRUTH}, "_type": "List"},
         ),
+        ("masks", pa.list_(file), {"feature": _FILE, "_type": "List"}),
+        ("ground_truth", file, _FILE),
     ]
-    kept = [column for column in columns if previews or column[0] != "preview"]
+    left_out = {"preview": not previews, "masks": not maps, "ground_truth": not maps}
+    kept = [column for column in columns if not left_out.get(column[0])]
     features = {name: feature for name, _, feature in kept}
     told = json.dumps({"info": {"features": features}})
     return pa.schema([(name, kind) for name, kind, _ in kept]).with_metadata({"huggingface": told})
@@ -79,11 +86,11 @@ def schema(previews: bool) -> pa.Schema:
 class _Part:
     """One file that is being written."""
 
-    def __init__(self, stream: BinaryIO, previews: bool) -> None:
+    def __init__(self, stream: BinaryIO, columns: pa.Schema) -> None:
         import pyarrow.parquet as pq
 
         self.hashed = Hashed(stream)
-        self._schema = schema(previews)
+        self._schema = columns
         # Images are compressed already, and the few numbers beside them are not worth a reader's trouble.
         self._writer: pq.ParquetWriter = pq.ParquetWriter(
             self.hashed, self._schema, compression="none", use_dictionary=False, write_statistics=["number"]
@@ -115,7 +122,8 @@ class ParquetWriter:
     def __init__(self, store: Store, job: ShardJob) -> None:
         self._store = store
         self._shard = shard_key(job.shard)
-        self._previews = job.options.previews
+        maps = any(lighting.masks is not None for lighting in job.choice.lightings_of(job.position))
+        self._schema = schema(job.options.previews, maps)
         self._stack = ExitStack()
         self._parts: dict[str, _Part] = {}
 
@@ -127,14 +135,16 @@ class ParquetWriter:
         """Write the row of an image."""
         name = f"{sample.split or 'data'}/{self._shard}.parquet"
         if name not in self._parts:
-            self._parts[name] = _Part(self._stack.enter_context(self._store.create(name)), self._previews)
+            self._parts[name] = _Part(self._stack.enter_context(self._store.create(name)), self._schema)
         told = about(sample)
-        row = {"number": told.pop("image"), **told}
-        size = 0
+        row: dict[str, Any] = {"number": told.pop("image"), **told, "masks": []}
         for kind, ending, data in sample.files:
-            row["image" if kind == "images" else "preview"] = {"bytes": data, "path": f"{sample.key}{ending}"}
-            size += len(data)
-        self._parts[name].append(row, size)
+            file = {"bytes": data, "path": f"{sample.key}{ending}"}
+            if kind == "masks":
+                row["masks"].append(file)
+            else:
+                row[_COLUMNS[kind]] = file
+        self._parts[name].append(row, sum(len(data) for _, _, data in sample.files))
 
     def close(self) -> list[FileSum]:
         """Finish the files and return them."""

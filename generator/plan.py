@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import BaseModel, ConfigDict
 
@@ -95,15 +95,6 @@ class ShardJob:
     seed: int
     options: Options
     versions: dict[str, str]
-
-
-@runtime_checkable
-class SelfNaming(Protocol):
-    """A list of sources that can tell its own hash without making every source."""
-
-    def digest(self) -> str:
-        """Return a hash that differs where a source or the order differs."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,8 +266,6 @@ def sources_sha256(sources: Sequence[Source]) -> str:
     Where a file lies and what is in it are left out: a list is the same on every machine, and its files are hashed when
     they are read.
     """
-    if isinstance(sources, SelfNaming):
-        return sources.digest()
     digest = hashlib.sha256()
     for source in sources:
         digest.update(json.dumps(source.told(), sort_keys=True).encode() + b"\n")

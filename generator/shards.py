@@ -235,24 +235,39 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _Read:
 
 def _make(job: ShardJob, lut: Lut, writer: ShardWriter, number: int, got: _Read, lighting: Lighting) -> Sample:
     from generator.encode import Shot, encode_image, encode_preview, suffix_of
-    from generator.kernel import draw_samples
 
-    picture = got.picture
-    height, width = picture.shape[:2]
-    if lighting.masks is not None:
-        raise InputError("several lights in one image are not made into datasets yet")
-    (mixture,) = lighting.mixtures
-    samples = mixture.samples(lut, job.seed, height * width)
-    image = draw_samples(samples, picture, seed=job.seed, image=number)
+    height, width = got.picture.shape[:2]
     white_level = lut.provenance.white_level
-    truth = chromaticity(mixture.white(lut))
-    rows = [LightRow(illumination=mixture.label, truth=truth)]
+    image, truth, maps = _photograph(lut, got.picture, lighting, job.seed, number)
     shot = Shot(white_level, truth, lut.provenance.camera)
-    files = [("images", suffix_of(job.options.form), encode_image(image, job.options.form, shot))]
+    files = [("images", suffix_of(job.options.form), encode_image(image, job.options.form, shot)), *maps]
     if job.options.previews:
         files.append(("previews", ".jpg", encode_preview(preview_of(image, white_level))))
+    rows = [
+        LightRow(illumination=mixture.label, truth=chromaticity(mixture.white(lut))) for mixture in lighting.mixtures
+    ]
     record = ImageRecord(number=number, position=got.record.position, truth=truth, lights=rows)
     return writer.store(Sample(record, got.record.name, got.record.split, width, height, tuple(files)))
+
+
+def _photograph(
+    lut: Lut, picture: Picture, lighting: Lighting, seed: int, number: int
+) -> tuple[npt.NDArray[np.uint16], Triple, list[tuple[str, str, bytes]]]:
+    """Return the raw image, the mean of its lights, and the files that say where each of several lights falls."""
+    from generator.kernel import draw_samples
+    from generator.mask_files import encode_maps
+    from generator.mixing import mix_samples
+
+    height, width = picture.shape[:2]
+    tables = [mixture.samples(lut, seed, height * width) for mixture in lighting.mixtures]
+    if lighting.masks is None:
+        image = draw_samples(tables[0], picture, seed=seed, image=number)
+        return image, chromaticity(lighting.whites(lut)[0]), []
+    weights = lighting.weights_of(height, width)
+    white_level = lut.provenance.white_level
+    image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
+    mean = weights.mean(axis=(0, 1), dtype=np.float64) @ lighting.whites(lut)
+    return image, chromaticity(mean), encode_maps(lut, lighting, weights)
 
 
 def chromaticity(white: npt.NDArray[np.float64]) -> Triple:

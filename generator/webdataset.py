@@ -3,6 +3,7 @@
     000123.png           the image
     000123.json          its ground truth, source and part
     000123.preview.jpg   its preview, where there are previews
+    000123.masks_0.png … and 000123.ground_truth.png, where several lights fall on an image
 
 The format is POSIX.1-1988 ustar. Owner, time and mode are the same in every header, so that equal images make equal
 files. Layout of names after the WebDataset specification ("key", then everything after the first dot).
@@ -23,7 +24,7 @@ from generator.plan import ShardJob
 from generator.records import FileSum, shard_key
 from generator.store import Store
 
-_ENDINGS: Final = {"images": "", "previews": ".preview", "masks": ".masks"}
+_ENDINGS: Final = {"images": "", "previews": ".preview", "masks": ".masks", "ground_truth": ".ground_truth"}
 
 
 class Hashed(io.RawIOBase):

@@ -115,9 +115,7 @@ class Workplace:
             except OSError as error:
                 raise storage_error(out, error) from error
             sync_folder(out.parent)
-            shutil.rmtree(self.files.root.parent, ignore_errors=True)
-        else:
-            self.notes.remove("")
+        _remove_notes(self.notes)
 
 
 def _record_name(shard: int) -> str:
@@ -130,15 +128,22 @@ def finished(out: str | Path, identity: Identity) -> bool:
     A program that is killed between the two leaves it so.
     """
     notes = _notes(out)
-    if not notes.has(PLAN) or not open_store(out).has(DESCRIPTION):
+    if not open_store(out).has(DESCRIPTION):
         return False
-    if list(_differences(_load(notes), _plain(identity))):
+    known = notes.has(PLAN)
+    if known and list(_differences(_load(notes), _plain(identity))):
         return False
+    _remove_notes(notes)
+    return known
+
+
+def _remove_notes(notes: Store) -> None:
+    """Remove the notes, the plan last: until then a program that is run again knows that the dataset is its own."""
+    notes.remove(RECORDS)
     if isinstance(notes, LocalStore):
         shutil.rmtree(notes.root.parent, ignore_errors=True)
     else:
         notes.remove("")
-    return True
 
 
 def require_free_place(out: str | Path) -> None:
