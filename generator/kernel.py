@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from numba import uint32
 
 from drivers.errors import InputError
 from generator.arguments import (
@@ -33,7 +34,7 @@ from generator.arguments import (
 from generator.choice import AHEAD, SCRATCH, choose_group, row_keys, slot
 from generator.compiled import compiled
 from generator.palette import fit_picture
-from generator.vector import GROUP, SAMPLE_BYTES, copy2, copy6, copy8, offset_at
+from generator.vector import GROUP, LANES, SAMPLE_BYTES, choose, copy2, copy6, copy8, offset_at
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
@@ -65,23 +66,28 @@ def _gather(
 
     Offsets are chosen two groups ahead of the samples they lead to, so that the processor multiplies while it waits.
     """
-    groups = (width + GROUP - 1) // GROUP
+    groups, whole = (width + GROUP - 1) // GROUP, width // GROUP
     for y in range(rows):
         keys = row_keys(first_row + y, 0, image, seed)
-        for group in range(groups + AHEAD):
-            if group < groups:
-                choose_group(picture + y * pitch, width, group, keys, count, bits, scratch, slot(scratch, group))
-            done = group - AHEAD
-            if done < 0:
-                continue
-            offsets, to = slot(scratch, done), target + y * target_pitch + SAMPLE_BYTES * GROUP * done
-            if done < groups - 1:
+        row, to = picture + y * pitch, target + y * target_pitch
+        group = 0
+        while group < groups + AHEAD:
+            while AHEAD <= group < whole:
+                source, word = row + 3 * GROUP * group, uint32(LANES * group)
+                choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, group))
+                offsets, begin = slot(scratch, group - AHEAD), to + SAMPLE_BYTES * GROUP * (group - AHEAD)
                 # Each copy's last two bytes are the next one's first two.
                 for i in range(GROUP):
-                    copy8(samples + offset_at(offsets + 4 * i), to + SAMPLE_BYTES * i)
-            else:
-                for i in range(width - GROUP * done):
-                    copy6(samples + offset_at(offsets + 4 * i), to + SAMPLE_BYTES * i)
+                    copy8(samples + offset_at(offsets + 4 * i), begin + SAMPLE_BYTES * i)
+                group += 1
+            # The first groups of a row have none to fetch yet, the last ones none to choose or fewer pixels.
+            if group < groups:
+                choose_group(row, width, group, keys, count, bits, scratch, slot(scratch, group))
+            done = group - AHEAD
+            if done >= 0:
+                for i in range(min(GROUP, width - GROUP * done)):
+                    copy6(samples + offset_at(slot(scratch, done) + 4 * i), to + SAMPLE_BYTES * (GROUP * done + i))
+            group += 1
 
 
 @compiled
@@ -102,25 +108,30 @@ def _gather_mosaic(
     scratch: int,
 ) -> None:
     """Fill rows of a mosaic; the pattern's four channels are two bits each."""
-    groups = (width + GROUP - 1) // GROUP
+    groups, whole = (width + GROUP - 1) // GROUP, width // GROUP
     for y in range(rows):
         keys = row_keys(first_row + y, 0, image, seed)
+        row, to = picture + y * pitch, target + y * target_pitch
         channels = pattern >> (4 * ((first_row + y) & 1))
         even, odd = samples + 2 * (channels & 3), samples + 2 * (channels >> 2 & 3)
-        for group in range(groups + AHEAD):
-            if group < groups:
-                choose_group(picture + y * pitch, width, group, keys, count, bits, scratch, slot(scratch, group))
-            done = group - AHEAD
-            if done < 0:
-                continue
-            offsets, to = slot(scratch, done), target + y * target_pitch + 2 * GROUP * done
-            if done < groups - 1:
+        group = 0
+        while group < groups + AHEAD:
+            while AHEAD <= group < whole:
+                source, word = row + 3 * GROUP * group, uint32(LANES * group)
+                choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, group))
+                offsets, begin = slot(scratch, group - AHEAD), to + 2 * GROUP * (group - AHEAD)
                 for i in range(0, GROUP, 2):
-                    copy2(even + offset_at(offsets + 4 * i), to + 2 * i)
-                    copy2(odd + offset_at(offsets + 4 * i + 4), to + 2 * i + 2)
-            else:
-                for i in range(width - GROUP * done):
-                    copy2((odd if i & 1 else even) + offset_at(offsets + 4 * i), to + 2 * i)
+                    copy2(even + offset_at(offsets + 4 * i), begin + 2 * i)
+                    copy2(odd + offset_at(offsets + 4 * i + 4), begin + 2 * i + 2)
+                group += 1
+            if group < groups:
+                choose_group(row, width, group, keys, count, bits, scratch, slot(scratch, group))
+            done = group - AHEAD
+            if done >= 0:
+                for i in range(min(GROUP, width - GROUP * done)):
+                    site = (odd if i & 1 else even) + offset_at(slot(scratch, done) + 4 * i)
+                    copy2(site, to + 2 * (GROUP * done + i))
+            group += 1
 
 
 def draw_samples(
