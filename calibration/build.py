@@ -82,6 +82,7 @@ def check(session: Session) -> BuildResult:
     if dark is not None:
         tally.add_dark(work.measure_dark(decode(session, dark), work.first))
     figures = measured.figures
+    stains = tally.stains(figures.paper.field)
     return BuildResult(
         session=session.folder,
         lut=None,
@@ -92,7 +93,8 @@ def check(session: Session) -> BuildResult:
         white=figures.paper.white[None],
         white_error=figures.paper.error[None],
         white_level=round(decoded.saturation - float(decoded.black.mean())),
-        unfit=tally.unfit(decoded.saturation),
+        unfit=tally.unfit(decoded.saturation, stains),
+        stains=stains,
         frames=(figures,),
         grey_names=work.levels.names,
         greys=figures.greys[None],
@@ -317,7 +319,9 @@ class _Work:
                 greys[light], grey_errors[light] = figures.greys, figures.grey_errors
         dark = tally.darkness
         gains, full_white = _drift(frames, len(lights))
-        unfit = tally.unfit(limit)
+        even = next((figures for figures in frames if self._is_even(figures.record)), frames[0])
+        stains = tally.stains(even.paper.field)
+        unfit = tally.unfit(limit, stains)
         level = round(limit - float(np.mean([figures.black.mean() for figures in frames])))
         result = BuildResult(
             session=session.folder,
@@ -330,6 +334,7 @@ class _Work:
             white_error=error,
             white_level=level,
             unfit=unfit,
+            stains=stains,
             frames=tuple(frames),
             noise=tally.noise(),
             white_references=len(chart.white_references),

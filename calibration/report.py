@@ -29,6 +29,7 @@ from calibration.radiometry import MAX_BLACK_DRIFT
 from calibration.registration import Registration
 from calibration.result import BuildResult
 from calibration.sampling import WINDOW, noise_of
+from calibration.stains import Stains
 from calibration.verdict import Judged, Verdict, grey_tints_deg, report_json, shown
 from drivers.rawfile import read_raw
 from drivers.storage import write_whole
@@ -75,6 +76,13 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
             "Shape of the light under the frame that was registered, from its white references; it is divided out of "
             "samples and ground truth. Each contour is 2 %.",
             _drawn(_field, chart, result),
+        ),
+        (
+            "The print",
+            "How far cells and their surroundings are off what their codes give elsewhere on the sheet, in the channel "
+            "that is off most. Noise is a fine grain of some tenths of a per cent; stains, folds and shadows have a "
+            "shape. Crosses are cells listed for it.",
+            _drawn(_print, chart, result.stains),
         ),
         (
             "The lights",
@@ -432,6 +440,21 @@ def _field(figure: Any, chart: Chart, result: BuildResult) -> None:
         axes.set(title="RGB"[channel], xlabel="mm")
     grid[0].set_ylabel("mm")
     figure.colorbar(image, ax=list(grid), label="light, mean 1", shrink=0.85)
+
+
+def _print(figure: Any, chart: Chart, stains: Stains) -> None:
+    page_w, page_h = chart.page_mm
+    figure.set_size_inches(10, 8.6 * page_h / page_w)
+    axes = figure.subplots()
+    places = chart.centres_mm[chart.cell_of_colour]
+    # A marker's size is an area in points: of a cell, with the axes about 8.2 inches wide.
+    side = 72 * 8.2 / page_w * float(np.mean(chart.cell_mm))
+    image = axes.scatter(
+        *places.T, c=100 * stains.largest(), s=side**2, marker="s", linewidths=0, cmap="RdBu", vmin=-3, vmax=3
+    )
+    axes.plot(*places[stains.stained].T, "x", color=_INK, markersize=max(3.0, 0.5 * side), markeredgewidth=0.8)
+    axes.set(xlabel="mm", ylabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal")
+    figure.colorbar(image, ax=axes, label="% off, brighter > 0", shrink=0.8, extend="both")
 
 
 def _chromaticities(figure: Any, codes: _Array, black_body: npt.NDArray[np.bool_], white: _Array, seen: str) -> None:

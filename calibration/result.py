@@ -14,6 +14,7 @@ from calibration.measuring import FrameFigures
 from calibration.noise import PhotonTransfer
 from calibration.radiometry import black_drift
 from calibration.registration import Registration
+from calibration.stains import Stains
 from calibration.verdict import Verdict, figures_of, judge
 
 _Array = npt.NDArray[np.float64]
@@ -43,6 +44,8 @@ class BuildResult:
         Sample value of saturation.
     unfit
         Cells not to be used.
+    stains
+        Where the print is not of its codes' colours, in the order of colour indices.
     frames
         Figures of every frame read, in order.
     noise
@@ -75,6 +78,7 @@ class BuildResult:
     white_error: _Array
     white_level: int
     unfit: tuple[Unfit, ...]
+    stains: Stains
     frames: tuple[FrameFigures, ...] = field(default=())
     noise: _Array = field(default_factory=lambda: np.zeros(3))
     white_references: int = 0

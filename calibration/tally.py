@@ -20,8 +20,9 @@ from calibration.darkness import DarkFigures, Darkness, HotSamples, darkness, us
 from calibration.lut import Unfit
 from calibration.matching import MIN_BLOCK_SCORE
 from calibration.measuring import Measured, MeasuredDark, Stretch
-from calibration.radiometry import CLIPPED
+from calibration.radiometry import CLIPPED, Field
 from calibration.sampling import dead_samples, uneven
+from calibration.stains import Stains, find_stains
 
 _Array = npt.NDArray[np.float64]
 
@@ -109,13 +110,20 @@ class Tally:
         level = np.percentile(self._even_sum.mean(axis=1) / frames, 99.5, axis=0)
         return np.sqrt(np.median(self._even_noise / frames, axis=0)) / np.maximum(level, 1e-6)
 
-    def unfit(self, saturation_counts: int) -> tuple[Unfit, ...]:
+    def stains(self, field: Field) -> Stains:
+        """Return where the print is not of its codes' colours; `field` is that of a frame of even light."""
+        cells = self._chart.centres_mm[self._chart.cell_of_colour]
+        level = self._even_sum.mean(axis=1, dtype=np.float64) / max(self._even_frames, 1) / field.at(cells)
+        return find_stains(level, cells, self._chart.bits, ~(self._outside | self._covered))
+
+    def unfit(self, saturation_counts: int, stains: Stains) -> tuple[Unfit, ...]:
         """Return the cells not to be used, each with the first cause that applies."""
         frames, dark = max(self._even_frames, 1), self.darkness
         hottest = dark.hottest if len(dark.hottest) else np.zeros(self._chart.colour_count)
         dead = dead_samples(self._even_sum / frames)
         unevenness = uneven(self._even_sum / frames, np.sqrt(self._even_noise) / frames)
         allowed, samples = CLIPPED * saturation_counts, self._even_sum.shape[1]
+        aside = stains.largest()
         found: list[Unfit] = []
         for colour in range(self._chart.colour_count):
             cause = ""
@@ -127,6 +135,9 @@ class Tally:
                 cause = f"clipped: {int(self._highest[colour])} counts under {under}, below {allowed:.0f} allowed"
             elif self._covered[colour]:
                 cause = "covered: it does not look like the chart's (covered, damaged, or printed otherwise)"
+            elif stains.stained[colour]:
+                how = f"{abs(aside[colour]):.1%} {'darker' if aside[colour] < 0 else 'brighter'}"
+                cause = f"stained: its surroundings are {how} than their codes elsewhere (a stain, a fold or a shadow)"
             elif hottest[colour] > 0:
                 cause = f"hot: a photosite stands out by {hottest[colour]:.0f} counts in every dark frame"
             elif dead[colour]:

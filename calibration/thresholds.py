@@ -116,6 +116,11 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "colours without samples are missing from every picture", JUDGEMENT, "",
     ),
     Threshold(
+        "doubtful_share", "Cells whose surroundings are 1 % off their codes", "share", "at most", 0.0003, None,
+        "a stain, a fold or a shadow on the print; from 2 % on its cells are listed as unfit",
+        SIMULATED + ": none on a clean flat print", "clean the print, hang it flatter, and look for shadows on it",
+    ),
+    Threshold(
         "moved_anew", "Frames registered anew", "", "at most", 0, None,
         "the chart or the camera moved between frames; the grid followed", JUDGEMENT, _STILL,
     ),

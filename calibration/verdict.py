@@ -34,6 +34,7 @@ _REMEDIES = {
     "covered": "uncover the chart",
     "hot": "let the camera cool",
     "dead": "have the camera's pixels remapped",
+    "stained": "clean the print or print it anew, and light it evenly",
     "uneven": "focus on the print and keep the camera still",
 }
 _Array = npt.NDArray[np.float64]
@@ -131,6 +132,7 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "blocks_good": float(registration.blocks.good.mean()),
         "agreement": registration.agreement,
         "unfit_share": len(result.unfit) / max(len(registration.strangers), 1),
+        "doubtful_share": float(result.stains.doubtful.mean()),
         "moved_anew": float(sum(frame.registered for frame in result.frames)),
         "black_drift_counts": result.black_drift,
         "references_used": used / max(result.white_references, 1),

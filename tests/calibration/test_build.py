@@ -202,7 +202,7 @@ def test_a_lamp_that_fades_is_told_and_not_corrected(lab: Lab, tmp_path: Path) -
 def test_the_report_stands_alone(built: BuildResult) -> None:
     assert built.lut is not None
     page = (built.lut / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 6
+    assert page.count("data:image/png;base64,") == 7
     assert re.search(r"(src|href)='?http", page) is None
     for name, _, _ in summary(built):
         assert html.escape(name) in page
