@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from numba import uint16, uint32, uint64
+from numba import uint8, uint16, uint32, uint64
 
 from generator.compiled import compiled
 from generator.encoders.huffman import (
@@ -63,11 +63,14 @@ def _length_symbol(length: int) -> tuple[int, int, int]:
 
 
 # Symbols of distances: of 1 … 256, then of every 128th.
-_NEAR: Final = np.array([_distance_symbol(distance) for distance in range(1, 257)], dtype=np.int64)
-_FAR: Final = np.array([_distance_symbol(distance + 1) for distance in range(0, _WINDOW, 128)], dtype=np.int64)
+_DISTANCE_SYMBOLS: Final = np.array(
+    [_distance_symbol(distance) for distance in (*range(1, 257), *range(1, _WINDOW, 128))], dtype=np.uint8
+)
 _DISTANCE_BITS: Final = np.array([max(symbol // 2 - 1, 0) for symbol in range(DISTANCES)], dtype=np.int64)
 # Symbol, extra bits and their value of a run of so many pixels; extra bits of each symbol.
 _RUNS: Final = np.array([(0, 0, 0), *(_length_symbol(6 * run) for run in range(1, _LONGEST_RUN + 1))], dtype=np.int64)
+_ONE: Final = int(_RUNS[1, 0])
+"""The symbol of a match of one pixel."""
 _LENGTH_BITS: Final = np.zeros(LITERALS, np.int64)
 _LENGTH_BITS[_RUNS[:, 0]] = _RUNS[:, 1]
 
@@ -145,37 +148,41 @@ def find_repeats(image: Any, seen: Any, distances: Any) -> None:
 
 
 @compiled
-def _run(distances: Any, y: int, x: int) -> int:
-    """Return how many pixels from there on lie that distance back, one after the other."""
-    run = 1
-    while run < _LONGEST_RUN and x + run < distances.shape[1] and distances[y, x + run] == distances[y, x]:
-        run += 1
-    return run
-
-
-@compiled
-def _symbol_of(distance: Any) -> int:
-    back = np.int64(distance) - 1
-    return _NEAR[back] if back < 256 else _FAR[back >> 7]
+def _symbol_of(distance: Any) -> Any:
+    """Return the symbol of a distance; some symbol where there is none."""
+    back = (uint32(distance) - uint32(1)) & uint32(_WINDOW - 1)
+    return _DISTANCE_SYMBOLS[back if back < uint32(256) else uint32(256) + (back >> uint32(7))]
 
 
 @compiled
 def _count(rows: Any, distances: Any, literals: Any, backs: Any) -> None:
     """Add the symbols of rows to the frequencies of literals and distances."""
+    # Whether a pixel is a match cannot be foreseen, so there is no branch on it; each of a pixel's bytes has a counter
+    # of its own, so that equal ones do not wait for each other.
+    counts = np.zeros((6, 256), np.uint32)
+    matches = 0
     for y in range(rows.shape[0]):
-        row = rows[y]
+        row, back = rows[y], distances[y]
         literals[row[0]] += 1
-        x = 0
-        while x < distances.shape[1]:
-            if distances[y, x]:
-                run = _run(distances, y, x)
+        run, before = 1, uint32(0)
+        for x in range(len(back)):
+            distance = uint32(back[x])
+            if distance == before and distance != uint32(0) and run < _LONGEST_RUN:
+                literals[_RUNS[run, 0]] -= 1
+                run += 1
                 literals[_RUNS[run, 0]] += 1
-                backs[_symbol_of(distances[y, x])] += 1
-                x += run
-            else:
-                for i in range(1 + 6 * x, 7 + 6 * x):
-                    literals[row[i]] += 1
-                x += 1
+                continue
+            run, before = 1, distance
+            literal = uint32(distance == uint32(0))
+            for i in range(6):
+                counts[i, row[1 + 6 * x + i]] += literal
+            match = np.int64(uint32(1) - literal)
+            backs[_symbol_of(distance)] += match
+            matches += match
+    literals[_ONE] += matches
+    for value in range(256):
+        for i in range(6):
+            literals[value] += counts[i, value]
 
 
 def _bits(literals: Counts, backs: Counts) -> int:
@@ -186,27 +193,42 @@ def _bits(literals: Counts, backs: Counts) -> int:
 
 @compiled
 def _flush(out: Any, at: Any, waiting: Any, number: Any) -> Any:
-    """Write a word of the waiting bits, and count it if it was full."""
-    out[at] = uint32(waiting)
-    words = number >> uint64(5)
-    return at + words, waiting >> (words << uint64(5)), number & uint64(31)
+    """Write the waiting bits, 63 at most, and go on after the whole bytes among them."""
+    # The compiler makes one store of these.
+    out[at] = uint8(waiting)
+    out[at + uint64(1)] = uint8(waiting >> uint64(8))
+    out[at + uint64(2)] = uint8(waiting >> uint64(16))
+    out[at + uint64(3)] = uint8(waiting >> uint64(24))
+    out[at + uint64(4)] = uint8(waiting >> uint64(32))
+    out[at + uint64(5)] = uint8(waiting >> uint64(40))
+    out[at + uint64(6)] = uint8(waiting >> uint64(48))
+    out[at + uint64(7)] = uint8(waiting >> uint64(56))
+    return at + (number >> uint64(3)), waiting >> (number & uint64(56)), number & uint64(7)
+
+
+@compiled
+def _three(codes: Any, row: Any, i: int) -> Any:
+    """Return the codes of three bytes of a row as one, and its bits."""
+    mask, length = uint64(0xFFFF), uint64(16)
+    first, second, third = uint64(codes[row[i]]), uint64(codes[row[i + 1]]), uint64(codes[row[i + 2]])
+    two = (first >> length) + (second >> length)
+    joined = (first & mask) | ((second & mask) << (first >> length)) | ((third & mask) << two)
+    return joined, two + (third >> length)
 
 
 @compiled
 def _put_bytes(out: Any, writer: Any, rows: Any, codes: Any) -> None:
-    """Write rows (height, odd number) byte by byte."""
+    """Write rows (height, 1 + 6 width) byte by byte."""
     at, waiting, number = writer[0], writer[1], writer[2]
     for y in range(rows.shape[0]):
         row = rows[y]
-        code = codes[row[0]]
-        waiting |= uint64(code & uint32(0xFFFF)) << number
-        at, waiting, number = _flush(out, at, waiting, number + uint64(code >> uint32(16)))
-        for i in range(1, len(row), 2):
-            upper, lower = codes[row[i]], codes[row[i + 1]]
-            waiting |= uint64(upper & uint32(0xFFFF)) << number
-            number += uint64(upper >> uint32(16))
-            waiting |= uint64(lower & uint32(0xFFFF)) << number
-            at, waiting, number = _flush(out, at, waiting, number + uint64(lower >> uint32(16)))
+        code = uint64(codes[row[0]])
+        waiting |= (code & uint64(0xFFFF)) << number
+        at, waiting, number = _flush(out, at, waiting, number + (code >> uint64(16)))
+        for i in range(1, len(row), 3):
+            code, bits = _three(codes, row, i)
+            waiting |= code << number
+            at, waiting, number = _flush(out, at, waiting, number + bits)
     writer[0], writer[1], writer[2] = at, waiting, number
 
 
@@ -214,37 +236,41 @@ def _put_bytes(out: Any, writer: Any, rows: Any, codes: Any) -> None:
 def _put_repeats(out: Any, writer: Any, rows: Any, distances: Any, codes: Any, back_codes: Any) -> None:
     """Write rows as literals and matches."""
     at, waiting, number = writer[0], writer[1], writer[2]
+    mask, length = uint64(0xFFFF), uint64(16)
     for y in range(rows.shape[0]):
-        row = rows[y]
-        code = codes[row[0]]
-        waiting |= uint64(code & uint32(0xFFFF)) << number
-        at, waiting, number = _flush(out, at, waiting, number + uint64(code >> uint32(16)))
+        row, back = rows[y], distances[y]
+        code = uint64(codes[row[0]])
+        waiting |= (code & mask) << number
+        at, waiting, number = _flush(out, at, waiting, number + (code >> length))
         x = 0
-        while x < distances.shape[1]:
-            if distances[y, x]:
-                run = _run(distances, y, x)
-                code = codes[_RUNS[run, 0]]
-                waiting |= uint64(code & uint32(0xFFFF)) << number
-                number += uint64(code >> uint32(16))
-                waiting |= uint64(_RUNS[run, 2]) << number
-                at, waiting, number = _flush(out, at, waiting, number + uint64(_RUNS[run, 1]))
-                symbol = _symbol_of(distances[y, x])
-                code = back_codes[symbol]
-                waiting |= uint64(code & uint32(0xFFFF)) << number
-                number += uint64(code >> uint32(16))
-                bits = uint64(_DISTANCE_BITS[symbol])
-                low = (uint64(distances[y, x]) - uint64(1)) & ((uint64(1) << bits) - uint64(1))
-                waiting |= low << number
-                at, waiting, number = _flush(out, at, waiting, number + bits)
-                x += run
-            else:
-                for i in range(1 + 6 * x, 7 + 6 * x, 2):
-                    upper, lower = codes[row[i]], codes[row[i + 1]]
-                    waiting |= uint64(upper & uint32(0xFFFF)) << number
-                    number += uint64(upper >> uint32(16))
-                    waiting |= uint64(lower & uint32(0xFFFF)) << number
-                    at, waiting, number = _flush(out, at, waiting, number + uint64(lower >> uint32(16)))
+        while x < len(back):
+            distance = back[x]
+            if distance == 0:
+                left, left_bits = _three(codes, row, 1 + 6 * x)
+                right, right_bits = _three(codes, row, 4 + 6 * x)
+                waiting |= left << number
+                at, waiting, number = _flush(out, at, waiting, number + left_bits)
+                waiting |= right << number
+                at, waiting, number = _flush(out, at, waiting, number + right_bits)
                 x += 1
+                continue
+            run = 1
+            while run < _LONGEST_RUN and x + run < len(back) and back[x + run] == distance:
+                run += 1
+            # Length, its extra bits, distance, its extra bits: 12 + 5 + 12 + 13 at most.
+            code = uint64(codes[_RUNS[run, 0]])
+            match, bits = code & mask, code >> length
+            match |= uint64(_RUNS[run, 2]) << bits
+            bits += uint64(_RUNS[run, 1])
+            symbol = _symbol_of(distance)
+            code = uint64(back_codes[symbol])
+            match |= (code & mask) << bits
+            bits += code >> length
+            extra = uint64(_DISTANCE_BITS[symbol])
+            match |= ((uint64(distance) - uint64(1)) & ((uint64(1) << extra) - uint64(1))) << bits
+            waiting |= match << number
+            at, waiting, number = _flush(out, at, waiting, number + bits + extra)
+            x += run
     writer[0], writer[1], writer[2] = at, waiting, number
 
 
@@ -255,7 +281,7 @@ class Packer:
         self._seen = np.empty(_PLACES, np.uint64)
         self._bytes = np.empty((2, 0), np.uint8)
         self._distances = np.empty(0, np.uint16)
-        self._out = np.empty(0, np.uint32)
+        self._out = np.empty(0, np.uint8)
 
     def pack(self, image: npt.NDArray[np.uint16], *, last: bool) -> tuple[bytes, npt.NDArray[np.uint8]]:
         """Return a band of an image as deflate data, and the bytes that they unpack to.
@@ -295,12 +321,13 @@ class Packer:
         lengths, back_lengths = code_lengths(literals, LONGEST), code_lengths(backs, LONGEST)
         codes = codes_of(lengths)
         head = head_of(lengths, back_lengths, last=last)
-        words = (head.number + _bits(literals, backs)) // 32 + 2
-        if len(self._out) < words:
-            self._out = np.empty(words, np.uint32)
-        done = head.number // 32
-        self._out[:done] = np.frombuffer(head.to_bytes()[: 4 * done], np.uint32)
-        writer = np.array([done, head.value >> 32 * done, head.number % 32], dtype=np.uint64)
+        # A flush writes eight bytes, however few of them count.
+        size = (head.number + _bits(literals, backs)) // 8 + 16
+        if len(self._out) < size:
+            self._out = np.empty(size, np.uint8)
+        done = head.number // 8
+        self._out[:done] = np.frombuffer(head.to_bytes()[:done], np.uint8)
+        writer = np.array([done, head.value >> 8 * done, head.number % 8], dtype=np.uint64)
         if repeats:
             _put_repeats(self._out, writer, rows, distances, codes, codes_of(back_lengths))
         else:

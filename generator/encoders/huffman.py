@@ -23,7 +23,7 @@ LITERALS: Final = 286
 DISTANCES: Final = 30
 END: Final = 256
 LONGEST: Final = 12
-"""Bits of the longest code for literals and distances: four fit into 64 bits with what waits to be written."""
+"""Bits of the longest code for literals and distances; three and up to seven bits that wait fit into 64."""
 
 _LONGEST_OF_LENGTHS: Final = 7
 _LENGTHS: Final = 19
