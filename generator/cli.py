@@ -5,6 +5,9 @@ Parses, builds, calls, prints. Libraries that take long to load are imported whe
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,21 +16,28 @@ import typer
 from drivers.console import EXIT_CODES, run
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
-    from generator.illuminant import LightChoice
+    from rich.progress import Progress, TaskID
+
+    from generator.dataset import Dataset
     from generator.picture import Preparation
     from generator.scene import Source
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
 
+_SOURCES = "Source pictures"
+_LIGHT = "Light"
+_IMAGES = "Images"
+_WORK = "Work"
+
 _HELP = f"""Make a dataset of raw linear images with exact ground truth.
 
-Reads the table LUT (made by build-lut) and the source pictures. Writes the folder OUT, which appears when it is
-complete: images/ (16-bit linear camera RGB), previews/, ground_truth.csv, gt.txt, dataset.json and SHA256SUMS.
+Reads the table LUT (made by build-lut) and the source pictures. Writes the dataset OUT, a folder or a URL of a store
+that fsspec knows, which appears when it is complete: images/ (linear camera RGB), previews/, ground_truth.csv, gt.txt,
+sources.csv, dataset.json and SHA256SUMS.
 
 Each picture is printed, lit and photographed by the table: every pixel becomes one of the samples that the camera took
 of its colour under the light. The same seed, pictures and table give the same bytes, whatever the workers. A picture
-that cannot be read is passed over and told.
+that cannot be read is passed over and told. When it was interrupted or killed, run the same command again to go on.
 
 {EXIT_CODES}
 """
@@ -35,27 +45,101 @@ that cannot be read is passed over and told.
 
 @app.command(help=_HELP)
 def generate(
-    lut: Annotated[Path, typer.Argument(metavar="LUT", help="Folder of the table.", show_default=False)],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to make; must not exist.", show_default=False)],
+    lut: Annotated[Path | None, typer.Argument(metavar="LUT", help="Folder of the table.", show_default=False)] = None,
+    out: Annotated[
+        str | None, typer.Argument(metavar="OUT", help="Folder or URL to make; must not exist.", show_default=False)
+    ] = None,
     sources: Annotated[
         list[str] | None,
         typer.Option(
             metavar="PLACE",
             help="A picture, or a folder that is searched with those below it, or a URL of either on a store that "
             "fsspec knows; may be repeated.",
+            rich_help_panel=_SOURCES,
         ),
     ] = None,
     random_scenes: Annotated[
-        int, typer.Option(metavar="N", help="Add N pictures of uniformly random colours.", min=0)
+        int,
+        typer.Option(metavar="N", help="Add N pictures of uniformly random colours.", min=0, rich_help_panel=_SOURCES),
     ] = 0,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Size of the random pictures, px.")] = "512x512",
+    size: Annotated[
+        str, typer.Option(metavar="WxH", help="Size of the random pictures, px.", rich_help_panel=_SOURCES)
+    ] = "512x512",
+    max_side: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PX",
+            help="Make larger pictures this small first.",
+            min=1,
+            show_default=False,
+            rich_help_panel=_SOURCES,
+        ),
+    ] = None,
+    crop: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH",
+            help="Cut pictures to this size; smaller ones are passed over.",
+            show_default=False,
+            rich_help_panel=_SOURCES,
+        ),
+    ] = None,
+    cover: Annotated[
+        bool,
+        typer.Option(
+            "--cover",
+            help="Make pictures as small as still covers the crop before they are cut.",
+            rich_help_panel=_SOURCES,
+        ),
+    ] = False,
+    crop_at: Annotated[
+        Literal["centre", "random"],
+        typer.Option(help="Where to cut; random is chosen by the seed.", rich_help_panel=_SOURCES),
+    ] = "centre",
+    profiles: Annotated[
+        Literal["honour", "ignore"],
+        typer.Option(
+            help="Convert pictures with another colour profile to sRGB, or take their codes as they stand.",
+            rich_help_panel=_SOURCES,
+        ),
+    ] = "honour",
     illuminations: Annotated[
         str | None,
-        typer.Option(metavar="LIST", help="These lights for every picture: 0,5,12-20 or all.", show_default=False),
+        typer.Option(
+            metavar="LIST",
+            help="These lights for every picture: 0,5,12-20 or all.",
+            show_default=False,
+            rich_help_panel=_LIGHT,
+        ),
+    ] = None,
+    light: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LIGHT",
+            help="A light for every picture, mixed of the table's: 12, 12:0.25+40:0.75, 5600K, or a chromaticity "
+            "r=.3,b=.25; may be repeated.",
+            show_default=False,
+            rich_help_panel=_LIGHT,
+        ),
     ] = None,
     random: Annotated[
         int | None,
-        typer.Option(metavar="K", help="K distinct random lights for each picture. [default: 1]", show_default=False),
+        typer.Option(
+            metavar="K",
+            help="K images of each picture, under distinct random lights of the table, or under lights drawn from "
+            "--distribution. [default: 1]",
+            show_default=False,
+            rich_help_panel=_LIGHT,
+        ),
+    ] = None,
+    distribution: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Draw chromaticities from uniform, gaussian:r=.3,b=.25,…, or the file of ground truths of a data set.",
+            show_default=False,
+            rich_help_panel=_LIGHT,
+        ),
     ] = None,
     nearest: Annotated[
         Path | None,
@@ -64,105 +148,288 @@ def generate(
             help="For the picture at place i the light nearest in angle to ground truth i of this file "
             "(columns GT_R,GT_G,GT_B or r,g,b, or lines of three numbers).",
             show_default=False,
+            rich_help_panel=_LIGHT,
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
-    format: Annotated[Literal["png", "tiff"], typer.Option(help="PNG, or uncompressed TIFF: fast and large.")] = "png",
-    workers: Annotated[
-        int | None, typer.Option(metavar="N", help="Threads. [default: one a processor]", show_default=False)
+    match: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="GT.csv",
+            help="The same with a mixture of lights that matches the ground truth.",
+            show_default=False,
+            rich_help_panel=_LIGHT,
+        ),
     ] = None,
-    max_side: Annotated[
-        int | None, typer.Option(metavar="PX", help="Make larger pictures this small first.", min=1, show_default=False)
+    outside: Annotated[
+        Literal["refuse", "nearest"],
+        typer.Option(help="What to do about lights that the table cannot make.", rich_help_panel=_LIGHT),
+    ] = "refuse",
+    lights_per_image: Annotated[
+        int | None,
+        typer.Option(
+            metavar="K",
+            help="Let K lights fall on each image. [default: 1; 2 with --masks]",
+            show_default=False,
+            rich_help_panel=_LIGHT,
+        ),
     ] = None,
-    crop: Annotated[
+    masks: Annotated[
         str | None,
         typer.Option(
-            metavar="WxH", help="Cut pictures to this size; smaller ones are passed over.", show_default=False
+            metavar="KIND",
+            help="Where each of several lights falls: half-plane, soft-edge, spots, smooth, window, or a folder of "
+            "masks. [default: smooth]",
+            show_default=False,
+            rich_help_panel=_LIGHT,
         ),
     ] = None,
-    cover: Annotated[
-        bool, typer.Option("--cover", help="Make pictures as small as still covers the crop before they are cut.")
-    ] = False,
-    crop_at: Annotated[
-        Literal["centre", "random"], typer.Option(help="Where to cut; random is chosen by the seed.")
-    ] = ("centre"),
-    profiles: Annotated[
-        Literal["honour", "ignore"],
-        typer.Option(help="Convert pictures with another colour profile to sRGB, or take their codes as they stand."),
-    ] = "honour",
-    preview: Annotated[bool, typer.Option(help="Write tone-mapped previews.")] = True,
+    seed: Annotated[int, typer.Option(help="Seed of everything random.", rich_help_panel=_IMAGES)] = 0,
+    format: Annotated[
+        Literal["png", "tiff", "exr", "jxl", "dng"],
+        typer.Option(
+            help="PNG; uncompressed TIFF, fast and large; OpenEXR; JPEG XL, small; or raw files, Bayer DNG.",
+            rich_help_panel=_IMAGES,
+        ),
+    ] = "png",
+    layout: Annotated[
+        Literal["folder", "webdataset", "parquet"],
+        typer.Option(
+            help="Each image in a file of its own, or those of a shard in a tar file (WebDataset) or in a Parquet file "
+            "(Hugging Face datasets).",
+            rich_help_panel=_IMAGES,
+        ),
+    ] = "folder",
+    split: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SHARES",
+            help="Divide by source into train, validation and test, such as 0.8,0.1,0.1.",
+            show_default=False,
+            rich_help_panel=_IMAGES,
+        ),
+    ] = None,
+    preview: Annotated[bool, typer.Option(help="Write tone-mapped previews.", rich_help_panel=_IMAGES)] = True,
     contact_sheet: Annotated[
         Path | None,
-        typer.Option(metavar="PATH", help="Write a page of previews to this PNG file.", show_default=False),
+        typer.Option(
+            metavar="PATH",
+            help="Write a page of previews to this PNG file.",
+            show_default=False,
+            rich_help_panel=_IMAGES,
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Threads, or processes of the engine dask. [default: one a processor]",
+            show_default=False,
+            rich_help_panel=_WORK,
+        ),
+    ] = None,
+    engine: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="local, dask (a cluster on this machine), or dask://HOST:PORT of a scheduler; docs/clusters.md.",
+            rich_help_panel=_WORK,
+        ),
+    ] = "local",
+    shard_images: Annotated[
+        int, typer.Option(metavar="N", help="Images of a shard: what a kill may cost.", min=1, rich_help_panel=_WORK)
+    ] = 256,
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            metavar="I/N",
+            help="Make share I of N only, I from 0, beside other programs that make theirs; then --finish.",
+            show_default=False,
+            rich_help_panel=_WORK,
+        ),
+    ] = None,
+    finish: Annotated[
+        str | None,
+        typer.Option(
+            metavar="OUT",
+            help="Make the dataset OUT of its shards when all shares are done; no other argument is needed.",
+            show_default=False,
+            rich_help_panel=_WORK,
+        ),
+    ] = None,
+    verify: Annotated[
+        str | None,
+        typer.Option(
+            metavar="OUT",
+            help="Hash every file of the dataset OUT again and tell what has changed; no other argument is needed.",
+            show_default=False,
+            rich_help_panel=_WORK,
+        ),
     ] = None,
 ) -> None:
     """Make a dataset."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    if verify is not None:
+        _verify(verify)
+        return
+    if finish is not None:
+        from generator.dataset import finish_dataset
+
+        _tell(finish_dataset(finish), finish)
+        return
 
     from calibration.lut import open_lut
     from drivers.errors import InputError
-    from generator.dataset import generate_dataset
-    from generator.engines import default_workers
+    from generator.dataset import make_dataset, make_share
+    from generator.engines import check_workers, default_workers
+    from generator.light_request import LightRequest
     from generator.picture import Preparation
+    from generator.plan import Options, Plan, parse_share, parse_split
     from generator.workplace import require_free_place
 
+    if lut is None or out is None:
+        raise InputError("the table and the place of the dataset are missing; write generate LUT OUT --sources DIR")
+    at_once = default_workers() if workers is None else workers
+    check_workers(engine, at_once)
     require_free_place(out)
-    if contact_sheet is not None and contact_sheet.suffix.lower() != ".png":
-        raise InputError(f"the contact sheet {contact_sheet} is to be a PNG file; let its name end in .png")
-    if contact_sheet is not None and contact_sheet.exists():
-        raise InputError(f"{contact_sheet} already exists; name a new file for the contact sheet, or remove it first")
+    if contact_sheet is not None:
+        _check_sheet(contact_sheet)
     table = open_lut(lut)
     preparation = Preparation(max_side, None if crop is None else _size(crop, "--crop"), cover, crop_at, profiles, seed)
     pictures = _choose_sources(sources or [], random_scenes, size, seed, preparation)
-    choice = _choose_lights(table, illuminations, random, nearest, seed)
-    console = Console(stderr=True)
-    with Progress(
-        TextColumn("[progress.description]{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
-        console=console,
-    ) as progress:
-        task = progress.add_task("images", total=len(pictures) * choice.lights_each, rate="")
-
-        def on_image() -> None:
-            speed = progress.tasks[0].speed
-            progress.update(task, advance=1, rate=f"{speed:.1f}/s" if speed else "")
-
-        def on_skip(name: str, reason: str, images: int) -> None:
-            progress.update(task, total=(progress.tasks[0].total or 0) - images)
-            progress.console.print(f"passed over {name}: {reason}", style="yellow", markup=False, highlight=False)
-
-        dataset = generate_dataset(
-            table,
+    request = LightRequest(
+        illuminations=illuminations,
+        light=tuple(light or ()),
+        random=random,
+        distribution=distribution,
+        nearest=nearest,
+        match=match,
+        outside=outside,
+        lights_per_image=lights_per_image,
+        masks=masks,
+    )
+    options = Options(
+        form=format,
+        layout=layout,
+        previews=preview,
+        split=None if split is None else parse_split(split),
+        shard_images=shard_images,
+        sources=preparation.describe(),
+    )
+    plan = Plan(table, pictures, request.choose(table, seed), seed, options)
+    if shard is not None:
+        share = parse_share(shard)
+        with _progress(sum(plan.images_of(number) for number in range(share[0], plan.shards, share[1]))) as told:
+            done, shards = make_share(
+                plan,
+                out,
+                share,
+                engine=engine,
+                workers=at_once,
+                on_done=told.done,
+                on_image=told.image,
+                on_skip=told.skip,
+            )
+        rest = f"make a dataset of them with generate --finish {out}" if done == shards else "others are to be made yet"
+        print(f"{done} of {shards} shards of {out} are done; {rest}")
+        return
+    with _progress(plan.total) as told:
+        dataset = make_dataset(
+            plan,
             out,
-            pictures,
-            choice,
-            seed=seed,
-            form=format,
-            reading=preparation.describe(),
-            workers=default_workers() if workers is None else workers,
-            previews=preview,
-            on_image=on_image,
-            on_skip=on_skip,
+            engine=engine,
+            workers=at_once,
+            on_done=told.done,
+            on_image=told.image,
+            on_skip=told.skip,
         )
-    made = dataset.description
-    print(f"{out}: {made.images} images of {made.sources} pictures under {len(made.lights)} lights")
-    if made.skipped:
-        print(f"{len(made.skipped)} of {len(pictures)} pictures could not be read; dataset.json lists them")
-    if made.replaced_pixels:
-        share = 100 * made.replaced_pixels / made.pixels
-        print(
-            f"{made.replaced_pixels} source pixels ({share:.2g} %) are of the {len(table.provenance.unfit)} colours "
-            "that the table lists as unfit; they took the nearest fit colour"
-        )
+    _tell(dataset, out)
     if contact_sheet is not None:
         from generator.contact import save_contact_sheet
 
         save_contact_sheet(dataset, contact_sheet)
         print(f"{contact_sheet}: contact sheet")
+
+
+@dataclass
+class _Told:
+    """What is shown while images are made."""
+
+    progress: Progress
+    task: TaskID
+
+    def done(self, images: int) -> None:
+        """Show what was there already."""
+        if images:
+            self.progress.update(self.task, total=(self.progress.tasks[0].total or 0) - images)
+            self.progress.console.print(f"{images} images were there already", highlight=False)
+
+    def image(self) -> None:
+        """Show that one more image is made."""
+        speed = self.progress.tasks[0].speed
+        self.progress.update(self.task, advance=1, rate=f"{speed:.1f}/s" if speed else "")
+
+    def skip(self, name: str, reason: str, images: int) -> None:
+        """Show that a picture cannot be read."""
+        self.progress.update(self.task, total=(self.progress.tasks[0].total or 0) - images)
+        self.progress.console.print(f"passed over {name}: {reason}", style="yellow", markup=False, highlight=False)
+
+
+@contextmanager
+def _progress(images: int) -> Generator[_Told]:
+    """Show how many images are made, how fast, and the time left, on stderr while the block runs."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("[progress.description]{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        yield _Told(progress, progress.add_task("images", total=images, rate=""))
+
+
+def _tell(dataset: Dataset, out: str) -> None:
+    """Print what was made."""
+    made = dataset.description
+    print(f"{out}: {made.images} images of {made.sources} pictures under {len(made.lights)} lights")
+    if made.splits:
+        print(", ".join(f"{images} for {part}" for part, images in made.splits.items()))
+    if made.skipped:
+        tried = made.sources + len(made.skipped)
+        print(f"{len(made.skipped)} of {tried} pictures could not be read; dataset.json lists them")
+    if made.replaced_pixels:
+        share = 100 * made.replaced_pixels / made.pixels
+        print(
+            f"{made.replaced_pixels} source pixels ({share:.2g} %) are of colours that the table lists as unfit; they "
+            "took the nearest fit colour"
+        )
+
+
+def _verify(out: str) -> None:
+    """Print every fault of a dataset; a QualityError if there is one."""
+    from drivers.errors import QualityError
+    from generator.assembly import damage
+    from generator.dataset import open_dataset
+
+    dataset = open_dataset(out)
+    faults = 0
+    for fault in damage(out):
+        print(fault)
+        faults += 1
+    if faults:
+        raise QualityError(f"{out} is not as it was made, see above ({faults} faults); make it again, or copy it again")
+    print(f"{out}: {dataset.description.images} images, every file as it was made")
+
+
+def _check_sheet(contact_sheet: Path) -> None:
+    from drivers.errors import InputError
+
+    if contact_sheet.suffix.lower() != ".png":
+        raise InputError(f"the contact sheet {contact_sheet} is to be a PNG file; let its name end in .png")
+    if contact_sheet.exists():
+        raise InputError(f"{contact_sheet} already exists; name a new file for the contact sheet, or remove it first")
 
 
 def _choose_sources(
@@ -188,27 +455,6 @@ def _size(text: str, option: str) -> tuple[int, int]:
     if not match:
         raise InputError(f"{option} is {text!r}, expected width x height such as 512x512")
     return int(match[1]), int(match[2])
-
-
-def _choose_lights(
-    table: Lut, illuminations: str | None, random: int | None, nearest: Path | None, seed: int
-) -> LightChoice:
-    from drivers.errors import InputError
-    from generator import illuminant
-
-    given = [
-        name
-        for name, value in (("--illuminations", illuminations), ("--random", random), ("--nearest", nearest))
-        if value is not None
-    ]
-    if len(given) > 1:
-        raise InputError(f"{' and '.join(given)} were both given; choose lights in one way")
-    total = len(table.illuminations)
-    if illuminations is not None:
-        return illuminant.parse_lights(illuminations, total)
-    if nearest is not None:
-        return illuminant.nearest_lights(table, illuminant.load_ground_truths(nearest), nearest.name)
-    return illuminant.RandomLights(1 if random is None else random, total, seed)
 
 
 def main() -> int:

@@ -239,8 +239,8 @@ def _client(address: str, workers: int) -> Generator[distributed.Client]:
         with client:
             yield client
         return
-    with (
-        LocalCluster(
+    try:
+        cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
             processes=True,
@@ -248,7 +248,11 @@ def _client(address: str, workers: int) -> Generator[distributed.Client]:
             dashboard_address="127.0.0.1:0",
             memory_limit=None,
             silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
+        )
+    except RuntimeError as error:
+        raise DeviceError(
+            f"the Dask cluster of this machine cannot be started ({error}): a worker died at once; run the same "
+            "command again to go on, or with fewer --workers"
+        ) from error
+    with cluster, Client(cluster, set_as_default=False) as client:
         yield client

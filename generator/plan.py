@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
+import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -229,6 +230,20 @@ def parse_split(text: str) -> tuple[float, float, float]:
         raise InputError(f"the split {text!r} is to be shares of train, validation and test, such as 0.8,0.1,0.1")
     total = sum(parts)
     return parts[0] / total, parts[1] / total, parts[2] / total
+
+
+def parse_share(text: str) -> tuple[int, int]:
+    """Return (i, n) of a text such as `3/16`: share i of n, i from 0.
+
+    Raises
+    ------
+    InputError
+        The text is no such share.
+    """
+    match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip(), re.ASCII)
+    if not match or not int(match[1]) < int(match[2]):
+        raise InputError(f"{text!r} is no share; write I/N with I from 0 to N - 1, such as 0/16")
+    return int(match[1]), int(match[2])
 
 
 def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:

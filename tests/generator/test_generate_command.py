@@ -85,6 +85,57 @@ def test_random_and_nearest_lights_and_random_scenes(generate: Generate) -> None
     assert json.loads(Path("c/dataset.json").read_text())["options"]["lights"] == {"choice": "random", "count": 1}
 
 
+def test_layouts_parts_formats_and_several_lights(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
+    wish = ("--random-scenes", "12", "--size", "30x24", "--seed", "2")
+    assert generate("lut", "a", *wish, "--layout", "webdataset", "--split", "50,50", "--format", "jxl") == 0
+    printed = capsys.readouterr().out
+    made = open_dataset("a")
+    counts = made.description.splits
+    assert f"{counts['train']} for train, 0 for validation, {counts['test']} for test" in printed
+    assert sum(counts.values()) == 12
+    assert sorted(path.name for path in Path("a").iterdir() if path.is_dir()) == ["splits", "test", "train"]
+    assert generate("lut", "b", *wish, "--lights-per-image", "2", "--masks", "soft-edge", "--format", "exr") == 0
+    several = open_dataset("b")
+    assert all(len(entry.lights) == 2 for entry in several.entries)
+    assert len(list(Path("b/masks").iterdir())) == 24
+    assert several.read_image(several.entries[0]).shape == (24, 30, 3)
+    assert generate("lut", "c", *wish, "--light", "0:0.5+2:0.5", "--light", "3", "--contact-sheet", "sheet.png") == 0
+    assert {entry.illumination for entry in open_dataset("c").entries} == {"0:0.5+2:0.5", "3"}
+    assert cv2.imread("sheet.png") is not None
+
+
+def test_shares_are_finished_and_verified(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
+    wish = ("--sources", "pictures", "--illuminations", "all", "--shard-images", "3")
+    assert generate("lut", "whole", *wish) == 0
+    capsys.readouterr()
+    assert generate("lut", "out", *wish, "--shard", "1/2") == 0
+    assert "1 of 3 shards of out are done; others are to be made yet" in capsys.readouterr().out
+    assert generate("--finish", "out") == 2
+    assert "2 of 3 shards of out are not made yet: 0, 2; run their shares" in capsys.readouterr().err
+    assert generate("lut", "out", *wish, "--shard", "0/2") == 0
+    assert "3 of 3 shards of out are done; make a dataset of them with generate --finish out" in capsys.readouterr().out
+    assert generate("--finish", "out") == 0
+    assert "out: 8 images of 2 pictures under 4 lights" in capsys.readouterr().out
+    assert Path("out/SHA256SUMS").read_text() == Path("whole/SHA256SUMS").read_text()
+    assert generate("--verify", "out") == 0
+    assert "out: 8 images, every file as it was made" in capsys.readouterr().out
+    Path("out/images/000005.png").write_bytes(b"")
+    assert generate("--verify", "out") == 4
+    printed = capsys.readouterr()
+    assert printed.out == "images/000005.png has changed\n"
+    assert "out is not as it was made, see above (1 faults)" in printed.err
+
+
+def test_a_share_is_gone_on_with_by_the_whole(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
+    wish = ("--sources", "pictures", "--illuminations", "all", "--shard-images", "3")
+    assert generate("lut", "out", *wish, "--shard", "0/2") == 0
+    assert generate("lut", "out", *wish, "--seed", "1") == 2
+    assert "out was begun with another plan (seed 0, now 1)" in " ".join(capsys.readouterr().err.split())
+    assert generate("lut", "out", *wish) == 0
+    assert "5 images were there already" in capsys.readouterr().err
+    assert [path.name for path in Path().iterdir() if path.name.startswith(".")] == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -99,6 +150,13 @@ def test_random_and_nearest_lights_and_random_scenes(generate: Generate) -> None
         (("lut", "out", "--random-scenes", "1", "--size", "big"), "--size is 'big'"),
         (("lut", "out", "--sources", "pictures", "--random", "1", "--illuminations", "0"), "choose lights in one way"),
         (("lut", "out", "--sources", "pictures", "--workers", "0"), "0 workers"),
+        (("lut", "out", "--sources", "pictures", "--engine", "ray"), "'ray' is no engine"),
+        (("lut", "out", "--sources", "pictures", "--shard", "4/4"), "'4/4' is no share; write I/N with I from 0"),
+        (("lut", "out", "--sources", "pictures", "--split", "1,-1"), "the split '1,-1' is to be shares of train"),
+        (("lut", "nowhere://out", "--sources", "pictures"), "cannot reach nowhere://out"),
+        (("lut",), "the table and the place of the dataset are missing"),
+        (("--verify", "lut"), "lut is no dataset"),
+        (("--finish", "nowhere"), "no dataset is being made at nowhere"),
         (("lut", "out", "--sources", "pictures", "--contact-sheet", "sheet.jpg"), "end in .png"),
         (("lut", "out", "--sources", "pictures", "--contact-sheet", "pictures/one.png"), "already exists"),
     ],
