@@ -45,6 +45,9 @@ from generator.vector import GROUP, LANES, MEAN_BYTES, SAMPLE_BYTES, SUM_BYTES, 
 MIXTURES: Final = np.uint32(philox.MIXTURES)
 STRETCH: Final = 512
 """Pixels of a row whose offsets are chosen before their samples are fetched, a whole number of groups."""
+FAULTS: Final = 4 * LANES
+"""Bytes that tell faulty weights."""
+SUMS: Final = SUM_BYTES * (STRETCH // LANES + 1)
 ROOM: Final = OFFSETS * (STRETCH // GROUP + 1)
 """Bytes of a stretch's offsets; the last one of a row may be longer by up to seven pixels."""
 
@@ -120,11 +123,11 @@ def _mix_pixels(
 ) -> None:
     """Fill rows of at least eight pixels. `weight_steps` are the bytes from row to row, pixel to pixel, light to light.
 
-    A stretch of a row at a time: offsets of all lights first, then eight pixels of all lights. In scratch memory stand
-    a row's last pixels, the sums, the colours' offsets and each light's.
+    A stretch of a row at a time: offsets of all lights first, then the sums light by light. In scratch memory stand a
+    row's last pixels, what tells faulty weights, the sums, the colours' offsets and each light's.
     """
     lights = len(tables)
-    sums, colours = scratch + 64, scratch + 64 + SUM_BYTES
+    sums, colours = scratch + 64 + FAULTS, scratch + 64 + FAULTS + SUMS
     mean_bytes = MEAN_BYTES << (3 * np.int64(bits))
     for y in range(rows):
         start = 0
@@ -139,24 +142,26 @@ def _mix_pixels(
                 for group in range(start // GROUP, (end + GROUP - 1) // GROUP):
                     to = colours + ROOM * (light + 1) + OFFSETS * (group - start // GROUP)
                     choose_group(picture + y * pitch, width, group, keys, count, bits, scratch, to)
-            x = start
-            while x < end:
-                x = min(x, end - LANES)
-                place = 4 * (x - start)
-                for light in range(lights):
-                    weight = weights + y * weight_steps[0] + x * weight_steps[1] + light * weight_steps[2]
-                    offsets = colours + ROOM * (light + 1) + place
+            blocks = (end - start + LANES - 1) // LANES
+            for light in range(lights):
+                weight = weights + y * weight_steps[0] + light * weight_steps[2]
+                for block in range(blocks):
+                    # The last eight pixels may be some of the ones before again, with sums of their own.
+                    x = min(start + LANES * block, end - LANES)
+                    place = 4 * (x - start)
                     add_light8(
                         tables[light],
-                        offsets,
+                        colours + ROOM * (light + 1) + place,
                         means + light * mean_bytes,
                         colours + place,
-                        weight,
+                        weight + x * weight_steps[1],
                         weight_steps[1],
-                        sums,
+                        sums + SUM_BYTES * block,
+                        scratch + 64,
                     )
-                round8(sums, white, target + y * target_pitch + SAMPLE_BYTES * x)
-                x += LANES
+            for block in range(blocks):
+                x = min(start + LANES * block, end - LANES)
+                round8(sums + SUM_BYTES * block, white, target + y * target_pitch + SAMPLE_BYTES * x)
             start = end
 
 
@@ -288,7 +293,7 @@ def mix_samples(
     faults: list[bool] = []
 
     def fill(top: int, bottom: int) -> None:
-        scratch = np.zeros(64 + SUM_BYTES + ROOM * (1 + len(lights)), np.uint8)
+        scratch = np.zeros(64 + FAULTS + SUMS + ROOM * (1 + len(lights)), np.uint8)
         _mix_pixels(
             source[top:].ctypes.data,
             source.strides[0],
@@ -308,7 +313,7 @@ def mix_samples(
             work.strides[0],
             scratch.ctypes.data,
         )
-        faults.append(bool(scratch[64 : 64 + SUM_BYTES].any()))
+        faults.append(bool(np.isnan(scratch[64 : 64 + FAULTS].view(np.float32)).any()))
 
     share(fill, len(picture), threads)
     if any(faults):

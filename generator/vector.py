@@ -24,7 +24,7 @@ SAMPLE_BYTES: Final = 6
 MEAN_BYTES: Final = 16
 """Of a colour's mean: red, green, blue and nothing, float32."""
 SUM_BYTES: Final = 16 * LANES
-"""Of eight pixels' sums: red, green, blue and a flag, 32 bits each."""
+"""Of eight pixels' sums: red, green, blue and nothing, float32."""
 
 _I8, _I16, _I32, _I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 _F32 = ir.FloatType()
@@ -220,6 +220,17 @@ def copy1(typing: Any, source: Any, target: Any) -> Any:
     return _void(emit, _ADDRESS, _ADDRESS)
 
 
+def _joined(builder: Builder, parts: Sequence[Value]) -> Value:
+    """Return vectors as one; there are a power of two."""
+    while len(parts) > 1:
+        kind = ir.VectorType(_I32, 2 * parts[0].type.count)
+        parts = [
+            builder.shuffle_vector(first, second, _constant(kind, range(kind.count)))
+            for first, second in zip(parts[::2], parts[1::2], strict=True)
+        ]
+    return parts[0]
+
+
 def _channels(builder: Builder, samples: Value, offsets: Value, step: Value) -> list[Value]:
     """Return red, green and blue, eight float32 each, of the samples whose offsets are `step` bytes apart."""
     quads = ir.VectorType(_I16, 4)
@@ -237,17 +248,12 @@ def _channels(builder: Builder, samples: Value, offsets: Value, step: Value) -> 
         )
         for lane in range(LANES)
     ]
-    while len(parts) > 1:
-        kind = ir.VectorType(_I32, 2 * parts[0].type.count)
-        parts = [
-            builder.shuffle_vector(first, second, _constant(kind, range(kind.count)))
-            for first, second in zip(parts[::2], parts[1::2], strict=True)
-        ]
+    everything = _joined(builder, parts)
     lanes = ir.VectorType(_I32, LANES)
     return [
         builder.sitofp(
             builder.zext(
-                builder.shuffle_vector(parts[0], parts[0], _constant(lanes, range(channel, 4 * LANES, 4))),
+                builder.shuffle_vector(everything, everything, _constant(lanes, range(channel, 4 * LANES, 4))),
                 _WORDS,
             ),
             _FLOATS,
@@ -311,14 +317,15 @@ def prefetch(typing: Any, address: Any) -> Any:
 
 @intrinsic
 def add_light8(
-    typing: Any, samples: Any, offsets: Any, means: Any, colours: Any, weights: Any, step: Any, total: Any
+    typing: Any, samples: Any, offsets: Any, means: Any, colours: Any, weights: Any, step: Any, total: Any, faults: Any
 ) -> Any:
-    """Add one light to eight pixels' sums at `total`, float32 red, green, blue and a flag for each; see `mixing.py`.
+    """Add one light to eight pixels' sums at `total`; see `mixing.py`.
 
-    `offsets` leads to the samples, `colours` to the means, four float32 each of which the last is not used; weights are
-    float32, `step` bytes apart. A flag is set where a weight is negative, infinite or no number.
+    `offsets` leads to the samples, `colours` to the means; weights are float32, `step` bytes apart. Sums are four
+    float32 a pixel, red, green, blue and one without meaning. The eight float32 at `faults` are no numbers from the
+    moment that a weight was negative, infinite or no number.
     """
-    del typing, samples, offsets, means, colours, weights, step, total
+    del typing, samples, offsets, means, colours, weights, step, total, faults
 
     def emit(
         builder: Builder,
@@ -329,6 +336,7 @@ def add_light8(
         weights: Value,
         step: Value,
         total: Value,
+        faults: Value,
     ) -> None:
         weight = ir.Constant(_FLOATS, ir.Undefined)
         for lane in range(LANES):
@@ -340,55 +348,48 @@ def add_light8(
         )
         root = builder.call(root_of, [weight])
         rest = builder.fsub(weight, root)
-        quads = ir.VectorType(_F32, 4)
-        parts = [
-            _load(builder, builder.add(means, builder.zext(_load(builder, colours, 4 * lane, _I32), _I64)), 0, quads)
-            for lane in range(LANES)
-        ]
-        while len(parts) > 1:
-            kind = ir.VectorType(_I32, 2 * parts[0].type.count)
-            parts = [
-                builder.shuffle_vector(first, second, _constant(kind, range(kind.count)))
-                for first, second in zip(parts[::2], parts[1::2], strict=True)
-            ]
-        drawn = _channels(builder, samples, offsets, ir.Constant(_I64, 4))
-        for channel in range(3):
-            mean = builder.shuffle_vector(parts[0], parts[0], _constant(_WORDS, range(channel, 4 * LANES, 4)))
-            value = _load(builder, total, 4 * LANES * channel, _FLOATS)
-            value = builder.fadd(value, builder.fmul(root, drawn[channel]))
-            _store(builder, builder.fadd(value, builder.fmul(rest, mean)), total, 4 * LANES * channel)
-        zero, endless = (ir.Constant(_FLOATS, [number] * LANES) for number in (0.0, float("inf")))
-        sound = builder.and_(builder.fcmp_ordered(">=", weight, zero), builder.fcmp_ordered("<", weight, endless))
-        flags = builder.or_(_load(builder, total, 12 * LANES, _WORDS), builder.sext(builder.not_(sound), _WORDS))
-        _store(builder, flags, total, 12 * LANES)
 
-    return _void(emit, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS)
+        def two(base: Value, places: Value, first: int, kind: Any) -> Value:
+            """Return the four numbers each that pixels `first` and the next find at their places."""
+            parts = [
+                _load(builder, builder.add(base, builder.zext(_load(builder, places, 4 * lane, _I32), _I64)), 0, kind)
+                for lane in (first, first + 1)
+            ]
+            return builder.shuffle_vector(*parts, _constant(_WORDS, range(LANES)))
+
+        for first in range(0, LANES, 2):
+            pixels = _constant(_WORDS, [first] * 4 + [first + 1] * 4)
+            drawn = builder.zext(two(samples, offsets, first, ir.VectorType(_I16, 4)), _WORDS)
+            drawn = builder.fmul(builder.sitofp(drawn, _FLOATS), builder.shuffle_vector(root, root, pixels))
+            mean = two(means, colours, first, ir.VectorType(_F32, 4))
+            mean = builder.fmul(mean, builder.shuffle_vector(rest, rest, pixels))
+            value = builder.fadd(builder.fadd(_load(builder, total, 16 * first, _FLOATS), drawn), mean)
+            _store(builder, value, total, 16 * first)
+        # The root of what is negative, and nothing times infinity, are no numbers.
+        nothing = builder.fmul(root, ir.Constant(_FLOATS, [0.0] * LANES))
+        _store(builder, builder.fadd(_load(builder, faults, 0, _FLOATS), nothing), faults, 0)
+
+    return _void(emit, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS)
 
 
 @intrinsic
 def round8(typing: Any, total: Any, white: Any, target: Any) -> Any:
-    """Write eight pixels' sums as uint16, rounded, from 0 to `white`, and set the sums to 0; the flags stay."""
+    """Write eight pixels' sums as uint16, rounded, from 0 to `white`, and set the sums to 0."""
     del typing, total, white, target
 
     def emit(builder: Builder, total: Value, white: Value, target: Value) -> None:
         half, zero = ir.Constant(_FLOATS, [0.5] * LANES), ir.Constant(_FLOATS, [0.0] * LANES)
         most = _spread(builder, white, _FLOATS)
-        channels: list[Value] = []
-        for channel in range(3):
-            value = builder.fadd(_load(builder, total, 4 * LANES * channel, _FLOATS), half)
-            _store(builder, zero, total, 4 * LANES * channel)
+        parts: list[Value] = []
+        for first in range(0, LANES, 2):
+            value = builder.fadd(_load(builder, total, 16 * first, _FLOATS), half)
+            _store(builder, zero, total, 16 * first)
             value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
             whole = builder.fptosi(_least(builder, value, most), _WORDS)
-            channels.append(builder.trunc(whole, ir.VectorType(_I16, LANES)))
-        pairs = builder.shuffle_vector(
-            channels[0], channels[1], _constant(ir.VectorType(_I32, 2 * LANES), range(2 * LANES))
-        )
-        third = builder.shuffle_vector(
-            channels[2], channels[2], _constant(ir.VectorType(_I32, 2 * LANES), range(2 * LANES))
-        )
-        order = [lane + LANES * channel for lane in range(LANES) for channel in range(3)]
-        _store(
-            builder, builder.shuffle_vector(pairs, third, _constant(ir.VectorType(_I32, 3 * LANES), order)), target, 0
-        )
+            parts.append(builder.trunc(whole, ir.VectorType(_I16, LANES)))
+        everything = _joined(builder, parts)
+        order = [4 * pixel + channel for pixel in range(LANES) for channel in range(3)]
+        kind = ir.VectorType(_I32, 3 * LANES)
+        _store(builder, builder.shuffle_vector(everything, everything, _constant(kind, order)), target, 0)
 
     return _void(emit, _ADDRESS, types.float32, _ADDRESS)
