@@ -297,10 +297,10 @@ def preview_of(image: npt.NDArray[np.uint16], white_level: int, side: int = PREV
 
     from generator.tonemap import flash
 
-    linear = image.astype(np.float32) / np.float32(white_level)
     height, width = image.shape[:2]
     scale = side / max(height, width)
     if scale < 1:
+        # In whole numbers: floats of the full size would take more memory than all else.
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        linear = np.asarray(cv2.resize(linear, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-    return flash(linear)
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint16)
+    return flash(image.astype(np.float32) / np.float32(white_level))

@@ -17,6 +17,10 @@ DARK = 1e-9
 """What stands for brightness 0 in the mean of logarithms; linear values are 0 … 1, so it is far below any signal."""
 
 
+_NOTHING = np.float32(1e-30)
+"""Has a logarithm and is still black."""
+
+
 @dataclass(frozen=True)
 class Flash:
     """The operator with its parameters fixed to one image, so that it can be undone.
@@ -73,12 +77,32 @@ def fit_flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2
         raise InputError(
             f"tone mapping wants an image and parameters above 0; got {linear.shape}, a={a}, gamma={gamma}"
         )
-    brightness = np.maximum(np.asarray(linear, dtype=np.float64).max(axis=-1), DARK)
-    k = float(a * np.exp(np.log(brightness).mean()))
+    brightness = _brightness(np.asarray(linear))
+    k = float(a * np.exp(np.log(brightness).mean(dtype=np.float64)))
     peak = float(brightness.max())
     return Flash(k, 255.0 / (peak / (peak + k)) ** (1 / gamma), gamma)
 
 
 def flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2.2) -> npt.NDArray[np.uint8]:
-    """Return the picture (..., 3) uint8 of a linear image (..., 3) float, 1 = saturation; see `fit_flash`."""
-    return np.rint(np.clip(fit_flash(linear, a, gamma).apply(linear), 0, 255)).astype(np.uint8)
+    """Return the picture (..., 3) uint8 of a linear image (..., 3) float, 1 = saturation; see `fit_flash`.
+
+    Computed in single precision: a code may differ by one from that of `Flash.apply` where that lies between two.
+    """
+    linear = np.asarray(linear, dtype=np.float32)
+    operator = fit_flash(linear, a, gamma)
+    mapped = linear / (_brightness(linear) + np.float32(operator.k))[..., None]
+    if gamma != 1:
+        # Through logarithms, which numpy computes several at once; a power takes ten times as long.
+        np.maximum(mapped, _NOTHING, out=mapped)
+        np.log(mapped, out=mapped)
+        mapped *= np.float32(1 / gamma)
+        np.exp(mapped, out=mapped)
+    mapped *= np.float32(operator.scale)
+    np.rint(mapped, out=mapped)
+    return np.clip(mapped, 0, 255, out=mapped).astype(np.uint8)
+
+
+def _brightness(linear: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """Return the largest channel (...) of `linear` (..., 3), never quite 0."""
+    largest = np.maximum(np.maximum(linear[..., 0], linear[..., 1]), linear[..., 2])
+    return np.maximum(largest, linear.dtype.type(DARK))

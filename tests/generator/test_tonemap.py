@@ -53,6 +53,16 @@ def test_black_stays_black() -> None:
     assert flash(image)[1, 1].tolist() == [0, 0, 0]
 
 
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_single_precision_moves_no_code_by_more_than_one(gamma: float) -> None:
+    image = np.random.default_rng(4).exponential(0.05, (200, 200, 3))
+    image[:3] = 0
+    exact = np.clip(fit_flash(image, gamma=gamma).apply(image), 0, 255)
+    codes = flash(image, gamma=gamma)
+    assert np.abs(codes - exact).max() < 0.501
+    assert (codes != np.rint(exact)).mean() < 1e-3
+
+
 @pytest.mark.parametrize(("a", "gamma"), [(0, 2.2), (5, 0)])
 def test_impossible_parameters_are_refused(a: float, gamma: float) -> None:
     with pytest.raises(InputError, match="parameters above 0"):
