@@ -13,7 +13,8 @@ On Linux the window is an X window. Under Wayland that is XWayland, whose compos
 `FullScreen.warnings` says so. Gamma ramps, which night light and colour management load, lie behind everything that can
 be read back; `warnings` looks at them, too.
 
-Sources: GLFW 3.4 reference; OpenGL 2.1, clauses 4.2.3 (Clear) and 4.3.2 (ReadPixels).
+Sources: GLFW 3.4 reference; OpenGL 2.1, clauses 4.2.3 (Clear) and 4.3.2 (ReadPixels); ICC Profiles in X
+Specification 0.4.
 """
 
 from __future__ import annotations
@@ -254,6 +255,11 @@ class FullScreen:
             found.append(
                 "power saving may darken the display: install libxcb-screensaver0, or switch it off (xset -dpms)"
             )
+        if self._screen is not None and self._screen.has_root_property(_profile_of(self._glfw, self._monitor)):
+            found.append(
+                f"a colour profile is set for {self.display.name}, which desktops may apply to what they show: remove "
+                "it in the desktop's colour settings (colormgr, dispwin -U)"
+            )
         twins = [str(one) for one, _ in _displays(self._glfw) if one.place == self.display.place]
         if len(twins) > 1:
             found.append(f"the same picture goes to several displays ({'; '.join(twins)}): extend, do not mirror")
@@ -401,6 +407,13 @@ class FullScreen:
             raise DeviceError(f"display {self.display} was closed; open it again")
         if threading.get_ident() != self._thread:
             raise DeviceError(f"display {self.display} belongs to the thread that opened it; use it from there")
+
+
+def _profile_of(glfw: Any, monitor: Any) -> str:
+    """Return the root window's property for a display's profile (ICC Profiles in X Specification 0.4, section 2)."""
+    addresses = [ctypes.addressof(one.contents) for one in glfw.get_monitors()]
+    number = addresses.index(ctypes.addressof(monitor.contents))
+    return "_ICC_PROFILE" if number == 0 else f"_ICC_PROFILE_{number}"
 
 
 def _is_noise(ramp: npt.NDArray[np.float64]) -> bool:

@@ -7,8 +7,8 @@ Laws that hold inside:
   `outlive` talks it out of that.
 - The hold on screen saver and power saving ends with the connection, hence with the process, however that ends.
 
-Sources: X Window System Protocol, GetImage and QueryExtension; MIT-SCREEN-SAVER extension 1.1, Suspend; Xlib,
-XSetIOErrorHandler(3) and XSetIOErrorExitHandler(3), the latter from libX11 1.7 on.
+Sources: X Window System Protocol, GetImage, QueryExtension and GetProperty; MIT-SCREEN-SAVER extension 1.1, Suspend;
+Xlib, XSetIOErrorHandler(3) and XSetIOErrorExitHandler(3), the latter from libX11 1.7 on.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ _Z_PIXMAP = 2
 _ALL_PLANES = 0xFFFFFFFF
 _REPLY_PRESENT = 8
 """Offset of `present` in a QueryExtension reply."""
+_REPLY_ATOM = 8
+"""Offset of `atom` in an InternAtom reply."""
+_ANY_TYPE = 0
 
 
 _lost: set[int] = set()
@@ -145,6 +148,26 @@ class XScreen:
         self._libc.free(reply)
         return bool(present)
 
+    def has_root_property(self, name: str) -> bool:
+        """Return whether the root window has a property `name` that is not empty."""
+        if self._connection is None:
+            return False
+        cookie = self._xcb.xcb_intern_atom(self._connection, 1, len(name), name.encode("ascii"))
+        reply = self._xcb.xcb_intern_atom_reply(self._connection, cookie, None)
+        if not reply:
+            return False
+        atom = ctypes.c_uint32.from_address(reply + _REPLY_ATOM).value
+        self._libc.free(reply)
+        if not atom:
+            return False
+        cookie = self._xcb.xcb_get_property(self._connection, 0, self._root, atom, _ANY_TYPE, 0, 1)
+        reply = self._xcb.xcb_get_property_reply(self._connection, cookie, None)
+        if not reply:
+            return False
+        size: int = self._xcb.xcb_get_property_value_length(reply)
+        self._libc.free(reply)
+        return size > 0
+
     def close(self) -> None:
         """Hang up, and let the screen saver run again; a second call does nothing."""
         connection, self._connection = self._connection, None
@@ -183,6 +206,11 @@ def _declare(xcb: ctypes.CDLL) -> None:
         "xcb_get_image_data_length": (ctypes.c_int, [pointer]),
         "xcb_query_extension": (_Cookie, [pointer, ctypes.c_uint16, ctypes.c_char_p]),
         "xcb_query_extension_reply": (pointer, [pointer, _Cookie, pointer]),
+        "xcb_intern_atom": (_Cookie, [pointer, ctypes.c_uint8, ctypes.c_uint16, ctypes.c_char_p]),
+        "xcb_intern_atom_reply": (pointer, [pointer, _Cookie, pointer]),
+        "xcb_get_property": (_Cookie, [pointer, ctypes.c_uint8, integer, integer, integer, integer, integer]),
+        "xcb_get_property_reply": (pointer, [pointer, _Cookie, pointer]),
+        "xcb_get_property_value_length": (ctypes.c_int, [pointer]),
         "xcb_request_check": (pointer, [pointer, _Cookie]),
         "xcb_disconnect": (None, [pointer]),
     }

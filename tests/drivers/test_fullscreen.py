@@ -313,6 +313,28 @@ def test_a_gamma_ramp_that_was_never_written_is_none(screen: FullScreen, monkeyp
     assert len(ramps(screen)) == 1, "inverted colours are somebody's wish"
 
 
+def test_a_colour_profile_of_the_display_is_reported(outputs: str) -> None:
+    if shutil.which("xprop") is None:
+        pytest.skip("xprop is not installed: apt-get install x11-utils")
+    presenter = FullScreen("right")
+    try:
+
+        def told() -> list[str]:
+            return [warning for warning in presenter.warnings() if "profile" in warning]
+
+        def set_profile(name: str) -> None:
+            subprocess.run(["xprop", "-root", "-f", name, "8s", "-set", name, "profile"], check=True)
+
+        assert told() == []
+        set_profile("_ICC_PROFILE")
+        assert told() == [], "that is the other display's"
+        set_profile("_ICC_PROFILE_1")
+        (warning,) = told()
+        assert "colour profile is set for DUMMY1" in warning
+    finally:
+        presenter.close()
+
+
 def ramps(presenter: FullScreen) -> list[str]:
     return [warning for warning in presenter.warnings() if "gamma" in warning]
 
