@@ -18,17 +18,29 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
-    from generator.dataset import generate_dataset
+    from generator.dataset import generate_dataset, open_dataset
     from generator.kernel import draw_samples, render
     from generator.picture import read_picture
+    from generator.scene import find_pictures
     from generator.tonemap import flash
 
-__all__ = ["draw_samples", "flash", "generate_dataset", "open_lut", "read_picture", "render"]
+__all__ = [
+    "draw_samples",
+    "find_pictures",
+    "flash",
+    "generate_dataset",
+    "open_dataset",
+    "open_lut",
+    "read_picture",
+    "render",
+]
 
 _HOMES = {
     "draw_samples": "generator.kernel",
+    "find_pictures": "generator.scene",
     "flash": "generator.tonemap",
     "generate_dataset": "generator.dataset",
+    "open_dataset": "generator.dataset",
     "read_picture": "generator.picture",
     "render": "generator.kernel",
 }

@@ -1,0 +1,63 @@
+"""The examples of the documentation do what they say."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+
+if TYPE_CHECKING:
+    from calibration.lut import Lut
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def here(make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Go to a folder with a table `lut` and a picture `cat.png`."""
+    make_lut()
+    codes = np.random.default_rng(3).integers(0, 256, (40, 50, 3)).astype(np.uint8)
+    (tmp_path / "cat.png").write_bytes(cv2.imencode(".png", codes)[1].tobytes())
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_lines_of_the_page_for_programmers(here: Path) -> None:
+    blocks = re.findall(r"(?:^    .*\n)+", (ROOT / "docs" / "library.md").read_text(), re.MULTILINE)
+    assert len(blocks) == 3
+    assert len(blocks[0].splitlines()) == 3
+    names: dict[str, Any] = {}
+    for block in blocks:
+        exec(textwrap.dedent(block), names)
+    raw, lut = names["raw"], names["lut"]
+    assert (raw.dtype, raw.shape) == (np.uint16, (40, 50, 3))
+    assert {tuple(pixel) for pixel in raw.reshape(-1, 3)} <= {tuple(row) for row in lut.samples[3].reshape(-1, 3)}
+    assert names["truth"].sum() == pytest.approx(1)
+    assert names["balanced"].max() == 1
+    assert names["image"].shape == (40, 50, 3)
+    assert names["made"].description.images == 2
+    assert names["entry"].truth == pytest.approx(tuple(lut.ground_truth[3]), abs=1e-9)
+
+
+def test_the_array_of_jobs(here: Path) -> None:
+    script = ROOT / "examples" / "slurm" / "generate.sbatch"
+    job = {"SLURM_ARRAY_TASK_ID": "0", "SLURM_ARRAY_TASK_COUNT": "1", "SLURM_CPUS_PER_TASK": "1"}
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", script, "lut", "out", "--sources", "cat.png"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, **job, "PATH": path},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "1 of 1 shards of out are done; make a dataset of them with generate --finish out" in done.stdout
