@@ -1,29 +1,46 @@
-"""How fast images are made: `python -m benchmarks.generator` prints one JSON object a line.
+"""How fast the kernels are: `python -m benchmarks.generator` prints one JSON object a line.
 
-Figures of one run are to be compared with each other, not with another day's: `against` names what a ratio is to.
+The limit is a streaming copy of the same picture, 3 bytes in and 6 out, in as many threads. All calls take turns, band
+by band of the picture; of each band the fastest turn counts, and the bands are added up. With one thread the time is
+the processor's, else the clock's. So ratios hold on a machine with other work to do, the clock's less so.
+
+The bound of fetching is a compiled loop that does nothing but load the samples which the kernel loads, their places
+being known: what the caches allow, whoever chooses.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+import skimage.data
 
 from calibration.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
-from generator.dataset import default_workers, generate_dataset
-from generator.encode import Shot, encode_image
-from generator.kernel import draw_samples
-from generator.scene import find_pictures
+from generator.choice import SCRATCH, choose_group, row_keys
+from generator.compiled import compiled
+from generator.kernel import draw_mosaic, draw_samples
+from generator.mixing import mix_samples
+from generator.planar import draw_planar
+from generator.vector import GROUP, offset_at
 
 SAMPLES = 25
-REPEATS = 5
+REPEATS = 7
+WHITE = 12000
+
+Bands = Callable[[slice], object]
 
 
 def best(call: Callable[[], object], repeats: int = REPEATS) -> float:
@@ -72,6 +89,14 @@ def noisy_table(folder: Path, lights: int) -> Lut:
     return open_lut(folder)
 
 
+def photograph(width: int, height: int) -> npt.NDArray[np.uint8]:
+    """Return a photograph (height, width, 3) enlarged to the size of a camera's, with a camera's grain."""
+    small = np.asarray(skimage.data.coffee(), dtype=np.uint8)
+    larger = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC), dtype=np.float32)
+    grain = np.random.default_rng(3).normal(0, 3, larger.shape)
+    return np.clip(larger + grain, 0, 255).astype(np.uint8)
+
+
 def by_numpy(samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16]:
     """Return a raw image in the way that first comes to mind."""
     colour = (picture >> 3).astype(np.int64) @ np.array([1024, 32, 1])
@@ -79,56 +104,163 @@ def by_numpy(samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) ->
     return np.take(samples.reshape(-1, 3), colour * SAMPLES + choice, axis=0)
 
 
+@compiled
+def _choose_all(picture: int, width: int, height: int, count: Any, bits: Any, target: int, scratch: int) -> None:
+    groups = width // GROUP
+    for y in range(height):
+        keys = row_keys(y, 0, 0, np.uint64(0))
+        for group in range(groups):
+            to = target + 4 * GROUP * (y * groups + group)
+            choose_group(picture + 3 * y * width, width, group, keys, count, bits, scratch, to)
+
+
+@compiled
+def _fetch(samples: int, places: int, count: int) -> int:
+    total = 0
+    for i in range(0, count, 4):
+        for k in range(4):
+            total ^= offset_at(samples + offset_at(places + 4 * (i + k)))
+    return total
+
+
+def fetching(samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> Bands:
+    """Return a call that loads the samples of a band's pixels; the width must be whole groups."""
+    height, width = picture.shape[:2]
+    places = np.zeros((height, width), np.uint32)
+    scratch = np.empty(SCRATCH, np.uint8)
+    numbers = np.uint32(SAMPLES), np.uint32(5)
+    _choose_all(picture.ctypes.data, width, height, *numbers, places.ctypes.data, scratch.ctypes.data)
+    return lambda band: _fetch(samples.ctypes.data, places[band].ctypes.data, places[band].size)
+
+
+def in_turns(
+    calls: Mapping[str, Bands], rows: int, bands: int, clock: Callable[[], float], repeats: int = REPEATS
+) -> dict[str, float]:
+    """Return the seconds of each call for all rows, the fastest turn of each band."""
+    edges = [rows * band // bands for band in range(bands + 1)]
+    fastest = {name: np.full(bands, np.inf) for name in calls}
+    for call in calls.values():
+        call(slice(0, edges[1]))
+    for _ in range(repeats):
+        for name, call in calls.items():
+            for band in range(bands):
+                start = clock()
+                call(slice(edges[band], edges[band + 1]))
+                fastest[name][band] = min(fastest[name][band], clock() - start)
+    return {name: float(seconds.sum()) for name, seconds in fastest.items()}
+
+
+def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArray[np.uint16]) -> None:
+    """Report the kernels on a picture of 18 Mpx."""
+    height, width = picture.shape[:2]
+    pixels = width * height / 1e6
+    samples = tables[0]
+    out = np.empty(picture.shape, np.uint16)
+    sites = np.empty(picture.shape[:2], np.uint16)
+    planes = np.empty((3, height, width), np.float32)
+    weights = np.random.default_rng(4).random((height, width, 2), dtype=np.float32)
+    calls: dict[str, Bands] = {
+        "streaming copy": lambda band: np.copyto(out[band], picture[band]),
+        "bound of fetching": fetching(samples, picture),
+        "kernel": lambda band: draw_samples(samples, picture[band], first_row=band.start, out=out[band]),
+        "mosaic": lambda band: draw_mosaic(samples, picture[band], first_row=band.start, out=sites[band]),
+        "planes": lambda band: draw_planar(
+            samples,
+            picture,
+            white_level=WHITE,
+            window=(0, band.start, width, band.stop - band.start),
+            out=planes[:, band],
+        ),
+        "two lights": lambda band: mix_samples(
+            tables, picture[band], weights[band], white_level=WHITE, first_row=band.start, out=out[band]
+        ),
+    }
+    seconds = in_turns(calls, height, 8, time.thread_time)
+    seconds |= in_turns({"numpy take": lambda band: by_numpy(samples, picture[band])}, height, 8, time.thread_time, 2)
+    for call, took in seconds.items():
+        report(f"{call}, {name}, one thread", pixels / took, "Mpx/s")
+    limit = seconds["streaming copy"]
+    for call in ("bound of fetching", "kernel", "mosaic", "planes", "two lights"):
+        report(f"{call}, {name}, one thread", limit / seconds[call], "ratio", "streaming copy, 3 bytes in and 6 out")
+    report(f"kernel, {name}, one thread", seconds["numpy take"] / seconds["kernel"], "ratio", "numpy take")
+
+    threads = os.cpu_count() or 1
+    with ThreadPoolExecutor(threads) as pool:
+
+        def copy(top: int, bottom: int) -> None:
+            np.copyto(out[top:bottom], picture[top:bottom])
+
+        def copy_together(band: slice) -> None:
+            edges = [band.start + (band.stop - band.start) * part // threads for part in range(threads + 1)]
+            list(pool.map(copy, edges[:-1], edges[1:]))
+
+        together: dict[str, Bands] = {
+            "streaming copy": copy_together,
+            "kernel": lambda band: draw_samples(
+                samples, picture[band], first_row=band.start, threads=threads, out=out[band]
+            ),
+        }
+        seconds = in_turns(together, height, 4, time.perf_counter, 10 * REPEATS)
+    for call, took in seconds.items():
+        report(f"{call}, {name}, {threads} threads", pixels / took, "Mpx/s")
+    ratio = seconds["streaming copy"] / seconds["kernel"]
+    report(f"kernel, {name}, {threads} threads", ratio, "ratio", "streaming copy in as many threads")
+
+
+def measure_small(samples: npt.NDArray[np.uint16]) -> None:
+    """Report the kernel on 512 x 512 pixels, all in the caches."""
+    picture = np.ascontiguousarray(photograph(5184, 3456)[:512, :512])
+    out = np.empty(picture.shape, np.uint16)
+    call = partial(draw_samples, samples, picture, out=out)
+    seconds = in_turns({"kernel": lambda _: call()}, 512, 1, time.thread_time, 300)["kernel"]
+    report("kernel, 512 x 512 px, one thread", picture.size / 3e6 / seconds, "Mpx/s")
+
+
+START = """
+import time
+import numpy as np
+begin = time.process_time()
+import generator.kernel as kernel
+middle = time.process_time()
+kernel.draw_samples(np.zeros((8, 25, 3), np.uint16), np.zeros((9, 99, 3), np.uint8))
+print(middle - begin, time.process_time() - middle)
+"""
+
+
+def measure_start() -> None:
+    """Report what the first call costs of the processor's time, with and without machine code on disk."""
+
+    def child(cache: str) -> tuple[float, float]:
+        done = subprocess.run(
+            [sys.executable, "-c", START],
+            env={**os.environ, "NUMBA_CACHE_DIR": cache},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        imported, called = map(float, done.stdout.split())
+        return imported, called
+
+    with tempfile.TemporaryDirectory() as cache:
+        _, compiling = child(cache)
+        later = [child(cache) for _ in range(3)]
+    report("import of the kernel after numpy", min(imported for imported, _ in later), "s")
+    report("first call, compiled", compiling, "s")
+    report("first call, machine code from disk", min(called for _, called in later), "s")
+
+
 def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
-        lut = noisy_table(Path(scratch) / "lut", 2)
-        samples = np.array(lut.samples[0])
-        for name, width, height in (("18 Mpx", 5184, 3456), ("512 px", 512, 512)):
-            picture = natural_picture(width, height)
-            pixels = width * height / 1e6
-            out = np.empty(picture.shape, np.uint16)
-            copy = pixels / best(lambda picture=picture, out=out: np.copyto(out, picture))
-            one = pixels / best(lambda picture=picture, out=out: draw_samples(samples, picture, out=out))
-            two = pixels / best(lambda picture=picture, out=out: draw_samples(samples, picture, out=out, threads=2))
-            plain = pixels / best(lambda picture=picture: by_numpy(samples, picture), 2)
-            report(f"streaming copy, {name}", copy, "Mpx/s")
-            report(f"kernel, {name}, one thread", one, "Mpx/s")
-            report(f"kernel, {name}, one thread", one / copy, "ratio", "streaming copy of 3 bytes in, 6 out")
-            report(f"kernel, {name}, two threads", two, "Mpx/s")
-            report(f"numpy take with rng.integers, {name}", plain, "Mpx/s")
-            report(f"kernel, {name}, one thread", one / plain, "ratio", "numpy take with rng.integers")
-        large = natural_picture(5184, 3456)
-        image = draw_samples(samples, large)
-        shot = Shot(12000, (4000.0, 4000.0, 4000.0), "Benchmark")
-        for form in ("png", "tiff"):
-            took = best(lambda form=form: encode_image(image, "png" if form == "png" else "tiff", shot), 1)
-            size = len(encode_image(image, "png" if form == "png" else "tiff", shot)) / image.nbytes
-            report(f"{form} encoder, 18 Mpx", large.size / 3e6 / took, "Mpx/s")
-            report(f"{form} encoder, 18 Mpx, size", size, "ratio", "the image's bytes in memory")
-        sources = Path(scratch) / "sources"
-        sources.mkdir()
-        for number in range(2):
-            data = cv2.imencode(".jpg", large)[1].tobytes()
-            (sources / f"{number}.jpg").write_bytes(data)
-        for number in range(32):
-            (sources / f"small-{number}.jpg").write_bytes(
-                cv2.imencode(".jpg", large[number * 64 :][:512, :512])[1].tobytes()
-            )
-        workers = default_workers()
-        for form in ("png", "tiff"):
-            for name, pattern, lights in (("18 Mpx", "[0-9].jpg", (0, 1)), ("512 px", "small-*.jpg", (0, 1))):
-                found = find_pictures(sorted(sources.glob(pattern)))
-                start = time.perf_counter()
-                generate_dataset(
-                    lut,
-                    Path(scratch) / f"out-{form}-{name}",
-                    found,
-                    lights,
-                    form="png" if form == "png" else "tiff",
-                    workers=workers,
-                )
-                rate = len(found) * len(lights) / (time.perf_counter() - start)
-                report(f"whole datasets of {form}, {name}, previews too, {workers} workers", rate, "images/s")
+        tables = np.array(noisy_table(Path(scratch) / "lut", 2).samples)
+    measure_start()
+    measure_small(tables[0])
+    pictures = {
+        "photograph of 18 Mpx": photograph(5184, 3456),
+        "synthetic picture of 18 Mpx": natural_picture(5184, 3456),
+        "random colours of 18 Mpx": np.random.default_rng(5).integers(0, 256, (3456, 5184, 3), np.uint8),
+    }
+    for name, picture in pictures.items():
+        measure_picture(name, picture, tables)
 
 
 if __name__ == "__main__":
