@@ -276,8 +276,8 @@ def parse_lights(text: str, total: int) -> ListedLights:
 def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outside = "refuse") -> Mixture:
     """Return the light that a text names.
 
-    ``12`` and ``12:0.25+40:0.75`` are lights of the table, ``cct=4500`` a black body in kelvin (`gamut.black_body`),
-    ``r=.3,b=.25`` a chromaticity in linear RGB of the table's camera.
+    ``12`` and ``12:0.25+40:0.75`` are lights of the table, ``cct=4500`` or ``4500K`` a black body in kelvin
+    (`gamut.black_body`), ``r=.3,b=.25`` a chromaticity in linear RGB of the table's camera.
 
     Parameters
     ----------
@@ -295,6 +295,9 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
     InputError
         It names none, or one that the table cannot make.
     """
+    kelvin = re.fullmatch(r"(\d+(?:\.\d*)?)\s*[kK]", text.strip(), re.ASCII)
+    if kelvin:
+        text = f"cct={kelvin[1]}"
     if "=" not in text:
         mixture = parse_mixture(text.strip())
         mixture.white(lut)

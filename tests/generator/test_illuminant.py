@@ -122,6 +122,7 @@ def test_texts_of_lights(make_lut: Callable[..., Lut]) -> None:
     assert parse_light("3", lut) == plain(3)
     assert parse_light("1:0.25+3:0.75", lut) == Mixture((1, 3), (0.25, 0.75))
     assert parse_light("cct=3001", lut) == plain(1)
+    assert parse_light(" 3001 K", lut) == plain(1)
     assert parse_light("CCT=3002", lut).lights == (1, 3)
     r, _, b = lut.ground_truth[2]
     assert parse_light(f"r={r},b={b}", lut) == plain(2)
