@@ -1,12 +1,13 @@
 """A 16-bit linear image as the bytes of a file, losslessly, and back; the small pictures beside them.
 
-    png     16-bit RGB; read by everything, compressed; see `encoders.png`
+    png     16-bit RGB; read by everything; the smallest of photographs
     tiff    16-bit RGB, uncompressed: the fastest to write and to read
     exr     OpenEXR, 32-bit float, which holds every 16-bit number (half does not); compressed by zip
-    jxl     JPEG XL, lossless, 16 bits: the smallest
+    jxl     JPEG XL, lossless, 16 bits: the smallest of smooth pictures
     dng     a raw file: the Bayer mosaic of the image, two thirds of the values left out as by a sensor
 
-Every encoder lets go of the interpreter's lock, and no byte depends on the number of threads.
+Every encoder lets go of the interpreter's lock while it computes (not while it copies uncompressed pixels into the
+file), and no byte depends on the number of threads. Beside image and file a PNG takes some megabytes, however large.
 """
 
 from __future__ import annotations

@@ -1,0 +1,94 @@
+"""How fast images become files, and how large: `python -m benchmarks.encode` prints one JSON object a line.
+
+Calls alternate with `cv2.imencode` of the same image, and the fastest of each counts, so that ratios hold on a machine
+with other work to do. Three images drawn from a table: a photograph of 512 px; the same made 18 Mpx large, with the
+grain of a camera; and a picture of that size so smooth that few pixels share a colour.
+"""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import skimage.data
+
+from benchmarks.generator import natural_picture, noisy_table, report
+from generator.encode import FORMATS, Shot, encode_image
+from generator.encoders.png import encode_png
+from generator.kernel import draw_samples
+
+REPEATS = 3
+GRAIN = 2.0
+"""Standard deviation of the grain, codes of 8 bits."""
+SHOT = Shot(12000, (4000.0, 4000.0, 4000.0), "Canon EOS 550D")
+
+
+def photograph(width: int, height: int) -> npt.NDArray[np.uint8]:
+    """Return a photograph (height, width, 3), enlarged where it is too small, and then with grain."""
+    picture = np.asarray(skimage.data.astronaut(), dtype=np.uint8)
+    if (height, width) == picture.shape[:2]:
+        return picture
+    larger = np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC), dtype=np.float32)
+    grain = np.random.default_rng(3).normal(0, GRAIN, larger.shape)
+    return np.clip(np.rint(larger + grain), 0, 255).astype(np.uint8)
+
+
+def fastest(calls: Mapping[str, Callable[[], object]], repeats: int = REPEATS) -> dict[str, float]:
+    """Return the seconds of the fastest of some calls of each, taken in turn."""
+    times = {name: float("inf") for name in calls}
+    for _ in range(repeats):
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            times[name] = min(times[name], time.perf_counter() - start)
+    return times
+
+
+def at_once(pool: ThreadPoolExecutor, calls: Sequence[Callable[[], object]]) -> None:
+    """Make some calls in the pool's threads and wait for all."""
+    for future in [pool.submit(call) for call in calls]:
+        future.result()
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        samples = np.array(noisy_table(Path(scratch) / "lut", 1).samples[0])
+    pictures = {
+        "photograph 512 px": photograph(512, 512),
+        "photograph 18 Mpx": photograph(5184, 3456),
+        "smooth 18 Mpx": natural_picture(5184, 3456),
+    }
+    for (name, picture), form in itertools.product(pictures.items(), FORMATS):
+        image = draw_samples(samples, picture)
+        usual = cv2.imencode(".png", image[..., ::-1])[1].size
+        size = len(encode_image(image, form, SHOT))
+        report(f"{form}, {name}, size", size / image.nbytes, "ratio", "the image in memory")
+        report(f"{form}, {name}, size", size / usual, "ratio", "PNG by cv2.imencode")
+        with ThreadPoolExecutor(2) as pool:
+            ours = partial(encode_image, image, form, SHOT)
+            calls: dict[str, Callable[[], object]] = {
+                "cv2": partial(cv2.imencode, ".png", image),
+                "ours": ours,
+                "two": partial(at_once, pool, [ours, ours]),
+            }
+            if form == "png":
+                calls["shared"] = partial(encode_png, image, SHOT, threads=2)
+            took = fastest(calls, REPEATS if picture.size > 10**7 else 20)
+        pixels = picture.size / 3e6
+        report(f"{form}, {name}, one thread", pixels / took["ours"], "Mpx/s")
+        report(f"{form}, {name}, one thread", took["cv2"] / took["ours"], "ratio", "PNG by cv2.imencode")
+        report(f"{form}, {name}, two threads", 2 * took["ours"] / took["two"], "ratio", "one thread")
+        if form == "png":
+            report(f"{form}, {name}, one image by two threads", took["ours"] / took["shared"], "ratio", "one thread")
+
+
+if __name__ == "__main__":
+    main()
