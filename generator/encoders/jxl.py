@@ -1,4 +1,4 @@
-"""JPEG XL (ISO/IEC 18181), lossless at its lowest effort: small files of smooth pictures; PNG does better on photographs.
+"""JPEG XL (ISO/IEC 18181), lossless at its lowest effort: small for smooth pictures; PNG is smaller for photographs.
 
 libjxl writes it; other versions may give other bytes. The shot is not told in it.
 """
