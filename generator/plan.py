@@ -12,7 +12,6 @@ import hashlib
 import importlib.metadata
 import json
 import re
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -293,8 +292,7 @@ def versions(form: Format, layout: Layout) -> dict[str, str]:
     names = ["numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "simplejpeg"]
     if layout == "parquet":
         names.append("pyarrow")
-    found = {name: importlib.metadata.version(name) for name in (*names, *libraries_of(form))}
-    return {**found, "zlib": zlib.ZLIB_RUNTIME_VERSION}
+    return {name: importlib.metadata.version(name) for name in (*names, *libraries_of(form))}
 
 
 def software() -> str:
