@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from acquisition.movement import Shift
 from acquisition.session import FrameRecord, Session
+from calibration.choices import Choices
 from calibration.darkness import DarkFigures, additivity, drift_gains
 from calibration.frames import (
     Progress,
@@ -42,7 +43,7 @@ from calibration.radiometry import Field, corrections
 from calibration.references import NAME as REFERENCES_FILE
 from calibration.references import references_csv
 from calibration.result import BuildResult, Growth
-from calibration.sampling import WINDOW
+from calibration.subtraction import DarkLight
 from calibration.tally import Tally
 from calibration.verdict import refusal
 from drivers.errors import FormatError, QualityError
@@ -53,15 +54,25 @@ REPORT_FILES = ("report.html", "report.json")
 CHECKPOINT_EVERY = 16
 """Frames from one checkpoint to the next: what a build that is killed has to do again."""
 
-METHOD = 3
+METHOD = 2
 """Raised when samples or ground truth come out otherwise than before, so that no table is made by two methods."""
+
+PLAIN = Choices()
+"""The paper's way: 25 samples, nothing subtracted but black."""
 
 _Array = npt.NDArray[np.float64]
 _Report = Callable[[BuildResult, Session, Path], None]
 
 
-def check(session: Session) -> BuildResult:
+def check(session: Session, choices: Choices = PLAIN) -> BuildResult:
     """Register a session's best frame and judge it; write nothing.
+
+    Parameters
+    ----------
+    session
+        The session.
+    choices
+        How the table would be made; a window that is too large is told.
 
     Raises
     ------
@@ -72,10 +83,11 @@ def check(session: Session) -> BuildResult:
     QualityError
         The white references cannot be used.
     """
+    _require_darks(session, choices)
     best = best_frame(session)
     decoded = decode(session, best)
-    work = Measurement(session.chart, decoded)
-    tally = Tally(session.chart, WINDOW**2, work.first)
+    work = Measurement(session.chart, decoded, choices.window)
+    tally = Tally(session.chart, choices.samples, work.first)
     measured = work.measure_first(decoded, work.first, Shift(0.0, 0.0, 0.0, 0), even=True)
     tally.add(measured)
     dark = next((record for record in session.frames() if record.kind == "dark" and record.accepted), None)
@@ -104,10 +116,17 @@ def check(session: Session) -> BuildResult:
         saturated=tally.saturated(decoded.saturation),
         noise=tally.noise(),
         white_references=len(session.chart.white_references),
+        window=choices.window,
     )
 
 
-def build(session: Session, out: Path, progress: Progress | None = None, report: _Report | None = None) -> BuildResult:
+def build(
+    session: Session,
+    out: Path,
+    progress: Progress | None = None,
+    report: _Report | None = None,
+    choices: Choices = PLAIN,
+) -> BuildResult:
     """Build the table of a session.
 
     Parameters
@@ -120,11 +139,14 @@ def build(session: Session, out: Path, progress: Progress | None = None, report:
         Told after every frame.
     report
         Writes the report into the table's folder before it gets its name; `calibration.report.write_report`.
+    choices
+        How the table is made.
 
     Raises
     ------
     FormatError
-        A light has no accepted frame, or a frame's file is missing or not what the journal says.
+        A light has no accepted frame, dark frames are lacking that are to be subtracted, or a frame's file is missing
+        or not what the journal says.
     RegistrationError
         The chart is not found, or not the one expected.
     QualityError
@@ -142,14 +164,19 @@ def build(session: Session, out: Path, progress: Progress | None = None, report:
             f"{session.folder}: {len(missing)} of {len(session.illuminations)} lights have no accepted frame: {named}; "
             "finish the session with acquire run, then build the table; or let it grow with build-lut --append"
         )
+    _require_darks(session, choices)
     with growing(out) as making:
-        work = _Work(session, making, chosen, progress or _silent)
+        work = _Work(session, making, chosen, progress or _silent, choices)
         work.take_in()
         return work.finish(out, report)
 
 
 def append(
-    session: Session, out: Path, progress: Progress | None = None, report: _Report | None = None
+    session: Session,
+    out: Path,
+    progress: Progress | None = None,
+    report: _Report | None = None,
+    choices: Choices = PLAIN,
 ) -> BuildResult | Growth:
     """Let the table of a session that is being taken grow by the frames that have come.
 
@@ -159,8 +186,9 @@ def append(
     chosen, missing = chosen_frames(session)
     # The plan of a session that was put together otherwise may be empty; its lights are the plan then.
     complete = not missing and {step.number for step in session.steps} <= session.done_steps()
+    _require_darks(session, choices)
     with growing(out) as making:
-        work = _Work(session, making, chosen, progress or _silent)
+        work = _Work(session, making, chosen, progress or _silent, choices)
         before = work.taken_in
         if complete:
             work.take_in()
@@ -176,13 +204,17 @@ def append(
 class _Work:
     """One table being made: what was taken in before, and what is to follow."""
 
-    def __init__(self, session: Session, making: Growing, chosen: Sequence[FrameRecord], told: Progress) -> None:
+    def __init__(
+        self, session: Session, making: Growing, chosen: Sequence[FrameRecord], told: Progress, choices: Choices
+    ) -> None:
         self._session, self._making, self._chosen, self._told = session, making, chosen, told
+        self._choices = choices
         self._best = best_frame(session)
         self._keys = [f"{record.kind},{record.illumination},{record.sha256}" for record in chosen]
         self._identity = {
             "software": _software(),
             "method": METHOD,
+            "choices": choices.told(),
             "chart": session.chart.sha256,
             "lights": hashlib.sha256(repr(session.illuminations).encode()).hexdigest(),
             "registered": self._best.sha256,
@@ -204,7 +236,7 @@ class _Work:
 
     def _open_writer(self) -> LutWriter:
         """Return the writer of the samples, in a folder that holds what the checkpoint tells and nothing else."""
-        shape = len(self._session.illuminations), self._session.chart.colour_count, WINDOW**2
+        shape = len(self._session.illuminations), self._session.chart.colour_count, self._choices.samples
         if self._before is not None:
             written = {int(light): known for light, known in self._before.told["sha256"].items()}
             writer = LutWriter(self._making.folder, *shape, written=written)
@@ -221,16 +253,20 @@ class _Work:
         self._told(0, len(self._chosen), "finding the chart")
         first = decode(session, self._best)
         self._camera = first.mosaic.camera
-        self._measurement = Measurement(chart, first)
+        self._measurement = Measurement(chart, first, self._choices.window)
         self._stretch = self._measurement.first
-        self._tally = Tally(chart, WINDOW**2, self._stretch)
+        self._tally = Tally(chart, self._choices.samples, self._stretch)
         self._limit = first.saturation
+        self._subtraction = self._measurement.subtraction()
+        self._dark: DarkLight | None = None
         # Held for no longer than it is needed: it is read again in its turn.
         del first
         if self._before is not None:
             self._recall(self._before)
         saved = len(self._figures)
-        for record, early in ahead(self._measured, self._chosen[saved:], _nothing_waits):
+        if self._choices.subtract_dark and self._dark is None:
+            self._dark = self._first_dark()
+        for record, early in ahead(self._measured, self._chosen[saved:], self._others_wait):
             self._take_in(record, early)
             if (len(self._figures) - saved) % CHECKPOINT_EVERY == 0:
                 self.save()
@@ -249,6 +285,18 @@ class _Work:
             adopted = next(record for record in self._chosen if record.file == told["stretch"])
             self._stretch = self._measurement.register(decode(self._session, adopted))
         self._tally.restore(before.arrays, self._darks)
+        self._subtraction.restore(before.arrays)
+        self._dark = self._subtraction.now
+
+    def _first_dark(self) -> DarkLight:
+        """Return what is subtracted from the frames before the first dark one: what that one tells."""
+        record = next(record for record in self._chosen if record.kind == "dark")
+        measured = self._measurement.measure_dark(decode(self._session, record), self._measurement.first)
+        return self._measurement.learn(self._measurement.subtraction(), measured)
+
+    def _others_wait(self, record: FrameRecord) -> bool:
+        """Return whether those after a frame need what is learnt from it."""
+        return self._choices.subtract_dark and record.kind == "dark"
 
     @property
     def _darks(self) -> list[DarkFigures]:
@@ -263,7 +311,7 @@ class _Work:
         stretch, decoded = self._stretch, decode(self._session, record)
         if record.kind == "dark":
             return self._measurement.measure_dark(decoded, stretch)
-        measured = self._measurement.measure(decoded, stretch, self._is_even(record))
+        measured = self._measurement.measure(decoded, stretch, self._is_even(record), self._dark)
         return None if isinstance(measured, Shift) else measured
 
     def _is_even(self, record: FrameRecord) -> bool:
@@ -278,10 +326,14 @@ class _Work:
             shift = self._measurement.measure(decoded, self._stretch, even=False)
             assert isinstance(shift, Shift)
             self._stretch = self._measurement.register(decoded)
-            measured = self._measurement.measure_first(decoded, self._stretch, shift, self._is_even(record))
+            self._subtraction.move()
+            even = self._is_even(record)
+            measured = self._measurement.measure_first(decoded, self._stretch, shift, even, self._dark)
         self._figures.append(measured.figures)
         if isinstance(measured, MeasuredDark):
             self._tally.add_dark(measured)
+            if self._choices.subtract_dark:
+                self._dark = self._measurement.learn(self._subtraction, measured)
             return
         self._tally.add(measured)
         self._limit = min(self._limit, measured.saturation)
@@ -297,7 +349,8 @@ class _Work:
             "figures": [figures.told() for figures in self._figures],
         }
         taken_in = self._keys[: len(self._figures)]
-        self._making.save(Checkpoint(self._identity, taken_in, told, self._tally.state()))
+        state = {**self._tally.state(), **self._subtraction.state()}
+        self._making.save(Checkpoint(self._identity, taken_in, told, state))
 
     def finish(self, out: Path, report: _Report | None) -> BuildResult:
         """Judge the table and give it its name."""
@@ -306,7 +359,7 @@ class _Work:
         self._told(len(self._figures), len(self._figures), "writing the report")
         white, error = np.zeros((len(lights), 3)), np.zeros((len(lights), 3))
         fields: list[Field | None] = [None] * len(lights)
-        blacks = np.zeros((len(lights), 2, 2))
+        blacks, subtracted, at_zero = np.zeros((len(lights), 2, 2)), np.zeros((len(lights), 3)), np.zeros(len(lights))
         greys, grey_errors = (np.full((len(lights), len(work.levels.names), 3), np.nan) for _ in range(2))
         for figures in frames:
             light = figures.record.illumination
@@ -315,7 +368,7 @@ class _Work:
                 white[light] = np.maximum(figures.paper.white, np.maximum(figures.paper.error, 1e-3))
                 error[light] = figures.paper.error
                 fields[light] = figures.paper.field
-                blacks[light] = figures.black
+                blacks[light], subtracted[light], at_zero[light] = figures.black, figures.dark, figures.at_zero
                 greys[light], grey_errors[light] = figures.greys, figures.grey_errors
         dark = tally.darkness
         gains, full_white = _drift(frames, len(lights))
@@ -342,10 +395,15 @@ class _Work:
             greys=greys,
             grey_errors=grey_errors,
             darkness=dark,
-            added=additivity(lights, white, full_white, dark.light, gains),
+            added=additivity(
+                lights, white, full_white, np.zeros(3) if self._choices.subtract_dark else dark.light, gains
+            ),
             gains=gains,
             transfer=work.transfer,
             saturated=tally.saturated(limit),
+            window=self._choices.window,
+            subtracted=subtracted if self._choices.subtract_dark else None,
+            at_zero=at_zero,
         )
         records = [figures.record for figures in self._figures]
         self._writer.finish(
@@ -362,6 +420,8 @@ class _Work:
                     [shape for shape in fields if shape],
                     measured=result.saturated,
                     gains=None if full_white is None else gains,
+                    subtracted=result.subtracted,
+                    at_zero=at_zero,
                 ),
                 session_sha256=session_sha256(records),
                 chart_sha256=chart.sha256,
@@ -382,8 +442,13 @@ class _Work:
         return result
 
 
-def _nothing_waits(record: FrameRecord) -> bool:
-    return False
+def _require_darks(session: Session, choices: Choices) -> None:
+    """Refuse to subtract what no frame tells."""
+    if choices.subtract_dark and not any(record.kind == "dark" and record.accepted for record in session.frames()):
+        raise FormatError(
+            f"{session.folder} has no accepted dark frame, and --subtract-dark takes the light to subtract from them; "
+            "take the session with acquire run, which takes dark frames, or build the table without --subtract-dark"
+        )
 
 
 def _software() -> str:

@@ -15,6 +15,7 @@ from drivers.errors import FormatError, InputError
 
 if TYPE_CHECKING:
     from acquisition.session import Session
+    from calibration.choices import Choices
     from calibration.result import BuildResult, Growth
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -35,7 +36,7 @@ def _version(asked: bool) -> None:
 
 @app.command(
     no_args_is_help=True,
-    help="Build the look-up table of a session: 25 samples of every colour under every light, and the ground truth.\n\n"
+    help="Build the look-up table of a session: samples of every colour under every light, and the ground truth.\n\n"
     "Reads SESSION (chart.json, illuminations.csv, journal.sqlite, frames/) and checks each frame's SHA-256. Finds the "
     "chart once, follows it if it moves, divides the light's unevenness out, and writes LUT: samples.npy, "
     "illuminations.csv with the ground truth, lut.json, frames.csv, report.html. LUT appears whole or not at all; a "
@@ -54,6 +55,20 @@ def build_lut(
     check: Annotated[bool, typer.Option("--check", help="Register and judge only; write nothing.")] = False,
     append: Annotated[
         bool, typer.Option("--append", help="Take in what has come of a session that is being taken.")
+    ] = False,
+    window: Annotated[
+        int | None,
+        typer.Option(
+            "--window", metavar="N", help="Pixels along the side of a cell's window: 3, 5, 7 or 9.  [default: 5]"
+        ),
+    ] = None,
+    subtract_dark: Annotated[
+        bool,
+        typer.Option(
+            "--subtract-dark",
+            help="Subtract the light of the dark frames, the projector's leak and the room's, from every sample and "
+            "from the ground truth.",
+        ),
     ] = False,
     info: Annotated[
         Path | None,
@@ -86,6 +101,12 @@ def build_lut(
     given = [name for name, value in asked.items() if value]
     if len(given) > 1:
         raise InputError(f"{' and '.join(given)} are two commands; give one of them")
+    made = {"--window": window is not None, "--subtract-dark": subtract_dark}
+    if (info or verify or match) and any(made.values()):
+        raise InputError(
+            f"{next(name for name, value in made.items() if value)} tells how a table is made, and {given[0]} reads "
+            "one; leave one of them out"
+        )
     if (lut if verify else session if info or match else None) is not None:
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
     if info is not None:
@@ -95,10 +116,12 @@ def build_lut(
     elif match is not None:
         _match(*match)
     else:
-        _make(session, lut, check, append)
+        from calibration.choices import Choices
+
+        _make(session, lut, check, append, Choices(5 if window is None else window, subtract_dark))
 
 
-def _make(session: Path | None, lut: Path | None, check: bool, append: bool) -> None:
+def _make(session: Path | None, lut: Path | None, check: bool, append: bool, choices: Choices) -> None:
     if check and lut is not None:
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
     if session is None:
@@ -111,9 +134,9 @@ def _make(session: Path | None, lut: Path | None, check: bool, append: bool) -> 
         if lut is None:
             from calibration.build import check as judge
 
-            result = judge(opened)
+            result = judge(opened, choices)
         else:
-            result = _build(opened, lut, append)
+            result = _build(opened, lut, append, choices)
     from calibration.result import Growth
 
     if isinstance(result, Growth):
@@ -130,12 +153,12 @@ def _make(session: Path | None, lut: Path | None, check: bool, append: bool) -> 
         raise QualityError(f"{result.session}: {refusal(verdict, result)}")
 
 
-def _build(opened: Session, lut: Path, growing: bool) -> BuildResult | Growth:
+def _build(opened: Session, lut: Path, growing: bool, choices: Choices) -> BuildResult | Growth:
     from calibration.build import append, build
     from calibration.report import write_report
 
     with _bar("finding the chart") as told:
-        return (append if growing else build)(opened, lut, told, write_report)
+        return (append if growing else build)(opened, lut, told, write_report, choices)
 
 
 def _tell_table(folder: Path) -> None:

@@ -3,7 +3,8 @@
 Laws that hold inside:
 
 - Leak and ambient light cannot be told apart and are one figure, read on bare paper in the dark frames.
-- They are part of every light: samples and ground truth hold them alike, so nothing is subtracted unless asked for.
+- They are part of every light: samples and ground truth hold them alike, so nothing is subtracted unless asked for
+  (`calibration.subtraction`).
 - A photosite is hot when it stands out in every dark frame; what stands out once is a cosmic ray.
 """
 
@@ -47,6 +48,8 @@ class Darkness:
         (3,) float64 counts, standard deviation of a sample: read noise, of green that of the mean of two photosites.
     hottest
         (C,) float64 counts, how far the hottest sample of each cell stands out in every frame; 0 where it does not.
+    lights
+        (3,) float64 counts on bare paper, of each frame.
     """
 
     files: tuple[str, ...] = ()
@@ -55,6 +58,7 @@ class Darkness:
     blacks: tuple[_Array, ...] = ()
     noise: _Array = field(default_factory=lambda: np.full(3, np.nan))
     hottest: _Array = field(default_factory=lambda: np.zeros(0))
+    lights: tuple[_Array, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +185,7 @@ def darkness(frames: Sequence[DarkFigures], hot: HotSamples) -> Darkness:
         tuple(dark.black for dark in frames),
         noise,
         hot.hottest(noise),
+        tuple(dark.light for dark in frames),
     )
 
 

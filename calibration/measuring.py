@@ -23,12 +23,12 @@ from acquisition.planes import CHANNELS, Channel, Plane, channel_offset_px, phas
 from acquisition.session import FrameRecord
 from calibration.darkness import DarkFigures, read_dark
 from calibration.frames import Decoded
-from calibration.likeness import Expectation, Likeness
 from calibration.noise import PhotonTransfer, photon_transfer
 from calibration.radiometry import CLIPPED, Field, Paper, PaperReader
 from calibration.references import Levels
 from calibration.registration import Registration, register
 from calibration.sampling import WINDOW, Sites, gather, gather_values, noise_of, sites_at, table_values
+from calibration.subtraction import DarkLight, Subtraction, quiet_means, reflectances
 from drivers.errors import FormatError
 from drivers.rawfile import Mosaic
 
@@ -58,10 +58,12 @@ class FrameFigures:
         Whether this frame was registered anew.
     paper
         Field and white.
-    likeness
-        How like the print, as it was first registered, the frame is.
     greys, grey_errors
         (G, 3) float64 counts above black of each level of grey, field divided out, and their standard errors.
+    dark
+        (3,) float64 counts, dark light of bare paper that was subtracted; zeros where none was.
+    at_zero
+        Share of the table's samples that are 0.
     """
 
     record: FrameRecord
@@ -70,9 +72,10 @@ class FrameFigures:
     shift: Shift
     registered: bool
     paper: Paper
-    likeness: Likeness
     greys: _Array = field(default_factory=lambda: np.zeros((0, 3)))
     grey_errors: _Array = field(default_factory=lambda: np.zeros((0, 3)))
+    dark: _Array = field(default_factory=lambda: np.zeros(3))
+    at_zero: float = 0.0
 
     def told(self) -> dict[str, Any]:
         """Return the figures as JSON holds them; `recall` makes them again to the last bit."""
@@ -86,9 +89,10 @@ class FrameFigures:
             "error": self.paper.error.tolist(),
             "references": self.paper.references,
             "spread": self.paper.spread.tolist(),
-            "likeness": [self.likeness.scatter, self.likeness.block, *self.likeness.at_mm],
             "greys": self.greys.tolist(),
             "grey_errors": self.grey_errors.tolist(),
+            "dark": self.dark.tolist(),
+            "at_zero": self.at_zero,
         }
 
     @staticmethod
@@ -97,7 +101,6 @@ class FrameFigures:
         red, green, blue = (tuple(np.array(factor) for factor in factors) for factors in told["field"])
         field = Field(page_mm, (red, green, blue))
         white, error, spread = (np.array(told[name]) for name in ("white", "error", "spread"))
-        scatter, block, x_mm, y_mm = told["likeness"]
         return FrameFigures(
             record,
             np.array(told["black"]),
@@ -105,8 +108,10 @@ class FrameFigures:
             Shift(*told["shift"]),
             told["registered"],
             Paper(field, white, error, told["references"], spread),
-            Likeness(scatter, block, (x_mm, y_mm)),
-            *(np.array(told[name]).reshape(-1, 3) for name in ("greys", "grey_errors")),
+            np.array(told["greys"]).reshape(-1, 3),
+            np.array(told["grey_errors"]).reshape(-1, 3),
+            np.array(told["dark"]),
+            told["at_zero"],
         )
 
 
@@ -143,8 +148,8 @@ class Measured:
     ----------
     figures
         For the report, the ground truth and the field.
-    stretch
-        What it was measured with.
+    stretch, dark
+        What it was measured with, and what was subtracted.
     saturation
         Raw count of saturation, as far as this frame tells.
     values
@@ -159,6 +164,7 @@ class Measured:
 
     figures: FrameFigures
     stretch: Stretch
+    dark: DarkLight | None
     saturation: int
     values: npt.NDArray[np.uint16]
     highest: npt.NDArray[np.uint16]
@@ -169,11 +175,24 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredDark:
-    """A dark frame as measured: its figures, with what, and how far samples (C, S, 3) stand above their cells."""
+    """A dark frame as measured.
+
+    Attributes
+    ----------
+    figures
+        What it says.
+    stretch
+        What it was measured with.
+    aside
+        (C, S, 3) int16, how far samples stand above their cells.
+    means
+        (P, 3) float64 mean counts of cells, then references.
+    """
 
     figures: DarkFigures
     stretch: Stretch
     aside: npt.NDArray[np.int16]
+    means: _Array
 
 
 def tags_of(mosaic: Mosaic, channel: Channel, black: _Array, framing: Framing) -> Plane:
@@ -210,6 +229,7 @@ class Measurement:
         self.levels = Levels.of(greys)
         self._white_mm = np.array([reference.centre_mm for reference in whites]).reshape(-1, 2)
         self._grey_mm = np.array([reference.centre_mm for reference in greys]).reshape(-1, 2)
+        self._references_mm = np.concatenate([self._white_mm, self._grey_mm])
         # The table is ordered by colour index, the chart by its own order.
         self.cells_mm = chart.centres_mm[chart.cell_of_colour]
         self._shape = first.mosaic.block_planes().shape[2:]
@@ -222,11 +242,9 @@ class Measurement:
         self._paper = PaperReader(self._white_mm, self.cells_mm, chart.page_mm, base)
         self._base_at_whites = base.at(self._white_mm)
         cells = gather(first.mosaic, first.black, self.first.cells)[0].astype(np.float64)
-        level = cells.mean(axis=1)
-        self.transfer: PhotonTransfer = photon_transfer(level, cells.var(axis=1, ddof=1), window**2)
-        there = self.first.cells.inside & ~self.first.registration.strangers[chart.cell_of_colour]
-        codes = chart.rgb[chart.cell_of_colour]
-        self._expected = Expectation(codes, self.cells_mm, level / base.at(self.cells_mm), there)
+        self.transfer: PhotonTransfer = photon_transfer(cells.mean(axis=1), cells.var(axis=1, ddof=1), window**2)
+        self._first_means = np.concatenate([cells.mean(axis=1), samples.mean(axis=1, dtype=np.float64)])
+        self._first_seen = seen
 
     def register(self, decoded: Decoded) -> Stretch:
         """Find the chart in a frame, which begins a stretch."""
@@ -240,13 +258,37 @@ class Measurement:
     def _sites(self, registration: Registration) -> tuple[Sites, Sites]:
         """Return the sites of the cells and of the references."""
         height, width = self._shape
-        groups = self.cells_mm, np.concatenate([self._white_mm, self._grey_mm])
+        groups = self.cells_mm, self._references_mm
         cells, references = (
             sites_at(registration.to_pixels(places), (height, width), self._window) for places in groups
         )
         return cells, references
 
-    def measure(self, decoded: Decoded, stretch: Stretch, even: bool) -> Measured | Shift:
+    def subtraction(self) -> Subtraction:
+        """Return what learns the dark light, with the reflectances that the first frame shows."""
+        paper, shape = self._paper.read(self._first_seen, self._first_file)
+        field = np.concatenate([shape, paper.field.at(self._references_mm)])
+        inside = np.concatenate([self.first.cells.inside, self.first.references.inside])
+        return Subtraction(reflectances(self._first_means, field, paper.white), inside, self._window**2)
+
+    def learn(self, subtraction: Subtraction, measured: MeasuredDark) -> DarkLight:
+        """Take a dark frame into a subtraction.
+
+        Raises
+        ------
+        QualityError
+            The white references cannot be used.
+        """
+        cells = len(self.cells_mm)
+        inside = measured.stretch.references.inside[: len(self._white_mm), None]
+        seen = np.where(inside, measured.means[cells:][: len(self._white_mm)], np.nan)
+        paper, shape = self._paper.read(seen, measured.figures.record.file)
+        field = np.concatenate([shape, paper.field.at(self._references_mm)])
+        return subtraction.add(measured.means, measured.figures.noise, paper, field)
+
+    def measure(
+        self, decoded: Decoded, stretch: Stretch, even: bool, dark: DarkLight | None = None
+    ) -> Measured | Shift:
         """Return what a frame says; its movement alone, if that is such that it has to be registered anew.
 
         Parameters
@@ -257,6 +299,8 @@ class Measurement:
             What holds for it.
         even
             Whether its samples are wanted, for what is learnt from frames of even light.
+        dark
+            What is subtracted from samples and references; nothing if not given.
 
         Raises
         ------
@@ -277,11 +321,13 @@ class Measurement:
         cells, references = stretch.cells, stretch.references
         if shift.length_px > STILL_PX:
             cells, references = self._sites(stretch.registration.shifted(shift.dx, shift.dy))
-        return self._measured(decoded, stretch, cells, references, shift, even)
+        return self._measured(decoded, stretch, cells, references, shift, even, dark)
 
-    def measure_first(self, decoded: Decoded, stretch: Stretch, shift: Shift, even: bool) -> Measured:
+    def measure_first(
+        self, decoded: Decoded, stretch: Stretch, shift: Shift, even: bool, dark: DarkLight | None = None
+    ) -> Measured:
         """Return what the frame says that has begun a stretch, `shift` after the one before; else as `measure`."""
-        return self._measured(decoded, stretch, stretch.cells, stretch.references, shift, even, registered=True)
+        return self._measured(decoded, stretch, stretch.cells, stretch.references, shift, even, dark, registered=True)
 
     def measure_dark(self, decoded: Decoded, stretch: Stretch) -> MeasuredDark:
         """Return what a dark frame says; no tag is seen in it, so the chart is taken to lie where it did."""
@@ -292,7 +338,8 @@ class Measurement:
         figures, aside = read_dark(
             decoded.record, decoded.black, cells, references[whites], self._base_at_whites[whites]
         )
-        return MeasuredDark(figures, stretch, aside)
+        means = np.concatenate([quiet_means(patches, figures.noise) for patches in (cells, references)])
+        return MeasuredDark(figures, stretch, aside, means)
 
     def _require_geometry(self, decoded: Decoded) -> None:
         mosaic = decoded.mosaic
@@ -312,25 +359,37 @@ class Measurement:
         references: Sites,
         shift: Shift,
         even: bool,
+        dark: DarkLight | None,
         registered: bool = False,
     ) -> Measured:
         samples, highest = gather(decoded.mosaic, decoded.black, references)
         seen = _means(samples, highest, references, decoded.saturation)
+        count = len(self.cells_mm)
+        if dark is not None:
+            seen -= dark.patches[count:]
+        dark_cells = None if dark is None else dark.patches[:count]
         whites = len(self._white_mm)
         paper, shape = self._paper.read(seen[:whites], decoded.record.file)
         greys, grey_errors = self.levels.read(seen[whites:], paper.field.at(self._grey_mm))
         if even:
             kept, highest = gather(decoded.mosaic, decoded.black, cells)
-            values, noise = table_values(kept, shape), noise_of(kept)
+            values, noise = table_values(kept, shape, dark_cells), noise_of(kept)
         else:
-            values, highest = gather_values(decoded.mosaic, decoded.black, cells, shape)
+            values, highest = gather_values(decoded.mosaic, decoded.black, cells, shape, dark_cells)
             kept = noise = None
-        mean = values[self._expected.cells].mean(axis=1, dtype=np.float64)
-        likeness = self._expected.held_against(mean, self.transfer.variance(mean) / self._window**2)
         figures = FrameFigures(
-            decoded.record, decoded.black, decoded.strongest, shift, registered, paper, likeness, greys, grey_errors
+            decoded.record,
+            decoded.black,
+            decoded.strongest,
+            shift,
+            registered,
+            paper,
+            greys,
+            grey_errors,
+            np.zeros(3) if dark is None else dark.paper,
+            1 - int(np.count_nonzero(values)) / values.size,
         )
-        return Measured(figures, stretch, decoded.saturation, values, highest, cells.inside, kept, noise)
+        return Measured(figures, stretch, dark, decoded.saturation, values, highest, cells.inside, kept, noise)
 
 
 def _means(samples: npt.NDArray[np.float32], highest: npt.NDArray[np.uint16], sites: Sites, saturation: int) -> _Array:

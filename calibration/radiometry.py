@@ -267,6 +267,8 @@ def corrections(
     *,
     measured: bool = False,
     gains: _Array | None = None,
+    subtracted: _Array | None = None,
+    at_zero: _Array | None = None,
 ) -> list[dict[str, Any]]:
     """Return what was done to the counts, in order, for `lut.json`.
 
@@ -284,6 +286,10 @@ def corrections(
         Whether saturation was seen, rather than stated by the raw file.
     gains
         (L, 3) the lamp's drift at each light; None where no white frame tells.
+    subtracted
+        (L, 3) dark light of bare paper that was subtracted; None where none was to be.
+    at_zero
+        (L,) share of each light's samples that are 0; None where it was not counted.
     """
     done: list[dict[str, Any]] = [
         {
@@ -297,6 +303,7 @@ def corrections(
             "name": "half size",
             "how": "R, mean of both G, B of each 2x2 block; nothing interpolated",
         },
+        *([] if subtracted is None else [_dark_correction(subtracted)]),
         {
             "name": "saturation",
             "how": f"cells with a count of {CLIPPED:g} of it or more are unfit",
@@ -316,7 +323,12 @@ def corrections(
             "page_mm": list(page_mm),
             "per_light": [field.parameters() for field in fields],
         },
-        {"name": "rounding", "how": "to the nearest integer, negative values to 0"},
+        {
+            "name": "rounding",
+            "how": "to the nearest integer, negative values to 0, which lifts the mean of cells as dark as their "
+            "noise, by 0.4 standard deviations of a sample at most; the ground truth is neither rounded nor cut",
+            **({} if at_zero is None else {"share_at_zero": np.round(at_zero, 6).tolist()}),
+        },
     ]
     if gains is not None:
         done.append(
@@ -329,3 +341,15 @@ def corrections(
             }
         )
     return done
+
+
+def _dark_correction(subtracted: _Array) -> dict[str, Any]:
+    return {
+        "name": "dark",
+        "how": "subtracted from samples, ground truth and references before the field is divided out: the light of the "
+        "last dark frame before (projector's leak and the room's), which is at a patch that of bare paper times the "
+        "dark frame's field times the patch's reflectance under white, corrected by what patches show beyond that in "
+        "the dark frames so far, as far as it is more than noise; here that of bare paper, field divided out",
+        "unit": "counts",
+        "per_light": np.round(subtracted, 4).tolist(),
+    }

@@ -28,9 +28,9 @@ from calibration.mosaic import half_size
 from calibration.radiometry import MAX_BLACK_DRIFT
 from calibration.registration import Registration
 from calibration.result import BuildResult
-from calibration.sampling import WINDOW, noise_of
+from calibration.sampling import noise_of, rim_against_middle, sites_at
 from calibration.stains import Stains
-from calibration.verdict import Judged, Verdict, grey_tints_deg, report_json, shown
+from calibration.verdict import Judged, Verdict, bleed, grey_tints_deg, largest_window, report_json, shown
 from drivers.rawfile import read_raw
 from drivers.storage import write_whole
 
@@ -63,7 +63,11 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
     black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
     seen = f"seen by the {result.camera}"
     figures = [
-        ("The chart as registered", _grid_caption(result), _drawn(_grid, picture, chart, result.registration)),
+        (
+            "The chart as registered",
+            _grid_caption(result),
+            _drawn(_grid, picture, chart, result.registration, result.window),
+        ),
         (
             "What the registration leaves",
             "Left: how far the cells moved the map from what the tags and the lens alone say, which is the paper's "
@@ -98,8 +102,8 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
         (
             "The worst cells",
             f"The {_WORST} cells whose rim and middle differ most under white, in standard deviations, each between "
-            "its neighbours; the frame is the 25 samples.",
-            _drawn(_worst, picture, chart, result.registration),
+            "its neighbours; the frame is the samples.",
+            _drawn(_worst, picture, chart, result.registration, result.window),
         ),
     ]
     write_whole(folder / NAME, _page(result, figures))
@@ -190,6 +194,7 @@ def summary(result: BuildResult) -> list[tuple[str, str, str]]:
         ("Frame registered", result.registered_file, ""),
         ("Tags found", f"{tags} of {tags + len(registration.framing.missing)}", ""),
         ("Cell", f"{registration.cell_px:.1f} px", "at least 8 for 25 pixels inside it"),
+        ("Window", f"{result.window}×{result.window} samples", _window_note(result)),
         ("Blur", f"σ {registration.blur_px:.2f} px", "about 0.6 is sharp"),
         ("Tags' corners", f"{registration.tag_rms_px:.3f} px RMS", "0.09 is the detector's own error"),
         ("Waviness", f"{registration.lens_residual_px:.2f} px RMS", "of the tags against a plane seen through a lens"),
@@ -218,6 +223,15 @@ def _percents(values: npt.NDArray[np.floating]) -> str:
 def _light_figures(result: BuildResult) -> list[tuple[str, str, str]]:
     """Return what dark frames, primaries, greys and noise say."""
     told: list[tuple[str, str, str]] = []
+    if len(result.at_zero):
+        worst = int(np.argmax(result.at_zero))
+        told.append(
+            (
+                "Samples at 0",
+                f"{result.at_zero.mean():.3%}, {result.at_zero[worst]:.2%} under light {worst}",
+                "no light within the noise; what was below is cut, and the mean of such cells a little high",
+            )
+        )
     white = [figures.paper.white for figures in result.frames if figures.record.kind == "white"]
     dark = result.darkness
     if dark.files and white:
@@ -227,7 +241,8 @@ def _light_figures(result: BuildResult) -> list[tuple[str, str, str]]:
             (
                 "Light while black is shown",
                 f"{counts} counts, {share} of white",
-                f"leak and ambient light on bare paper, {len(dark.files)} dark frames; not subtracted",
+                f"leak and ambient light on bare paper, {len(dark.files)} dark frames; "
+                + ("not subtracted" if result.subtracted is None else "subtracted from samples and ground truth"),
             )
         )
     if result.added is not None:
@@ -252,10 +267,21 @@ def _light_figures(result: BuildResult) -> list[tuple[str, str, str]]:
     return told
 
 
+def _window_note(result: BuildResult) -> str:
+    """Return what windows the cells allow."""
+    registration = result.registration
+    largest = largest_window(registration.cell_px, registration.blur_px)
+    share = bleed(registration.cell_px, registration.blur_px, result.window)
+    if result.window > largest:
+        allowed = f"{largest}×{largest} would stay below" if largest else "no window stays below"
+        return f"larger than these cells allow: {share:.2g} of the worst sample's light is from beyond; {allowed} 0.2 %"
+    return f"up to {largest}×{largest} at most 0.2 % of a sample's light is from beyond its cell"
+
+
 def _grid_caption(result: BuildResult) -> str:
     return (
         f"{result.registered_file}, contrast stretched, with the tags as found; below, magnified: the outline of "
-        "every cell and the pixels of its 25 samples, in the corners and in the middle."
+        f"every cell and the pixels of its {result.window**2} samples, in the corners and in the middle."
     )
 
 
@@ -292,7 +318,7 @@ def _stretched(picture: _Image) -> _Image:
     return np.clip(picture / white, 0, 1).astype(np.float32) ** np.float32(1 / 2.2)
 
 
-def _grid(figure: Any, picture: _Image, chart: Chart, registration: Registration) -> None:
+def _grid(figure: Any, picture: _Image, chart: Chart, registration: Registration, window: int) -> None:
     height, width = picture.shape[:2]
     figure.set_size_inches(10, 10 * height / width + 2.4)
     whole, crops = figure.subfigures(2, 1, height_ratios=(10 * height / width, 2.4))
@@ -323,7 +349,7 @@ def _grid(figure: Any, picture: _Image, chart: Chart, registration: Registration
     for axes, (name, spot) in zip(crops.subplots(1, len(spots)), spots, strict=True):
         nearest = int(((chart.centres_mm - np.asarray(spot)) ** 2).sum(axis=1).argmin())
         middle = places[nearest]
-        _magnified(axes, shown, middle, reach, chart, registration, places)
+        _magnified(axes, shown, middle, reach, chart, registration, places, window)
         axes.set_title(name)
 
 
@@ -350,6 +376,7 @@ def _magnified(
     chart: Chart,
     registration: Registration,
     places: _Array,
+    window: int,
 ) -> None:
     """Draw part of the frame with the outlines of cells and of their samples."""
     height, width = shown.shape[:2]
@@ -366,7 +393,7 @@ def _magnified(
         outline = registration.to_pixels(chart.centres_mm[cell] + corner)
         axes.plot(outline[:, 0], outline[:, 1], color="white", linewidth=0.6)
         x, y = np.rint(places[cell])
-        half = WINDOW / 2
+        half = window / 2
         axes.plot(
             x + half * np.array([-1, 1, 1, -1, -1]), y + half * np.array([-1, -1, 1, 1, -1]), color=_MARK, linewidth=0.8
         )
@@ -520,26 +547,21 @@ def _course(figure: Any, result: BuildResult) -> None:
     white.set(title="bare paper under white", ylabel="% of the first", xlabel="frame")
 
 
-def _worst(figure: Any, picture: _Image, chart: Chart, registration: Registration) -> None:
+def _worst(figure: Any, picture: _Image, chart: Chart, registration: Registration, window: int) -> None:
     figure.set_size_inches(10, 3.1)
     height, width = picture.shape[:2]
     places = registration.to_pixels(chart.centres_mm)
-    reach = WINDOW // 2
-    columns, rows = np.rint(places).astype(int).T
-    inside = (columns >= reach) & (rows >= reach) & (columns < width - reach) & (rows < height - reach)
-    offsets = np.arange(-reach, reach + 1)
-    at = np.flatnonzero(inside)
-    samples = picture[rows[at, None, None] + offsets[:, None], columns[at, None, None] + offsets]
-    samples = samples.reshape(len(at), WINDOW * WINDOW, 3)
-    inner = np.zeros((WINDOW, WINDOW), dtype=bool)
-    inner[1:-1, 1:-1] = True
-    difference = np.abs(samples[:, inner.ravel()].mean(axis=1) - samples[:, ~inner.ravel()].mean(axis=1))
-    sigma = noise_of(samples) * np.sqrt(1 / 9 + 1 / 16)
+    sites = sites_at(places, (height, width), window)
+    offsets = np.arange(window) - window // 2
+    at = np.flatnonzero(sites.inside)
+    samples = picture[sites.rows[at, None, None] + offsets[:, None], sites.columns[at, None, None] + offsets]
+    samples = samples.reshape(len(at), window**2, 3)
+    difference, sigma = rim_against_middle(samples, noise_of(samples))
     score = (difference / np.maximum(sigma, 1e-6)).max(axis=1)
     shown = _stretched(picture)
     order = np.argsort(-score)[:_WORST]
     for axes, index in zip(figure.subplots(2, _WORST // 2).ravel(), order, strict=False):
         cell = int(at[index])
-        _magnified(axes, shown, places[cell], 0.95 * registration.cell_px, chart, registration, places)
+        _magnified(axes, shown, places[cell], 0.95 * registration.cell_px, chart, registration, places, window)
         red, green, blue = chart.rgb[cell]
         axes.set_title(f"{red} {green} {blue}\n{score[index]:.1f} σ", fontsize=8)

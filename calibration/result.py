@@ -14,6 +14,7 @@ from calibration.measuring import FrameFigures
 from calibration.noise import PhotonTransfer
 from calibration.radiometry import black_drift
 from calibration.registration import Registration
+from calibration.sampling import WINDOW
 from calibration.stains import Stains
 from calibration.verdict import Verdict, figures_of, judge
 
@@ -66,6 +67,12 @@ class BuildResult:
         Noise of the cells of the frame that was registered first.
     saturated
         Whether a photosite of a cell reached saturation, so that its count was measured.
+    window
+        Pixels along the side of a cell's window.
+    subtracted
+        (L, 3) dark light of bare paper that was subtracted from each light; None where none was to be.
+    at_zero
+        (L,) share of each light's samples that are 0 in the table.
     """
 
     session: Path
@@ -90,6 +97,9 @@ class BuildResult:
     gains: _Array = field(default_factory=lambda: np.ones((0, 3)))
     transfer: PhotonTransfer | None = None
     saturated: bool = False
+    window: int = WINDOW
+    subtracted: _Array | None = None
+    at_zero: _Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def verdict(self) -> Verdict:

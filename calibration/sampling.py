@@ -183,6 +183,16 @@ def _inner(samples: int) -> npt.NDArray[np.bool_]:
     return inner.ravel()
 
 
+def rim_against_middle(
+    samples: npt.NDArray[np.floating], noise: npt.NDArray[np.floating]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return by how much rim and middle of patches differ (N, 3), and the standard deviation of that; as `uneven`."""
+    inner = _inner(samples.shape[1])
+    middle = samples[:, inner].mean(axis=1, dtype=np.float64)
+    rim = samples[:, ~inner].mean(axis=1, dtype=np.float64)
+    return np.abs(rim - middle), noise * np.sqrt(1 / inner.sum() + 1 / (~inner).sum())
+
+
 def uneven(samples: npt.NDArray[np.floating], noise: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Return how uneven patches are: the largest significant difference of rim and middle, relative, 0 where none is.
 
@@ -202,11 +212,7 @@ def uneven(samples: npt.NDArray[np.floating], noise: npt.NDArray[np.floating]) -
     ndarray
         (N,) float64.
     """
-    inner = _inner(samples.shape[1])
-    middle = samples[:, inner].mean(axis=1, dtype=np.float64)
-    rim = samples[:, ~inner].mean(axis=1, dtype=np.float64)
-    difference = np.abs(rim - middle)
-    sigma = noise * np.sqrt(1 / inner.sum() + 1 / (~inner).sum())
+    difference, sigma = rim_against_middle(samples, noise)
     level = np.maximum(samples.mean(axis=1, dtype=np.float64), 1e-6)
     significant = (difference > UNEVEN_SIGMA * sigma) & (difference > UNEVEN_SHARE * level)
     return np.where(significant, difference / level, 0.0).max(axis=1)

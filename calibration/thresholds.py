@@ -83,9 +83,9 @@ THRESHOLDS: tuple[Threshold, ...] = (
     ),
     Threshold(
         "bleed", "Neighbours' light in the worst sample", "share", "at most", 0.005, 0.03,
-        "the outermost of 25 pixels sees the neighbouring cells through the lens's blur",
+        "the outermost of the window's pixels sees the neighbouring cells through the lens's blur",
         "normal integral beyond the cell's edge at 0.75 px misplacement; 0.2 % is a sharp lens at 10 px a cell",
-        "focus on the print, stop down to f/8, bring the camera nearer",
+        "focus on the print, stop down to f/8, bring the camera nearer, or take a smaller window (build-lut --window)",
     ),
     Threshold(
         "tag_residual_px", "Tags against plane and lens", "px RMS", "at most", 2.5, MAX_TAG_RESIDUAL_PX,
@@ -121,18 +121,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
         SIMULATED + ": none on a clean flat print", "clean the print, hang it flatter, and look for shadows on it",
     ),
     Threshold(
-        "unlike_scatter", "Cells about what their codes give, worst frame", "share", "at most", 0.012, 0.03,
-        "the frame is out of focus, or shows another print: its samples are not its colours'",
-        SIMULATED + ": to 0.8 % without noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
-        "see that nothing changes during the session",
-    ),
-    Threshold(
-        "unlike_block", "Worst part of the print in the worst frame", "share", "at most", 0.01, 0.03,
-        "a hand, a shadow or a reflection lay on the print in that frame, and its samples hold it",
-        SIMULATED + ": to 0.4 % beyond noise",
-        "see that nobody comes between lamp, print and camera",
-    ),
-    Threshold(
         "moved_anew", "Frames registered anew", "", "at most", 0, None,
         "the chart or the camera moved between frames; the grid followed", JUDGEMENT, _STILL,
     ),
@@ -154,7 +142,13 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold(
         "leak_share", "Light while the projector shows black, of white", "share", "at most", 0.005, 0.1,
         "every light holds this much of the projector's leak and the room's light, so that deep colours are paler",
-        JUDGEMENT + "; a contrast of 1 : 1500 leaks 0.07 %", "darken the room, and cover lamps and displays",
+        JUDGEMENT + "; a contrast of 1 : 1500 leaks 0.07 %",
+        "darken the room, cover lamps and displays, or have it subtracted (build-lut --subtract-dark)",
+    ),
+    Threshold(
+        "dark_drift", "Change of that light between dark frames, of white", "share", "at most", 0.002, 0.05,
+        "the room's light changes; what is subtracted, or part of each light, is not what was there",
+        JUDGEMENT + ": a hundredth of a cell of a fifth of white", "darken the room, and keep daylight out",
     ),
     Threshold(
         "additivity", "White against the sum of the primaries", "share", "at most", 0.02, None,
