@@ -23,6 +23,7 @@ from acquisition.planes import CHANNELS, Channel, Plane, channel_offset_px, phas
 from acquisition.session import FrameRecord
 from calibration.darkness import DarkFigures, read_dark
 from calibration.frames import Decoded
+from calibration.likeness import Expectation, Likeness
 from calibration.noise import PhotonTransfer, photon_transfer
 from calibration.radiometry import CLIPPED, Field, Paper, PaperReader
 from calibration.references import Levels
@@ -58,6 +59,8 @@ class FrameFigures:
         Whether this frame was registered anew.
     paper
         Field and white.
+    likeness
+        How like the print, as it was first registered, the frame is.
     greys, grey_errors
         (G, 3) float64 counts above black of each level of grey, field divided out, and their standard errors.
     dark
@@ -72,6 +75,7 @@ class FrameFigures:
     shift: Shift
     registered: bool
     paper: Paper
+    likeness: Likeness
     greys: _Array = field(default_factory=lambda: np.zeros((0, 3)))
     grey_errors: _Array = field(default_factory=lambda: np.zeros((0, 3)))
     dark: _Array = field(default_factory=lambda: np.zeros(3))
@@ -89,6 +93,7 @@ class FrameFigures:
             "error": self.paper.error.tolist(),
             "references": self.paper.references,
             "spread": self.paper.spread.tolist(),
+            "likeness": [self.likeness.scatter, self.likeness.block, *self.likeness.at_mm],
             "greys": self.greys.tolist(),
             "grey_errors": self.grey_errors.tolist(),
             "dark": self.dark.tolist(),
@@ -101,6 +106,7 @@ class FrameFigures:
         red, green, blue = (tuple(np.array(factor) for factor in factors) for factors in told["field"])
         field = Field(page_mm, (red, green, blue))
         white, error, spread = (np.array(told[name]) for name in ("white", "error", "spread"))
+        scatter, block, x_mm, y_mm = told["likeness"]
         return FrameFigures(
             record,
             np.array(told["black"]),
@@ -108,6 +114,7 @@ class FrameFigures:
             Shift(*told["shift"]),
             told["registered"],
             Paper(field, white, error, told["references"], spread),
+            Likeness(scatter, block, (x_mm, y_mm)),
             np.array(told["greys"]).reshape(-1, 3),
             np.array(told["grey_errors"]).reshape(-1, 3),
             np.array(told["dark"]),
@@ -242,9 +249,13 @@ class Measurement:
         self._paper = PaperReader(self._white_mm, self.cells_mm, chart.page_mm, base)
         self._base_at_whites = base.at(self._white_mm)
         cells = gather(first.mosaic, first.black, self.first.cells)[0].astype(np.float64)
-        self.transfer: PhotonTransfer = photon_transfer(cells.mean(axis=1), cells.var(axis=1, ddof=1), window**2)
-        self._first_means = np.concatenate([cells.mean(axis=1), samples.mean(axis=1, dtype=np.float64)])
+        level = cells.mean(axis=1)
+        self.transfer: PhotonTransfer = photon_transfer(level, cells.var(axis=1, ddof=1), window**2)
+        self._first_means = np.concatenate([level, samples.mean(axis=1, dtype=np.float64)])
         self._first_seen = seen
+        there = self.first.cells.inside & ~self.first.registration.strangers[chart.cell_of_colour]
+        codes = chart.rgb[chart.cell_of_colour]
+        self._expected = Expectation(codes, self.cells_mm, level / base.at(self.cells_mm), there)
 
     def register(self, decoded: Decoded) -> Stretch:
         """Find the chart in a frame, which begins a stretch."""
@@ -377,6 +388,8 @@ class Measurement:
         else:
             values, highest = gather_values(decoded.mosaic, decoded.black, cells, shape, dark_cells)
             kept = noise = None
+        mean = values[self._expected.cells].mean(axis=1, dtype=np.float64)
+        likeness = self._expected.held_against(mean, self.transfer.variance(mean) / self._window**2)
         figures = FrameFigures(
             decoded.record,
             decoded.black,
@@ -384,6 +397,7 @@ class Measurement:
             shift,
             registered,
             paper,
+            likeness,
             greys,
             grey_errors,
             np.zeros(3) if dark is None else dark.paper,

@@ -48,6 +48,11 @@ class PhotonTransfer:
     ratio: _Array
     allowed: float
 
+    def variance(self, level: _Array) -> _Array:
+        """Return the variance (..., 3) of one sample at levels (..., 3), counts above black."""
+        lit = np.maximum(level, 0)
+        return self.read_noise**2 + lit / self.gain_e + (self.response * lit) ** 2
+
     @property
     def noisy(self) -> npt.NDArray[np.bool_]:
         """(N,) whether a cell's noise deviates."""

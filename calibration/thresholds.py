@@ -121,6 +121,18 @@ THRESHOLDS: tuple[Threshold, ...] = (
         SIMULATED + ": none on a clean flat print", "clean the print, hang it flatter, and look for shadows on it",
     ),
     Threshold(
+        "unlike_scatter", "Cells about what their codes give, worst frame", "share", "at most", 0.012, 0.03,
+        "the frame is out of focus, or shows another print: its samples are not its colours'",
+        SIMULATED + ": to 0.8 % without noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
+        "see that nothing changes during the session",
+    ),
+    Threshold(
+        "unlike_block", "Worst part of the print in the worst frame", "share", "at most", 0.01, 0.03,
+        "a hand, a shadow or a reflection lay on the print in that frame, and its samples hold it",
+        SIMULATED + ": to 0.4 % beyond noise",
+        "see that nobody comes between lamp, print and camera",
+    ),
+    Threshold(
         "moved_anew", "Frames registered anew", "", "at most", 0, None,
         "the chart or the camera moved between frames; the grid followed", JUDGEMENT, _STILL,
     ),

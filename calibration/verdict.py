@@ -138,6 +138,8 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "agreement": registration.agreement,
         "unfit_share": len(result.unfit) / max(len(registration.strangers), 1),
         "doubtful_share": float(result.stains.doubtful.mean()),
+        "unlike_scatter": max((frame.likeness.scatter for frame in result.frames), default=0.0),
+        "unlike_block": max((frame.likeness.block for frame in result.frames), default=0.0),
         "moved_anew": float(sum(frame.registered for frame in result.frames)),
         "black_drift_counts": result.black_drift,
         "references_used": used / max(result.white_references, 1),
@@ -215,6 +217,8 @@ def refusal(verdict: Verdict, result: BuildResult) -> str:
     remedy = worst.threshold.remedy
     more = f" (and {len(verdict.refused) - 1} more)" if len(verdict.refused) > 1 else ""
     detail = ""
+    if worst.threshold.name in ("unlike_scatter", "unlike_block"):
+        detail = f", {_most_unlike(result, worst.threshold.name)}"
     if worst.threshold.name == "unfit_share":
         causes: dict[str, int] = {}
         for cell in result.unfit:
@@ -223,6 +227,15 @@ def refusal(verdict: Verdict, result: BuildResult) -> str:
         cause = max(causes, key=lambda name: causes[name])
         detail, remedy = f", {causes[cause]} of them {cause}", _REMEDIES.get(cause, "look at the report")
     return f"{worst.text()}{detail}{more}; {remedy}, and take the session anew"
+
+
+def _most_unlike(result: BuildResult, name: str) -> str:
+    """Return in which frame the worst of a figure is, and where on the print."""
+    if name == "unlike_scatter":
+        return f"in {max(result.frames, key=lambda frame: frame.likeness.scatter).record.file}"
+    frame = max(result.frames, key=lambda frame: frame.likeness.block)
+    x_mm, y_mm = frame.likeness.at_mm
+    return f"in {frame.record.file} about {x_mm:.0f}, {y_mm:.0f} mm"
 
 
 def _channels(result: BuildResult) -> dict[str, Any]:

@@ -344,7 +344,7 @@ def test_a_stain_and_a_fold_are_where_the_room_tells_and_as_deep() -> None:
     x, y = np.meshgrid(np.arange(20, columns - 20, 7), np.arange(20, rows - 20, 7))
     planes = channel_planes(worn.signal(WHITE, REFERENCE_EXPOSURE))[y, x]
     for channel, offset in enumerate((-0.25, 0, 0.25)):
-        places = worn.view.locate(np.stack([x, y], axis=-1) + offset)
+        places = worn.view.locate((np.stack([x, y], axis=-1) + offset).astype(np.float64))
         white = np.full((places[..., 0].size, 3), 255)
         true = worn.seen(white, places.reshape(-1, 2), WHITE, REFERENCE_EXPOSURE)[:, channel].reshape(x.shape)
         inside = ((places > 2) & (places < np.array(sheet.page_mm) - 2)).all(axis=-1)
