@@ -93,17 +93,15 @@ def disturbed(lut: Path, out: Path, images: int, workers: int, chance: random.Ra
     cluster whose worker is killed while it starts does not start.
     """
     killed_workers = killed_programs = gave_up = 0
-    while True:
+    while not (out / "dataset.json").is_file():
         program = start(lut, out, images, workers)
         try:
             while True:
                 try:
                     code = program.wait(chance.expovariate(1 / MEAN_S))
-                    if code == 0:
-                        return killed_workers, killed_programs, gave_up
-                    if code != DeviceError.exit_code:
+                    if code not in (0, DeviceError.exit_code):
                         raise RuntimeError(f"the program ended with {code} and not by a kill")
-                    gave_up += 1
+                    gave_up += code != 0
                     break
                 except subprocess.TimeoutExpired:
                     pass
@@ -119,6 +117,8 @@ def disturbed(lut: Path, out: Path, images: int, workers: int, chance: random.Ra
                     killed_workers += 1
         finally:
             _end(program.pid)
+    # A program that is killed while it ends has made the whole data set.
+    return killed_workers, killed_programs, gave_up
 
 
 def _words(process: psutil.Process) -> str:

@@ -21,9 +21,11 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -210,42 +212,65 @@ def _upgraded(told: dict[str, Any]) -> dict[str, Any]:
 def _entries(store: Store, description: Description) -> Iterator[Entry]:
     """Yield the images of `ground_truth.csv`, whose rows of one image follow each other."""
     name = f"{store.place}/{GROUND_TRUTH}"
-    part_of: dict[str, Split] = {
-        image: part
-        for part in SPLITS
-        if part in description.splits
-        for image in store.get(f"splits/{part}.txt").decode("utf-8", "replace").split()
-    }
-    truths = iter(store.get(TRUTHS).decode("utf-8", "replace").splitlines())
-    rows = csv.DictReader(io.StringIO(store.get(GROUND_TRUTH).decode("utf-8-sig", "replace")))
-    seen: set[str] = set()
-    for image, group in groupby(enumerate(rows, start=2), key=lambda numbered: numbered[1].get("image")):
-        lights: list[str] = []
-        whites: list[Triple] = []
-        source = ""
-        for number, row in group:
+    part_of: dict[int, Split] = {}
+    for part in SPLITS:
+        if part in description.splits:
+            with _text(store, f"splits/{part}.txt") as images:
+                part_of.update((_number(image), part) for image in images)
+    with _text(store, TRUTHS) as truths, _text(store, GROUND_TRUTH) as table:
+        rows = csv.DictReader(table)
+        last = -1
+        for image, group in groupby(enumerate(rows, start=2), key=lambda numbered: numbered[1].get("image")):
+            lights: list[tuple[str, Triple]] = []
+            source = ""
+            for line, row in group:
+                try:
+                    lights.append(_light(row["illumination"], row["r"], row["g"], row["b"]))
+                    source = sys.intern(row["source"])
+                except (KeyError, TypeError, ValueError, InputError) as error:
+                    raise FormatError(f"{name}, line {line}: expected {','.join(GROUND_TRUTH_COLUMNS)}") from error
+            labels, whites = _unzipped(tuple(lights))
             try:
-                lights.append(parse_mixture(row["illumination"]).label)
-                whites.append(_triple((row["r"], row["g"], row["b"])))
-                source = row["source"]
-            except (KeyError, TypeError, ValueError, InputError) as error:
-                raise FormatError(f"{name}, line {number}: expected {','.join(GROUND_TRUTH_COLUMNS)}") from error
-        try:
-            truth = _triple(next(truths, "").split())
-        except ValueError as error:
-            raise FormatError(
-                f"{store.place}/{TRUTHS}: expected three numbers for each of the {description.images} images of "
-                f"{DESCRIPTION}; make the dataset again"
-            ) from error
-        if not image or image in seen:
-            raise FormatError(f"{name}: the rows of {image!r} do not follow each other; make the dataset again")
-        seen.add(image)
-        yield Entry(image, source, tuple(lights), tuple(whites), truth, part_of.get(image))
+                truth = _triple(*next(truths, "").split())
+            except (TypeError, ValueError) as error:
+                raise FormatError(
+                    f"{store.place}/{TRUTHS}: expected three numbers for each of the {description.images} images of "
+                    f"{DESCRIPTION}; make the dataset again"
+                ) from error
+            number = _number(image or "")
+            if image is None or number <= last:
+                raise FormatError(f"{name}: {image!r} is not in the order of the images; make the dataset again")
+            last = number
+            yield Entry(image, source, labels, whites, truth, part_of.get(number))
 
 
-def _triple(numbers: Sequence[str]) -> Triple:
-    red, green, blue = (float(number) for number in numbers)
-    return red, green, blue
+@contextmanager
+def _text(store: Store, name: str) -> Generator[io.TextIOWrapper]:
+    """Open a file of text to be read line by line."""
+    with store.open(name) as stream, io.TextIOWrapper(stream, "utf-8-sig", "replace", newline="") as text:
+        yield text
+
+
+def _number(image: str) -> int:
+    """Return the number of an image by its name; -1 if it has none."""
+    digits = image.partition(".")[0]
+    return int(digits) if digits.isdecimal() else -1
+
+
+# Many images share a light: what is alike is kept once.
+@lru_cache(maxsize=4096)
+def _light(label: str, red: str, green: str, blue: str) -> tuple[str, Triple]:
+    return parse_mixture(label).label, _triple(red, green, blue)
+
+
+@lru_cache(maxsize=4096)
+def _unzipped(lights: tuple[tuple[str, Triple], ...]) -> tuple[tuple[str, ...], tuple[Triple, ...]]:
+    return tuple(label for label, _ in lights), tuple(white for _, white in lights)
+
+
+@lru_cache(maxsize=4096)
+def _triple(red: str, green: str, blue: str) -> Triple:
+    return float(red), float(green), float(blue)
 
 
 def generate_dataset(
