@@ -19,16 +19,23 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from calibration.lut import Lut
     from generator.dataset import generate_dataset, open_dataset
-    from generator.kernel import draw_samples, render
+    from generator.kernel import draw_mosaic, draw_samples, render
+    from generator.mixing import mix_samples, mixed_table
     from generator.picture import read_picture
+    from generator.planar import draw_batch, draw_planar
     from generator.scene import find_pictures
     from generator.tonemap import flash
 
 __all__ = [
+    "draw_batch",
+    "draw_mosaic",
+    "draw_planar",
     "draw_samples",
     "find_pictures",
     "flash",
     "generate_dataset",
+    "mix_samples",
+    "mixed_table",
     "open_dataset",
     "open_lut",
     "read_picture",
@@ -36,10 +43,15 @@ __all__ = [
 ]
 
 _HOMES = {
+    "draw_batch": "generator.planar",
+    "draw_mosaic": "generator.kernel",
+    "draw_planar": "generator.planar",
     "draw_samples": "generator.kernel",
     "find_pictures": "generator.scene",
     "flash": "generator.tonemap",
     "generate_dataset": "generator.dataset",
+    "mix_samples": "generator.mixing",
+    "mixed_table": "generator.mixing",
     "open_dataset": "generator.dataset",
     "read_picture": "generator.picture",
     "render": "generator.kernel",
