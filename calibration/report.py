@@ -96,7 +96,9 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
         ),
         (
             "The course of the session",
-            "Black level, movement of the chart and bare paper under white, frame by frame.",
+            "Black level, movement of the chart, bare paper under white, and how far cells are off what their codes "
+            "give under each light, frame by frame: all of them where the focus goes, part of the print where a hand "
+            "or a shadow lies on it.",
             _drawn(_course, result),
         ),
         (
@@ -516,8 +518,8 @@ def _chromaticities(figure: Any, codes: _Array, black_body: npt.NDArray[np.bool_
 
 
 def _course(figure: Any, result: BuildResult) -> None:
-    figure.set_size_inches(10, 2.8)
-    black, shift, white = figure.subplots(1, 3)
+    figure.set_size_inches(10, 5)
+    (black, shift), (white, like) = figure.subplots(2, 2)
     count = np.arange(len(result.frames))
     level = np.array([figures.black.mean() for figures in result.frames])
     black.plot(count, level, ".", color=_INK, markersize=3)
@@ -545,6 +547,25 @@ def _course(figure: Any, result: BuildResult) -> None:
         white.legend(frameon=False, fontsize=8)
     white.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     white.set(title="bare paper under white", ylabel="% of the first", xlabel="frame")
+    like.plot(
+        count,
+        [100 * figures.likeness.scatter for figures in result.frames],
+        ".",
+        color=_INK,
+        markersize=3,
+        label="all cells",
+    )
+    like.plot(
+        count,
+        [100 * figures.likeness.block for figures in result.frames],
+        "x",
+        color=_MARK,
+        markersize=3,
+        label="worst part",
+    )
+    like.legend(frameon=False, fontsize=8)
+    like.set(title="cells off what their codes give", ylabel="%", xlabel="frame")
+    like.set_ylim(bottom=0, top=max(1.5, like.get_ylim()[1]))
 
 
 def _worst(figure: Any, picture: _Image, chart: Chart, registration: Registration, window: int) -> None:

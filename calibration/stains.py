@@ -54,12 +54,15 @@ class Stains:
         (C, 3) float64, of each cell's neighbourhood, seen over expected less 1; NaN where it cannot be told.
     error
         (C, 3) float64, its standard error.
+    alone
+        (C, 3) float64, deviation of each cell by itself, noise and the prediction's error included; NaN likewise.
     stained
         (C,) bool, cells to be listed.
     """
 
     deviation: _Array
     error: _Array
+    alone: _Array
     stained: _Mask
 
     @property
@@ -69,8 +72,18 @@ class Stains:
 
     def largest(self) -> _Array:
         """Return (C,) the deviation, with its sign, of the channel that deviates most; 0 where it cannot be told."""
-        known = np.nan_to_num(self.deviation)
-        return np.take_along_axis(known, np.abs(known).argmax(axis=1)[:, None], axis=1)[:, 0]
+        return _largest(self.deviation)
+
+    def told(self, cell: int) -> float:
+        """Return a stained cell's deviation, with its sign: of its neighbourhood, or its own where that is larger."""
+        both = np.array([_largest(self.deviation[[cell]])[0], _largest(self.alone[[cell]])[0]])
+        return float(both[np.abs(both).argmax()])
+
+
+def _largest(deviation: _Array) -> _Array:
+    """Return (N,) the deviation (N, 3), with its sign, of the channel that deviates most; 0 where none is known."""
+    known = np.nan_to_num(deviation)
+    return np.take_along_axis(known, np.abs(known).argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
 def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | None = None) -> Stains:
@@ -104,8 +117,8 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
         stained = found
         trusted = usable & ~stained
     with np.errstate(invalid="ignore"):
-        alone = (np.abs(np.expm1(aside)) > np.maximum(RIM_SIGMA * _usual(aside), STAINED)).any(axis=1)
-    return Stains(deviation, error, stained | (alone & stained[near].any(axis=1)))
+        off = (np.abs(np.expm1(aside)) > np.maximum(RIM_SIGMA * _usual(aside), STAINED)).any(axis=1)
+    return Stains(deviation, error, np.expm1(aside), stained | (off & stained[near].any(axis=1)))
 
 
 def _usual(aside: _Array) -> _Array:

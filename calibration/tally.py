@@ -123,7 +123,6 @@ class Tally:
         dead = dead_samples(self._even_sum / frames)
         unevenness = uneven(self._even_sum / frames, np.sqrt(self._even_noise) / frames)
         allowed, samples = CLIPPED * saturation_counts, self._even_sum.shape[1]
-        aside = stains.largest()
         found: list[Unfit] = []
         for colour in range(self._chart.colour_count):
             cause = ""
@@ -136,8 +135,9 @@ class Tally:
             elif self._covered[colour]:
                 cause = "covered: it does not look like the chart's (covered, damaged, or printed otherwise)"
             elif stains.stained[colour]:
-                how = f"{abs(aside[colour]):.1%} {'darker' if aside[colour] < 0 else 'brighter'}"
-                cause = f"stained: its surroundings are {how} than their codes elsewhere (a stain, a fold or a shadow)"
+                aside = stains.told(colour)
+                how = f"{abs(aside):.1%} {'darker' if aside < 0 else 'brighter'}"
+                cause = f"stained: it is, or its surroundings are, {how} than their codes elsewhere on the print"
             elif hottest[colour] > 0:
                 cause = f"hot: a photosite stands out by {hottest[colour]:.0f} counts in every dark frame"
             elif dead[colour]:
