@@ -36,6 +36,7 @@ from calibration.frames import (
     session_sha256,
 )
 from calibration.growing import Checkpoint, Growing, growing
+from calibration.linearity import read_linearity
 from calibration.lut import SAMPLES as SAMPLES_FILE
 from calibration.lut import LutWriter, Provenance
 from calibration.measuring import FrameFigures, Measured, MeasuredDark, Measurement
@@ -64,7 +65,7 @@ _Array = npt.NDArray[np.float64]
 _Report = Callable[[BuildResult, Session, Path], None]
 
 
-def check(session: Session, choices: Choices = PLAIN) -> BuildResult:
+def check(session: Session, choices: Choices = PLAIN, linearity: Path | None = None) -> BuildResult:
     """Register a session's best frame and judge it; write nothing.
 
     Parameters
@@ -73,6 +74,8 @@ def check(session: Session, choices: Choices = PLAIN) -> BuildResult:
         The session.
     choices
         How the table would be made; a window that is too large is told.
+    linearity
+        A folder of exposures that tell the sensor's linearity; `calibration.linearity.read_linearity`.
 
     Raises
     ------
@@ -117,6 +120,7 @@ def check(session: Session, choices: Choices = PLAIN) -> BuildResult:
         noise=tally.noise(),
         white_references=len(session.chart.white_references),
         window=choices.window,
+        linearity=None if linearity is None else read_linearity(linearity, work),
     )
 
 
@@ -126,6 +130,7 @@ def build(
     progress: Progress | None = None,
     report: _Report | None = None,
     choices: Choices = PLAIN,
+    linearity: Path | None = None,
 ) -> BuildResult:
     """Build the table of a session.
 
@@ -141,6 +146,8 @@ def build(
         Writes the report into the table's folder before it gets its name; `calibration.report.write_report`.
     choices
         How the table is made.
+    linearity
+        A folder of exposures that tell the sensor's linearity; read before the frames, told in the report.
 
     Raises
     ------
@@ -166,7 +173,7 @@ def build(
         )
     _require_darks(session, choices)
     with growing(out) as making:
-        work = _Work(session, making, chosen, progress or _silent, choices)
+        work = _Work(session, making, chosen, progress or _silent, choices, linearity)
         work.take_in()
         return work.finish(out, report)
 
@@ -177,6 +184,7 @@ def append(
     progress: Progress | None = None,
     report: _Report | None = None,
     choices: Choices = PLAIN,
+    linearity: Path | None = None,
 ) -> BuildResult | Growth:
     """Let the table of a session that is being taken grow by the frames that have come.
 
@@ -188,7 +196,7 @@ def append(
     complete = not missing and {step.number for step in session.steps} <= session.done_steps()
     _require_darks(session, choices)
     with growing(out) as making:
-        work = _Work(session, making, chosen, progress or _silent, choices)
+        work = _Work(session, making, chosen, progress or _silent, choices, linearity)
         before = work.taken_in
         if complete:
             work.take_in()
@@ -205,10 +213,16 @@ class _Work:
     """One table being made: what was taken in before, and what is to follow."""
 
     def __init__(
-        self, session: Session, making: Growing, chosen: Sequence[FrameRecord], told: Progress, choices: Choices
+        self,
+        session: Session,
+        making: Growing,
+        chosen: Sequence[FrameRecord],
+        told: Progress,
+        choices: Choices,
+        series: Path | None,
     ) -> None:
         self._session, self._making, self._chosen, self._told = session, making, chosen, told
-        self._choices = choices
+        self._choices, self._series = choices, series
         self._best = best_frame(session)
         self._keys = [f"{record.kind},{record.illumination},{record.sha256}" for record in chosen]
         self._identity = {
@@ -257,6 +271,7 @@ class _Work:
         self._stretch = self._measurement.first
         self._tally = Tally(chart, self._choices.samples, self._stretch)
         self._limit = first.saturation
+        self._linearity = None if self._series is None else read_linearity(self._series, self._measurement)
         self._subtraction = self._measurement.subtraction()
         self._dark: DarkLight | None = None
         # Held for no longer than it is needed: it is read again in its turn.
@@ -404,6 +419,7 @@ class _Work:
             window=self._choices.window,
             subtracted=subtracted if self._choices.subtract_dark else None,
             at_zero=at_zero,
+            linearity=self._linearity,
         )
         records = [figures.record for figures in self._figures]
         self._writer.finish(
@@ -429,10 +445,11 @@ class _Work:
                 unfit=list(unfit),
             ),
             listed(records),
+            {REFERENCES_FILE: references_csv(work.levels.names, white, error, greys, grey_errors)}
+            if work.levels.names
+            else {},
         )
         folder = self._making.folder
-        if work.levels.names:
-            write_whole(folder / REFERENCES_FILE, references_csv(work.levels.names, white, error, greys, grey_errors))
         if report is not None:
             report(result, session, folder)
         if result.verdict.refused:

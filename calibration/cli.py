@@ -70,6 +70,16 @@ def build_lut(
             "from the ground truth.",
         ),
     ] = False,
+    linearity: Annotated[
+        Path | None,
+        typer.Option(
+            "--linearity",
+            metavar="FOLDER",
+            help="Judge the sensor's linearity by raw files of the chart in its place, under one light, with exposure "
+            "times from dim to nearly saturated.",
+            show_default=False,
+        ),
+    ] = None,
     info: Annotated[
         Path | None,
         typer.Option("--info", metavar="LUT", help="Tell what a table is and came from.", show_default=False),
@@ -101,7 +111,7 @@ def build_lut(
     given = [name for name, value in asked.items() if value]
     if len(given) > 1:
         raise InputError(f"{' and '.join(given)} are two commands; give one of them")
-    made = {"--window": window is not None, "--subtract-dark": subtract_dark}
+    made = {"--window": window is not None, "--subtract-dark": subtract_dark, "--linearity": linearity is not None}
     if (info or verify or match) and any(made.values()):
         raise InputError(
             f"{next(name for name, value in made.items() if value)} tells how a table is made, and {given[0]} reads "
@@ -118,10 +128,12 @@ def build_lut(
     else:
         from calibration.choices import Choices
 
-        _make(session, lut, check, append, Choices(5 if window is None else window, subtract_dark))
+        _make(session, lut, check, append, Choices(5 if window is None else window, subtract_dark), linearity)
 
 
-def _make(session: Path | None, lut: Path | None, check: bool, append: bool, choices: Choices) -> None:
+def _make(
+    session: Path | None, lut: Path | None, check: bool, append: bool, choices: Choices, linearity: Path | None
+) -> None:
     if check and lut is not None:
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
     if session is None:
@@ -134,9 +146,9 @@ def _make(session: Path | None, lut: Path | None, check: bool, append: bool, cho
         if lut is None:
             from calibration.build import check as judge
 
-            result = judge(opened, choices)
+            result = judge(opened, choices, linearity)
         else:
-            result = _build(opened, lut, append, choices)
+            result = _build(opened, lut, append, choices, linearity)
     from calibration.result import Growth
 
     if isinstance(result, Growth):
@@ -153,12 +165,12 @@ def _make(session: Path | None, lut: Path | None, check: bool, append: bool, cho
         raise QualityError(f"{result.session}: {refusal(verdict, result)}")
 
 
-def _build(opened: Session, lut: Path, growing: bool, choices: Choices) -> BuildResult | Growth:
+def _build(opened: Session, lut: Path, growing: bool, choices: Choices, linearity: Path | None) -> BuildResult | Growth:
     from calibration.build import append, build
     from calibration.report import write_report
 
     with _bar("finding the chart") as told:
-        return (append if growing else build)(opened, lut, told, write_report, choices)
+        return (append if growing else build)(opened, lut, told, write_report, choices, linearity)
 
 
 def _tell_table(folder: Path) -> None:

@@ -16,10 +16,11 @@ import csv
 import hashlib
 import io
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -71,6 +72,8 @@ class Provenance(BaseModel):
     lights_sha256
         Of each light's samples as they lie in the file, in the order of lights, so that damage is told to the light;
         empty in tables made before they were recorded.
+    files_sha256
+        Of further files of the table, `references.csv`; empty in tables made before they were recorded.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -88,6 +91,7 @@ class Provenance(BaseModel):
     samples_sha256: str | None = None
     illuminations_sha256: str | None = None
     lights_sha256: list[str] = []
+    files_sha256: dict[str, str] = {}
 
 
 @dataclass(frozen=True)
@@ -255,6 +259,11 @@ def damage(lut: Lut, progress: Callable[[int, int], None] | None = None) -> list
     faults: list[str] = []
     if _file_sha256(lut.folder / "illuminations.csv") != known.illuminations_sha256:
         faults.append("illuminations.csv is not as it was built: lights or ground truth have changed")
+    faults += [
+        f"{name} is not as it was built, or is gone"
+        for name, then in known.files_sha256.items()
+        if not (lut.folder / name).is_file() or _file_sha256(lut.folder / name) != then
+    ]
     whole, lights = _samples_sha256(lut.folder / SAMPLES, lut.samples, progress)
     changed = [light for light, (now, then) in enumerate(zip(lights, known.lights_sha256, strict=True)) if now != then]
     if changed:
@@ -445,6 +454,7 @@ class LutWriter:
         white: npt.NDArray[np.float64],
         provenance: Provenance,
         frames: Sequence[Frame] = (),
+        files: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Write the frames, the ground truth and the provenance; after this the folder is a table.
 
@@ -458,6 +468,8 @@ class LutWriter:
             The content of `lut.json`; the hashes of samples and lights are added here.
         frames
             What the table was made of, in the order taken.
+        files
+            Further files of the table, their text by name.
 
         Raises
         ------
@@ -497,7 +509,10 @@ class LutWriter:
                     ],
                 ),
             )
+        for name, text in files.items():
+            write_whole(self._folder / name, text)
         hashes = {
+            "files_sha256": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in files.items()},
             "samples_sha256": whole,
             "illuminations_sha256": hashlib.sha256(truth.encode()).hexdigest(),
             "lights_sha256": lights,

@@ -275,6 +275,31 @@ class Measurement:
         )
         return cells, references
 
+    def movement(self, mosaic: Mosaic, black: _Array, channel: Channel, what: str) -> Shift:
+        """Return how far the chart has moved in a frame since the first one.
+
+        Raises
+        ------
+        FormatError
+            The sensor is not that of the first frame.
+        """
+        self._require_geometry(mosaic, what)
+        framing = self.first.registration.framing
+        return shift_between(self.first.planes[channel], framing, tags_of(mosaic, channel, black, framing))
+
+    def patches(self, mosaic: Mosaic, black: _Array) -> tuple[_Array, npt.NDArray[np.uint16]]:
+        """Return the mean counts (P, 3) and highest raw counts (P,) of cells, then references, where they were first.
+
+        NaN where a patch does not lie in the frame.
+        """
+        means: list[_Array] = []
+        peaks: list[npt.NDArray[np.uint16]] = []
+        for sites in (self.first.cells, self.first.references):
+            samples, highest = gather(mosaic, black, sites)
+            means.append(np.where(sites.inside[:, None], samples.mean(axis=1, dtype=np.float64), np.nan))
+            peaks.append(highest)
+        return np.concatenate(means), np.concatenate(peaks)
+
     def subtraction(self) -> Subtraction:
         """Return what learns the dark light, with the reflectances that the first frame shows."""
         paper, shape = self._paper.read(self._first_seen, self._first_file)
@@ -320,7 +345,7 @@ class Measurement:
         QualityError
             The white references cannot be used.
         """
-        self._require_geometry(decoded)
+        self._require_geometry(decoded.mosaic, decoded.record.file)
         channel, framing = decoded.strongest, stretch.registration.framing
         shift = shift_between(
             stretch.planes[channel], framing, tags_of(decoded.mosaic, channel, decoded.black, framing)
@@ -342,7 +367,7 @@ class Measurement:
 
     def measure_dark(self, decoded: Decoded, stretch: Stretch) -> MeasuredDark:
         """Return what a dark frame says; no tag is seen in it, so the chart is taken to lie where it did."""
-        self._require_geometry(decoded)
+        self._require_geometry(decoded.mosaic, decoded.record.file)
         cells, _ = gather(decoded.mosaic, decoded.black, stretch.cells)
         references, _ = gather(decoded.mosaic, decoded.black, stretch.references)
         whites = np.flatnonzero(stretch.references.inside[: len(self._white_mm)])
@@ -352,11 +377,10 @@ class Measurement:
         means = np.concatenate([quiet_means(patches, figures.noise) for patches in (cells, references)])
         return MeasuredDark(figures, stretch, aside, means)
 
-    def _require_geometry(self, decoded: Decoded) -> None:
-        mosaic = decoded.mosaic
+    def _require_geometry(self, mosaic: Mosaic, what: str) -> None:
         if (mosaic.visible, mosaic.sensor.shape, mosaic.pattern) != self._geometry:
             raise FormatError(
-                f"{decoded.record.file}: the sensor has {mosaic.sensor.shape[1]}×{mosaic.sensor.shape[0]} photosites "
+                f"{what}: the sensor has {mosaic.sensor.shape[1]}×{mosaic.sensor.shape[0]} photosites "
                 f"{mosaic.pattern}, that of {self._first_file} {self._geometry[1][1]}×{self._geometry[1][0]} "
                 f"{self._geometry[2]}; "
                 "a session has one camera with one setting"

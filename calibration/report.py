@@ -213,6 +213,7 @@ def summary(result: BuildResult) -> list[tuple[str, str, str]]:
             " / ".join(f"{value:.2%}" for value in result.noise.tolist()),
             "R, G, B, of paper under white",
         ),
+        ("Linearity", *_linearity(result)),
         *_light_figures(result),
         ("Cells unfit", str(len(result.unfit)), "listed in lut.json, never filled"),
     ]
@@ -267,6 +268,17 @@ def _light_figures(result: BuildResult) -> list[tuple[str, str, str]]:
     measured = "measured" if result.saturated else "as the raw files state it; no photosite reached it"
     told.append(("Saturation's source", measured, "a statement may be too high; samples do not suffer"))
     return told
+
+
+def _linearity(result: BuildResult) -> tuple[str, str]:
+    """Return what the series of exposures said."""
+    if result.linearity is None:
+        return "not measured", "a series of exposures of the chart, given with --linearity, tells"
+    low, high = result.linearity.covered
+    return (
+        f"{result.linearity.worst:.2%} off a line at most",
+        f"{len(result.linearity.files)} exposures, {low:.0%} to {high:.0%} of saturation; 1 % is usual",
+    )
 
 
 def _window_note(result: BuildResult) -> str:

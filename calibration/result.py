@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.darkness import Darkness
+from calibration.linearity import Linearity
 from calibration.lut import Unfit
 from calibration.measuring import FrameFigures
 from calibration.noise import PhotonTransfer
@@ -73,6 +74,8 @@ class BuildResult:
         (L, 3) dark light of bare paper that was subtracted from each light; None where none was to be.
     at_zero
         (L,) share of each light's samples that are 0 in the table.
+    linearity
+        What a series of exposures said; None where none was given.
     """
 
     session: Path
@@ -100,6 +103,7 @@ class BuildResult:
     window: int = WINDOW
     subtracted: _Array | None = None
     at_zero: _Array = field(default_factory=lambda: np.zeros(0))
+    linearity: Linearity | None = None
 
     @property
     def verdict(self) -> Verdict:

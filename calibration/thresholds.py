@@ -163,6 +163,12 @@ THRESHOLDS: tuple[Threshold, ...] = (
         JUDGEMENT + ": a hundredth of a cell of a fifth of white", "darken the room, and keep daylight out",
     ),
     Threshold(
+        "linearity", "Bend of the sensor's response, 5 to 95 % of saturation", "share", "at most", 0.01, 0.05,
+        "counts are not proportional to light, so that chromaticities change with brightness",
+        "EMVA 1288 asks for the range; 1 % is " + JUDGEMENT,
+        "expose less, switch the camera's highlight priority off, and take the series in steady light",
+    ),
+    Threshold(
         "additivity", "White against the sum of the primaries", "share", "at most", 0.02, None,
         "the projector brightens or converts white, so a light cannot be predicted from its codes; the table holds",
         JUDGEMENT + "; the drift of the lamp is taken out first",

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.choices import WINDOWS
+from calibration.linearity import curve
 from calibration.references import tint_deg
 from calibration.sampling import WINDOW
 from calibration.thresholds import THRESHOLDS, Threshold
@@ -153,6 +154,8 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         figures["leak_share"] = float(np.abs(result.darkness.light / full).max())
     if len(result.darkness.lights) > 1:
         figures["dark_drift"] = float((np.ptp(result.darkness.lights, axis=0) / full).max())
+    if result.linearity is not None:
+        figures["linearity"] = result.linearity.worst
     if result.added is not None:
         figures["additivity"] = float(np.abs(result.added).max())
     if (tint := grey_tints_deg(result)).size and np.isfinite(tint).any():
@@ -250,6 +253,7 @@ def _channels(result: BuildResult) -> dict[str, Any]:
     return {
         "window": result.window,
         "largest_window": largest_window(result.registration.cell_px, result.registration.blur_px),
+        "linearity": None if result.linearity is None else curve(result.linearity),
         "dark_frames": len(dark.files),
         "dark_subtracted": result.subtracted is not None,
         "dark_counts": told(dark.light),
