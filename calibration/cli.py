@@ -45,7 +45,8 @@ def _version(asked: bool) -> None:
     "its report is then in LUT.refused/, and the exit code 4.\n\n"
     "With --check, finds the chart in the session's best frame, judges it, and writes nothing. With --append, takes in "
     "the frames that have come so far of a session that is being taken; LUT appears with the last of them. With "
-    "--info, --verify and --match, reads a table and writes nothing.\n\n" + EXIT_CODES,
+    "--info, --verify and --match, reads a table and writes nothing. With --publish and --fetch, copies a table to a "
+    "store for others and back.\n\n" + EXIT_CODES,
 )
 def build_lut(
     session: Annotated[
@@ -102,22 +103,41 @@ def build_lut(
             show_default=False,
         ),
     ] = None,
+    publish: Annotated[
+        tuple[Path, str] | None,
+        typer.Option(
+            "--publish",
+            metavar="LUT URL",
+            help="Write a table as a sharded Zarr array to a folder or a store that fsspec knows, such as s3://….",
+            show_default=False,
+        ),
+    ] = None,
+    fetch: Annotated[
+        tuple[str, Path] | None,
+        typer.Option(
+            "--fetch",
+            metavar="URL LUT",
+            help="Copy a published table to a new folder, where it is used, and verify it.",
+            show_default=False,
+        ),
+    ] = None,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
     ] = False,
 ) -> None:
     """Build, check or read; what the command does is told by its help text."""
-    asked = {"--check": check, "--append": append, "--info": info, "--verify": verify, "--match": match}
+    reading = {"--info": info, "--verify": verify, "--match": match, "--publish": publish, "--fetch": fetch}
+    asked = {"--check": check, "--append": append, **reading}
     given = [name for name, value in asked.items() if value]
     if len(given) > 1:
         raise InputError(f"{' and '.join(given)} are two commands; give one of them")
     made = {"--window": window is not None, "--subtract-dark": subtract_dark, "--linearity": linearity is not None}
-    if (info or verify or match) and any(made.values()):
+    if any(reading.values()) and any(made.values()):
         raise InputError(
             f"{next(name for name, value in made.items() if value)} tells how a table is made, and {given[0]} reads "
             "one; leave one of them out"
         )
-    if (lut if verify else session if info or match else None) is not None:
+    if (lut if verify else session if any(reading.values()) else None) is not None:
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
     if info is not None:
         _tell_table(info)
@@ -125,6 +145,10 @@ def build_lut(
         _verify(verify, session)
     elif match is not None:
         _match(*match)
+    elif publish is not None:
+        _publish(*publish)
+    elif fetch is not None:
+        _fetch(*fetch)
     else:
         from calibration.choices import Choices
 
@@ -209,6 +233,24 @@ def _match(one: Path, other: Path) -> None:
     require_match(*tables)
     cameras = " and ".join(table.provenance.camera for table in tables)
     print(f"{one} and {other} ({cameras}): colours and lights correspond number by number")
+
+
+def _publish(folder: Path, url: str) -> None:
+    from calibration.lut import open_lut
+    from calibration.published import publish
+
+    lut = open_lut(folder)
+    with _bar("writing lights") as told:
+        publish(lut, url, lambda done, total: told(done, total, "writing lights"))
+    print(f"{url}: {len(lut.samples)} lights of {folder}; others get them by build-lut --fetch {url} LUT")
+
+
+def _fetch(url: str, folder: Path) -> None:
+    from calibration.published import fetch
+
+    with _bar("reading lights") as told:
+        lut = fetch(url, folder, lambda done, total: told(done, total, "reading lights"))
+    print(f"{folder}: {len(lut.samples)} lights, {lut.provenance.camera}; every byte is as it was published")
 
 
 @contextmanager

@@ -90,6 +90,19 @@ def test_match_compares_two_tables(lut: Path, command: Command) -> None:
     assert "3 bits of each channel against 1" in err
 
 
+def test_a_published_table_comes_back_byte_by_byte(lut: Path, command: Command, tmp_path: Path) -> None:
+    code, out, _ = command("--publish", lut, tmp_path / "published")
+    assert code == 0
+    assert f"{len(LIGHTS)} lights" in out
+    code, out, _ = command("--fetch", tmp_path / "published", tmp_path / "fetched")
+    assert code == 0
+    assert "every byte is as it was published" in out
+    assert (tmp_path / "fetched" / "samples.npy").read_bytes() == (lut / "samples.npy").read_bytes()
+    code, _, err = command("--fetch", tmp_path / "nothing", tmp_path / "again")
+    assert code == 2
+    assert "holds no table" in err
+
+
 def test_append_says_how_far_the_table_is(session: Session, command: Command, tmp_path: Path) -> None:
     shutil.copytree(session.folder, tmp_path / "session")
     last = next((tmp_path / "session" / "frames").glob("*light_012*"))

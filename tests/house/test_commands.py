@@ -16,7 +16,10 @@ COMMANDS = {
     "sim": "sim.cli",
 }
 ROOMS = ("drivers", "sim", "acquisition", "calibration", "generator", "evaluation")
-HEAVY = ("numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO", "reportlab")
+HEAVY = (
+    *("numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO", "reportlab"),
+    *("distributed", "pyarrow", "torch", "zarr"),
+)
 
 
 def call(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
