@@ -114,8 +114,9 @@ def build_timed(session: Session, out: Path) -> Costs:
     marks: list[Costs] = []
     build(session, out, lambda done, total, what: marks.append(Costs(time.perf_counter(), time.process_time())))
     shutil.rmtree(out)
-    # The first mark is set before the chart is sought, the second when the first frame is done, the last after all.
-    first, last, frames = marks[1], marks[-2], len(marks) - 3
+    # The first mark is set before the chart is sought, the second when the first frame is done, the last after all. As
+    # many frames are under way at the first one counted as at the last one: towards the end, threads run out of work.
+    first, last, frames = marks[1], marks[-2 - threads()], len(marks) - 3 - threads()
     return Costs((last.wall - first.wall) / frames, (last.processor - first.processor) / frames)
 
 

@@ -36,7 +36,9 @@ LOWEST, HIGHEST = 0.05, 0.95
 _NODES = 10
 _LEAST_PATCHES = 50.0
 _STOPS = 3
-_HARD, _SOFT = 1e4, 0.1
+_LEAST_POWER = 0.1
+"""Below, the frames did not follow their times at all, and the figure is as bad as can be."""
+_HARD, _SOFT = 1e2, 0.1
 _Array = npt.NDArray[np.float64]
 
 
@@ -210,10 +212,9 @@ def _bend(seen: _Array, log_times: _Array, nodes: _Array) -> tuple[_Array, float
     # The frames' factors against their times tell the power.
     seen_frames = np.array([row[:, : frames - 1].any(axis=0) for row in rows]).any(axis=0)
     steps, factors = np.diff(log_times)[seen_frames], solution[: frames - 1][seen_frames]
-    course, stated = np.cumsum(factors) - np.cumsum(factors).mean(), np.cumsum(steps) - np.cumsum(steps).mean()
-    power = (
-        float(course @ stated / max(float(stated @ stated), 1e-12)) if len(steps) > 1 else float(factors[0] / steps[0])
-    )
+    course, stated = (np.concatenate([[0.0], np.cumsum(each)]) for each in (factors, steps))
+    course, stated = course - course.mean(), stated - stated.mean()
+    power = max(float(course @ stated) / max(float(stated @ stated), 1e-12), _LEAST_POWER)
     bend = np.where(told, solution[frames - 1 :] + (1 - 1 / power) * at, np.nan)
     off = course - power * stated
     return np.asarray(bend - np.nanmean(bend), dtype=np.float64), float(np.sqrt((off**2).mean()))

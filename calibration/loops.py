@@ -165,6 +165,27 @@ def combined(basis: _Array, factors: _Array, out: _Array) -> None:
 
 
 @_compiled
+def weighted_fit(design: _Array, values: _Array, weights: _Array) -> _Array:
+    """Return the x (K,) that minimises Σ w (values − design x)²; as `calibration.fitting.least_squares`."""
+    count, unknowns = design.shape
+    gram, solution = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    for point in range(count):
+        line = design[point]
+        for i in range(unknowns):
+            weighted = weights[point] * line[i]
+            solution[i] += weighted * values[point]
+            for j in range(i + 1):
+                gram[i, j] += weighted * line[j]
+    trace = 0.0
+    for i in range(unknowns):
+        trace += gram[i, i]
+    for i in range(unknowns):
+        gram[i, i] += 1e-10 * max(trace / unknowns, 1e-30)
+    _solve(gram, solution)
+    return solution
+
+
+@_compiled
 def robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Array, _Array]:
     """Return solution (K,), weights (N,) and residuals (N,) of a fit without what lies far off.
 
@@ -183,23 +204,9 @@ def robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Ar
     """
     count, unknowns = design.shape
     weights, residual = np.ones(count), values.copy()
-    gram, solution = np.empty((unknowns, unknowns)), np.empty(unknowns)
+    solution = np.zeros(unknowns)
     for _ in range(rounds):
-        gram[:] = 0
-        solution[:] = 0
-        for point in range(count):
-            line = design[point]
-            for i in range(unknowns):
-                weighted = weights[point] * line[i]
-                solution[i] += weighted * values[point]
-                for j in range(i + 1):
-                    gram[i, j] += weighted * line[j]
-        trace = 0.0
-        for i in range(unknowns):
-            trace += gram[i, i]
-        for i in range(unknowns):
-            gram[i, i] += 1e-10 * max(trace / unknowns, 1e-30)
-        _solve(gram, solution)
+        solution = weighted_fit(design, values, weights)
         for point in range(count):
             predicted = 0.0
             for i in range(unknowns):
