@@ -16,13 +16,14 @@ import numpy.typing as npt
 from acquisition.chart import Chart, load_chart
 from acquisition.config import LabSettings
 from acquisition.exposure import measure_exposure, refusal
-from acquisition.framing import MIN_MODULE_PX, Framing, blur_px, find_chart
+from acquisition.framing import MIN_MODULE_PX, Framing, find_chart
 from acquisition.health import make_ready
 from acquisition.homography import project
 from acquisition.planes import Plane, strongest_plane
 from acquisition.rig import open_rig
 from acquisition.sequencer import Devices
 from acquisition.session import FrameKind
+from acquisition.sharpness import blur_px
 from drivers.camera import keep_awake
 from drivers.errors import RegistrationError
 from drivers.presenter import BLACK, WHITE, Colour, SelfDoubting

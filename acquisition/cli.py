@@ -66,9 +66,9 @@ def chart(
     from drivers.storage import whole_folder
 
     if arrangement is Arrangement.PAPER:
-        if bits != 5 or cell_mm is not None:
-            raise InputError("the paper's arrangement has 5 bits and fills its page; leave --bits and --cell-mm out")
-        design = paper_chart(_page(page))
+        if cell_mm is not None:
+            raise InputError("the paper's arrangement fills its page; leave --cell-mm out, or choose another --page")
+        design = paper_chart(_page(page), bits)
     else:
         design = design_chart(bits, _page(page), seed, cell_mm)
     with whole_folder(out, "the chart") as folder:

@@ -1,4 +1,4 @@
-"""Where the chart is in a picture: its tags found, its pose judged, its sharpness measured.
+"""Where the chart is in a picture: its tags found or its field, its pose judged.
 
 Laws that hold inside:
 
@@ -21,8 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart import Chart
+from acquisition.field import Field, find_field
 from acquisition.homography import project, rms, robust_homography
-from acquisition.planes import MIN_SIGNAL, Plane, paper_level, strongest_plane
+from acquisition.planes import CHANNELS, MIN_SIGNAL, Plane, frame_black, paper_level, plane_of, strongest_plane
 from drivers.errors import RegistrationError
 from drivers.rawfile import Mosaic
 
@@ -109,15 +110,18 @@ class Framing:
     homography
         (3, 3) float64, millimetres on the print to half-size px, lens distortion not included.
     residual_px
-        RMS distance of the tags' corners from the homography: distortion and waviness included, some pixels.
+        RMS distance of the tags' corners, or the field's outline, from the homography: distortion and waviness
+        included, some pixels.
     module_px
-        Half-size pixels per tag module, the smallest tag's.
+        Half-size pixels per tag module, the smallest tag's; NaN without tags.
     fill
         Share of the picture's height or width that the page takes, the larger of the two; 1 is full.
     inside
         Whether all four corners of the page lie in the picture.
     rotation_deg
         Of the page's x axis against the picture's, clockwise as seen.
+    field
+        Outline of the field of cells, by which a chart without tags is found; None for one with tags.
     """
 
     plane: Plane
@@ -129,6 +133,7 @@ class Framing:
     fill: float
     inside: bool
     rotation_deg: float
+    field: Field | None = None
 
     @property
     def complete(self) -> bool:
@@ -136,24 +141,36 @@ class Framing:
         return not self.missing
 
 
-def find_chart(frame: Mosaic | Plane, chart: Chart, what: str = "the frame") -> Framing:
+def find_chart(
+    frame: Mosaic | Plane,
+    chart: Chart,
+    what: str = "the frame",
+    corners: npt.ArrayLike | None = None,
+    near: Framing | None = None,
+) -> Framing:
     """Return how `chart` stands in a picture.
 
     Parameters
     ----------
     frame
-        A mosaic, of which the strongest colour is searched, or one plane.
+        A mosaic, of which the strongest colour is searched, or one plane; a chart without tags needs the mosaic.
     chart
         The chart expected.
     what
         The frame's name for messages.
+    corners
+        (4, 2) half-size px, corners of the field of cells, clockwise from the printed top-left, for a chart without
+        tags; found by themselves if not given.
+    near
+        How the chart stands in another frame of the session: without tags, it then hangs the same way up.
 
     Raises
     ------
     RegistrationError
-        The chart has no tags; none is seen; they are mirrored, too small, not this chart's, too few, or their places
-        do not fit it.
+        None of the chart is seen; it is mirrored, too small, another chart, or too little of it fits.
     """
+    if not chart.tags and isinstance(frame, Mosaic):
+        return _find_field(frame, chart, what, corners, near)
     if len(chart.tags) < MIN_TAGS:
         raise RegistrationError(
             f"{what}: the chart has {len(chart.tags)} tags, and it is found by its tags, at least {MIN_TAGS}; "
@@ -170,8 +187,7 @@ def find_chart(frame: Mosaic | Plane, chart: Chart, what: str = "the frame") -> 
         raise _not_found(plane, found, tags, looked_for, what)
     chart_points = np.concatenate([expected[tag.id].corners_mm for tag in tags])
     frame_points = np.concatenate([tag.corners_px for tag in tags])
-    height, width = plane.values.shape
-    homography, fits = robust_homography(chart_points, frame_points, 0.01 * width)
+    homography, fits = robust_homography(chart_points, frame_points, 0.01 * plane.values.shape[1])
     misplaced = [tag.id for number, tag in enumerate(tags) if not fits[4 * number : 4 * number + 4].all()]
     if len(misplaced) > 0.2 * len(tags):
         raise RegistrationError(
@@ -192,22 +208,32 @@ def find_chart(frame: Mosaic | Plane, chart: Chart, what: str = "the frame") -> 
                 else "uncover the chart, light all of it, and bring all of it into the picture and into focus"
             )
         )
+    residual = project(homography, chart_points[fits]) - frame_points[fits]
+    return Framing(plane, tags, missing, homography, rms(residual), module, *_stand(homography, chart, plane))
+
+
+def _stand(homography: npt.NDArray[np.float64], chart: Chart, plane: Plane) -> tuple[float, bool, float]:
+    """Return how much of the picture the page fills, whether it lies inside, and how it is turned, degrees."""
+    height, width = plane.values.shape
     page_w, page_h = chart.page_mm
     corners = project(homography, [(0, 0), (page_w, 0), (page_w, page_h), (0, page_h)])
     axis = project(homography, [(0.4 * page_w, page_h / 2), (0.6 * page_w, page_h / 2)])
-    residual = project(homography, chart_points[fits]) - frame_points[fits]
     spans = np.ptp(corners, axis=0) / (width, height)
-    return Framing(
-        plane=plane,
-        tags=tags,
-        missing=missing,
-        homography=homography,
-        residual_px=rms(residual),
-        module_px=module,
-        fill=float(spans.max()),
-        inside=bool((corners >= -0.5).all() and (corners <= (width - 0.5, height - 0.5)).all()),
-        rotation_deg=float(np.degrees(np.arctan2(*(axis[1] - axis[0])[::-1]))),
-    )
+    inside = bool((corners >= -0.5).all() and (corners <= (width - 0.5, height - 0.5)).all())
+    return float(spans.max()), inside, float(np.degrees(np.arctan2(*(axis[1] - axis[0])[::-1])))
+
+
+def _find_field(
+    mosaic: Mosaic, chart: Chart, what: str, corners: npt.ArrayLike | None, near: Framing | None
+) -> Framing:
+    black = frame_black(mosaic)
+    planes = [plane_of(mosaic, channel, black) for channel in CHANNELS]
+    before = None if near is None or near.field is None else near.field.corners_px
+    field = find_field(planes, chart, what, corners, before)
+    off = ((project(field.homography, field.outline_mm) - field.outline_px) * field.normals).sum(axis=1)
+    plane = max(planes, key=paper_level)
+    stand = _stand(field.homography, chart, plane)
+    return Framing(plane, (), (), field.homography, float(np.sqrt((off**2).mean())), float("nan"), *stand, field=field)
 
 
 def _not_found(
@@ -249,61 +275,3 @@ def _not_found(
 def _some(ids: Sequence[int]) -> str:
     text = ", ".join(str(number) for number in ids[:8])
     return text + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")
-
-
-def blur_px(framing: Framing) -> float:
-    """Return how soft the picture is: σ of the Gaussian that the tags' black edges have been blurred with, px.
-
-    Median over the tags' edges. Across an edge lie the tag's data, its black border, its white rim and what is beyond,
-    the middle two one module wide: a staircase of four unknown levels and known steps, blurred. The σ whose staircase
-    fits the pixels best, each at its own distance from the edge, is taken; nothing is interpolated, which would blur as
-    well (a slanted edge, as in ISO 12233). Contained is what lens, focus and movement do, and the photosites' own size
-    and spacing: 0.29 px for green (two photosites half a pixel apart), 0.14 px for red and blue. Good to 0.01 px up to
-    a quarter of a module, beyond that read up to a tenth high, as the corners themselves are less sure.
-    """
-    found = np.concatenate([_edge_blurs(framing.plane, tag) for tag in framing.tags])
-    return float(np.median(found)) if len(found) else float("nan")
-
-
-_BLURS = np.geomspace(0.15, 4, 48)
-
-
-def _edge_blurs(plane: Plane, tag: FoundTag) -> npt.NDArray[np.float64]:
-    """Return the σ of each of a tag's four edges; none where the picture ends."""
-    module = tag.side_px / TAG_MODULES
-    corners = tag.corners_px - plane.offset_px
-    left, top = np.floor(corners.min(axis=0) - module).astype(int)
-    right, bottom = np.ceil(corners.max(axis=0) + module).astype(int) + 1
-    height, width = plane.values.shape
-    if left < 0 or top < 0 or right > width or bottom > height:
-        return np.empty(0)
-    values = plane.values[top:bottom, left:right].ravel().astype(np.float64)
-    rows, columns = np.mgrid[top:bottom, left:right]
-    pixels = np.column_stack([columns.ravel(), rows.ravel()])
-    sigma = _BLURS[:, None]
-    found = np.empty(4)
-    for edge, (start, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
-        length = float(np.linalg.norm(end - start))
-        tangent = (end - start) / length
-        along = (pixels - start) @ tangent / length
-        # Corners run clockwise with y down, so this points out of the tag.
-        across = (pixels - start) @ np.array([tangent[1], -tangent[0]])
-        # Clear of the corners, where another edge is near.
-        near = (along > 0.2) & (along < 0.8) & (np.abs(across) < module)
-        seen, aside = values[near], across[near]
-        steps = [_normal_cdf((aside - at) / sigma) for at in (-module, 0.0, module)]
-        # The slope of the middle step takes up what the corners are off.
-        slope = np.exp(-0.5 * (aside / sigma) ** 2)
-        basis = np.linalg.qr(np.stack([np.ones_like(slope), *steps, slope], axis=-1)).Q
-        misfit = (seen**2).sum() - ((seen @ basis) ** 2).sum(axis=-1)
-        best = int(np.clip(misfit.argmin(), 1, len(_BLURS) - 2))
-        before, least, after = misfit[best - 1 : best + 2]
-        part = 0.5 * (before - after) / max(before - 2 * least + after, 1e-12)
-        found[edge] = _BLURS[best] * (_BLURS[1] / _BLURS[0]) ** float(np.clip(part, -1, 1))
-    return found
-
-
-def _normal_cdf(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    from scipy.special import ndtr
-
-    return np.asarray(ndtr(x), dtype=np.float64)

@@ -49,9 +49,14 @@ TAG_IDS = 587
 """Codes in the family 36h11."""
 
 MARGIN_MM = 8.0
-PAPER_COLUMNS, PAPER_ROWS = 256, 128
+PAPER_BLOCKS = {1: (2, 1), 2: (2, 2), 3: (4, 2), 4: (4, 4), 5: (8, 4)}
+"""Columns and rows of blocks in the paper's grid, for each number of bits: one block for each level of blue."""
+
 PAPER_REFERENCE_MM = 100.0
-"""Distance between the patches of bare paper in the margin of the paper's grid."""
+"""Largest distance between the patches of bare paper in the margin of the paper's grid."""
+
+PAPER_REFERENCES = 4
+"""Parts into which these patches divide the upper and the right margin at least."""
 
 A_SERIES_MM: dict[str, tuple[float, float]] = {
     "A0": (1189, 841),
@@ -259,7 +264,7 @@ def _choose_grid(
     return fitting, page_mm
 
 
-def paper_chart(page: str | tuple[float, float] | None = None) -> Chart:
+def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) -> Chart:
     """Return the paper's plain grid: 256 × 128 cells, each of the 32 768 colours once, without tags.
 
     The paper's figure of the pattern gives no order, so this one is a reconstruction: 8 × 4 blocks of 32 × 32 cells.
@@ -268,42 +273,49 @@ def paper_chart(page: str | tuple[float, float] | None = None) -> Chart:
     neighbours differ by one step in one channel, but for blue between blocks above each other.
 
     References are patches of bare paper in the margin, which the sheet is taken to have: 5 mm squares at the corners
-    and every 100 mm above and on the right of the field.
+    and every 100 mm or less above and on the right of the field.
 
     Parameters
     ----------
     page
         As in `design_chart`; A0 when not given. Cells are the largest whole pixels at 600 dpi that leave a margin of
         8 mm: 108 × 152 on A0, 4.57 × 6.43 mm.
+    bits
+        Bits kept of each channel, 1 … 5; the paper has 5. Fewer make a small grid of the same kind, for trials.
 
     Raises
     ------
     InputError
-        The page is unknown, or too small for cells that can be printed.
+        The bits are out of range, the page is unknown, or too small for cells that can be printed.
     """
+    if bits not in PAPER_BLOCKS:
+        raise InputError(f"a chart has 1 to 5 bits a channel, not {bits}")
     page_mm = _page_mm("A0" if page is None else page)
     margin_px = math.ceil(MARGIN_MM / _PX_MM)
     page_px = [math.floor(side / _PX_MM) for side in page_mm]
-    counts = (PAPER_COLUMNS, PAPER_ROWS)
+    across, down = PAPER_BLOCKS[bits]
+    levels = 1 << bits
+    counts = (levels * across, levels * down)
     cell_w, cell_h = ((side - 2 * margin_px) // count for side, count in zip(page_px, counts, strict=True))
     if min(cell_w, cell_h) < LEAST_SLOT_PX:
         raise InputError(
-            f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm is too small for {PAPER_COLUMNS} × {PAPER_ROWS} cells of "
+            f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm is too small for {counts[0]} × {counts[1]} cells of "
             f"{LEAST_SLOT_PX * _PX_MM:.2f} mm, the smallest that can be printed; choose a larger one, A0 at best"
         )
     x0, y0 = ((side - count * cell) // 2 for side, count, cell in zip(page_px, counts, (cell_w, cell_h), strict=True))
-    row, column = (places.ravel() for places in np.indices((PAPER_ROWS, PAPER_COLUMNS), dtype=np.int64))
-    block_column, block_row = column // 32, row // 32
-    red = np.where(block_column % 2 == 0, column % 32, 31 - column % 32)
-    green = np.where(block_row % 2 == 0, row % 32, 31 - row % 32)
-    blue = 8 * block_row + np.where(block_row % 2 == 0, block_column, 7 - block_column)
-    field = (x0, y0, x0 + PAPER_COLUMNS * cell_w, y0 + PAPER_ROWS * cell_h)
+    row, column = (places.ravel() for places in np.indices((counts[1], counts[0]), dtype=np.int64))
+    block_column, block_row = column // levels, row // levels
+    last = levels - 1
+    red = np.where(block_column % 2 == 0, column % levels, last - column % levels)
+    green = np.where(block_row % 2 == 0, row % levels, last - row % levels)
+    blue = across * block_row + np.where(block_row % 2 == 0, block_column, across - 1 - block_column)
+    field = (x0, y0, x0 + counts[0] * cell_w, y0 + counts[1] * cell_h)
     return Chart(
         page_mm=page_mm,
-        bits=5,
+        bits=bits,
         cell_mm=(cell_w * _PX_MM, cell_h * _PX_MM),
         centres_mm=_PX_MM * np.array([x0 + (column + 0.5) * cell_w, y0 + (row + 0.5) * cell_h], dtype=np.float64).T,
-        colours=(red << 10) | (green << 5) | blue,
+        colours=(red << 2 * bits) | (green << bits) | blue,
         tags=(),
         references=tuple(_margin_whites(field)),
         software=_software(),
@@ -314,7 +326,8 @@ def _margin_whites(field_px: tuple[int, int, int, int]) -> list[Reference]:
     """Return patches of bare paper around a field, a margin's clear 1.5 mm away from it."""
     left, top, right, bottom = field_px
     side, away, step = 118, 35 + 59, PAPER_REFERENCE_MM / _PX_MM
-    across, down = (math.ceil((high - low) / step) for low, high in ((left, right), (top, bottom)))
+    sides = ((left, right), (top, bottom))
+    across, down = (max(PAPER_REFERENCES, math.ceil((high - low) / step)) for low, high in sides)
     places = [(x, y) for y in (top - away, bottom + away) for x in (left - away, right + away)]
     places += [(left + round(k * (right - left) / across), top - away) for k in range(1, across)]
     places += [(right + away, top + round(k * (bottom - top) / down)) for k in range(1, down)]

@@ -40,9 +40,13 @@ class ColourModel:
         """Return camera RGB (N, 3), counts, of printed codes (N, 3) under even light."""
         return _code_terms(rgb, self.degree) @ self.coefficients
 
+    def light_at(self, points_mm: _Array) -> _Array:
+        """Return the light (N, 3) at points of the page, mean about 1."""
+        return _page_terms(points_mm, self.page_mm) @ self.light
+
     def seen(self, rgb: npt.ArrayLike, points_mm: _Array) -> _Array:
         """Return camera RGB (N, 3), counts, of printed codes at points of the page."""
-        return self.flat(rgb) * (_page_terms(points_mm, self.page_mm) @ self.light)
+        return self.flat(rgb) * self.light_at(points_mm)
 
 
 def _code_terms(rgb: npt.ArrayLike, degree: int) -> _Array:
@@ -56,7 +60,9 @@ def _page_terms(points_mm: _Array, page_mm: tuple[float, float]) -> _Array:
     return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
 
-def fit_colours(rgb: _Array, points_mm: _Array, seen: _Array, page_mm: tuple[float, float]) -> ColourModel:
+def fit_colours(
+    rgb: _Array, points_mm: _Array, seen: _Array, page_mm: tuple[float, float], finely: bool = False
+) -> ColourModel:
     """Return the colour model through patches, robust against those that are covered or not where they are thought.
 
     Parameters
@@ -69,8 +75,11 @@ def fit_colours(rgb: _Array, points_mm: _Array, seen: _Array, page_mm: tuple[flo
         (N, 3) camera RGB, counts.
     page_mm
         Width and height of the sheet.
+    finely
+        Whether the steps between neighbouring codes must be true: a polynomial of degree 6 where patches suffice,
+        which leaves a third of what one of degree 3 leaves.
     """
-    degree = 3 if len(rgb) >= 200 else 2 if len(rgb) >= 60 else 1
+    degree = 6 if finely and len(rgb) >= 2000 else 3 if len(rgb) >= 200 else 2 if len(rgb) >= 60 else 1
     terms, page = _code_terms(rgb, degree), _page_terms(points_mm, page_mm)
     coefficients, light = np.zeros((terms.shape[1], 3)), np.zeros((6, 3))
     for channel in range(3):

@@ -54,7 +54,9 @@ class Lens:
         return seen * self.radius_px + self.centre_px
 
 
-def fit_lens(points_mm: _Array, places_px: _Array, frame_size: tuple[int, int]) -> tuple[Lens, _Array]:
+def fit_lens(
+    points_mm: _Array, places_px: _Array, frame_size: tuple[int, int], normals: _Array | None = None
+) -> tuple[Lens, _Array]:
     """Return the lens through point pairs and the residuals.
 
     Plain least squares first, then robustly: robust from the start it sticks far off.
@@ -65,11 +67,13 @@ def fit_lens(points_mm: _Array, places_px: _Array, frame_size: tuple[int, int]) 
         (N, 2) pairs, N ≥ 8.
     frame_size
         Width and height of the frame, half-size px.
+    normals
+        (N, 2) the directions in which places are known, if they lie on lines; None where they are points.
 
     Returns
     -------
     Lens, ndarray
-        (N, 2) float64 residuals, seen minus fitted, px.
+        (N, 2) float64 residuals, seen minus fitted, px; along the normals if there are some.
     """
     centre = (np.array(frame_size, dtype=np.float64) - 1) / 2
     radius = float(np.hypot(*frame_size)) / 2
@@ -79,7 +83,7 @@ def fit_lens(points_mm: _Array, places_px: _Array, frame_size: tuple[int, int]) 
     normal = np.array([[1 / spread, 0, -middle[0] / spread], [0, 1 / spread, -middle[1] / spread], [0, 0, 1]])
     start = fit_homography((points_mm - middle) / spread, (places_px - centre) / radius)
     if start is None:
-        raise RegistrationError("the tags lie on one line; bring more of the chart into the frame")
+        raise RegistrationError("the marks lie on one line; bring more of the chart into the frame")
     scale = np.array([[radius, 0, centre[0]], [0, radius, centre[1]], [0, 0, 1]])
 
     def lens(parameters: _Array) -> Lens:
@@ -87,10 +91,12 @@ def fit_lens(points_mm: _Array, places_px: _Array, frame_size: tuple[int, int]) 
         return Lens(scale @ inner @ normal, centre, radius, np.append(parameters[8:], np.zeros(4 - free)))
 
     def residuals(parameters: _Array) -> _Array:
-        return (lens(parameters).to_pixels(points_mm) - places_px).ravel()
+        off = lens(parameters).to_pixels(points_mm) - places_px
+        return off.ravel() if normals is None else np.asarray((off * normals).sum(axis=1))
 
     start = np.append((start / start[2, 2]).ravel()[:8], np.zeros(free))
     plain = optimize.least_squares(residuals, start, x_scale="jac")
     robust = optimize.least_squares(residuals, plain.x, loss="soft_l1", f_scale=1.0, x_scale="jac")
     found = lens(np.asarray(robust.x))
-    return found, places_px - found.to_pixels(points_mm)
+    left = places_px - found.to_pixels(points_mm)
+    return found, left if normals is None else (left * normals).sum(axis=1, keepdims=True) * normals

@@ -35,6 +35,21 @@ _COARSE_CELLS = 10
 _BLOCK_CELLS = 8
 _KNOT_CELLS = 5
 _COARSE_PER_CELL = 5
+_FOLLOWED_CELLS = 12
+_WINDOW_WORTH = 4
+_RIM_SIGMAS = 3.0
+_COLOURS_REPEAT = 10
+"""How many neighbouring elements the misfit of the colours is alike over, where steps of colour are all there is."""
+
+_SLIP_CELLS = 16
+_SLIP = 0.5
+_SLIP_SIGMAS = 6.0
+_PART_WORTH = 8
+_COLOUR_MISFIT, _MOST_NOISE = 0.003, 0.01
+"""Of paper white: what the model of the colours leaves, and what noise may count for beside it."""
+
+_STRANGE = 20.0
+_LOOK_CELLS = 0.6
 _COLOUR_PATCHES = 5000
 _INTERPOLATION_PX = 0.28
 """σ that cubic interpolation adds to a frame's edges: measured on edges of σ 0.4 to 0.7 px, less where they are softer.
@@ -98,6 +113,8 @@ class Matcher:
         self, chart: Chart, planes: list[Plane], lens: Lens, anchors: Anchors, blur_px: float, cell_px: float
     ) -> None:
         self._chart = chart
+        # An even order, as the paper's, has no more than the steps between neighbouring codes to go by.
+        self._finely = not chart.tags
         self._planes = planes
         self.lens = lens
         self._anchors = anchors
@@ -127,8 +144,14 @@ class Matcher:
         self._raster = Raster.of(low, cell / self._per_cell, self._cells_across * self._per_cell)
         self._cover = self._raster.coverage(self._centres, self._sizes)
         self._free = self._raster.outside_tags(chart.tags) & self._raster.near(self._cover, self._per_cell)
+        if self._finely:
+            # The margin's light that is blurred into the outermost cells is stronger than all their steps.
+            rim = 2 * int(np.ceil(_RIM_SIGMAS * blur_px / cell_px * self._per_cell)) + 1
+            cells = (self._raster.coverage(chart.centres_mm, self._sizes[: chart.colour_count]) > 0).sum(axis=1)
+            covered = np.asarray(cells).reshape(self._raster.shape).astype(np.uint8)
+            self._free = np.asarray(cv2.erode(covered, np.ones((rim, rim), dtype=np.uint8))).astype(np.bool_)
         self.colours = self._fit_colours()
-        self.blocks = Blocks(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2)))
+        self._left = np.zeros((0, 2, 2)), np.zeros((0, 2)), np.zeros(0)
 
     def to_pixels(self, points_mm: npt.ArrayLike) -> _Array:
         """Return the half-size pixels (N, 2) of points (N, 2) mm by the map of the moment."""
@@ -155,14 +178,16 @@ class Matcher:
         there = np.flatnonzero(np.isfinite(seen).all(axis=1))
         # Some thousand patches tell a polynomial all they can.
         there = there[:: max(1, len(there) // _COLOUR_PATCHES)]
-        return fit_colours(self._rgb[there], self._centres[there], seen[there], self._chart.page_mm)
+        return fit_colours(self._rgb[there], self._centres[there], seen[there], self._chart.page_mm, self._finely)
 
     def _template(self, raster: Raster, cover: sparse.csr_array, blur_px: float) -> _Float:
-        """Return the print as the camera would see it, (H, W, 3) float32, under even light."""
+        """Return the print as the camera would see it, (H, W, 3) float32; under even light if it has tags."""
         flat = self.colours.flat(self._rgb)
         paper = self.colours.flat(np.array([[255, 255, 255]]))[0]
         image = np.asarray(cover @ (flat - paper)) + paper
         image = image.reshape(*raster.shape, 3).astype(np.float32)
+        if self._finely:
+            image *= raster.smooth(self.colours.light_at)
         blurred = float(np.hypot(blur_px, _INTERPOLATION_PX))
         sigma = blurred / self.cell_px * self._cell / raster.step_mm
         return np.asarray(cv2.GaussianBlur(image, (0, 0), float(sigma[0]), sigmaY=float(sigma[1])), dtype=np.float32)
@@ -228,9 +253,106 @@ class Matcher:
         if best < 0.3:
             raise not_this_chart(what, f"blocks of cells correlate by {best:.2f} with the chart's, 0.3 expected")
 
+    def follow(self, sigma_cells: float) -> float:
+        """Move the map by one Gauss-Newton step of what is coarser than cells; return the RMS movement, px.
+
+        Blurred by `sigma_cells`, the steps between cells are gone, and with them the danger to lock onto the
+        neighbouring cell; folds of a smooth order and the texture of a random one remain. Where the colours only rise
+        evenly nothing can be told, and nothing is claimed: the map goes on smoothly from where it can.
+        """
+        points, information, pull, _ = self._compared_softly(sigma_cells)
+        # What the colours leave is alike over many cells: a window is about one measurement.
+        repeat = (_FOLLOWED_CELLS * _COARSE_PER_CELL) ** 2 / _WINDOW_WORTH
+        moved = self._move(points, information / repeat, pull / repeat)
+        self.colours = self._fit_colours()
+        return moved
+
+    def _compared_softly(self, sigma_cells: float) -> tuple[_Array, _Array, _Array, _Array]:
+        """Return what `_compared` does of print and frame, both blurred by some cells."""
+        n = _COARSE_PER_CELL
+        raster = Raster.of(self._low, self._cell / n, self._cells_across * n)
+        cover = raster.coverage(self._centres, self._sizes)
+        free = raster.outside_tags(self._chart.tags) & raster.near(cover, n)
+        template = self._template(raster, cover, sigma_cells * self.cell_px)
+        image, there = self._rectified(raster)
+        image[~free] = self._template(raster, cover, self.blur_px)[~free]
+        more = float(np.sqrt(max(sigma_cells**2 - (self.blur_px / self.cell_px) ** 2, 0.01)))
+        for channel in range(3):
+            image[..., channel] = cv2.GaussianBlur(image[..., channel], (0, 0), more * n)
+        weight = (there & free).astype(np.float32)
+        return self._compared(raster, n, template, image, weight, _FOLLOWED_CELLS * n, even=True)
+
+    def blocks(self) -> Blocks:
+        """Return how each block fits after the last step."""
+        information, pull, score = self._left
+        if self._finely:
+            # The steps of dark cells drown in noise; whether these are the chart's colours shows over many cells.
+            score = self._compared_softly(_LOOK_CELLS)[3]
+        return self._blocks(information, pull, score)
+
+    def slipped(self, strangers: _Mask) -> tuple[_Array, int]:
+        """Return the middles (B, 2) mm of parts of the field that look like their neighbours, and of how many parts.
+
+        By the colours' own level, which steps and correlations do not look at: what is seen less what is wanted is
+        held against what the next cell would change, part by part. `strangers` (N,) are cells left out.
+        """
+        seen, wanted, paper = self.patches()
+        count = self._chart.colour_count
+        column, row = np.floor((self._chart.centres_mm - self._low) / self._cell).astype(int).T
+        columns, rows = self._cells_across
+        grid = np.full((2, rows + 2, columns + 2, 3), np.nan)
+        for picture, colours in zip(grid, (seen, wanted), strict=True):
+            picture[row + 1, column + 1] = colours[:count]
+        grid[0, row[strangers] + 1, column[strangers] + 1] = np.nan
+        error = (grid[0] - grid[1])[1:-1, 1:-1]
+        # Noise, from neighbour to neighbour, and what a model of colours leaves; a slip must not count as usual.
+        noise = 1.0484 * np.nanmedian(np.abs(np.diff(error, axis=1)), axis=(0, 1))
+        usual = np.hypot(np.minimum(noise, _MOST_NOISE * paper), _COLOUR_MISFIT * paper) + 1e-9
+        steps = (
+            (grid[1, 1:-1, 2:] - grid[1, 1:-1, :-2]) / 2 / usual,
+            (grid[1, 2:, 1:-1] - grid[1, :-2, 1:-1]) / 2 / usual,
+        )
+        error = np.clip(error / usual, -_STRANGE, _STRANGE)
+        places: list[_Array] = []
+        parts_seen = 0
+        size = int(np.clip(min(rows, columns) // 2, 4, _SLIP_CELLS))
+        for top in range(0, rows, size):
+            for left in range(0, columns, size):
+                part = np.s_[top : top + size, left : left + size]
+                parts = [picture[part].ravel() for picture in (*steps, error)]
+                known = np.isfinite(parts).all(axis=0)
+                if known.sum() < size**2:
+                    continue
+                parts_seen += 1
+                design = np.stack([values[known] for values in parts[:2]], axis=1)
+                gram = design.T @ design
+                slip = np.linalg.solve(gram + 1e-9 * np.eye(2), design.T @ parts[2][known])
+                # The misfit of the colours is alike over many cells: a part tells a few things only.
+                sure = np.sqrt(np.diag(gram) * _PART_WORTH / known.sum())
+                if ((np.abs(slip) > _SLIP) & (np.abs(slip) * sure > _SLIP_SIGMAS)).any():
+                    places.append(self._low + (np.array([left, top]) + size / 2) * self._cell)
+        return np.array(places).reshape(-1, 2), parts_seen
+
     def step(self) -> float:
         """Move the map by one Gauss-Newton step of all cells together; return the RMS movement, px."""
-        points, information, pull, score = self._measure()
+        raster, n = self._raster, self._per_cell
+        template = self._template(raster, self._cover, self.blur_px)
+        image, there = self._rectified(raster)
+        weight = (there & self._free).astype(np.float32)
+        points, information, pull, score = self._compared(
+            raster, n, template, image, weight, self._block_cells * n, self._finely
+        )
+        if self._finely:
+            information, pull = information / _COLOURS_REPEAT, pull / _COLOURS_REPEAT
+        before = self.displacement
+        moved = self._move(points, information, pull)
+        # What the cells still ask for after the step is what they asked for less what they got.
+        got = self.displacement.at(points) - before.at(points)
+        self._left = information, pull - np.einsum("nij,nj->ni", information, got), score
+        return moved
+
+    def _move(self, points: _Array, information: _Array, pull: _Array) -> float:
+        """Move the map to where measured places (N, 2) and the anchors ask for; return the RMS movement, px."""
         anchors = self._anchors
         all_points = np.concatenate([points, anchors.points_mm])
         all_information = np.concatenate([information, anchors.information])
@@ -240,21 +362,27 @@ class Matcher:
         total = np.concatenate([pull, anchored]) + np.einsum("nij,nj->ni", all_information, before)
         self.displacement = self.displacement.fitted(all_points, all_information, total)
         moved = (self.displacement.at(all_points) - before)[: len(points)]
-        # What the cells still ask for after the step is what they asked for less what they got.
-        left = pull - np.einsum("nij,nj->ni", information, moved)
-        self.blocks = self._blocks(information, left, score)
-        seen = information[:, 0, 0] > 0
-        return rms(moved[seen])
+        return rms(moved[information[:, 0, 0] > 0])
 
-    def _measure(self) -> tuple[_Array, _Array, _Array, _Array]:
-        """Return places (N, 2) mm, information (N, 2, 2), pull (N, 2) and score (N,) of every cell-sized square."""
-        raster, n = self._raster, self._per_cell
-        template = self._template(raster, self._cover, self.blur_px)
-        image, there = self._rectified(raster)
-        there &= self._free
-        window = self._block_cells * n
-        weight = there.astype(np.float32)
-        share = np.maximum(box(weight, window), np.float32(1e-3))
+    def _compared(
+        self, raster: Raster, n: int, template: _Float, image: _Float, weight: _Float, window: int, even: bool = False
+    ) -> tuple[_Array, _Array, _Array, _Array]:
+        """Return places (N, 2) mm, information (N, 2, 2), pull (N, 2) and score (N,) of tiles of n × n elements.
+
+        Parameters
+        ----------
+        raster, n
+            The raster, and the elements of a tile along a side.
+        template, image
+            (H, W, 3) the print as it should be seen and the frame.
+        weight
+            (H, W) 1 where they can be compared, else 0.
+        window
+            Elements over which gain and offset are thought constant.
+        even
+            Whether what an even gradient could tell is left out, as an offset explains it as well as a movement does.
+        """
+        mean = _Mean(weight, window, even)
         agreeing = np.zeros(raster.shape, dtype=np.float32)
         wanted_power, seen_power = np.zeros_like(agreeing), np.zeros_like(agreeing)
         sums = np.zeros((*raster.tiles(n), 5), dtype=np.float64)
@@ -262,24 +390,29 @@ class Matcher:
             wanted, seen = template[..., channel], image[..., channel]
             gy, gx = np.gradient(wanted)
             # Gain and offset are local, as the light and the lens's shading are.
-            wanted = (wanted - box(wanted * weight, window) / share) * weight
-            seen = (seen - box(seen * weight, window) / share) * weight
+            wanted = (wanted - mean(wanted)) * weight
+            seen = (seen - mean(seen)) * weight
             power, common = box(wanted * wanted, window), box(wanted * seen, window)
             gain = common / np.maximum(power, np.float32(1e-6))
             error = seen - gain * wanted
             size = np.abs(error)
-            noise = np.float32(1.4826 * float(np.median(size[::3, ::3][there[::3, ::3]])) + 1e-3)
+            noise = np.float32(1.4826 * float(np.median(size[::3, ::3][weight[::3, ::3] > 0])) + 1e-3)
             agreeing += common / noise**2
             wanted_power += power / noise**2
             seen_power += box(seen * seen, window) / noise**2
             huber = weight / np.maximum(noise * noise, 0.5 * noise * size)
-            gx *= gain
-            gy *= gain
+            if even:
+                gx, gy = ((slope - mean(slope)) * weight for slope in (gx, gy))
+                gx, gy = (
+                    slope - wanted * box(slope * wanted, window) / np.maximum(power, np.float32(1e-6))
+                    for slope in (gx, gy)
+                )
+            gx, gy = gx * gain, gy * gain
             for place, (one, other) in enumerate(((gx, gx), (gx, gy), (gy, gy), (gx, error), (gy, error))):
                 sums[..., place] += sums_of(huber * one * other, n)
         score = agreeing / np.sqrt(np.maximum(wanted_power * seen_power, np.float32(1e-6)))
-        score *= share > 0.25
-        points = raster.points_oftiles(n)
+        score *= mean.share > 0.25
+        points = raster.points_of_tiles(n)
         information, pull = to_pixel_units(sums.reshape(-1, 5), jacobians(self.to_pixels, points, raster.step_mm))
         # Neighbouring raster elements repeat each other's noise where they are finer than the photosites.
         repeat = max(1.0, (n / self.cell_px) ** 2)
@@ -299,7 +432,7 @@ class Matcher:
         np.add.at(matrix, block, information)
         np.add.at(right, block, pull)
         # Blank margins have nothing to compare: only squares that hold a cell are judged.
-        points = self._raster.points_oftiles(self._per_cell)
+        points = self._raster.points_of_tiles(self._per_cell)
         column, row = np.floor((self._chart.centres_mm - self._low) / self._cell).astype(int).T
         held = np.zeros((rows, columns))
         held[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)] = 1
@@ -312,13 +445,35 @@ class Matcher:
         known = np.linalg.eigvalsh(matrix)[:, 0] > _LEAST_INFORMATION
         residual = np.zeros((count, 2))
         residual[known] = np.linalg.solve(matrix[known], right[known, :, None])[..., 0]
-        return Blocks(centres[used], np.where(known, mean, 0.0)[used], residual[used])
+        return Blocks(centres[used], np.where(known | self._finely, mean, 0.0)[used], residual[used])
+
+
+class _Mean:
+    """The mean over a window around each element, of those that count."""
+
+    def __init__(self, weight: _Float, window: int, even: bool) -> None:
+        self._weight, self._window = weight, window
+        self.share = np.maximum(box(weight, window), np.float32(1e-3))
+        rows, columns = (np.flatnonzero(weight.any(axis=axis)) for axis in (1, 0))
+        self._inner = None
+        if even and min(len(rows), len(columns)) > window:
+            self._inner = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+    def __call__(self, image: _Float) -> _Float:
+        """Return the mean (H, W); if even, an even gradient is its own mean up to the border of what counts."""
+        if self._inner is None:
+            return np.asarray(box(image * self._weight, self._window) / self.share, dtype=np.float32)
+        around = self._window // 2 + 1
+        padded = np.pad(image[self._inner], around, mode="reflect", reflect_type="odd")
+        mean = np.zeros_like(image)
+        mean[self._inner] = box(padded, self._window)[around:-around, around:-around]
+        return mean
 
 
 def not_this_chart(what: str, measured: str) -> RegistrationError:
     """Return that the chart seen is another one."""
     return RegistrationError(
-        f"{what}: the tags fit, but the cells' colours are not those of the chart: {measured}; "
+        f"{what}: a chart is there, but its cells' colours are not those of the chart: {measured}; "
         "name the chart.json of this print, or uncover it"
     )
 

@@ -43,7 +43,7 @@ class Raster:
         """Return rows and columns of whole tiles of size × size elements."""
         return self.shape[0] // size, self.shape[1] // size
 
-    def points_oftiles(self, size: int) -> _Array:
+    def points_of_tiles(self, size: int) -> _Array:
         """Return the middles (N, 2) mm of tiles of size × size elements, row by row."""
         rows, columns = self.tiles(size)
         y, x = np.mgrid[:rows, :columns]
@@ -65,6 +65,18 @@ class Raster:
         v, u = (rows - i)[:, None, None], (columns - j)[None, :, None]
         along = lattice[:, j] * (1 - u) + lattice[:, j + 1] * u
         return (along[i] * (1 - v) + along[i + 1] * v).astype(np.float32)
+
+    def smooth(self, of_points: ToPixels) -> _Float:
+        """Return what changes slowly over the print, (H, W, K) float32, from its values (N, K) at points (N, 2) mm."""
+        rows, columns = (max(2, length // 32) for length in self.shape)
+        y, x = np.mgrid[:rows, :columns]
+        low, high = self.low_mm + self.step_mm / 2, self.low_mm + (np.array(self.shape[::-1]) - 0.5) * self.step_mm
+        share = np.stack([x.ravel() / (columns - 1), y.ravel() / (rows - 1)], axis=-1)
+        coarse = of_points(low + share * (high - low)).reshape(rows, columns, -1).astype(np.float32)
+        sizes = zip((columns, rows), self.shape[::-1], strict=True)
+        across, down = (np.linspace(0, count - 1, length, dtype=np.float32) for count, length in sizes)
+        where_x, where_y = np.meshgrid(across, down)
+        return np.asarray(cv2.remap(coarse, where_x, where_y, cv2.INTER_LINEAR), dtype=np.float32)
 
     def coverage(self, centres_mm: _Array, sizes_mm: _Array) -> sparse.csr_array:
         """Return the share of each element that each rectangle covers, (H · W, N)."""

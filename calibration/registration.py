@@ -1,10 +1,12 @@
-"""Where every point of the print lies in a frame: tags first, then the cells themselves.
+"""Where every point of the print lies in a frame: tags or the field's outline first, then the cells themselves.
 
 Laws that hold inside:
 
 - Tags give a homography and Brown's distortion and nothing finer: 35 of them cannot sample a wavy sheet. The local
   part is measured on the cells: the frame is rectified to the print, compared with the print's colours as the camera
   sees them (a colour model fitted on the frame itself), and a smooth displacement is fitted to what does not coincide.
+- A chart without tags has the outline of its field for that, and is then followed from coarse to fine: a map that has
+  slipped by a cell is looked for, and refused.
 - All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres.
 - The result judges itself. A registration that cannot be trusted is a `RegistrationError`, never a value.
 
@@ -20,9 +22,11 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from acquisition.chart import Chart
-from acquisition.framing import Framing, blur_px, find_chart
+from acquisition.field import Field
+from acquisition.framing import Framing, find_chart
 from acquisition.homography import rms
 from acquisition.planes import CHANNELS, frame_black, plane_of
+from acquisition.sharpness import blur_px
 from calibration.colours import ColourModel
 from calibration.displacement import Displacement
 from calibration.lens import Lens, fit_lens
@@ -46,11 +50,25 @@ MAX_TAG_RESIDUAL_PX = 8.0
 MIN_AGREEMENT = 0.8
 """Least correlation of the cells' colours with those predicted; another order of cells gives about 0."""
 
+MIN_PLAIN_AGREEMENT = 0.95
+"""The same for a chart without tags, whose smooth order a model of colours can follow into a cover; 0.99 is usual."""
+
 MIN_GOOD_BLOCKS = 0.75
 MAX_BLOCK_RESIDUAL_PX = 0.5
 
 _GAUSS_NEWTON_STEPS = 5
 _TAG_SIGMA_PX = 0.15
+_OUTLINE_SIGMA_PX = 0.1
+_APART, _APART_PX = 5.0, 1.0
+"""Points of an outline further from the lens than five of their standard deviations, and a pixel, are not of it."""
+
+_FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
+"""Blur in cells of the steps that follow a chart without tags, before its cells are looked at."""
+
+_FEW_SLIPPED = 2
+_SLIPPED_SHARE = 0.015
+"""Parts of a field from which on it is refused; none looks slipped in any simulated room that is registered well."""
+
 _STRANGE_SIGMA = 10.0
 _NEIGHBOURS = 13
 """A cell and the twelve within two cells of it."""
@@ -70,13 +88,13 @@ class Registration:
     Attributes
     ----------
     framing
-        The tags as found.
+        The tags, or the field's outline, as found.
     lens, displacement
         The two parts of the map.
-    tag_residual_px
-        (T, 4, 2) float64, corners of the tags in `framing.tags` against the final map.
+    marks_residual_px
+        (N, 2) float64, the tags' corners against the final map; of a chart without tags the field's outline, across.
     lens_residual_px
-        RMS of the tags against the lens alone: what the paper's waviness leaves.
+        RMS of the same against the lens alone: what the paper's waviness leaves.
     blocks
         Fit of the cells.
     colours
@@ -86,7 +104,7 @@ class Registration:
     agreement
         Correlation of the cells' colours with the model's, the mean of the channels that carry light.
     blur_px
-        σ of the tags' edges.
+        σ of the tags' edges, or of the field's.
     cell_px
         Half-size pixels per cell, the shorter side of the smallest.
     shift_px
@@ -96,7 +114,7 @@ class Registration:
     framing: Framing
     lens: Lens
     displacement: Displacement
-    tag_residual_px: _Array
+    marks_residual_px: _Array
     lens_residual_px: float
     blocks: Blocks
     colours: ColourModel
@@ -115,9 +133,9 @@ class Registration:
         return replace(self, shift_px=(self.shift_px[0] + dx, self.shift_px[1] + dy))
 
     @property
-    def tag_rms_px(self) -> float:
-        """RMS distance of the tags' corners from the final map."""
-        return rms(self.tag_residual_px)
+    def marks_rms_px(self) -> float:
+        """RMS distance of the tags' corners, or the field's outline, from the final map."""
+        return rms(self.marks_residual_px)
 
     @property
     def block_rms_px(self) -> float:
@@ -125,52 +143,111 @@ class Registration:
         return rms(self.blocks.residual_px[self.blocks.good])
 
 
-def register(mosaic: Mosaic, chart: Chart, what: str = "the frame") -> Registration:
+def register(
+    mosaic: Mosaic,
+    chart: Chart,
+    what: str = "the frame",
+    corners: npt.ArrayLike | None = None,
+    near: Registration | None = None,
+) -> Registration:
     """Return where the chart lies in a frame.
 
-    About 5 s of one processor for the 32 768 cells on an 18-megapixel frame.
+    About 5 s of one processor for the 32 768 cells on an 18-megapixel frame, three times that without tags.
 
     Parameters
     ----------
     mosaic
-        The frame; a white one is best, any with light in it will do.
+        The frame; a white one is best, any with light in it will do if the chart has tags.
     chart
         The chart expected.
     what
         The frame's name for messages.
+    corners
+        For a chart without tags: (4, 2) half-size px, the corners of the field of cells, clockwise from the printed
+        top-left, to some 20 px; found by themselves if not given.
+    near
+        An earlier registration of the same session: a chart without tags then hangs the same way up.
 
     Raises
     ------
     RegistrationError
-        The tags are missing, mirrored, too small or do not fit; the frame is out of focus or too small in the
-        picture; the cells' colours are not those of the chart.
+        The tags or the field are missing, mirrored, too small or do not fit; the frame is out of focus or too small in
+        the picture; the cells' colours are not those of the chart, or are those of their neighbours.
     """
     black = frame_black(mosaic)
-    framing = find_chart(mosaic, chart, what)
+    framing = find_chart(mosaic, chart, what, corners, None if near is None else near.framing)
     blur = blur_px(framing)
     planes = [plane_of(mosaic, channel, black) for channel in CHANNELS]
-    tags = {tag.id: tag for tag in chart.tags}
-    corners_mm = np.concatenate([tags[tag.id].corners_mm for tag in framing.tags])
-    corners_px = np.concatenate([tag.corners_px for tag in framing.tags])
     height, width = planes[0].values.shape
-    lens, residual = fit_lens(corners_mm, corners_px, (width, height))
+    if framing.field is None:
+        marks = _tag_corners(framing, chart)
+        lens, residual = fit_lens(marks.points_mm, marks.places_px, (width, height))
+    else:
+        field, lens, residual = _field_through_lens(framing.field, (width, height))
+        framing, marks = replace(framing, field=field), _outline(field)
     lens_rms = rms(residual)
     if lens_rms > MAX_TAG_RESIDUAL_PX:
         raise RegistrationError(
-            f"{what}: the tags lie {lens_rms:.1f} px RMS off a plane seen through a lens, {MAX_TAG_RESIDUAL_PX:g} "
-            "allowed; hang the print flat, and see that it is this chart's"
+            f"{what}: the {'tags' if chart.tags else 'edges of the field'} lie {lens_rms:.1f} px RMS off a plane seen "
+            f"through a lens, {MAX_TAG_RESIDUAL_PX:g} allowed; hang the print flat, and see that it is this chart's"
         )
     cell_px = _cell_px(lens, chart)
     _require_size_and_focus(cell_px, blur, what)
-    anchors = Anchors(corners_mm, corners_px, np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2)))
-    matcher = Matcher(chart, planes, lens, anchors, blur, cell_px)
-    matcher.match_coarsely(what)
+    matcher = Matcher(chart, planes, lens, marks, blur, cell_px)
+    if chart.tags:
+        matcher.match_coarsely(what)
+    else:
+        for softness in _FOLLOWED_SOFTLY:
+            matcher.follow(softness)
     for _ in range(_GAUSS_NEWTON_STEPS):
         if matcher.step() < 0.01:
             break
-    registration = _registered(chart, framing, matcher, lens_rms)
-    _judge(registration, what)
+    registration = _registered(chart, framing, matcher, marks, lens_rms)
+    _judge(registration, MIN_AGREEMENT if chart.tags else MIN_PLAIN_AGREEMENT, what)
+    if not chart.tags:
+        _require_own_cells(matcher, registration.strangers, what)
     return registration
+
+
+def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
+    tags = {tag.id: tag for tag in chart.tags}
+    corners_mm = np.concatenate([tags[tag.id].corners_mm for tag in framing.tags])
+    corners_px = np.concatenate([tag.corners_px for tag in framing.tags])
+    return Anchors(corners_mm, corners_px, np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2)))
+
+
+def _outline(field: Field) -> Anchors:
+    """Return the field's outline, whose places are known across alone."""
+    known = np.einsum("ni,nj->nij", field.normals, field.normals) / _OUTLINE_SIGMA_PX**2
+    return Anchors(field.outline_mm, field.outline_px, known)
+
+
+def _field_through_lens(field: Field, frame_size: tuple[int, int]) -> tuple[Field, Lens, _Array]:
+    """Return the field without points of its outline that stand apart, which are marks; its lens; and residuals."""
+    lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
+    for _ in range(2):
+        size = np.linalg.norm(residual, axis=1)
+        fits = size <= max(_APART * 1.4826 * float(np.median(size)), _APART_PX)
+        field = replace(
+            field,
+            outline_mm=field.outline_mm[fits],
+            outline_px=field.outline_px[fits],
+            normals=field.normals[fits],
+        )
+        lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
+    return field, lens, residual
+
+
+def _require_own_cells(matcher: Matcher, strangers: _Mask, what: str) -> None:
+    """Refuse a map on which parts of the field show the colours of the cells beside them."""
+    places, parts = matcher.slipped(strangers)
+    if len(places) >= max(_FEW_SLIPPED, _SLIPPED_SHARE * parts):
+        x, y = places[0]
+        raise RegistrationError(
+            f"{what}: {len(places)} of {parts} parts of the field look as if they lay one cell aside, the first about "
+            f"{x:.0f}, {y:.0f} mm from the sheet's top-left corner; uncover the print, hang it flatter, and see that "
+            "chart.json has its cells where they are printed"
+        )
 
 
 def _cell_px(lens: Lens, chart: Chart) -> float:
@@ -195,27 +272,41 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
         )
 
 
-def _registered(chart: Chart, framing: Framing, matcher: Matcher, lens_rms: float) -> Registration:
+def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors, lens_rms: float) -> Registration:
     """Return the map with everything that tells how good it is."""
     seen, wanted, paper = matcher.patches()
-    there = np.isfinite(seen).all(axis=1)
-    tags = {tag.id: tag for tag in chart.tags}
-    residual = np.stack([tag.corners_px - matcher.to_pixels(tags[tag.id].corners_mm) for tag in framing.tags])
+    there = np.asarray(np.isfinite(seen).all(axis=1))
+    residual = marks.places_px - matcher.to_pixels(marks.points_mm)
+    if framing.field is not None:
+        residual = (residual * framing.field.normals).sum(axis=1, keepdims=True) * framing.field.normals
+    strangers = _with_neighbours(
+        _strangers(seen, wanted, paper)[: chart.colour_count], chart.centres_mm / np.array(chart.cell_mm)
+    )
+    blocks = matcher.blocks()
+    if not chart.tags:
+        there[: chart.colour_count] &= ~strangers
+        blocks = _without_strangers(blocks, strangers, chart)
     return Registration(
         framing=framing,
         lens=matcher.lens,
         displacement=matcher.displacement,
-        tag_residual_px=residual,
+        marks_residual_px=residual,
         lens_residual_px=lens_rms,
-        blocks=matcher.blocks,
+        blocks=blocks,
         colours=matcher.colours,
-        strangers=_with_neighbours(
-            _strangers(seen, wanted, paper)[: chart.colour_count], chart.centres_mm / np.array(chart.cell_mm)
-        ),
+        strangers=strangers,
         agreement=_agreement(seen[there], wanted[there]),
         blur_px=matcher.blur_px,
         cell_px=matcher.cell_px,
     )
+
+
+def _without_strangers(blocks: Blocks, strangers: _Mask, chart: Chart) -> Blocks:
+    """Return blocks whose score sinks with the share of strangers: a smooth order looks alike through a wide window."""
+    block = np.asarray(cKDTree(blocks.centres_mm).query(chart.centres_mm)[1])
+    cells = np.maximum(np.bincount(block, minlength=len(blocks.score)), 1)
+    share = np.bincount(block, strangers, minlength=len(blocks.score)) / cells
+    return replace(blocks, score=blocks.score * (1 - share))
 
 
 def _strangers(seen: _Array, wanted: _Array, paper: _Array) -> _Mask:
@@ -242,12 +333,12 @@ def _agreement(seen: _Array, wanted: _Array) -> float:
     return float(np.mean([np.corrcoef(seen[:, channel], wanted[:, channel])[0, 1] for channel in used]))
 
 
-def _judge(registration: Registration, what: str) -> None:
+def _judge(registration: Registration, least_agreement: float, what: str) -> None:
     """Refuse a registration that would build a wrong table."""
     blocks = registration.blocks
-    if registration.agreement < MIN_AGREEMENT:
+    if registration.agreement < least_agreement:
         raise not_this_chart(
-            what, f"they correlate by {registration.agreement:.2f} with those expected, {MIN_AGREEMENT:g} needed"
+            what, f"they correlate by {registration.agreement:.2f} with those expected, {least_agreement:g} needed"
         )
     share = float(blocks.good.mean())
     if share < MIN_GOOD_BLOCKS:

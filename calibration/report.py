@@ -198,7 +198,7 @@ def summary(result: BuildResult) -> list[tuple[str, str, str]]:
         ("Cell", f"{registration.cell_px:.1f} px", "at least 8 for 25 pixels inside it"),
         ("Window", f"{result.window}×{result.window} samples", _window_note(result)),
         ("Blur", f"σ {registration.blur_px:.2f} px", "about 0.6 is sharp"),
-        ("Tags' corners", f"{registration.tag_rms_px:.3f} px RMS", "0.09 is the detector's own error"),
+        ("Tags' corners", f"{registration.marks_rms_px:.3f} px RMS", "0.09 is the detector's own error"),
         ("Waviness", f"{registration.lens_residual_px:.2f} px RMS", "of the tags against a plane seen through a lens"),
         ("Blocks of cells", f"{registration.block_rms_px:.3f} px RMS", "movement they still ask for"),
         ("Colours agree", f"{registration.agreement:.4f}", "correlation of cells and chart; another chart has about 0"),

@@ -133,7 +133,7 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "cell_px": registration.cell_px,
         "bleed": bleed(registration.cell_px, registration.blur_px, result.window),
         "tag_residual_px": registration.lens_residual_px,
-        "tag_final_px": registration.tag_rms_px,
+        "tag_final_px": registration.marks_rms_px,
         "block_residual_px": registration.block_rms_px,
         "blocks_good": float(registration.blocks.good.mean()),
         "agreement": registration.agreement,

@@ -86,7 +86,7 @@ def test_the_paper_s_arrangement(chart: Run, capsys: pytest.CaptureFixture[str])
         (("--page", "A5"), "too small for the 32768 colours"),
         (("--page", "A1", "--cell-mm", "5.29"), "3.60 mm fit"),
         (("--cell-mm", "0.5"), "cannot be printed evenly"),
-        (("--arrangement", "paper", "--bits", "3"), "leave --bits and --cell-mm out"),
+        (("--arrangement", "paper", "--cell-mm", "3"), "leave --cell-mm out"),
         (("--arrangement", "paper", "--page", "A6"), "256 × 128 cells"),
         (("--page", "letter"), "is not known"),
     ],

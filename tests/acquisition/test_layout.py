@@ -278,6 +278,22 @@ def test_the_paper_s_arrangement_is_a_plain_grid_of_every_colour_once() -> None:
     assert codes[0, 255].tolist() == [0, 0, 56]
 
 
+@pytest.mark.parametrize("bits", [1, 2, 3, 4])
+def test_a_small_paper_s_arrangement_is_of_the_same_kind(bits: int) -> None:
+    chart = paper_chart("A4", bits)
+    assert sorted(chart.colours.tolist()) == list(range(8**bits))
+    assert len(chart.white_references) >= 6
+    columns = len(np.unique(chart.centres_mm[:, 0].round(3)))
+    codes = chart.rgb.astype(np.int64).reshape(-1, columns, 3) >> (8 - bits)
+    # Along a row neighbours differ by one step in one channel.
+    assert np.abs(np.diff(codes, axis=1)).sum(axis=2).max() == 1
+
+
+def test_a_paper_s_arrangement_of_six_bits_does_not_exist() -> None:
+    with pytest.raises(InputError, match="1 to 5 bits"):
+        paper_chart(bits=6)
+
+
 def test_the_paper_s_references_are_bare_margin() -> None:
     chart = paper_chart()
     places = np.array([reference.centre_mm for reference in chart.references])

@@ -86,6 +86,12 @@ def hang(bits: int = 3, page: str = "A5", body: str = "Test", seed: int = 1, roo
     return Lab(chart, World(sheet, BODIES[body], Room(waviness_mm=0.5) if room is None else room))
 
 
+def hang_chart(chart: Chart, body: str, room: Room) -> Lab:
+    """Return a lab with a chart of one's own."""
+    picture = drawing(chart)
+    return Lab(chart, World(Print(picture.page_mm, picture.rectangles_mm, picture.rgb), BODIES[body], room))
+
+
 def take(
     lab: Lab,
     folder: Path,
