@@ -132,7 +132,11 @@ class Hung:
 
 def hang(case: Case, bits: int = 5, page: str = "A0") -> Hung:
     """Return the room of a case with its chart hung up and photographed."""
-    chart = design_chart(bits, A_SERIES_MM[page], case.seed)
+    return photographed(case, design_chart(bits, A_SERIES_MM[page], case.seed))
+
+
+def photographed(case: Case, chart: Chart) -> Hung:
+    """Return the room of a case with a chart hung up and photographed."""
     drawn = drawing(chart)
     world = World(Print(drawn.page_mm, drawn.rectangles_mm, drawn.rgb), BODIES[case.body], case.room)
     stream = BytesIO()
