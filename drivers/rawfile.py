@@ -6,7 +6,8 @@ Rules that hold inside:
   the rotation that dcraw applies.
 - Whatever the bytes, the outcome is a `Mosaic` or one `FormatError`. A file that has been cut is an error wherever its
   structure betrays it, since LibRaw fills what is missing with zeros in some formats.
-- LibRaw is called here and nowhere else in the suite.
+- LibRaw is called here and nowhere else in the suite. A DNG that holds its counts plainly does not need it
+  (`drivers.dng_reading`).
 """
 
 from __future__ import annotations
@@ -24,29 +25,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.dng_reading import (
+    BAYER_PATTERNS,
+    Area,
+    PlainDng,
+    active_area,
+    raw_pixels,
+    read_plainly,
+    stated_areas,
+    stated_black,
+)
 from drivers.errors import FormatError
-from drivers.tiff import CFA, Directory, Tag, TiffDamaged, is_tiff, read_directories
+from drivers.tiff import Directory, Tag, TiffDamaged, is_tiff, read_directories
 
 if TYPE_CHECKING:
     from rawpy import RawPy
-
-BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 _SKIPPED_COLUMNS = 4
 """The first columns of a masked area are disturbed by the readout of the row (seen on the 550D)."""
 
 _LEAST_MASKED = 256
 """Photosites per phase below which a masked mean says less than the metadata."""
-
-
-@dataclass(frozen=True)
-class Area:
-    """A rectangle of photosites: first row and column, counted from 0, and how many of each."""
-
-    top: int
-    left: int
-    height: int
-    width: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +191,9 @@ def decode_raw(data: bytes, path: Path) -> Mosaic:
     if not data:
         raise _unreadable(path, "it is empty")
     directories = _check_structure(path, data)
+    plain = read_plainly(data, directories)
+    if plain is not None:
+        return _plain_mosaic(data, directories, plain)
     import rawpy
 
     with _libraw_silenced():
@@ -202,6 +204,23 @@ def decode_raw(data: bytes, path: Path) -> Mosaic:
             raise _unreadable(path, f"LibRaw says {_reason(error)}") from error
         except (MemoryError, NotImplementedError, RuntimeError, ValueError) as error:
             raise _unreadable(path, str(error) or type(error).__name__) from error
+
+
+def _plain_mosaic(data: bytes, directories: list[Directory], plain: PlainDng) -> Mosaic:
+    visible, camera = plain.active, _camera_name(data, directories)
+    return Mosaic(
+        counts=_part(plain.sensor, visible),
+        pattern=plain.pattern,
+        black=plain.black,
+        white_level=plain.white_level,
+        camera=camera,
+        sensor=plain.sensor,
+        visible=visible,
+        masked=_masked_areas(raw_pixels(directories), camera, visible, plain.sensor.shape),
+        iso=plain.iso,
+        aperture=plain.aperture,
+        shutter_s=plain.shutter_s,
+    )
 
 
 def _mosaic(path: Path, raw: RawPy, data: bytes, directories: list[Directory]) -> Mosaic:
@@ -225,8 +244,8 @@ def _mosaic(path: Path, raw: RawPy, data: bytes, directories: list[Directory]) -
         or min(framed.height, framed.width) < 2
     ):
         raise _unreadable(path, f"its visible area {framed} does not lie on its {columns}×{rows} sensor")
-    pixels = _pixels(directories)
-    visible = _active_area(pixels, (rows, columns)) or _dcraw_frame((rows, columns), framed)
+    pixels = raw_pixels(directories)
+    visible = active_area(pixels, (rows, columns)) or _dcraw_frame((rows, columns), framed)
     # rawpy's pattern is aligned with the sensor's corner, whatever the margins; ours with the visible one.
     colours = np.roll(pattern, (-visible.top, -visible.left), axis=(0, 1))
     names = raw.color_desc.decode("ascii", "replace")
@@ -234,15 +253,15 @@ def _mosaic(path: Path, raw: RawPy, data: bytes, directories: list[Directory]) -
     if letters not in BAYER_PATTERNS:
         raise _not_bayer(path, f"its colour filters are {letters}")
     black = np.array(raw.black_level_per_channel, dtype=np.float64)[colours]
-    stated_black = _stated_black(pixels)
-    if stated_black is not None:
-        black = stated_black
+    stated = stated_black(pixels)
+    if stated is not None:
+        black = stated
     black.setflags(write=False)
     exposure = raw.other
     # LibRaw makes up 1 s at f/1 for a file that states nothing; such a file has no ISO speed either.
     stated_exposure = exposure.iso_speed > 0
     return Mosaic(
-        counts=sensor[visible.top : visible.top + visible.height, visible.left : visible.left + visible.width],
+        counts=_part(sensor, visible),
         pattern=letters,
         black=black,
         white_level=int(raw.white_level),
@@ -254,6 +273,10 @@ def _mosaic(path: Path, raw: RawPy, data: bytes, directories: list[Directory]) -
         aperture=(round(exposure.aperture, 4) or None) if stated_exposure else None,
         shutter_s=(exposure.shutter_speed or None) if stated_exposure else None,
     )
+
+
+def _part(sensor: NDArray[np.uint16], area: Area) -> NDArray[np.uint16]:
+    return sensor[area.top : area.top + area.height, area.left : area.left + area.width]
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -278,39 +301,12 @@ def _check_structure(path: Path, data: bytes) -> list[Directory]:
         directories = read_directories(data)
     except TiffDamaged as error:
         raise _unreadable(path, str(error)) from error
-    pixels = _pixels(directories)
+    pixels = raw_pixels(directories)
     if pixels is not None:
         for offset, size in pixels.extents():
             if offset + size > len(data):
                 raise _unreadable(path, f"its pixels reach to byte {offset + size}, and it has only {len(data)}")
     return directories
-
-
-def _pixels(directories: list[Directory]) -> Directory | None:
-    """Return the directory that describes the raw pixels: the widest with a colour filter array, or CR2's own."""
-    found = [
-        directory
-        for directory in directories
-        if directory.integers(Tag.PHOTOMETRIC) == (CFA,) or directory.integers(Tag.CR2_SLICES)
-    ]
-    return max(found, key=lambda directory: directory.integers(Tag.WIDTH), default=None)
-
-
-def _stated_black(pixels: Directory | None) -> NDArray[np.float64] | None:
-    """Return DNG's BlackLevel for the visible block, (2, 2) float64; None where LibRaw has to say it.
-
-    LibRaw cuts the level to an integer. The rows and columns of BlackLevel count from the active area's corner
-    (DNG 1.7, BlackLevel); deltas per row and column enter by their mean, as in LibRaw.
-    """
-    if pixels is None or not pixels.numbers(Tag.BLACK_LEVEL):
-        return None
-    levels = np.array(pixels.numbers(Tag.BLACK_LEVEL), dtype=np.float64)
-    shape = pixels.integers(Tag.BLACK_LEVEL_REPEAT_DIM) or (1, 1)
-    if shape not in ((1, 1), (1, 2), (2, 1), (2, 2)) or levels.size != shape[0] * shape[1]:
-        return None
-    deltas = [pixels.numbers(tag) for tag in (Tag.BLACK_LEVEL_DELTA_H, Tag.BLACK_LEVEL_DELTA_V)]
-    extra = sum(float(np.mean(delta)) for delta in deltas if delta)
-    return np.broadcast_to(levels.reshape(shape), (2, 2)) + extra
 
 
 def _camera_name(data: bytes, directories: list[Directory]) -> str:
@@ -364,25 +360,9 @@ def _dcraw_frame(sensor: tuple[int, int], framed: Area) -> Area:
     return framed
 
 
-def _active_area(pixels: Directory | None, sensor: tuple[int, int]) -> Area | None:
-    """Return the visible area that a DNG states; LibRaw would make its top even for a Canon, dcraw does not."""
-    areas = _stated_areas(pixels, Tag.ACTIVE_AREA, sensor)
-    return areas[0] if areas and min(areas[0].height, areas[0].width) >= 2 else None
-
-
-def _stated_areas(pixels: Directory | None, tag: Tag, sensor: tuple[int, int]) -> tuple[Area, ...]:
-    """Return the rectangles of `tag`, told as top, left, bottom, right, that lie on the sensor."""
-    edges = () if pixels is None else pixels.integers(tag)
-    return tuple(
-        Area(top, left, bottom - top, right - left)
-        for top, left, bottom, right in zip(*(iter(edges),) * 4, strict=False)
-        if 0 <= top < bottom <= sensor[0] and 0 <= left < right <= sensor[1]
-    )
-
-
 def _masked_areas(pixels: Directory | None, camera: str, visible: Area, sensor: tuple[int, int]) -> tuple[Area, ...]:
     """Return the optically black areas that the file states, that are known of the sensor, or that Canon always has."""
-    stated = _stated_areas(pixels, Tag.MASKED_AREAS, sensor)
+    stated = stated_areas(pixels, Tag.MASKED_AREAS, sensor)
     if stated:
         return stated
     if (camera, sensor) in _MASKED:

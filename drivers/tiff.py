@@ -26,21 +26,33 @@ class Tag(IntEnum):
 
     WIDTH = 256
     LENGTH = 257
+    BITS_PER_SAMPLE = 258
     COMPRESSION = 259
     PHOTOMETRIC = 262
     MAKE = 271
     MODEL = 272
     STRIP_OFFSETS = 273
+    SAMPLES_PER_PIXEL = 277
     STRIP_BYTE_COUNTS = 279
     TILE_OFFSETS = 324
     TILE_BYTE_COUNTS = 325
     SUB_IFDS = 330
+    CFA_REPEAT_DIM = 33421
+    CFA_PATTERN = 33422
+    SHUTTER = 33434
+    APERTURE = 33437
+    EXIF = 34665
+    ISO = 34855
     DNG_VERSION = 50706
     UNIQUE_CAMERA_MODEL = 50708
+    CFA_PLANE_COLOR = 50710
+    CFA_LAYOUT = 50711
+    LINEARIZATION_TABLE = 50712
     BLACK_LEVEL_REPEAT_DIM = 50713
     BLACK_LEVEL = 50714
     BLACK_LEVEL_DELTA_H = 50715
     BLACK_LEVEL_DELTA_V = 50716
+    WHITE_LEVEL = 50717
     CR2_SLICES = 50752
     ACTIVE_AREA = 50829
     MASKED_AREAS = 50830
@@ -105,7 +117,7 @@ def is_tiff(data: bytes) -> bool:
 
 
 def read_directories(data: bytes) -> list[Directory]:
-    """Return the directories of the main chain and, after each, those it points to by SubIFDs.
+    """Return the directories of the main chain and, after each, those it points to by SubIFDs and as Exif.
 
     Raises
     ------
@@ -126,7 +138,7 @@ def read_directories(data: bytes) -> list[Directory]:
         directory, following = _read_directory(order, data, offset)
         directories.append(directory)
         waiting.append(following)
-        waiting.extend(reversed(directory.integers(Tag.SUB_IFDS)))
+        waiting.extend(reversed([*directory.integers(Tag.SUB_IFDS), *directory.integers(Tag.EXIF)]))
     return directories
 
 

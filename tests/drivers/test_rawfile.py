@@ -10,14 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from drivers import dng_reading, rawfile, tiff
 from drivers.camera import ExposureSettings
 from drivers.errors import FormatError
 from drivers.rawfile import Area, Mosaic, read_raw
 from sim.bodies import BODIES, Rectangle
 from sim.dng import write_dng as write_simulated_dng
-from tests.drivers.raw_files import longs, ratios, shorts, text, write_cr2, write_dng
+from tests.drivers.raw_files import Tags, longs, ratios, shorts, text, write_cr2, write_dng
 
 REAL = ("canon_eos_550d_colorchart.dng", "canon_powershot_g2.crw", "blackmagic.dng")
 
@@ -145,15 +148,80 @@ def test_a_simulated_camera_file_reads_back(tmp_path: Path) -> None:
         masked=(Rectangle(0, 0, 129, 40),),
     )
     counts = noise(body.sensor)
-    settings = ExposureSettings(400, 5.6, 0.25)
+    exposure = ExposureSettings(400, 5.6, 0.25)
     with (tmp_path / "s.dng").open("wb") as stream:
-        write_simulated_dng(stream, counts, body, settings=settings, taken_at=datetime(2026, 1, 1, tzinfo=UTC))
+        write_simulated_dng(stream, counts, body, settings=exposure, taken_at=datetime(2026, 1, 1, tzinfo=UTC))
     mosaic = read_raw(tmp_path / "s.dng")
     np.testing.assert_array_equal(mosaic.counts, counts[51:128, 47:204])
     assert mosaic.pattern == "RGGB"
     assert mosaic.masked == (Area(0, 0, 129, 40),)
     assert mosaic.white_level == 13584
     assert (mosaic.iso, mosaic.aperture, mosaic.shutter_s) == (400, pytest.approx(5.6), 0.25)
+
+
+def none(data: bytes, directories: list[tiff.Directory]) -> None:
+    """Stand in for a reader that is never sure."""
+
+
+_CODES = [b"\0\1\1\2", b"\1\0\2\1", b"\1\2\0\1", b"\2\1\1\0"]
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    size=st.tuples(st.integers(40, 70), st.integers(40, 70)),
+    code=st.sampled_from(_CODES),
+    corner=st.none() | st.tuples(st.integers(0, 9), st.integers(0, 9)),
+    black=st.sampled_from([{}, {50714: shorts(2048)}, {50713: shorts(2, 2), 50714: shorts(1, 2, 3, 4)}]),
+    table=st.booleans(),
+    maker=st.sampled_from(["Canon", "Nikon"]),
+)
+def test_a_plain_dng_is_what_libraw_reads(
+    tmp_path: Path,
+    size: tuple[int, int],
+    code: bytes,
+    corner: tuple[int, int] | None,
+    black: Tags,
+    table: bool,
+    maker: str,
+) -> None:
+    more: Tags = {271: text(maker), 272: text("Test"), 33422: (1, 4, code), **black}
+    if corner is not None:
+        more[50829] = longs(*corner, *size)
+    if table:
+        more[50712] = shorts(*range(0, 8192, 2))
+    write_dng(tmp_path / "a.dng", noise(size), more)
+    data = (tmp_path / "a.dng").read_bytes()
+    plain = dng_reading.read_plainly(data, tiff.read_directories(data))
+    # A table of tones is LibRaw's to apply, a visible area that is not stated its to know.
+    assert (plain is None) == (table or corner is None)
+    read = read_raw(tmp_path / "a.dng")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rawfile, "read_plainly", none)
+        unpacked = read_raw(tmp_path / "a.dng")
+    np.testing.assert_array_equal(read.sensor, unpacked.sensor)
+    np.testing.assert_array_equal(read.black, unpacked.black)
+    alike = ("pattern", "white_level", "camera", "visible", "masked", "iso", "aperture", "shutter_s")
+    assert [getattr(read, name) for name in alike] == [getattr(unpacked, name) for name in alike]
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {258: shorts(8)},
+        {277: shorts(2)},
+        {33421: shorts(2, 3)},
+        {33422: (1, 4, b"\0\0\1\2")},
+        {33422: (1, 4, b"\3\1\1\2")},
+        {50711: shorts(2)},
+        {50717: longs(4095, 4095)},
+        {279: longs(10)},
+        {259: shorts(7)},
+    ],
+)
+def test_what_is_not_plain_is_left_to_libraw(tmp_path: Path, more: Tags) -> None:
+    write_dng(tmp_path / "a.dng", noise((40, 60)), {50829: longs(0, 0, 40, 60), **more})
+    data = (tmp_path / "a.dng").read_bytes()
+    assert dng_reading.read_plainly(data, tiff.read_directories(data)) is None
 
 
 # Black
