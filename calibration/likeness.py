@@ -56,6 +56,27 @@ class Likeness:
     at_mm: tuple[float, float] = (0.0, 0.0)
 
 
+@dataclass(frozen=True, eq=False)
+class _Channel:
+    """What is known of one channel before any frame is held against it.
+
+    `terms` (N, K) and `level` (N,) of the compared cells, those `there` that are bright enough, `some` of them to fit
+    on, and the fit's `design` (F, K).
+    """
+
+    terms: _Array
+    level: _Array
+    there: npt.NDArray[np.int64]
+    some: npt.NDArray[np.int64]
+    design: _Array
+
+    @staticmethod
+    def of(terms: _Array, level: _Array, usable: _Mask) -> _Channel:
+        there = np.flatnonzero(usable & (level > LEAST_COUNTS))
+        some = there[:: max(1, len(there) // FIT_CELLS)]
+        return _Channel(terms, level, there, some, terms[some] * level[some, None])
+
+
 class Expectation:
     """What cells should look like under any light, from one frame of the print.
 
@@ -78,8 +99,9 @@ class Expectation:
 
     def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, level: _Array, usable: _Mask) -> None:
         self.cells = slice(None, None, max(1, len(cells_mm) // CELLS))
-        self._terms = _terms(np.asarray(rgb)[self.cells], DEGREE if len(cells_mm) >= 200 else 1)
-        self._level, self._usable = level[self.cells], usable[self.cells]
+        terms = _terms(np.asarray(rgb)[self.cells], DEGREE if len(cells_mm) >= 200 else 1)
+        self._usable = usable[self.cells]
+        self._channels = [_Channel.of(terms, level[self.cells, channel], self._usable) for channel in range(3)]
         self._block, self._middles = _blocks(cells_mm[self.cells])
 
     def held_against(self, mean: _Array, variance: _Array) -> Likeness:
@@ -95,19 +117,17 @@ class Expectation:
         worst = Likeness()
         light = np.median(mean[self._usable], axis=0)
         for channel in np.flatnonzero(light >= 0.2 * light.max()):
-            here = self._of_channel(self._level[:, channel], mean[:, channel], variance[:, channel])
+            here = self._of_channel(self._channels[channel], mean[:, channel], variance[:, channel])
             at_mm = here.at_mm if here.block > worst.block else worst.at_mm
             worst = Likeness(max(worst.scatter, here.scatter), max(worst.block, here.block), at_mm)
         return worst
 
-    def _of_channel(self, level: _Array, mean: _Array, variance: _Array) -> Likeness:
-        there = np.flatnonzero(self._usable & (level > LEAST_COUNTS))
-        if len(there) < 2 * self._terms.shape[1]:
+    def _of_channel(self, known: _Channel, mean: _Array, variance: _Array) -> Likeness:
+        if len(known.there) < 2 * known.terms.shape[1]:
             return Likeness()
-        some = there[:: max(1, len(there) // FIT_CELLS)]
-        design, seen = self._terms[some] * level[some, None], mean[some]
+        design, level, seen = known.design, known.level[known.some], mean[known.some]
         # Each cell counts by what it should tell, not by what it does: what is covered would count most.
-        sigma = 0.02 * float(np.median(seen / level[some])) * level[some] + 3
+        sigma = 0.02 * float(np.median(seen / level)) * level + 3
         if not sigma.min() > 0:
             return Likeness()
         weights = 1 / sigma**2
@@ -118,7 +138,7 @@ class Expectation:
             solution = least_squares(
                 design, seen, weights * np.minimum(1, 2 * usual / np.maximum(residual, 1e-12)) ** 2
             )
-        expected = self._terms @ solution * level
+        expected, there = known.terms @ solution * known.level, known.there
         there = there[expected[there] > LEAST_COUNTS]
         if len(there) < LEAST_CELLS:
             return Likeness()

@@ -149,6 +149,19 @@ def sample_to_table(
 
 
 @_compiled
+def patch_means(values: _Count, means: _Array) -> None:
+    """Fill means (N, 3) of values (N, S, 3)."""
+    samples = values.shape[1]
+    for patch in range(values.shape[0]):
+        red, green, blue = np.int64(0), np.int64(0), np.int64(0)
+        for number in range(samples):
+            red += values[patch, number, 0]
+            green += values[patch, number, 1]
+            blue += values[patch, number, 2]
+        means[patch, 0], means[patch, 1], means[patch, 2] = red / samples, green / samples, blue / samples
+
+
+@_compiled
 def combined(basis: _Array, factors: _Array, out: _Array) -> None:
     """Fill out (3, N) with the sums over k of factors[c, k] · basis[k, n]."""
     out[:] = 0

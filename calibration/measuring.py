@@ -28,7 +28,7 @@ from calibration.noise import PhotonTransfer, photon_transfer
 from calibration.radiometry import CLIPPED, Field, Paper, PaperReader
 from calibration.references import Levels
 from calibration.registration import Registration, register
-from calibration.sampling import WINDOW, Sites, gather, gather_values, noise_of, sites_at, table_values
+from calibration.sampling import WINDOW, Sites, gather, gather_values, noise_of, patch_means, sites_at, table_values
 from calibration.subtraction import DarkLight, Subtraction, quiet_means, reflectances
 from drivers.errors import FormatError
 from drivers.rawfile import Mosaic
@@ -412,7 +412,7 @@ class Measurement:
         else:
             values, highest = gather_values(decoded.mosaic, decoded.black, cells, shape, dark_cells)
             kept = noise = None
-        mean = values[self._expected.cells].mean(axis=1, dtype=np.float64)
+        mean = patch_means(values[self._expected.cells])
         likeness = self._expected.held_against(mean, self.transfer.variance(mean) / self._window**2)
         figures = FrameFigures(
             decoded.record,

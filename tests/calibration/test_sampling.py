@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.mosaic import half_size
-from calibration.sampling import gather, gather_values, noise_of, sites_at, table_values, uneven
+from calibration.sampling import gather, gather_values, noise_of, patch_means, sites_at, table_values, uneven
 from tests.calibration.lab import Lab
 
 
@@ -114,3 +114,9 @@ def test_noise_is_known_as_a_function_of_the_level() -> None:
     ratio = noise_of(samples) / sigma[:, None]
     assert np.median(ratio) == pytest.approx(1, abs=0.02)
     assert np.abs(ratio[level > 500] - 1).max() < 0.15
+
+
+def test_patch_means_are_numpys() -> None:
+    values = np.random.default_rng(4).integers(0, 65536, (50, 25, 3)).astype(np.uint16)
+    np.testing.assert_allclose(patch_means(values), values.mean(axis=1), rtol=1e-14)
+    np.testing.assert_allclose(patch_means(values[::3]), values[::3].mean(axis=1), rtol=1e-14)
