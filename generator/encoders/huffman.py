@@ -6,17 +6,12 @@ compiles this. A code is kept as its bits, the first one lowest as deflate packs
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import groupby
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
-from numba import uint32
+from numba import uint8, uint32, uint64
 
 from generator.compiled import compiled
-
-Lengths = npt.NDArray[np.int64]
 
 LITERALS: Final = 286
 """Symbols for literals, the end of a block and lengths."""
@@ -131,68 +126,99 @@ def codes_of(lengths: Any) -> Any:
     return codes
 
 
-class Bits:
-    """Bits in the order in which deflate writes them; for the few before and after a block's own."""
+@compiled
+def flush(out: Any, at: Any, waiting: Any, number: Any) -> Any:
+    """Write the waiting bits, 63 at most, and go on after the whole bytes among them.
 
-    def __init__(self, value: int = 0, number: int = 0) -> None:
-        self.value = value
-        self.number = number
-
-    def put(self, value: int, bits: int) -> None:
-        """Add the low `bits` of `value`, the others 0."""
-        self.value |= value << self.number
-        self.number += bits
-
-    def put_code(self, code: int) -> None:
-        """Add one code."""
-        self.put(code & 0xFFFF, code >> 16)
-
-    def to_bytes(self) -> bytes:
-        """Return whole bytes, the last one filled up with zeros."""
-        return self.value.to_bytes((self.number + 7) // 8, "little")
+    Bits wait in the order in which deflate writes them. Eight bytes are written, however few of them count.
+    """
+    # The compiler makes one store of these.
+    out[at] = uint8(waiting)
+    out[at + uint64(1)] = uint8(waiting >> uint64(8))
+    out[at + uint64(2)] = uint8(waiting >> uint64(16))
+    out[at + uint64(3)] = uint8(waiting >> uint64(24))
+    out[at + uint64(4)] = uint8(waiting >> uint64(32))
+    out[at + uint64(5)] = uint8(waiting >> uint64(40))
+    out[at + uint64(6)] = uint8(waiting >> uint64(48))
+    out[at + uint64(7)] = uint8(waiting >> uint64(56))
+    return at + (number >> uint64(3)), waiting >> (number & uint64(56)), number & uint64(7)
 
 
-def head_of(literals: Lengths, distances: Lengths, *, last: bool) -> Bits:
-    """Return the head of a block of dynamic codes of these lengths (RFC 1951, 3.2.7)."""
-    told_literals = max(END + 1, int(np.flatnonzero(literals)[-1]) + 1)
-    told_distances = max(1, int(np.flatnonzero(distances)[-1]) + 1) if distances.any() else 1
-    told = [*literals[:told_literals].tolist(), *distances[:told_distances].tolist()]
-    tokens = [token for value, run in groupby(told) for token in _tokens(value, len(list(run)))]
-    frequencies = np.bincount([symbol for symbol, _, _ in tokens], minlength=_LENGTHS)
-    lengths = code_lengths(frequencies, _LONGEST_OF_LENGTHS)
-    codes = codes_of(lengths).tolist()
-    ordered = lengths[_ORDER].tolist()
-    while len(ordered) > 4 and not ordered[-1]:
-        ordered.pop()
-    bits = Bits()
-    bits.put(int(last), 1)
-    bits.put(2, 2)
-    bits.put(told_literals - 257, 5)
-    bits.put(told_distances - 1, 5)
-    bits.put(len(ordered) - 4, 4)
-    for length in ordered:
-        bits.put(length, 3)
-    for symbol, extra, number in tokens:
-        bits.put_code(codes[symbol])
-        bits.put(extra, number)
-    return bits
+@compiled
+def put(out: Any, writer: Any, value: int, bits: int) -> None:
+    """Write the low `bits`, 32 at most, of `value`, the others 0.
+
+    `writer` holds the place in `out`, the waiting bits and their number.
+    """
+    waiting = writer[1] | (uint64(value) << writer[2])
+    writer[0], writer[1], writer[2] = flush(out, writer[0], waiting, writer[2] + uint64(bits))
 
 
-def _tokens(value: int, run: int) -> Iterator[tuple[int, int, int]]:
-    """Yield symbol, extra bits and their number for `run` equal lengths in a row."""
-    if value:
-        yield value, 0, 0
-        run -= 1
-    while run >= 3:
+@compiled
+def _tokens(told: Any, tokens: Any) -> int:
+    """Fill `tokens` with symbol, extra bits and their number for lengths in a row; return how many there are."""
+    found = 0
+    i = 0
+    while i < len(told):
+        value, run = told[i], 1
+        while i + run < len(told) and told[i + run] == value:
+            run += 1
+        i += run
         if value:
-            taken = min(run, 6)
-            yield 16, taken - 3, 2
-        elif run < 11:
-            taken = run
-            yield 17, taken - 3, 3
-        else:
-            taken = min(run, 138)
-            yield 18, taken - 11, 7
-        run -= taken
-    for _ in range(run):
-        yield value, 0, 0
+            tokens[found, 0], tokens[found, 1], tokens[found, 2] = value, 0, 0
+            found += 1
+            run -= 1
+        while run >= 3:
+            if value:
+                taken = min(run, 6)
+                symbol, extra, bits = 16, taken - 3, 2
+            elif run < 11:
+                taken = run
+                symbol, extra, bits = 17, taken - 3, 3
+            else:
+                taken = min(run, 138)
+                symbol, extra, bits = 18, taken - 11, 7
+            tokens[found, 0], tokens[found, 1], tokens[found, 2] = symbol, extra, bits
+            found += 1
+            run -= taken
+        for _ in range(run):
+            tokens[found, 0], tokens[found, 1], tokens[found, 2] = value, 0, 0
+            found += 1
+    return found
+
+
+@compiled
+def _told(lengths: Any, least: int) -> int:
+    """Return how many lengths are told, those after the last one of a code that occurs left out."""
+    told = len(lengths)
+    while told > least and not lengths[told - 1]:
+        told -= 1
+    return told
+
+
+@compiled
+def put_head(out: Any, writer: Any, literals: Any, distances: Any, last: int) -> None:
+    """Write the head of a block of dynamic codes of these lengths (RFC 1951, 3.2.7); `last`: no block follows."""
+    told_literals, told_distances = _told(literals, END + 1), _told(distances, 1)
+    told = np.concatenate((literals[:told_literals], distances[:told_distances]))
+    tokens = np.empty((len(told), 3), np.int64)
+    found = _tokens(told, tokens)
+    frequencies = np.zeros(_LENGTHS, np.int64)
+    for i in range(found):
+        frequencies[tokens[i, 0]] += 1
+    lengths = code_lengths(frequencies, _LONGEST_OF_LENGTHS)
+    codes = codes_of(lengths)
+    number = _LENGTHS
+    while number > 4 and not lengths[_ORDER[number - 1]]:
+        number -= 1
+    put(out, writer, last, 1)
+    put(out, writer, 2, 2)
+    put(out, writer, told_literals - 257, 5)
+    put(out, writer, told_distances - 1, 5)
+    put(out, writer, number - 4, 4)
+    for i in range(number):
+        put(out, writer, lengths[_ORDER[i]], 3)
+    for i in range(found):
+        code = codes[tokens[i, 0]]
+        put(out, writer, code & 0xFFFF, code >> 16)
+        put(out, writer, tokens[i, 1], tokens[i, 2])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
@@ -42,34 +43,49 @@ def encode_png(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> b
     InputError
         The image is wider or higher than a PNG may be.
     """
+    return b"".join([bytes(piece) for piece in png_pieces(image, shot, threads)])
+
+
+def png_pieces(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> Iterator[bytes | memoryview]:
+    """Yield the file of `encode_png` piece by piece; the memory of each is used again for the next."""
     height, width, _ = image.shape
     if width > WIDEST or height > TALLEST:
         raise InputError(
             f"an image of {width}x{height} px is too large for PNG: {WIDEST} columns and {TALLEST} rows at most; "
             "make it smaller"
         )
+    yield _SIGNATURE
+    yield from _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0))
+    yield from _chunk(b"tEXt", b"Description\0" + shot.note().encode("ascii"))
     rows = max(1, BAND // width)
     tops = range(0, height, rows)
+    total = 1
+    for number, (data, checksum, size) in enumerate(_bands(image, rows, tops, threads)):
+        total = _joined(total, checksum, size)
+        start = b"" if number else _ZLIB
+        end = struct.pack(">I", total) if number == len(tops) - 1 else b""
+        yield from _chunk(b"IDAT", start, data, end)
+    yield from _chunk(b"IEND")
 
-    def pack(top: int) -> tuple[bytes, int, int]:
-        data, plain = _packer().pack(np.ascontiguousarray(image[top : top + rows]), last=top + rows >= height)
-        return data, isal_zlib.adler32(plain.data), plain.size
+
+def _bands(
+    image: npt.NDArray[np.uint16], rows: int, tops: range, threads: int
+) -> Iterator[tuple[bytes | memoryview, int, int]]:
+    """Yield the packed data of each band, and the checksum and size of what it unpacks to."""
+
+    def pack(top: int) -> tuple[memoryview, int, int]:
+        data, plain = _packer().pack(np.ascontiguousarray(image[top : top + rows]), last=top + rows >= len(image))
+        return data.data, isal_zlib.adler32(plain.data), plain.size
+
+    def keep(top: int) -> tuple[bytes, int, int]:
+        data, checksum, size = pack(top)
+        return bytes(data), checksum, size
 
     if threads > 1 and len(tops) > 1:
         with ThreadPoolExecutor(threads) as pool:
-            bands = list(pool.map(pack, tops))
+            yield from pool.map(keep, tops)
     else:
-        bands = [pack(top) for top in tops]
-    total = 1
-    chunks: list[bytes] = []
-    for number, (data, checksum, size) in enumerate(bands):
-        total = _joined(total, checksum, size)
-        start = b"" if number else _ZLIB
-        end = struct.pack(">I", total) if number == len(bands) - 1 else b""
-        chunks += _chunk(b"IDAT", start, data, end)
-    head = _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0))
-    note = _chunk(b"tEXt", b"Description\0" + shot.note().encode("ascii"))
-    return b"".join([_SIGNATURE, *head, *note, *chunks, *_chunk(b"IEND")])
+        yield from map(pack, tops)
 
 
 def _packer() -> Packer:
@@ -86,10 +102,11 @@ def _joined(first: int, second: int, size: int) -> int:
     return high << 16 | low
 
 
-def _chunk(kind: bytes, *parts: bytes) -> list[bytes]:
-    """Return the pieces of a chunk (clause 5.3)."""
+def _chunk(kind: bytes, *parts: bytes | memoryview) -> Iterator[bytes | memoryview]:
+    """Yield the pieces of a chunk (clause 5.3)."""
     checksum = isal_zlib.crc32(kind)
     for part in parts:
         checksum = isal_zlib.crc32(part, checksum)
-    size = sum(len(part) for part in parts)
-    return [struct.pack(">I", size), kind, *parts, struct.pack(">I", checksum)]
+    yield struct.pack(">I", sum(len(part) for part in parts)) + kind
+    yield from filter(None, parts)
+    yield struct.pack(">I", checksum)
