@@ -1,4 +1,8 @@
-"""How far the chart has moved between two frames, measured on its tags in one colour plane."""
+"""How far the chart has moved between two frames, measured in one colour plane on a few gauges.
+
+A gauge is a tag, or without tags a strip across the edge between the field of cells and its margin, which is there in
+every light. Source: B. D. Lucas and T. Kanade, "An iterative image registration technique", IJCAI 1981.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.field import Field
 from acquisition.framing import FoundTag, Framing
 from acquisition.planes import Plane
 
@@ -15,6 +20,15 @@ MAX_SHIFT_PX = 3.0
 
 _GAUGE_TAGS = 8
 _STEPS = 5
+_AROUND_TAG_PX = 12
+
+_STRIPS = 32
+_STRIP_ALONG, _STRIP_ACROSS = 30, 8
+"""Half the length and the width of a strip, px."""
+
+_STRIP_REACH_PX = 6
+_MIN_STRIPS = 8
+_LEAST_ALIKE = 0.5
 
 _Points = npt.NDArray[np.float64]
 
@@ -26,11 +40,12 @@ class Shift:
     Attributes
     ----------
     dx, dy
-        Median over the tags measured, half-size px; positive when the chart lies further right or down.
+        Median over the tags measured, or what most of the strips say; half-size px, positive when the chart lies
+        further right or down.
     largest_px
-        The largest movement of a tag, so that a rotation shows.
+        The largest movement of a tag, or of a corner of the field, so that a rotation shows.
     tags
-        Tags that could be measured; 0 leaves the rest 0 and means unknown.
+        Tags, or strips, that could be measured; 0 leaves the rest 0 and means unknown.
     """
 
     dx: float
@@ -44,34 +59,48 @@ class Shift:
         return float(np.hypot(self.dx, self.dy))
 
 
+def gauge_boxes(framing: Framing) -> list[tuple[int, int, int, int]]:
+    """Return the parts of a plane that `shift_between` looks at: left, top, right, bottom, within some pixels."""
+    if framing.field is None:
+        outlines, around = [tag.corners_px for tag in _gauge_tags(framing)], _AROUND_TAG_PX
+    else:
+        outlines = [places.reshape(-1, 2) for places in _strip_places(*_strips(framing.field))]
+        around = _STRIP_REACH_PX
+    low = [np.maximum(np.floor(outline.min(axis=0)).astype(int) - around, 0) for outline in outlines]
+    high = [np.ceil(outline.max(axis=0)).astype(int) + around for outline in outlines]
+    return [(int(a[0]), int(a[1]), int(b[0]), int(b[1])) for a, b in zip(low, high, strict=True)]
+
+
 def shift_between(reference: Plane, framing: Framing, plane: Plane) -> Shift:
     """Return how far the chart has moved in `plane` since `reference`, of the same channel.
 
-    Two-parameter Lucas–Kanade on tag crops (Lucas and Kanade 1981), gain and offset free, up to about 3 px: below
-    that, good to 0.005 px where paper has some hundred counts. Costs about a millisecond.
+    By Lucas and Kanade's method, gain and offset free, up to about 3 px: below that, good to 0.005 px where paper has
+    some hundred counts. Costs some milliseconds.
 
     Parameters
     ----------
     reference
         The plane to compare with.
     framing
-        Where the tags are in `reference`; only tags and places are used, so its own plane may be another colour.
+        Where the gauges are in `reference`; only places are used, so its own plane may be another colour.
     plane
         The later plane.
     """
-    tags = sorted(framing.tags, key=lambda tag: tag.id)
-    shifts: list[_Points] = []
-    last = len(tags) - 1
-    for number in sorted({round(last * part / (_GAUGE_TAGS - 1)) for part in range(_GAUGE_TAGS)}):
-        tag = tags[number]
-        shift = _tag_shift(reference, plane, tag)
-        if shift is not None:
-            shifts.append(shift)
+    if framing.field is not None:
+        return _field_shift(reference, plane, framing.field)
+    shifts = [shift for tag in _gauge_tags(framing) if (shift := _tag_shift(reference, plane, tag)) is not None]
     if not shifts:
         return Shift(0.0, 0.0, 0.0, 0)
     table = np.array(shifts)
     median = np.median(table, axis=0)
     return Shift(float(median[0]), float(median[1]), float(np.linalg.norm(table, axis=1).max()), len(shifts))
+
+
+def _gauge_tags(framing: Framing) -> list[FoundTag]:
+    """Return the tags that the movement is measured on: a few, evenly by number."""
+    tags = sorted(framing.tags, key=lambda tag: tag.id)
+    last = len(tags) - 1
+    return [tags[number] for number in sorted({round(last * part / (_GAUGE_TAGS - 1)) for part in range(_GAUGE_TAGS)})]
 
 
 def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
@@ -110,3 +139,90 @@ def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
             break
     correlation = np.corrcoef(now, template)[0, 1]
     return shift if correlation > 0.5 else None
+
+
+def _strips(field: Field) -> tuple[_Points, _Points]:
+    """Return the middles (K, 2) px of strips spread over the field's outline, and the directions (K, 2) across it."""
+    chosen = np.unique(np.linspace(0, len(field.outline_px) - 1, _STRIPS).round().astype(int))
+    return field.outline_px[chosen], field.normals[chosen]
+
+
+def _strip_places(middles: _Points, normals: _Points) -> _Points:
+    """Return the places (K, along, across, 2) px of the strips' samples."""
+    along = np.stack([-normals[:, 1], normals[:, 0]], axis=-1)
+    u = np.arange(-_STRIP_ALONG, _STRIP_ALONG + 1)[None, :, None, None]
+    v = np.arange(-_STRIP_ACROSS, _STRIP_ACROSS + 1)[None, None, :, None]
+    return middles[:, None, None] + u * along[:, None, None] + v * normals[:, None, None]
+
+
+def _field_shift(reference: Plane, plane: Plane, field: Field) -> Shift:
+    """Return the movement of the field, from how far strips of its outline moved across themselves."""
+    unknown = Shift(0.0, 0.0, 0.0, 0)
+    middles, normals = _strips(field)
+    height, width = reference.values.shape
+    room = _STRIP_ALONG + _STRIP_ACROSS + _STRIP_REACH_PX
+    inside = np.asarray(((middles >= room) & (middles <= np.array([width, height]) - 1 - room)).all(axis=1))
+    middles, normals = middles[inside], normals[inside]
+    if len(middles) < _MIN_STRIPS:
+        return unknown
+    places = _strip_places(middles, normals) - reference.offset_px
+    before = _sampled(reference, places)
+    slope = np.gradient(before, axis=2)
+    # A strip's ends have no neighbours to tell the slope from.
+    seen = np.s_[:, :, 1:-1]
+    template, slope = (picture[seen].reshape(len(middles), -1) for picture in (before, slope))
+    design = np.stack([template, np.ones_like(template), slope], axis=-1)
+    gram = np.einsum("kni,knj->kij", design, design) + 1e-9 * np.eye(3)
+    moved: _Points = np.zeros(len(middles))
+    solution: _Points = np.zeros((len(middles), 3))
+    now = template
+    for _ in range(_STEPS):
+        later = _sampled(plane, places + moved[:, None, None, None] * normals[:, None, None])
+        now = later[seen].reshape(len(middles), -1)
+        # now = gain · (template + slope · step) + offset, linear in (gain, offset, gain · step).
+        found = np.asarray(np.linalg.solve(gram, np.einsum("kni,kn->ki", design, now)[..., None]), dtype=np.float64)
+        solution = found[..., 0]
+        step = solution[:, 2] / np.maximum(solution[:, 0], 1e-6)
+        moved = np.clip(moved - np.clip(step, -1, 1), -MAX_SHIFT_PX - 1, MAX_SHIFT_PX + 1)
+        if np.abs(step).max() < 1e-3:
+            break
+    centred = [values - values.mean(axis=1, keepdims=True) for values in (template, now)]
+    power = np.sqrt((centred[0] ** 2).sum(axis=1) * (centred[1] ** 2).sum(axis=1))
+    alike = (centred[0] * centred[1]).sum(axis=1) / np.maximum(power, 1e-9)
+    good = (alike > _LEAST_ALIKE) & (np.abs(moved) < MAX_SHIFT_PX)
+    if good.sum() < max(_MIN_STRIPS, 0.5 * len(middles)):
+        return unknown
+    left = now - np.einsum("kni,ki->kn", design, solution)
+    known = 1 / np.asarray(np.linalg.inv(gram), dtype=np.float64)[:, 2, 2]
+    weights = known * solution[:, 0] ** 2 / np.maximum((left**2).mean(axis=1), 1e-9)
+    return _rigid(middles[good], normals[good], moved[good], weights[good], field)
+
+
+def _sampled(plane: Plane, places: _Points) -> _Points:
+    """Return a plane's counts, slightly smoothed, at places (K, …, 2) given without its offset."""
+    x, y = (np.ascontiguousarray(places[..., axis].reshape(len(places), -1), dtype=np.float32) for axis in (0, 1))
+    found = np.asarray(cv2.remap(plane.values, x, y, cv2.INTER_CUBIC), dtype=np.float64).reshape(places.shape[:-1])
+    return (np.roll(found, 1, axis=1) + 2 * found + np.roll(found, -1, axis=1)) / 4
+
+
+def _rigid(middles: _Points, normals: _Points, moved: _Points, weights: _Points, field: Field) -> Shift:
+    """Return the shift, turn and growth that movements (K,) across strips tell of, robustly."""
+    centre = field.corners_px.mean(axis=0)
+    x, y = ((middles - centre) / np.abs(field.corners_px - centre).max()).T
+    # A turn moves (x, y) by (−y, x), a growth by (x, y).
+    aside = np.stack([normals[:, 1] * x - normals[:, 0] * y, normals[:, 0] * x + normals[:, 1] * y], axis=-1)
+    design = np.column_stack([normals, aside])
+    motion = np.zeros(4)
+    trust = np.ones(len(moved))
+    for _ in range(4):
+        root = np.sqrt(weights * trust)
+        motion = np.linalg.lstsq(design * root[:, None], moved * root, rcond=None)[0].astype(np.float64)
+        off = np.abs(moved - design @ motion) * np.sqrt(weights)
+        scale = 1.4826 * float(np.median(off)) + 1e-9
+        trust = np.minimum(1, 2 * scale / np.maximum(off, 1e-12))
+    dx, dy, turn, growth = motion.tolist()
+    corners = (field.corners_px - centre) / np.abs(field.corners_px - centre).max()
+    u, v = corners.T
+    at_corners = np.stack([dx - turn * v + growth * u, dy + turn * u + growth * v], axis=-1)
+    largest = max(float(np.linalg.norm(at_corners, axis=1).max()), float(np.hypot(dx, dy)))
+    return Shift(dx, dy, largest, len(moved))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr
 
 from acquisition.planes import MIN_SIGNAL, Plane, paper_level
 
@@ -32,6 +33,17 @@ _ROUNDS = ((CORNER_REACH_PX, 2, 1e3), (CORNER_REACH_PX / 2, 5, 12.0), (6.0, 5, 6
 
 _MIN_EDGE = 0.05
 """Of paper white: what the step from cells to paper must have to be taken for the outline."""
+
+_REFINE_ALONG_PX = np.arange(-2.0, 2.1)
+_REFINE_ACROSS_PX = np.arange(-3.5, 2.1, 0.5)
+"""Around a place of the edge: one cell inwards, and outwards not as far as marks in the margin begin."""
+
+_REFINE_STEPS = 6
+_INTERPOLATION_PX = 0.4
+"""σ that linear interpolation adds to an edge."""
+
+_CLEAR_EDGE = 0.15
+"""Of paper: a lower step from cells to margin does not tell its place to a tenth of a pixel."""
 
 _Float = npt.NDArray[np.float32]
 _Points = npt.NDArray[np.float64]
@@ -203,6 +215,53 @@ def follow(view: View, corners_px: _Points) -> Outline | None:
         corners = _corners_of(smooth)
         curves = [_curve_between(corners[side], corners[(side + 1) % 4], smooth[side], order) for side in range(4)]
     return Outline(corners, tuple(seen_px), tuple(normals))
+
+
+def refined(
+    planes: Sequence[Plane], places_px: _Points, normals: _Points, blur_px: float
+) -> tuple[_Points, npt.NDArray[np.bool_]]:
+    """Return places (N, 2) px of the edge, anew where it is clear, and whether (N,) it is.
+
+    A blurred step is fitted to the colour in which it is highest. Farther than a mark in the margin begins nothing is
+    looked at: a ruler's ticks would draw the edge by a tenth of a pixel.
+
+    Parameters
+    ----------
+    planes
+        Of red, green and blue, as measured.
+    places_px, normals
+        (N, 2) places known to a pixel, and directions outwards.
+    blur_px
+        σ of the picture's edges.
+    """
+    tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=-1)
+    grid = places_px[:, None, None] + _REFINE_ALONG_PX[None, :, None, None] * tangents[:, None, None]
+    grid = grid + _REFINE_ACROSS_PX[None, None, :, None] * normals[:, None, None]
+    profiles: list[_Points] = []
+    for plane in planes:
+        level = paper_level(plane)
+        if level < MIN_SIGNAL:
+            continue
+        x, y = (np.ascontiguousarray((grid - plane.offset_px)[..., axis].reshape(len(grid), -1)) for axis in (0, 1))
+        seen = cv2.remap(plane.values, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+        profiles.append(np.asarray(seen, dtype=np.float64).reshape(grid.shape[:-1]).mean(axis=1) / level)
+    rises = [profile[:, -3:].mean(axis=1) - profile[:, :5].mean(axis=1) for profile in profiles]
+    profile = np.stack(profiles)[np.argmax(rises, axis=0), np.arange(len(grid))]
+    sigma = float(np.hypot(blur_px, _INTERPOLATION_PX))
+    off: _Points = np.zeros(len(grid))
+    rise: _Points = np.zeros(len(grid))
+    for _ in range(_REFINE_STEPS):
+        aside = (_REFINE_ACROSS_PX[None] - off[:, None]) / sigma
+        step, slope = ndtr(aside), np.exp(-0.5 * aside**2) / np.sqrt(2 * np.pi) / sigma
+        # Cells and margin need not be even: the cells' side has a slope of its own.
+        design = np.stack([np.ones_like(step), step, slope, np.minimum(_REFINE_ACROSS_PX[None], 0) + 0 * step], axis=-1)
+        gram = np.einsum("kni,knj->kij", design, design) + 1e-9 * np.eye(4)
+        found = np.asarray(np.linalg.solve(gram, np.einsum("kni,kn->ki", design, profile)[..., None]), dtype=np.float64)
+        solution = found[..., 0]
+        rise = solution[:, 1]
+        off = off - np.clip(solution[:, 2] / np.where(np.abs(rise) > 0.01, rise, 0.01), -0.5, 0.5)
+    clear = (rise > _CLEAR_EDGE) & (np.abs(off) < 1.5)
+    return places_px + np.where(clear, off, 0.0)[:, None] * normals, np.asarray(clear)
 
 
 def _bent(share: _Points, curve: _Points, start: _Points, end: _Points) -> _Points:

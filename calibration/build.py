@@ -338,9 +338,9 @@ class _Work:
         measured = early if early is not None and early.stretch is self._stretch else self._measured(record)
         if measured is None:
             decoded = decode(self._session, record)
-            shift = self._measurement.measure(decoded, self._stretch, even=False)
-            assert isinstance(shift, Shift)
+            before = self._stretch
             self._stretch = self._measurement.register(decoded)
+            shift = self._measurement.moved(before, self._stretch)
             self._subtraction.move()
             even = self._is_even(record)
             measured = self._measurement.measure_first(decoded, self._stretch, shift, even, self._dark)

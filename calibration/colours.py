@@ -76,10 +76,18 @@ def fit_colours(
     page_mm
         Width and height of the sheet.
     finely
-        Whether the steps between neighbouring codes must be true: a polynomial of degree 6 where patches suffice,
+        Whether the steps between neighbouring codes must be true: a polynomial of degree 6 or 8 where patches suffice,
         which leaves a third of what one of degree 3 leaves.
     """
-    degree = 6 if finely and len(rgb) >= 2000 else 3 if len(rgb) >= 200 else 2 if len(rgb) >= 60 else 1
+    degree = (
+        (8 if len(rgb) >= 4000 else 6)
+        if finely and len(rgb) >= 2000
+        else 3
+        if len(rgb) >= 200
+        else 2
+        if len(rgb) >= 60
+        else 1
+    )
     terms, page = _code_terms(rgb, degree), _page_terms(points_mm, page_mm)
     coefficients, light = np.zeros((terms.shape[1], 3)), np.zeros((6, 3))
     for channel in range(3):

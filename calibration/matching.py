@@ -180,17 +180,23 @@ class Matcher:
         there = there[:: max(1, len(there) // _COLOUR_PATCHES)]
         return fit_colours(self._rgb[there], self._centres[there], seen[there], self._chart.page_mm, self._finely)
 
-    def _template(self, raster: Raster, cover: sparse.csr_array, blur_px: float) -> _Float:
-        """Return the print as the camera would see it, (H, W, 3) float32; under even light if it has tags."""
+    def _template(self, raster: Raster, cover: sparse.csr_array, sigma: _Array) -> _Float:
+        """Return the print as the camera would see it, (H, W, 3) float32; under even light if it has tags.
+
+        `sigma` (2,) along x and y is that of the blur in elements of the raster, interpolation not included.
+        """
         flat = self.colours.flat(self._rgb)
         paper = self.colours.flat(np.array([[255, 255, 255]]))[0]
         image = np.asarray(cover @ (flat - paper)) + paper
         image = image.reshape(*raster.shape, 3).astype(np.float32)
         if self._finely:
             image *= raster.smooth(self.colours.light_at)
-        blurred = float(np.hypot(blur_px, _INTERPOLATION_PX))
-        sigma = blurred / self.cell_px * self._cell / raster.step_mm
-        return np.asarray(cv2.GaussianBlur(image, (0, 0), float(sigma[0]), sigmaY=float(sigma[1])), dtype=np.float32)
+        x, y = np.hypot(sigma, self._elements(raster, _INTERPOLATION_PX)).tolist()
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), x, sigmaY=y), dtype=np.float32)
+
+    def _elements(self, raster: Raster, length_px: float) -> _Array:
+        """Return a length in the frame in elements of a raster, (2,) along x and y: cells need not be square."""
+        return np.asarray(length_px / self.cell_px * self._cell.min() / raster.step_mm, dtype=np.float64)
 
     def _rectified(self, raster: Raster) -> tuple[_Float, _Mask]:
         """Return the frame as seen on the print's raster, (H, W, 3), and where it exists."""
@@ -216,7 +222,7 @@ class Matcher:
         reach = round(_COARSE_PER_CELL * min(1.5, 0.25 * block))
         best = 0.0
         for _ in range(2):
-            template = self._template(raster, cover, max(self.blur_px, 0.7))
+            template = self._template(raster, cover, self._elements(raster, max(self.blur_px, 0.7)))
             image, there = self._rectified(raster)
             # What is printed in the margin is no cell's business.
             bare = ~raster.near(cover, _COARSE_PER_CELL)
@@ -273,12 +279,13 @@ class Matcher:
         raster = Raster.of(self._low, self._cell / n, self._cells_across * n)
         cover = raster.coverage(self._centres, self._sizes)
         free = raster.outside_tags(self._chart.tags) & raster.near(cover, n)
-        template = self._template(raster, cover, sigma_cells * self.cell_px)
+        template = self._template(raster, cover, np.full(2, sigma_cells * n))
         image, there = self._rectified(raster)
-        image[~free] = self._template(raster, cover, self.blur_px)[~free]
-        more = float(np.sqrt(max(sigma_cells**2 - (self.blur_px / self.cell_px) ** 2, 0.01)))
+        own = self._elements(raster, self.blur_px)
+        image[~free] = self._template(raster, cover, own)[~free]
+        x, y = np.sqrt(np.maximum((sigma_cells * n) ** 2 - own**2, 0.01 * n**2)).tolist()
         for channel in range(3):
-            image[..., channel] = cv2.GaussianBlur(image[..., channel], (0, 0), more * n)
+            image[..., channel] = cv2.GaussianBlur(image[..., channel], (0, 0), x, sigmaY=y)
         weight = (there & free).astype(np.float32)
         return self._compared(raster, n, template, image, weight, _FOLLOWED_CELLS * n, even=True)
 
@@ -336,7 +343,7 @@ class Matcher:
     def step(self) -> float:
         """Move the map by one Gauss-Newton step of all cells together; return the RMS movement, px."""
         raster, n = self._raster, self._per_cell
-        template = self._template(raster, self._cover, self.blur_px)
+        template = self._template(raster, self._cover, self._elements(raster, self.blur_px))
         image, there = self._rectified(raster)
         weight = (there & self._free).astype(np.float32)
         points, information, pull, score = self._compared(

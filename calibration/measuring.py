@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from acquisition.chart import Chart
 from acquisition.framing import Framing
-from acquisition.movement import Shift, shift_between
+from acquisition.movement import Shift, gauge_boxes, shift_between
 from acquisition.planes import CHANNELS, Channel, Plane, channel_offset_px, phases
 from acquisition.session import FrameRecord
 from calibration.darkness import DarkFigures, read_dark
@@ -35,8 +35,6 @@ from drivers.rawfile import Mosaic
 
 STILL_PX = 0.1
 BUMP_PX = 0.5
-_AROUND_TAG = 12
-"""Half-size pixels around a tag that its movement may need: more than `acquisition.framing` looks at."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -137,7 +135,7 @@ class Stretch:
     references
         Where the references are sampled, the white ones first.
     planes
-        The frame around its tags, to compare others with.
+        The frame around its tags, or the outline of its field, to compare others with.
     """
 
     file: str
@@ -202,15 +200,13 @@ class MeasuredDark:
     means: _Array
 
 
-def tags_of(mosaic: Mosaic, channel: Channel, black: _Array, framing: Framing) -> Plane:
-    """Return one colour of a mosaic around the tags, and 0 elsewhere: all that the chart's movement is measured in."""
+def gauges_of(mosaic: Mosaic, channel: Channel, black: _Array, framing: Framing) -> Plane:
+    """Return one colour of a mosaic around its gauges, and 0 elsewhere: all that a movement is measured in."""
     places = phases(mosaic)[channel]
     blocks = mosaic.block_planes()
     level = np.float32(np.mean([black[place] for place in places]))
     values = np.zeros(blocks.shape[2:], dtype=np.float32)
-    for tag in framing.tags:
-        left, top = np.maximum(np.floor(tag.corners_px.min(axis=0)).astype(int) - _AROUND_TAG, 0)
-        right, bottom = np.ceil(tag.corners_px.max(axis=0)).astype(int) + _AROUND_TAG
+    for left, top, right, bottom in gauge_boxes(framing):
         part = np.s_[top:bottom, left:right]
         values[part] = sum(blocks[place][part].astype(np.float32) for place in places) / np.float32(len(places)) - level
     return Plane(channel, values, channel_offset_px(places))
@@ -227,9 +223,13 @@ class Measurement:
         The frame that is registered first: its light's shape is the base of all others'.
     window
         Pixels along the side of a cell's window.
+    corners
+        As in `calibration.registration.register`, of the first frame; near enough for others.
     """
 
-    def __init__(self, chart: Chart, first: Decoded, window: int = WINDOW) -> None:
+    def __init__(
+        self, chart: Chart, first: Decoded, window: int = WINDOW, corners: npt.ArrayLike | None = None
+    ) -> None:
         self._chart, self._window = chart, window
         whites = [reference for reference in chart.references if reference.is_white]
         greys = [reference for reference in chart.references if not reference.is_white]
@@ -242,7 +242,11 @@ class Measurement:
         self._shape = first.mosaic.block_planes().shape[2:]
         self._geometry = first.mosaic.visible, first.mosaic.sensor.shape, first.mosaic.pattern
         self._first_file = first.record.file
+        self._corners = corners
+        self._near: Registration | None = None
         self.first = self.register(first)
+        # How the chart hangs is told once: always by the first frame, so that a build that goes on tells the same.
+        self._near = self.first.registration
         samples, highest = gather(first.mosaic, first.black, self.first.references)
         seen = _means(samples, highest, self.first.references, first.saturation)[: len(whites)]
         base = PaperReader(self._white_mm, self.cells_mm, chart.page_mm).read(seen, first.record.file)[0].field
@@ -259,10 +263,10 @@ class Measurement:
 
     def register(self, decoded: Decoded) -> Stretch:
         """Find the chart in a frame, which begins a stretch."""
-        registration = register(decoded.mosaic, self._chart, decoded.record.file)
+        registration = register(decoded.mosaic, self._chart, decoded.record.file, self._corners, self._near)
         cells, references = self._sites(registration)
         planes: dict[Channel, Plane] = {
-            channel: tags_of(decoded.mosaic, channel, decoded.black, registration.framing) for channel in CHANNELS
+            channel: gauges_of(decoded.mosaic, channel, decoded.black, registration.framing) for channel in CHANNELS
         }
         return Stretch(decoded.record.file, registration, cells, references, planes)
 
@@ -285,7 +289,7 @@ class Measurement:
         """
         self._require_geometry(mosaic, what)
         framing = self.first.registration.framing
-        return shift_between(self.first.planes[channel], framing, tags_of(mosaic, channel, black, framing))
+        return shift_between(self.first.planes[channel], framing, gauges_of(mosaic, channel, black, framing))
 
     def patches(self, mosaic: Mosaic, black: _Array) -> tuple[_Array, npt.NDArray[np.uint16]]:
         """Return the mean counts (P, 3) and highest raw counts (P,) of cells, then references, where they were first.
@@ -348,7 +352,7 @@ class Measurement:
         self._require_geometry(decoded.mosaic, decoded.record.file)
         channel, framing = decoded.strongest, stretch.registration.framing
         shift = shift_between(
-            stretch.planes[channel], framing, tags_of(decoded.mosaic, channel, decoded.black, framing)
+            stretch.planes[channel], framing, gauges_of(decoded.mosaic, channel, decoded.black, framing)
         )
         # A turn or a change of distance moves the tags differently; moving the grid along would not mend it.
         turned = shift.largest_px > shift.length_px + STILL_PX
@@ -358,6 +362,12 @@ class Measurement:
         if shift.length_px > STILL_PX:
             cells, references = self._sites(stretch.registration.shifted(shift.dx, shift.dy))
         return self._measured(decoded, stretch, cells, references, shift, even, dark)
+
+    def moved(self, before: Stretch, stretch: Stretch) -> Shift:
+        """Return how far the cells have moved from one stretch to another, however far that is."""
+        by = stretch.registration.to_pixels(self.cells_mm) - before.registration.to_pixels(self.cells_mm)
+        dx, dy = np.median(by, axis=0).tolist()
+        return Shift(dx, dy, float(np.linalg.norm(by, axis=1).max()), len(by))
 
     def measure_first(
         self, decoded: Decoded, stretch: Stretch, shift: Shift, even: bool, dark: DarkLight | None = None

@@ -25,7 +25,8 @@ from acquisition.chart import Chart
 from acquisition.field import Field
 from acquisition.framing import Framing, find_chart
 from acquisition.homography import rms
-from acquisition.planes import CHANNELS, frame_black, plane_of
+from acquisition.outline import refined
+from acquisition.planes import CHANNELS, Plane, frame_black, plane_of
 from acquisition.sharpness import blur_px
 from calibration.colours import ColourModel
 from calibration.displacement import Displacement
@@ -183,7 +184,8 @@ def register(
         marks = _tag_corners(framing, chart)
         lens, residual = fit_lens(marks.points_mm, marks.places_px, (width, height))
     else:
-        field, lens, residual = _field_through_lens(framing.field, (width, height))
+        clear = _clear_edges(framing.field, planes, blur)
+        field, lens, residual = _field_through_lens(clear, (width, height))
         framing, marks = replace(framing, field=field), _outline(field)
     lens_rms = rms(residual)
     if lens_rms > MAX_TAG_RESIDUAL_PX:
@@ -220,6 +222,12 @@ def _outline(field: Field) -> Anchors:
     """Return the field's outline, whose places are known across alone."""
     known = np.einsum("ni,nj->nij", field.normals, field.normals) / _OUTLINE_SIGMA_PX**2
     return Anchors(field.outline_mm, field.outline_px, known)
+
+
+def _clear_edges(field: Field, planes: list[Plane], blur: float) -> Field:
+    """Return the field with its outline measured finely, where it is clear enough for that."""
+    places, clear = refined(planes, field.outline_px, field.normals, blur)
+    return replace(field, outline_mm=field.outline_mm[clear], outline_px=places[clear], normals=field.normals[clear])
 
 
 def _field_through_lens(field: Field, frame_size: tuple[int, int]) -> tuple[Field, Lens, _Array]:

@@ -129,7 +129,6 @@ def figures_of(result: BuildResult) -> dict[str, float]:
     paper = result.white.max(axis=1)
     used = min((frame.paper.references for frame in result.frames), default=0)
     figures = {
-        "tags_found": tags / max(tags + len(registration.framing.missing), 1),
         "cell_px": registration.cell_px,
         "bleed": bleed(registration.cell_px, registration.blur_px, result.window),
         "tag_residual_px": registration.lens_residual_px,
@@ -149,6 +148,8 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "brightest_share": float(paper.max()) / result.white_level,
         "darkest_counts": float(paper.min()),
     }
+    if registration.framing.field is None:
+        figures["tags_found"] = tags / max(tags + len(registration.framing.missing), 1)
     full = white.mean(axis=0) if len(white) else result.white[int(np.argmax(result.white.sum(axis=1)))]
     if np.isfinite(result.darkness.light).all() and result.subtracted is None:
         figures["leak_share"] = float(np.abs(result.darkness.light / full).max())

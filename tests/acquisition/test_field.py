@@ -18,6 +18,7 @@ from acquisition.chart import Chart
 from acquisition.field import field_mm, find_field
 from acquisition.framing import find_chart
 from acquisition.layout import paper_chart
+from acquisition.outline import refined
 from acquisition.planes import CHANNELS, Plane, plane_of
 from acquisition.printing import drawing
 from acquisition.sharpness import blur_px
@@ -182,3 +183,28 @@ def test_a_photograph_without_the_chart_has_no_chart(name: str) -> None:
     with pytest.raises(RegistrationError, match=r"the field of 32768 cells, .* looked for") as caught:
         find_chart(read_raw(path), paper_chart(), name)
     assert "\n" not in str(caught.value)
+
+
+def test_marks_in_the_margin_do_not_draw_the_refined_edge(white: Mosaic) -> None:
+    field = find_field(planes_of(white), CHART, "the frame")
+    places, clear = refined(planes_of(white), field.outline_px, field.normals, 0.58)
+    off = ((places - truth(UPRIGHT, white, field.outline_mm)) * field.normals).sum(axis=1)
+    assert clear.mean() > 0.7
+    for side in ((0, -1), (1, 0), (0, 1), (-1, 0)):
+        of_side = clear & (field.normals @ np.array(side) > 0.9)
+        assert abs(np.median(off[of_side])) < 0.05
+        assert np.percentile(np.abs(off[of_side]), 80) < 0.12
+
+
+def test_an_edge_that_is_not_clear_is_not_refined(white: Mosaic) -> None:
+    field = find_field(planes_of(white), CHART, "the frame")
+    random = np.random.default_rng(0)
+    faint = [
+        replace(
+            plane, values=(4000 + 0.02 * plane.values + random.normal(0, 30, plane.values.shape)).astype(np.float32)
+        )
+        for plane in planes_of(white)
+    ]
+    places, clear = refined(faint, field.outline_px, field.normals, 0.58)
+    assert not clear.any()
+    assert (places == field.outline_px).all()
