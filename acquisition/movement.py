@@ -160,12 +160,13 @@ def _field_shift(reference: Plane, plane: Plane, field: Field) -> Shift:
     unknown = Shift(0.0, 0.0, 0.0, 0)
     middles, normals = _strips(field)
     height, width = reference.values.shape
-    room = _STRIP_ALONG + _STRIP_ACROSS + _STRIP_REACH_PX
-    inside = np.asarray(((middles >= room) & (middles <= np.array([width, height]) - 1 - room)).all(axis=1))
-    middles, normals = middles[inside], normals[inside]
+    places = _strip_places(middles, normals) - reference.offset_px
+    room = _STRIP_REACH_PX
+    seen_whole = (places >= room) & (places <= np.array([width, height]) - 1 - room)
+    inside = np.asarray(seen_whole.all(axis=(1, 2, 3)))
+    middles, normals, places = middles[inside], normals[inside], places[inside]
     if len(middles) < _MIN_STRIPS:
         return unknown
-    places = _strip_places(middles, normals) - reference.offset_px
     before = _sampled(reference, places)
     slope = np.gradient(before, axis=2)
     # A strip's ends have no neighbours to tell the slope from.

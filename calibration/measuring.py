@@ -21,6 +21,7 @@ from acquisition.framing import Framing
 from acquisition.movement import Shift, gauge_boxes, shift_between
 from acquisition.planes import CHANNELS, Channel, Plane, channel_offset_px, phases
 from acquisition.session import FrameRecord
+from calibration.cell_field import field_of_cells
 from calibration.darkness import DarkFigures, read_dark
 from calibration.frames import Decoded
 from calibration.likeness import Expectation, Likeness
@@ -250,15 +251,18 @@ class Measurement:
         samples, highest = gather(first.mosaic, first.black, self.first.references)
         seen = _means(samples, highest, self.first.references, first.saturation)[: len(whites)]
         base = PaperReader(self._white_mm, self.cells_mm, chart.page_mm).read(seen, first.record.file)[0].field
-        self._paper = PaperReader(self._white_mm, self.cells_mm, chart.page_mm, base)
-        self._base_at_whites = base.at(self._white_mm)
         cells = gather(first.mosaic, first.black, self.first.cells)[0].astype(np.float64)
         level = cells.mean(axis=1)
+        there = self.first.cells.inside & ~self.first.registration.strangers[chart.cell_of_colour]
+        codes = chart.rgb[chart.cell_of_colour]
+        if not chart.tags:
+            # Its references are in the margin, and do not tell what light there is in the middle.
+            base = field_of_cells(codes, self.cells_mm, level, there, self._white_mm, seen, chart.page_mm)
+        self._paper = PaperReader(self._white_mm, self.cells_mm, chart.page_mm, base)
+        self._base_at_whites = base.at(self._white_mm)
         self.transfer: PhotonTransfer = photon_transfer(level, cells.var(axis=1, ddof=1), window**2)
         self._first_means = np.concatenate([level, samples.mean(axis=1, dtype=np.float64)])
         self._first_seen = seen
-        there = self.first.cells.inside & ~self.first.registration.strangers[chart.cell_of_colour]
-        codes = chart.rgb[chart.cell_of_colour]
         self._expected = Expectation(codes, self.cells_mm, level / base.at(self.cells_mm), there)
 
     def register(self, decoded: Decoded) -> Stretch:

@@ -21,7 +21,7 @@ from sim.world import Room
 from tests.calibration.lab import Lab, hang_chart
 
 CHART = paper_chart("A6", 3)
-FILL = Room(waviness_mm=0.5, fill=0.8)
+FILL = Room(waviness_mm=0.5)
 
 
 @cache

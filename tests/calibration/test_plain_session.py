@@ -1,0 +1,95 @@
+"""Sessions of a chart without tags: what moves between frames is followed, and told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquisition.illuminations import Illumination
+from acquisition.layout import paper_chart
+from acquisition.session import Step
+from calibration.build import build
+from calibration.lut import open_lut
+from calibration.report import write_report
+from drivers.presenter import Colour
+from sim.world import Room
+from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang_chart, renumbered, take
+
+SMALL = paper_chart("A6", 3)
+ROOM = Room(waviness_mm=0.5)
+RED = Illumination(0, "uniform", None, Colour(255, 0, 0))
+
+
+@pytest.fixture(scope="module")
+def plain() -> Lab:
+    return hang_chart(SMALL, "Test", ROOM)
+
+
+def moved_by(dx: float, dy: float, roll_deg: float = 0.0) -> Lab:
+    """Return the lab with the camera shifted so that the chart lies (dx, dy) half-size pixels further."""
+    lab = hang_chart(SMALL, "Test", replace(ROOM, roll_deg=ROOM.roll_deg + roll_deg))
+    x, y = lab.world.view.centre_px
+    lab.world.view = replace(lab.world.view, centre_px=(x + dx, y + dy))
+    return lab
+
+
+def worst_error(lab: Lab, folder: Path) -> float:
+    """Return how far the means of cells lie from the room's truth, as a share of white, the worst of all lights."""
+    table = open_lut(folder)
+    codes = lab.chart.rgb[lab.chart.cell_of_colour]
+    worst = 0.0
+    for light in table.illuminations:
+        white = lab.world.white(light.colour, SETTINGS)
+        true = lab.world.reflected(codes, light.colour, SETTINGS) / white
+        mean = table.samples[light.index].mean(axis=1) / table.white[light.index]
+        lit = int(np.argmax(white))
+        worst = max(worst, float(np.abs(mean - true)[:, lit].max()))
+    return worst
+
+
+@pytest.mark.parametrize(("by", "anew"), [((0.3, -0.2), []), ((4.0, -2.5), [2])])
+def test_a_bump_is_followed_and_told(plain: Lab, tmp_path: Path, by: tuple[float, float], anew: list[int]) -> None:
+    bumped = moved_by(*by)
+    lights = renumbered([*LIGHTS[4:8], RED])
+
+    def frame(step: Step) -> bytes:
+        return (bumped if step.number >= 4 else plain).dng(step.colour, step.number)
+
+    with take(plain, tmp_path / "session", lights, frame=frame) as session:
+        result = build(session, tmp_path / "lut", report=write_report)
+    assert [figures.record.illumination for figures in result.frames if figures.registered] == anew
+    first = next(figures for figures in result.frames if figures.record.illumination == 2)
+    assert (first.shift.dx, first.shift.dy) == pytest.approx(by, abs=0.05)
+    assert result.largest_shift_px == pytest.approx(np.hypot(*by), abs=0.07)
+    # A grid left behind by 4 px reads the next cell: 0.15 of white here.
+    assert worst_error(plain, tmp_path / "lut") < 0.05
+    page = (tmp_path / "lut" / "report.html").read_text()
+    assert f"{len(anew)} frames registered anew" in page
+    remarks = [row.threshold.name for row in result.verdict.remarks]
+    assert ("moved_anew" in remarks) == bool(anew)
+
+
+def test_a_turn_is_registered_anew(plain: Lab, tmp_path: Path) -> None:
+    turned = moved_by(0.0, 0.0, roll_deg=0.7)
+    lights = renumbered(LIGHTS[4:7])
+
+    def frame(step: Step) -> bytes:
+        return (turned if step.number >= 3 else plain).dng(step.colour, step.number)
+
+    with take(plain, tmp_path / "session", lights, frame=frame) as session:
+        result = build(session, tmp_path / "lut")
+    assert [figures.record.illumination for figures in result.frames if figures.registered] == [1]
+    assert worst_error(plain, tmp_path / "lut") < 0.05
+
+
+def test_nothing_is_registered_anew_where_nothing_moves(plain: Lab, tmp_path: Path) -> None:
+    lights = renumbered([*LIGHTS[::3], RED])
+    with take(plain, tmp_path / "session", lights) as session:
+        result = build(session, tmp_path / "lut")
+    assert not any(figures.registered for figures in result.frames)
+    assert result.largest_shift_px < 0.05
+    assert min(figures.shift.tags for figures in result.frames) >= 16
+    assert worst_error(plain, tmp_path / "lut") < 0.05
