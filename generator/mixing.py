@@ -20,8 +20,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
+import numba
 import numpy as np
 import numpy.typing as npt
+from numba import uint32
 
 from drivers.errors import InputError
 from generator import philox
@@ -37,19 +39,21 @@ from generator.arguments import (
     readable,
     share,
 )
-from generator.choice import OFFSETS, choose_group, four_words, group_of, row_keys
+from generator.choice import OFFSETS, four_words, group_of, row_keys
 from generator.compiled import compiled
 from generator.palette import bits_of
-from generator.vector import GROUP, LANES, MEAN_BYTES, SAMPLE_BYTES, SUM_BYTES, add_light8, name_colours, round8
+from generator.vector import GROUP, LANES, SAMPLE_BYTES, choose_named, copy6, name_colours, offset_at
+from generator.vector_mixing import MEAN_BYTES, PLAN, copy_least, full8, line_up8, mean4, mix, part8
 
 MIXTURES: Final = np.uint32(philox.MIXTURES)
 STRETCH: Final = 512
 """Pixels of a row whose offsets are chosen before their samples are fetched, a whole number of groups."""
 FAULTS: Final = 4 * LANES
 """Bytes that tell faulty weights."""
-SUMS: Final = SUM_BYTES * (STRETCH // LANES + 1)
 ROOM: Final = OFFSETS * (STRETCH // GROUP + 1)
-"""Bytes of a stretch's offsets; the last one of a row may be longer by up to seven pixels."""
+"""Bytes of a stretch's offsets or weights; the last one of a row may be longer by up to seven pixels."""
+PAIR_ROOM: Final = 4 * ROOM
+"""Bytes of a stretch's weights and offsets of two lights."""
 
 
 @compiled
@@ -90,15 +94,19 @@ def _round_table(total: Any, white: float, out: Any) -> None:
 
 
 @compiled
-def _fill_means(samples: Any, means: Any) -> None:
-    """Fill the first three of `means` (C, 4) float32."""
-    count = samples.shape[1]
-    for colour in range(samples.shape[0]):
-        for channel in range(3):
-            total = 0
-            for i in range(count):
-                total += np.int64(samples[colour, i, channel])
-            means[colour, channel] = np.float32(total / count)
+def _fill_means(samples: int, colours: int, count: int, means: int, step: int) -> None:
+    """Write each colour's mean, `step` bytes from one to the next."""
+    for colour in range(colours):
+        mean4(samples + SAMPLE_BYTES * count * colour, count, means + step * colour)
+
+
+@numba.njit(inline="always")
+def _all_full(line: int, light: int, pixels: int) -> bool:
+    """Return whether all weights of a pair's light in a stretch are 1."""
+    full = True
+    for block in range((pixels + LANES - 1) // LANES):
+        full &= full8(line + 8 * LANES * block, light)
+    return full
 
 
 @compiled
@@ -120,48 +128,91 @@ def _mix_pixels(
     target: int,
     target_pitch: int,
     scratch: int,
+    plan: Any,
+    plan_at: int,
+    keys: Any,
+    lit: Any,
+    nothing: int,
 ) -> None:
     """Fill rows of at least eight pixels. `weight_steps` are the bytes from row to row, pixel to pixel, light to light.
 
-    A stretch of a row at a time: offsets of all lights first, then the sums light by light. In scratch memory stand a
-    row's last pixels, what tells faulty weights, the sums, the colours' offsets and each light's.
+    A stretch of a row at a time: weights and offsets of all lights first, then the sums, two lights at once. In scratch
+    memory stand a row's last pixels, what tells faulty weights, the colours' offsets in means and in samples, and each
+    pair's weights and offsets. Weights that are all 0 in a stretch add nothing there, so that such a light needs no
+    offsets; where only one light is left and all its weights are 1, its samples stand as they are.
     """
     lights = len(tables)
-    sums, colours = scratch + 64 + FAULTS, scratch + 64 + FAULTS + SUMS
-    mean_bytes = MEAN_BYTES << (3 * np.int64(bits))
+    pairs = (lights + 1) // 2
+    faults = scratch + 64
+    mean_places = faults + FAULTS
+    colours = mean_places + ROOM
+    lines = colours + ROOM
+    alternating = lights == 2 and weight_steps[1] == 8 and weight_steps[2] == 4
+    alike = weight_steps[0] == 0 and weight_steps[1] == 0
     for y in range(rows):
-        start = 0
+        row, start = picture + y * pitch, 0
+        for light in range(lights):
+            keys[light, 0], keys[light, 1], keys[light, 2] = row_keys(first_row + y, light, image, seed)
         while start < width:
             # What is left after a stretch must not be fewer than eight pixels.
             end = width if width - start < STRETCH + LANES else start + STRETCH
-            for group in range(start // GROUP, (end + GROUP - 1) // GROUP):
-                to = colours + OFFSETS * (group - start // GROUP)
-                name_colours(group_of(picture + y * pitch, width, group, scratch), bits, to)
-            for light in range(lights):
-                keys = row_keys(first_row + y, light, image, seed)
-                for group in range(start // GROUP, (end + GROUP - 1) // GROUP):
-                    to = colours + ROOM * (light + 1) + OFFSETS * (group - start // GROUP)
-                    choose_group(picture + y * pitch, width, group, keys, count, bits, scratch, to)
-            blocks = (end - start + LANES - 1) // LANES
-            for light in range(lights):
-                weight = weights + y * weight_steps[0] + light * weight_steps[2]
-                for block in range(blocks):
-                    # The last eight pixels may be some of the ones before again, with sums of their own.
-                    x = min(start + LANES * block, end - LANES)
-                    place = 4 * (x - start)
-                    add_light8(
-                        tables[light],
-                        colours + ROOM * (light + 1) + place,
-                        means + light * mean_bytes,
-                        colours + place,
-                        weight + x * weight_steps[1],
-                        weight_steps[1],
-                        sums + SUM_BYTES * block,
-                        scratch + 64,
-                    )
-            for block in range(blocks):
-                x = min(start + LANES * block, end - LANES)
-                round8(sums + SUM_BYTES * block, white, target + y * target_pitch + SAMPLE_BYTES * x)
+            low, high = start // GROUP, (end + GROUP - 1) // GROUP
+            for group in range(low, high):
+                place = OFFSETS * (group - low)
+                source = group_of(row, width, group, scratch)
+                name_colours(
+                    source,
+                    bits,
+                    uint32(2 * MEAN_BYTES * pairs),
+                    mean_places + place,
+                    uint32(SAMPLE_BYTES * count),
+                    colours + place,
+                )
+            shining, lit_pairs, alone = 0, 0, 0
+            for pair in range(pairs):
+                line, light = lines + PAIR_ROOM * pair, 2 * pair
+                if not alike or (y == 0 and start == 0):
+                    lit[pair] = 0
+                    blocks = STRETCH // LANES + 1 if alike else (end - start + LANES - 1) // LANES
+                    for block in range(blocks):
+                        x = min(start + LANES * block, end - LANES)
+                        first = weights + y * weight_steps[0] + x * weight_steps[1] + light * weight_steps[2]
+                        at = line + 8 * LANES * block
+                        if alternating:
+                            lit[pair] |= part8(first, at)
+                        elif light + 1 < lights:
+                            second = first + weight_steps[2]
+                            lit[pair] |= line_up8(first, weight_steps[1], second, weight_steps[1], at)
+                        else:
+                            # A light too few for the pair: its partner never has a weight.
+                            lit[pair] |= line_up8(first, weight_steps[1], nothing, 0, at)
+                if not lit[pair]:
+                    continue
+                for member in range(2):
+                    # In the place of a light without weight stands its partner.
+                    it = member if lit[pair] >> member & 1 else 1 - member
+                    plan[lit_pairs, 1 + member] = line + ROOM * (2 + it)
+                    plan[lit_pairs, 3 + member] = tables[light + it]
+                    if it != member:
+                        continue
+                    shining, alone = shining + 1, light + it
+                    k0, k1, k2 = keys[light + it, 0], keys[light + it, 1], keys[light + it, 2]
+                    for group in range(low, high):
+                        place, word = OFFSETS * (group - low), uint32(LANES * group)
+                        choose_named(colours + place, word, k0, k1, k2, count, line + ROOM * (2 + it) + place)
+                plan[lit_pairs, 0], plan[lit_pairs, 5] = line, means + 2 * MEAN_BYTES * pair
+                lit_pairs += 1
+            to, line = target + y * target_pitch + SAMPLE_BYTES * start, lines + PAIR_ROOM * (alone // 2)
+            if shining == 1 and _all_full(line, alone & 1, end - start):
+                offsets = line + ROOM * (2 + (alone & 1))
+                for i in range(end - start - 1):
+                    copy_least(tables[alone] + offset_at(offsets + 4 * i), white, to + SAMPLE_BYTES * i)
+                # Of the last pixel not more than its own bytes are written.
+                i = end - start - 1
+                copy_least(tables[alone] + offset_at(offsets + 4 * i), white, scratch)
+                copy6(scratch, to + SAMPLE_BYTES * i)
+            else:
+                mix(plan_at, lit_pairs, end - start, mean_places, faults, np.float32(white), to)
             start = end
 
 
@@ -259,7 +310,8 @@ def mix_samples(
     Returns
     -------
     ndarray
-        (H, W, 3) uint16, computed in float32, rounded to the nearest count, halves up.
+        (H, W, 3) uint16, computed in float32, rounded to the nearest count, halves up. What lights 2 j and 2 j + 1 give
+        is added up first, then the pairs in their order.
 
     Raises
     ------
@@ -287,13 +339,19 @@ def mix_samples(
         work = np.empty(source.shape, np.uint16)
     pieces = [readable(samples) for samples in lights]
     addresses = np.array([piece.ctypes.data for piece in pieces])
-    means = np.zeros((len(lights), len(lights[0]), MEAN_BYTES // 4), np.float32)
-    for samples, mean in zip(pieces, means, strict=True):
-        _fill_means(np.asarray(samples), mean)
+    pairs = (len(lights) + 1) // 2
+    colours, count = lights[0].shape[:2]
+    # A pair's means, 32 bytes, are to lie in one line of the cache.
+    room = np.zeros(8 * pairs * colours + 15, np.float32)
+    means = room[-room.ctypes.data % 64 // 4 :][: 8 * pairs * colours].reshape(colours, 2 * pairs, MEAN_BYTES // 4)
+    for light, samples in enumerate(pieces):
+        _fill_means(samples.ctypes.data, colours, count, means[:, light].ctypes.data, means.strides[0])
     faults: list[bool] = []
+    no_weight = np.zeros(1, np.float32)
 
     def fill(top: int, bottom: int) -> None:
-        scratch = np.zeros(64 + FAULTS + SUMS + ROOM * (1 + len(lights)), np.uint8)
+        scratch = np.zeros(64 + FAULTS + 2 * ROOM + PAIR_ROOM * pairs, np.uint8)
+        plan = np.zeros((pairs, PLAN), np.int64)
         _mix_pixels(
             source[top:].ctypes.data,
             source.strides[0],
@@ -301,17 +359,22 @@ def mix_samples(
             bottom - top,
             addresses,
             means.ctypes.data,
-            np.uint32(lights[0].shape[1]),
+            np.uint32(count),
             np.uint32(bits),
             each[top:].ctypes.data,
             np.array(each.strides),
-            np.float32(white_level),
+            np.uint16(white_level),
             key,
             image,
             first_row + top,
             work[top:].ctypes.data,
             work.strides[0],
             scratch.ctypes.data,
+            plan,
+            plan.ctypes.data,
+            np.zeros((len(lights), 3), np.uint32),
+            np.zeros(pairs, np.int64),
+            no_weight.ctypes.data,
         )
         faults.append(bool(np.isnan(scratch[64 : 64 + FAULTS].view(np.float32)).any()))
 

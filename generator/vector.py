@@ -21,95 +21,93 @@ LANES: Final = 8
 GROUP: Final = 2 * LANES
 """Pixels that share a vector of words; `choice.py`."""
 SAMPLE_BYTES: Final = 6
-MEAN_BYTES: Final = 16
-"""Of a colour's mean: red, green, blue and nothing, float32."""
-SUM_BYTES: Final = 16 * LANES
-"""Of eight pixels' sums: red, green, blue and nothing, float32."""
 
-_I8, _I16, _I32, _I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
-_F32 = ir.FloatType()
-_FLOATS = ir.VectorType(_F32, LANES)
-_WORDS = ir.VectorType(_I32, LANES)
-_PAIRS = ir.VectorType(_I64, LANES // 2)
-_ADDRESS = types.int64
+I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
+F32 = ir.FloatType()
+FLOATS = ir.VectorType(F32, LANES)
+WORDS = ir.VectorType(I32, LANES)
+_PAIRS = ir.VectorType(I64, LANES // 2)
+ADDRESS = types.int64
 _MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
 
 Builder = Any
 Value = Any
 
 
-def _constant(kind: Any, numbers: int | Sequence[int]) -> Value:
+def constant(kind: Any, numbers: int | Sequence[int]) -> Value:
+    """Return a constant vector, of one number in every lane or of a number a lane."""
     return ir.Constant(kind, [numbers] * kind.count if isinstance(numbers, int) else list(numbers))
 
 
-def _spread(builder: Builder, number: Value, kind: Any) -> Value:
+def spread(builder: Builder, number: Value, kind: Any) -> Value:
     """Return a vector whose every lane is `number`."""
     unset = ir.Constant(kind, ir.Undefined)
-    first = builder.insert_element(unset, number, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(first, unset, _constant(ir.VectorType(_I32, kind.count), 0))
+    first = builder.insert_element(unset, number, ir.Constant(I32, 0))
+    return builder.shuffle_vector(first, unset, constant(ir.VectorType(I32, kind.count), 0))
 
 
-def _at(builder: Builder, address: Value, offset: int, kind: Any) -> Value:
-    return builder.inttoptr(builder.add(address, ir.Constant(_I64, offset)), kind.as_pointer())
+def at(builder: Builder, address: Value, offset: int, kind: Any) -> Value:
+    """Return a pointer to what lies `offset` bytes behind `address`."""
+    return builder.inttoptr(builder.add(address, ir.Constant(I64, offset)), kind.as_pointer())
 
 
-def _load(builder: Builder, address: Value, offset: int, kind: Any) -> Value:
-    loaded = builder.load(_at(builder, address, offset, kind))
+def load(builder: Builder, address: Value, offset: int, kind: Any) -> Value:
+    """Return what lies there, wherever that is."""
+    loaded = builder.load(at(builder, address, offset, kind))
     loaded.align = 1
     return loaded
 
 
-def _store(builder: Builder, value: Value, address: Value, offset: int) -> None:
-    builder.store(value, _at(builder, address, offset, value.type)).align = 1
+def store(builder: Builder, value: Value, address: Value, offset: int) -> None:
+    """Write `value` there, wherever that is."""
+    builder.store(value, at(builder, address, offset, value.type)).align = 1
 
 
 def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
     """Return the colour indices of the eight pixels (24 bytes) at `picture`."""
-    bytes_ = ir.VectorType(_I8, 16)
-    first, second = _load(builder, picture, 0, bytes_), _load(builder, picture, 8, bytes_)
-    both = builder.shuffle_vector(first, second, _constant(ir.VectorType(_I32, 32), range(32)))
+    bytes_ = ir.VectorType(I8, 16)
+    first, second = load(builder, picture, 0, bytes_), load(builder, picture, 8, bytes_)
+    both = builder.shuffle_vector(first, second, constant(ir.VectorType(I32, 32), range(32)))
     lanes: list[int] = []
     for pixel in range(LANES):
         start = 3 * pixel if pixel < 4 else 3 * pixel - 8 + 16
         lanes += [start + 2, start + 1, start, 32]
-    spread = builder.shuffle_vector(
-        both, _constant(ir.VectorType(_I8, 32), 0), _constant(ir.VectorType(_I32, 32), lanes)
-    )
-    codes = builder.bitcast(spread, _WORDS)  # blue | green << 8 | red << 16
+    laid = builder.shuffle_vector(both, constant(ir.VectorType(I8, 32), 0), constant(ir.VectorType(I32, 32), lanes))
+    codes = builder.bitcast(laid, WORDS)  # blue | green << 8 | red << 16
 
     def field(place: int) -> Value:
-        shift = builder.sub(ir.Constant(_I32, 8 * (place + 1)), builder.mul(bits, ir.Constant(_I32, place + 1)))
-        ones = builder.sub(builder.shl(ir.Constant(_I32, 1), bits), ir.Constant(_I32, 1))
-        mask = builder.shl(ones, builder.mul(bits, ir.Constant(_I32, place)))
-        return builder.and_(builder.lshr(codes, _spread(builder, shift, _WORDS)), _spread(builder, mask, _WORDS))
+        shift = builder.sub(ir.Constant(I32, 8 * (place + 1)), builder.mul(bits, ir.Constant(I32, place + 1)))
+        ones = builder.sub(builder.shl(ir.Constant(I32, 1), bits), ir.Constant(I32, 1))
+        mask = builder.shl(ones, builder.mul(bits, ir.Constant(I32, place)))
+        return builder.and_(builder.lshr(codes, spread(builder, shift, WORDS)), spread(builder, mask, WORDS))
 
     return builder.or_(builder.or_(field(0), field(1)), field(2))
 
 
 def _digits(builder: Builder, word: Value, keys: Sequence[Value], count: Value) -> tuple[Value, Value]:
     """Return the choices of the pixels in the first and second half of a group; the rule is that of `choice.py`."""
-    numbers = builder.add(_spread(builder, word, _WORDS), _constant(_WORDS, range(LANES)))
-    h = builder.xor(numbers, _spread(builder, keys[0], _WORDS))
-    h = builder.mul(h, _constant(_WORDS, _MULTIPLIERS[0]))
+    numbers = builder.add(spread(builder, word, WORDS), constant(WORDS, range(LANES)))
+    h = builder.xor(numbers, spread(builder, keys[0], WORDS))
+    h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
     for key, shift, multiplier in zip(keys[1:], (16, 15), _MULTIPLIERS[1:], strict=True):
-        h = builder.xor(h, _spread(builder, key, _WORDS))
-        h = builder.xor(h, builder.lshr(h, _constant(_WORDS, shift)))
-        h = builder.mul(h, _constant(_WORDS, multiplier))
-    counts = _spread(builder, count, _WORDS)
+        h = builder.xor(h, spread(builder, key, WORDS))
+        h = builder.xor(h, builder.lshr(h, constant(WORDS, shift)))
+        h = builder.mul(h, constant(WORDS, multiplier))
+    counts = spread(builder, count, WORDS)
 
     def upper(numbers: Value) -> Value:
         """Return the upper halves of the products with `count`, even and odd lanes by one 64-bit product each."""
-        low, half = _constant(_PAIRS, 0xFFFFFFFF), _constant(_PAIRS, 32)
+        low, half = constant(_PAIRS, 0xFFFFFFFF), constant(_PAIRS, 32)
         pairs, factor = builder.bitcast(numbers, _PAIRS), builder.and_(builder.bitcast(counts, _PAIRS), low)
         even = builder.lshr(builder.mul(builder.and_(pairs, low), factor), half)
         odd = builder.mul(builder.lshr(pairs, half), factor)
-        odd = builder.and_(odd, _constant(_PAIRS, 0xFFFFFFFF << 32))
-        return builder.bitcast(builder.or_(even, odd), _WORDS)
+        odd = builder.and_(odd, constant(_PAIRS, 0xFFFFFFFF << 32))
+        return builder.bitcast(builder.or_(even, odd), WORDS)
 
     return upper(h), upper(builder.mul(h, counts))
 
 
-def _void(emit: Callable[..., None], *kinds: Any) -> Any:
+def void(emit: Callable[..., None], *kinds: Any) -> Any:
     """Return what numba wants of an intrinsic that returns nothing."""
 
     def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
@@ -140,27 +138,55 @@ def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, coun
         bits: Value,
         target: Value,
     ) -> None:
-        stride = _spread(builder, builder.mul(count, ir.Constant(_I32, SAMPLE_BYTES)), _WORDS)
+        stride = spread(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
         for half, choices in enumerate(_digits(builder, word, (k0, k1, k2), count)):
-            begin = builder.add(picture, ir.Constant(_I64, 3 * LANES * half))
+            begin = builder.add(picture, ir.Constant(I64, 3 * LANES * half))
             colours = builder.mul(_colours(builder, begin, bits), stride)
-            offsets = builder.add(colours, builder.mul(choices, _constant(_WORDS, SAMPLE_BYTES)))
-            _store(builder, offsets, target, 4 * LANES * half)
+            offsets = builder.add(colours, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
+            store(builder, offsets, target, 4 * LANES * half)
 
-    return _void(emit, _ADDRESS, number, number, number, number, number, number, _ADDRESS)
+    return void(emit, ADDRESS, number, number, number, number, number, number, ADDRESS)
 
 
 @intrinsic
-def name_colours(typing: Any, picture: Any, bits: Any, target: Any) -> Any:
-    """Write where the means of the 16 pixels at `picture` stand: uint32 offsets in bytes, `MEAN_BYTES` a colour."""
-    del typing, picture, bits, target
+def name_colours(
+    typing: Any, picture: Any, bits: Any, stride: Any, target: Any, other_stride: Any, other_target: Any
+) -> Any:
+    """Write the colours of the 16 pixels at `picture` as uint32: their indices times each stride, at each target."""
+    del typing, picture, bits, stride, target, other_stride, other_target
 
-    def emit(builder: Builder, picture: Value, bits: Value, target: Value) -> None:
+    def emit(
+        builder: Builder,
+        picture: Value,
+        bits: Value,
+        stride: Value,
+        target: Value,
+        other_stride: Value,
+        other_target: Value,
+    ) -> None:
         for half in range(2):
-            colours = _colours(builder, builder.add(picture, ir.Constant(_I64, 3 * LANES * half)), bits)
-            _store(builder, builder.mul(colours, _constant(_WORDS, MEAN_BYTES)), target, 4 * LANES * half)
+            colours = _colours(builder, builder.add(picture, ir.Constant(I64, 3 * LANES * half)), bits)
+            for factor, place in ((stride, target), (other_stride, other_target)):
+                store(builder, builder.mul(colours, spread(builder, factor, WORDS)), place, 4 * LANES * half)
 
-    return _void(emit, _ADDRESS, types.uint32, _ADDRESS)
+    return void(emit, ADDRESS, types.uint32, types.uint32, ADDRESS, types.uint32, ADDRESS)
+
+
+@intrinsic
+def choose_named(typing: Any, colours: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, target: Any) -> Any:
+    """Write what `choose` writes for the 16 pixels whose colours stand at `colours`, times the bytes of a colour."""
+    del typing, colours, word, k0, k1, k2, count, target
+    number = types.uint32
+
+    def emit(
+        builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
+    ) -> None:
+        for half, choices in enumerate(_digits(builder, word, (k0, k1, k2), count)):
+            named = load(builder, colours, 4 * LANES * half, WORDS)
+            offsets = builder.add(named, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
+            store(builder, offsets, target, 4 * LANES * half)
+
+    return void(emit, ADDRESS, number, number, number, number, number, ADDRESS)
 
 
 @intrinsic
@@ -170,9 +196,9 @@ def offset_at(typing: Any, source: Any) -> Any:
 
     def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
         del context, signature
-        return builder.zext(_load(builder, arguments[0], 0, _I32), _I64)
+        return builder.zext(load(builder, arguments[0], 0, I32), I64)
 
-    return types.int64(_ADDRESS), generate
+    return types.int64(ADDRESS), generate
 
 
 @intrinsic
@@ -181,9 +207,9 @@ def copy8(typing: Any, source: Any, target: Any) -> Any:
     del typing, source, target
 
     def emit(builder: Builder, source: Value, target: Value) -> None:
-        _store(builder, _load(builder, source, 0, _I64), target, 0)
+        store(builder, load(builder, source, 0, I64), target, 0)
 
-    return _void(emit, _ADDRESS, _ADDRESS)
+    return void(emit, ADDRESS, ADDRESS)
 
 
 @intrinsic
@@ -192,10 +218,10 @@ def copy6(typing: Any, source: Any, target: Any) -> Any:
     del typing, source, target
 
     def emit(builder: Builder, source: Value, target: Value) -> None:
-        _store(builder, _load(builder, source, 0, _I32), target, 0)
-        _store(builder, _load(builder, source, 4, _I16), target, 4)
+        store(builder, load(builder, source, 0, I32), target, 0)
+        store(builder, load(builder, source, 4, I16), target, 4)
 
-    return _void(emit, _ADDRESS, _ADDRESS)
+    return void(emit, ADDRESS, ADDRESS)
 
 
 @intrinsic
@@ -204,9 +230,9 @@ def copy2(typing: Any, source: Any, target: Any) -> Any:
     del typing, source, target
 
     def emit(builder: Builder, source: Value, target: Value) -> None:
-        _store(builder, _load(builder, source, 0, _I16), target, 0)
+        store(builder, load(builder, source, 0, I16), target, 0)
 
-    return _void(emit, _ADDRESS, _ADDRESS)
+    return void(emit, ADDRESS, ADDRESS)
 
 
 @intrinsic
@@ -215,17 +241,17 @@ def copy1(typing: Any, source: Any, target: Any) -> Any:
     del typing, source, target
 
     def emit(builder: Builder, source: Value, target: Value) -> None:
-        _store(builder, _load(builder, source, 0, _I8), target, 0)
+        store(builder, load(builder, source, 0, I8), target, 0)
 
-    return _void(emit, _ADDRESS, _ADDRESS)
+    return void(emit, ADDRESS, ADDRESS)
 
 
-def _joined(builder: Builder, parts: Sequence[Value]) -> Value:
+def joined(builder: Builder, parts: Sequence[Value]) -> Value:
     """Return vectors as one; there are a power of two."""
     while len(parts) > 1:
-        kind = ir.VectorType(_I32, 2 * parts[0].type.count)
+        kind = ir.VectorType(I32, 2 * parts[0].type.count)
         parts = [
-            builder.shuffle_vector(first, second, _constant(kind, range(kind.count)))
+            builder.shuffle_vector(first, second, constant(kind, range(kind.count)))
             for first, second in zip(parts[::2], parts[1::2], strict=True)
         ]
     return parts[0]
@@ -233,14 +259,14 @@ def _joined(builder: Builder, parts: Sequence[Value]) -> Value:
 
 def _channels(builder: Builder, samples: Value, offsets: Value, step: Value) -> list[Value]:
     """Return red, green and blue, eight float32 each, of the samples whose offsets are `step` bytes apart."""
-    quads = ir.VectorType(_I16, 4)
+    quads = ir.VectorType(I16, 4)
     parts = [
-        _load(
+        load(
             builder,
             builder.add(
                 samples,
                 builder.zext(
-                    _load(builder, builder.add(offsets, builder.mul(step, ir.Constant(_I64, lane))), 0, _I32), _I64
+                    load(builder, builder.add(offsets, builder.mul(step, ir.Constant(I64, lane))), 0, I32), I64
                 ),
             ),
             0,
@@ -248,21 +274,22 @@ def _channels(builder: Builder, samples: Value, offsets: Value, step: Value) -> 
         )
         for lane in range(LANES)
     ]
-    everything = _joined(builder, parts)
-    lanes = ir.VectorType(_I32, LANES)
+    everything = joined(builder, parts)
+    lanes = ir.VectorType(I32, LANES)
     return [
         builder.sitofp(
             builder.zext(
-                builder.shuffle_vector(everything, everything, _constant(lanes, range(channel, 4 * LANES, 4))),
-                _WORDS,
+                builder.shuffle_vector(everything, everything, constant(lanes, range(channel, 4 * LANES, 4))),
+                WORDS,
             ),
-            _FLOATS,
+            FLOATS,
         )
         for channel in range(3)
     ]
 
 
-def _least(builder: Builder, first: Value, second: Value) -> Value:
+def least(builder: Builder, first: Value, second: Value) -> Value:
+    """Return the smaller of two numbers in each lane."""
     return builder.select(builder.fcmp_ordered("<", first, second), first, second)
 
 
@@ -281,11 +308,11 @@ def planes8(typing: Any, samples: Any, offsets: Any, step: Any, scale: Any, red:
         green: Value,
         blue: Value,
     ) -> None:
-        factor, one = _spread(builder, scale, _FLOATS), ir.Constant(_FLOATS, [1.0] * LANES)
+        factor, one = spread(builder, scale, FLOATS), ir.Constant(FLOATS, [1.0] * LANES)
         for channel, target in zip(_channels(builder, samples, offsets, step), (red, green, blue), strict=True):
-            _store(builder, _least(builder, builder.fmul(channel, factor), one), target, 0)
+            store(builder, least(builder, builder.fmul(channel, factor), one), target, 0)
 
-    return _void(emit, _ADDRESS, _ADDRESS, _ADDRESS, types.float32, _ADDRESS, _ADDRESS, _ADDRESS)
+    return void(emit, ADDRESS, ADDRESS, ADDRESS, types.float32, ADDRESS, ADDRESS, ADDRESS)
 
 
 @intrinsic
@@ -294,10 +321,10 @@ def plane1(typing: Any, source: Any, scale: Any, target: Any) -> Any:
     del typing, source, scale, target
 
     def emit(builder: Builder, source: Value, scale: Value, target: Value) -> None:
-        value = builder.uitofp(_load(builder, source, 0, _I16), _F32)
-        _store(builder, _least(builder, builder.fmul(value, scale), ir.Constant(_F32, 1.0)), target, 0)
+        value = builder.uitofp(load(builder, source, 0, I16), F32)
+        store(builder, least(builder, builder.fmul(value, scale), ir.Constant(F32, 1.0)), target, 0)
 
-    return _void(emit, _ADDRESS, types.float32, _ADDRESS)
+    return void(emit, ADDRESS, types.float32, ADDRESS)
 
 
 @intrinsic
@@ -306,90 +333,10 @@ def prefetch(typing: Any, address: Any) -> Any:
     del typing, address
 
     def emit(builder: Builder, address: Value) -> None:
-        pointer = _I8.as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [pointer, _I32, _I32, _I32])
+        pointer = I8.as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [pointer, I32, I32, I32])
         function = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
-        numbers = [ir.Constant(_I32, number) for number in (0, 3, 1)]  # to read, keep close, data
-        builder.call(function, [_at(builder, address, 0, _I8), *numbers])
+        numbers = [ir.Constant(I32, number) for number in (0, 3, 1)]  # to read, keep close, data
+        builder.call(function, [at(builder, address, 0, I8), *numbers])
 
-    return _void(emit, _ADDRESS)
-
-
-@intrinsic
-def add_light8(
-    typing: Any, samples: Any, offsets: Any, means: Any, colours: Any, weights: Any, step: Any, total: Any, faults: Any
-) -> Any:
-    """Add one light to eight pixels' sums at `total`; see `mixing.py`.
-
-    `offsets` leads to the samples, `colours` to the means; weights are float32, `step` bytes apart. Sums are four
-    float32 a pixel, red, green, blue and one without meaning. The eight float32 at `faults` are no numbers from the
-    moment that a weight was negative, infinite or no number.
-    """
-    del typing, samples, offsets, means, colours, weights, step, total, faults
-
-    def emit(
-        builder: Builder,
-        samples: Value,
-        offsets: Value,
-        means: Value,
-        colours: Value,
-        weights: Value,
-        step: Value,
-        total: Value,
-        faults: Value,
-    ) -> None:
-        weight = ir.Constant(_FLOATS, ir.Undefined)
-        for lane in range(LANES):
-            number = _load(builder, builder.add(weights, builder.mul(step, ir.Constant(_I64, lane))), 0, _F32)
-            weight = builder.insert_element(weight, number, ir.Constant(_I32, lane))
-        name = f"llvm.sqrt.v{LANES}f32"
-        root_of = builder.module.globals.get(name) or ir.Function(
-            builder.module, ir.FunctionType(_FLOATS, [_FLOATS]), name
-        )
-        root = builder.call(root_of, [weight])
-        rest = builder.fsub(weight, root)
-
-        def two(base: Value, places: Value, first: int, kind: Any) -> Value:
-            """Return the four numbers each that pixels `first` and the next find at their places."""
-            parts = [
-                _load(builder, builder.add(base, builder.zext(_load(builder, places, 4 * lane, _I32), _I64)), 0, kind)
-                for lane in (first, first + 1)
-            ]
-            return builder.shuffle_vector(*parts, _constant(_WORDS, range(LANES)))
-
-        for first in range(0, LANES, 2):
-            pixels = _constant(_WORDS, [first] * 4 + [first + 1] * 4)
-            drawn = builder.zext(two(samples, offsets, first, ir.VectorType(_I16, 4)), _WORDS)
-            drawn = builder.fmul(builder.sitofp(drawn, _FLOATS), builder.shuffle_vector(root, root, pixels))
-            mean = two(means, colours, first, ir.VectorType(_F32, 4))
-            mean = builder.fmul(mean, builder.shuffle_vector(rest, rest, pixels))
-            value = builder.fadd(builder.fadd(_load(builder, total, 16 * first, _FLOATS), drawn), mean)
-            _store(builder, value, total, 16 * first)
-        # The root of what is negative, and nothing times infinity, are no numbers.
-        nothing = builder.fmul(root, ir.Constant(_FLOATS, [0.0] * LANES))
-        _store(builder, builder.fadd(_load(builder, faults, 0, _FLOATS), nothing), faults, 0)
-
-    return _void(emit, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS)
-
-
-@intrinsic
-def round8(typing: Any, total: Any, white: Any, target: Any) -> Any:
-    """Write eight pixels' sums as uint16, rounded, from 0 to `white`, and set the sums to 0."""
-    del typing, total, white, target
-
-    def emit(builder: Builder, total: Value, white: Value, target: Value) -> None:
-        half, zero = ir.Constant(_FLOATS, [0.5] * LANES), ir.Constant(_FLOATS, [0.0] * LANES)
-        most = _spread(builder, white, _FLOATS)
-        parts: list[Value] = []
-        for first in range(0, LANES, 2):
-            value = builder.fadd(_load(builder, total, 16 * first, _FLOATS), half)
-            _store(builder, zero, total, 16 * first)
-            value = builder.select(builder.fcmp_ordered(">", value, zero), value, zero)
-            whole = builder.fptosi(_least(builder, value, most), _WORDS)
-            parts.append(builder.trunc(whole, ir.VectorType(_I16, LANES)))
-        everything = _joined(builder, parts)
-        order = [4 * pixel + channel for pixel in range(LANES) for channel in range(3)]
-        kind = ir.VectorType(_I32, 3 * LANES)
-        _store(builder, builder.shuffle_vector(everything, everything, _constant(kind, order)), target, 0)
-
-    return _void(emit, _ADDRESS, types.float32, _ADDRESS)
+    return void(emit, ADDRESS)

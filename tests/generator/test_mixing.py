@@ -102,28 +102,62 @@ def weight_maps(height: int, width: int, lights: int) -> npt.NDArray[np.float32]
     return weights
 
 
+def by_formula(
+    rule: Rule,
+    tables: npt.NDArray[np.uint16],
+    picture: npt.NDArray[np.uint8],
+    weights: npt.NDArray[np.float32],
+    white: int,
+) -> npt.NDArray[np.uint16]:
+    """Return the image of seed 5 and number 9 by the formula at the head of `generator/mixing.py`."""
+    upper = (picture >> 6).astype(np.int64)
+    colour = upper[..., 0] << 4 | upper[..., 1] << 2 | upper[..., 2]
+    total = np.zeros(picture.shape, np.float32)
+    for first in range(0, len(tables), 2):
+        pair = np.zeros(picture.shape, np.float32)
+        for light in range(first, min(first + 2, len(tables))):
+            weight = weights[..., light, None]
+            root = np.sqrt(weight)
+            drawn = tables[light][colour, rule(5, 9, *colour.shape, place=light)]
+            mean = tables[light].mean(axis=1).astype(np.float32)[colour]
+            pair += root * drawn.astype(np.float32) + (weight - root) * mean
+        total += pair
+    return np.clip(total + np.float32(0.5), 0, white).astype(np.uint16)
+
+
 @pytest.mark.parametrize("lights", [1, 2, 3, 4])
 def test_mixed_pixels_follow_the_formula(
     rule: Rule, make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8], lights: int
 ) -> None:
-    lut = make_lut()
-    tables = lut.samples[:lights]
+    tables = make_lut().samples[:lights]
     weights = weight_maps(37, 1053, lights)
     mixed = mix_samples(tables, picture, weights, white_level=3000, seed=5, image=9, threads=3)
-    upper = (picture >> 6).astype(np.int64)
-    colour = upper[..., 0] << 4 | upper[..., 1] << 2 | upper[..., 2]
-    total = np.zeros(picture.shape, np.float32)
-    for light in range(lights):
-        weight = weights[..., light, None]
-        root = np.sqrt(weight)
-        drawn = tables[light][colour, rule(5, 9, *colour.shape, place=light)]
-        mean = tables[light].mean(axis=1).astype(np.float32)[colour]
-        total += root * drawn.astype(np.float32)
-        total += (weight - root) * mean
-    expected = np.clip(total + np.float32(0.5), 0, 3000).astype(np.uint16)
-    np.testing.assert_array_equal(mixed, expected)
+    np.testing.assert_array_equal(mixed, by_formula(rule, tables, picture, weights, 3000))
     assert (mixed[:, 40 * lights : 200] == 0).all()
     assert (mixed == 3000).any()
+
+
+@pytest.mark.parametrize("lights", [2, 3, 4])
+@pytest.mark.parametrize("width", [1, 7, 8, 9, 519, 520, 521, 1053])
+def test_rows_in_which_lights_are_alone_or_missing_follow_the_formula(
+    rule: Rule, make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8], lights: int, width: int
+) -> None:
+    tables = make_lut().samples[:lights]
+    part = picture[:12, :width]
+    weights = np.random.default_rng(8).uniform(0, 1.2, (12, width, lights)).astype(np.float32)
+    for row in range(8):
+        weights[row] = 0
+        # Alone at 1, alone at another weight, alone in the first 512 pixels, and at 1 but for the last pixel.
+        weights[row, : 512 if row in (4, 5) else width, row % lights] = 0.5 if row in (2, 3) else 1
+        if row > 5:
+            weights[row, -1, row % lights] = 0.25
+    weights[8] = 0
+    weights[9, :, 1:] = 0
+    weights[10, :, :-1] = 0
+    frame = np.full((12, width + 2, 3), 7, np.uint16)
+    mix_samples(tables, part, weights, white_level=3000, seed=5, image=9, out=frame[:, 1:-1])
+    np.testing.assert_array_equal(frame[:, 1:-1], by_formula(rule, tables, part, weights, 3000))
+    assert (frame[:, [0, -1]] == 7).all()
 
 
 def test_where_one_light_is_alone_its_own_samples_stand(

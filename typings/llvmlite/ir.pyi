@@ -5,6 +5,7 @@ from typing import Any
 Undefined: Any
 
 def Constant(kind: Any, value: Any) -> Any: ...  # noqa: N802
+def DoubleType() -> Any: ...  # noqa: N802
 def FloatType() -> Any: ...  # noqa: N802
 def Function(module: Any, kind: Any, name: str) -> Any: ...  # noqa: N802
 def FunctionType(result: Any, arguments: Any) -> Any: ...  # noqa: N802

@@ -1,6 +1,8 @@
 from typing import Any
 
+boolean: Any
 int64: Any
+uint16: Any
 uint32: Any
 uint64: Any
 float32: Any
