@@ -12,6 +12,7 @@ file), and no byte depends on the number of threads. Beside image and file a PNG
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, Literal, get_args
 
@@ -21,7 +22,17 @@ import numpy.typing as npt
 from drivers.errors import FormatError, InputError
 from generator.encoders.shot import Shot
 
-__all__ = ["FORMATS", "Format", "Shot", "decode_image", "encode_image", "encode_preview", "libraries_of", "suffix_of"]
+__all__ = [
+    "FORMATS",
+    "Format",
+    "Shot",
+    "decode_image",
+    "encode_image",
+    "encode_pieces",
+    "encode_preview",
+    "libraries_of",
+    "suffix_of",
+]
 
 Format = Literal["png", "tiff", "exr", "jxl", "dng"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)
@@ -62,8 +73,7 @@ def encode_image(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> byt
     InputError
         The image is not of that shape and type, or its size or the shot does not fit the format.
     """
-    if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
-        raise InputError(f"the image is {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
+    _check(image)
     if form == "png":
         from generator.encoders.png import encode_png
 
@@ -83,6 +93,29 @@ def encode_image(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> byt
     from generator.encoders.dng import encode_dng
 
     return encode_dng(image, shot)
+
+
+def encode_pieces(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> Iterable[bytes | memoryview]:
+    """Return the file of `encode_image` in pieces, whose memory may be used again for the next one.
+
+    Of a PNG they are encoded when they are asked for, so that a file of any size is written out of a cache's memory.
+
+    Raises
+    ------
+    InputError
+        As `encode_image`.
+    """
+    _check(image)
+    if form == "png":
+        from generator.encoders.png import png_pieces
+
+        return png_pieces(image, shot)
+    return (encode_image(image, form, shot),)
+
+
+def _check(image: npt.NDArray[np.uint16]) -> None:
+    if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise InputError(f"the image is {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
 
 
 def decode_image(data: bytes, form: Format, what: str) -> npt.NDArray[np.uint16]:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Final, Protocol, Self
 
 from generator.plan import ShardJob
 from generator.records import FileSum, ImageRecord, Split, image_key
-from generator.store import Store
+from generator.store import Pieces, Store, gathered
+
+_SETTLED_IMAGES: Final = 32
+_SETTLED_PIXELS: Final = 1 << 23
+"""Images, and pixels of them, from which files are brought to the disk while others are made."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +31,8 @@ class Sample:
     width, height
         px.
     files
-        Kind (`images`, `previews`, `masks`), what follows the number in the file's name, and the bytes; the image
-        first.
+        Kind (`images`, `previews`, `masks`), what follows the number in the file's name, and the bytes, which may be
+        asked for once; the image first.
     stored
         What is written already.
     """
@@ -36,7 +42,7 @@ class Sample:
     split: Split | None
     width: int
     height: int
-    files: tuple[tuple[str, str, bytes], ...]
+    files: tuple[tuple[str, str, Pieces], ...]
     stored: tuple[FileSum, ...] = ()
 
     @property
@@ -57,7 +63,7 @@ class ShardWriter(Protocol):
     def __exit__(self, *error: *Fault) -> None: ...
 
     def store(self, sample: Sample) -> Sample:
-        """Write what can be written by itself and return what `append` is to take; called from any thread."""
+        """Write what can be written by itself and return what `append` is to take; called where the sample was made."""
         ...
 
     def append(self, sample: Sample) -> None:
@@ -65,32 +71,58 @@ class ShardWriter(Protocol):
         ...
 
     def close(self) -> list[FileSum]:
-        """Finish all files and return them in the order of their names or numbers."""
+        """Finish all files, bring them to the disk and return them in the order of their names or numbers."""
         ...
 
 
+def hold(sample: Sample) -> Sample:
+    """Return a sample with all its bytes in memory of their own."""
+    return replace(sample, files=tuple((kind, ending, (gathered(data),)) for kind, ending, data in sample.files))
+
+
 class FolderWriter:
-    """Each image in a file of its own: `images/000123.png`, `previews/000123.jpg`."""
+    """Each image in a file of its own: `images/000123.png`, `previews/000123.jpg`.
+
+    Files are brought to the disk by a thread of their own, a few at a time, so that nobody waits for the disk but the
+    last of them.
+    """
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._files: list[FileSum] = []
+        self._thread = ThreadPoolExecutor(1)
+        self._settling: list[Future[None]] = []
+        self._written: list[str] = []
+        self._images = self._pixels = 0
 
     def store(self, sample: Sample) -> Sample:
         """Write the files of a sample, and let go of their bytes."""
         sums: list[FileSum] = []
         for kind, ending, data in sample.files:
             name = f"{kind}/{sample.key}{ending}"
-            self._store.put(name, data)
-            sums.append(FileSum(name=name, sha256=hashlib.sha256(data).hexdigest()))
+            digest = hashlib.sha256()
+            self._store.put(name, _passing(data, digest.update))
+            sums.append(FileSum(name=name, sha256=digest.hexdigest()))
         return replace(sample, files=(), stored=tuple(sums))
 
     def append(self, sample: Sample) -> None:
         """Note the files of a sample."""
         self._files += sample.stored
+        self._written += [file.name for file in sample.stored]
+        self._images += 1
+        self._pixels += sample.width * sample.height
+        if self._images >= _SETTLED_IMAGES or self._pixels >= _SETTLED_PIXELS:
+            self._settle()
+
+    def _settle(self) -> None:
+        self._settling.append(self._thread.submit(self._store.settle, self._written))
+        self._written, self._images, self._pixels = [], 0, 0
 
     def close(self) -> list[FileSum]:
-        """Return all files."""
+        """Wait until all files are on the disk and return them."""
+        self._settle()
+        for settled in self._settling:
+            settled.result()
         return self._files
 
     def __enter__(self) -> Self:
@@ -98,6 +130,13 @@ class FolderWriter:
 
     def __exit__(self, *error: *Fault) -> None:
         """Leave the files where they are: whoever makes the shard again writes the same."""
+        self._thread.shutdown(cancel_futures=True)
+
+
+def _passing(data: Pieces, see: Callable[[bytes | memoryview], object]) -> Iterator[bytes | memoryview]:
+    for piece in data:
+        see(piece)
+        yield piece
 
 
 def open_writer(job: ShardJob, store: Store) -> ShardWriter:

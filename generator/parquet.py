@@ -19,7 +19,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 
 from drivers.errors import FormatError, InputError
-from generator.layouts import Fault, Sample
+from generator.layouts import Fault, Sample, hold
 from generator.plan import ShardJob
 from generator.records import FileSum, shard_key
 from generator.store import Store
@@ -128,8 +128,8 @@ class ParquetWriter:
         self._parts: dict[str, _Part] = {}
 
     def store(self, sample: Sample) -> Sample:
-        """Return the sample: the rows of a shard are written one after the other."""
-        return sample
+        """Return the sample, encoded: the rows of a shard are written one after the other."""
+        return hold(sample)
 
     def append(self, sample: Sample) -> None:
         """Write the row of an image."""
@@ -138,19 +138,23 @@ class ParquetWriter:
             self._parts[name] = _Part(self._stack.enter_context(self._store.create(name)), self._schema)
         told = about(sample)
         row: dict[str, Any] = {"number": told.pop("image"), **told, "masks": []}
-        for kind, ending, data in sample.files:
+        size = 0
+        for kind, ending, pieces in sample.files:
+            data = b"".join(pieces)
+            size += len(data)
             file = {"bytes": data, "path": f"{sample.key}{ending}"}
             if kind == "masks":
                 row["masks"].append(file)
             else:
                 row[_COLUMNS[kind]] = file
-        self._parts[name].append(row, sum(len(data) for _, _, data in sample.files))
+        self._parts[name].append(row, size)
 
     def close(self) -> list[FileSum]:
-        """Finish the files and return them."""
+        """Finish the files, bring them to the disk and return them."""
         for part in self._parts.values():
             part.close()
         self._stack.close()
+        self._store.settle(self._parts)
         return [FileSum(name=name, sha256=self._parts[name].hashed.sha256) for name in sorted(self._parts)]
 
     def __enter__(self) -> Self:

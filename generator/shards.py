@@ -10,6 +10,7 @@ Laws that hold inside:
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Callable, Generator
@@ -37,6 +38,7 @@ from generator.records import (
     Triple,
 )
 from generator.scene import Source
+from generator.store import Pieces
 from generator.workplace import Workplace
 
 if TYPE_CHECKING:
@@ -44,6 +46,8 @@ if TYPE_CHECKING:
 
 PREVIEW_SIDE: Final = 512
 """Longest side of a preview, px."""
+
+_threads = threading.local()
 
 OnImage = Callable[[], None]
 OnSkip = Callable[[str, str, int], None]
@@ -234,15 +238,18 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _Read:
 
 
 def _make(job: ShardJob, lut: Lut, writer: ShardWriter, number: int, got: _Read, lighting: Lighting) -> Sample:
-    from generator.encode import Shot, encode_image, encode_preview, suffix_of
+    from generator.encode import Shot, encode_pieces, encode_preview, suffix_of
 
     height, width = got.picture.shape[:2]
     white_level = lut.provenance.white_level
     image, truth, maps = _photograph(lut, got.picture, lighting, job.seed, number)
     shot = Shot(white_level, truth, lut.provenance.camera)
-    files = [("images", suffix_of(job.options.form), encode_image(image, job.options.form, shot)), *maps]
+    files: list[tuple[str, str, Pieces]] = [
+        ("images", suffix_of(job.options.form), encode_pieces(image, job.options.form, shot)),
+        *((kind, ending, (data,)) for kind, ending, data in maps),
+    ]
     if job.options.previews:
-        files.append(("previews", ".jpg", encode_preview(preview_of(image, white_level))))
+        files.append(("previews", ".jpg", (encode_preview(preview_of(image, white_level)),)))
     rows = [
         LightRow(illumination=mixture.label, truth=chromaticity(mixture.white(lut))) for mixture in lighting.mixtures
     ]
@@ -261,13 +268,22 @@ def _photograph(
     height, width = picture.shape[:2]
     tables = [mixture.samples(lut, seed, height * width) for mixture in lighting.mixtures]
     if lighting.masks is None:
-        image = draw_samples(tables[0], picture, seed=seed, image=number)
+        image = draw_samples(tables[0], picture, seed=seed, image=number, out=_room(picture.shape))
         return image, chromaticity(lighting.whites(lut)[0]), []
     weights = lighting.weights_of(height, width)
     white_level = lut.provenance.white_level
     image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
     mean = weights.mean(axis=(0, 1), dtype=np.float64) @ lighting.whites(lut)
     return image, chromaticity(mean), encode_maps(lut, lighting, weights)
+
+
+def _room(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
+    """Return an array that the calling thread has again and again: fresh pages take as long as drawing into them."""
+    size = math.prod(shape)
+    room: npt.NDArray[np.uint16] | None = getattr(_threads, "room", None)
+    if room is None or room.size < size:
+        _threads.room = room = np.empty(size, np.uint16)
+    return room[:size].reshape(shape)
 
 
 def chromaticity(white: npt.NDArray[np.float64]) -> Triple:

@@ -26,6 +26,9 @@ from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
 from drivers.errors import CropError, FormatError, InputError, StorageError
 from drivers.storage import is_partial, partial_path, storage_error, sync_folder
 
+Pieces = Iterable[bytes | memoryview]
+"""A file's bytes in order; the memory of one piece may be that of the next."""
+
 _WAITING: Final = 16
 
 if TYPE_CHECKING:
@@ -40,7 +43,7 @@ class Store(Protocol):
         """The place as a person would write it."""
         ...
 
-    def put(self, name: str, data: bytes) -> None:
+    def put(self, name: str, data: bytes | Pieces) -> None:
         """Write a file; a StorageError says why it cannot be."""
         ...
 
@@ -84,10 +87,11 @@ class LocalStore:
         """The folder."""
         return str(self.root)
 
-    def put(self, name: str, data: bytes) -> None:
+    def put(self, name: str, data: bytes | Pieces) -> None:
         """Write a file."""
         with self.create(name) as stream:
-            stream.write(data)
+            for piece in (data,) if isinstance(data, bytes) else data:
+                stream.write(piece)
 
     @contextmanager
     def create(self, name: str) -> Generator[BinaryIO]:
@@ -202,10 +206,11 @@ class RemoteStore:
     def _root(self) -> str:
         return filesystem(self.url)[1].rstrip("/")
 
-    def put(self, name: str, data: bytes) -> None:
+    def put(self, name: str, data: bytes | Pieces) -> None:
         """Write an object."""
+        whole = data if isinstance(data, bytes) else gathered(data)
         with self._said(name):
-            self._files.pipe_file(self._path(name), data)
+            self._files.pipe_file(self._path(name), whole)
 
     @contextmanager
     def create(self, name: str) -> Generator[BinaryIO]:
@@ -271,6 +276,11 @@ class RemoteStore:
                 f"cannot write {self.place}/{name}: {reason}; check the address and that you may write there, then run "
                 "the same command again"
             ) from error
+
+
+def gathered(pieces: Pieces) -> bytes:
+    """Return pieces as one."""
+    return b"".join([bytes(piece) for piece in pieces])
 
 
 def is_remote(place: str) -> bool:

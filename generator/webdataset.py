@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from typing import Any, BinaryIO, Final, Self, cast
 
 from drivers.errors import FormatError
-from generator.layouts import Fault, Sample
+from generator.layouts import Fault, Sample, hold
 from generator.plan import ShardJob
 from generator.records import FileSum, shard_key
 from generator.store import Store
@@ -80,8 +80,8 @@ class TarWriter:
         self._open: dict[str, tuple[tarfile.TarFile, Hashed]] = {}
 
     def store(self, sample: Sample) -> Sample:
-        """Return the sample: the files of a shard are written one after the other."""
-        return sample
+        """Return the sample, encoded: the files of a shard are written one after the other."""
+        return hold(sample)
 
     def append(self, sample: Sample) -> None:
         """Write an image and what belongs to it."""
@@ -92,17 +92,19 @@ class TarWriter:
             self._open[name] = (tar, hashed)
         tar = self._open[name][0]
         text = json.dumps(about(sample), ensure_ascii=False) + "\n"
-        for kind, ending, data in (*sample.files, ("images", ".json", text.encode())):
+        for kind, ending, pieces in (*sample.files, ("images", ".json", (text.encode(),))):
+            data = b"".join(pieces)
             header = tarfile.TarInfo(f"{sample.key}{_ENDINGS[kind]}{ending}")
             header.size = len(data)
             header.mode = 0o644
             tar.addfile(header, io.BytesIO(data))
 
     def close(self) -> list[FileSum]:
-        """Finish the files and return them."""
+        """Finish the files, bring them to the disk and return them."""
         for tar, _ in self._open.values():
             tar.close()
         self._stack.close()
+        self._store.settle(self._open)
         return [FileSum(name=name, sha256=self._open[name][1].sha256) for name in sorted(self._open)]
 
     def __enter__(self) -> Self:

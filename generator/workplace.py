@@ -86,8 +86,7 @@ class Workplace:
             ) from error
 
     def commit(self, record: ShardRecord) -> None:
-        """Bring a shard's files to the disk, then its record: from here on it is done."""
-        self.files.settle(file.name for file in record.files)
+        """Bring the record of a shard to the disk whose files are there: from here on it is done."""
         name = _record_name(record.shard)
         self.notes.put(name, record.model_dump_json().encode())
         self.notes.settle([name])

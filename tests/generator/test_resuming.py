@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from drivers.errors import FormatError, InputError
+from generator import layouts
 from generator.dataset import Dataset, finish_dataset, generate_dataset, make_dataset, make_share
 from generator.illuminant import ListedLights, RandomLights
 from generator.plan import Options, Plan
+from generator.records import ShardRecord
 from generator.scene import random_scenes
-from generator.workplace import workplace
+from generator.workplace import Workplace, workplace
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
@@ -112,6 +114,32 @@ def test_a_kill_at_any_file_operation_is_gone_on_from(make_lut: Callable[..., Lu
         assert [path.name for path in below.iterdir()] == ["out"], f"killed before file operation {step}"
         shutil.rmtree(below)
     assert step > 40
+
+
+@pytest.mark.parametrize("layout", ["folder", "webdataset", "parquet"])
+def test_a_record_is_written_when_its_files_are_on_the_disk(
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str
+) -> None:
+    settled: set[int] = set()
+    checked: list[str] = []
+    fsync, commit = os.fsync, Workplace.commit
+
+    def noted(handle: int) -> None:
+        fsync(handle)
+        settled.add(os.fstat(handle).st_ino)
+
+    def checking(place: Workplace, record: ShardRecord) -> None:
+        for file in record.files:
+            path = Path(place.files.place) / file.name
+            assert {path.stat().st_ino, path.parent.stat().st_ino} <= settled, f"{file.name} is only in memory"
+            checked.append(file.name)
+        commit(place, record)
+
+    monkeypatch.setattr(layouts, "_SETTLED_IMAGES", 2)
+    monkeypatch.setattr(os, "fsync", noted)
+    monkeypatch.setattr(Workplace, "commit", checking)
+    make(make_lut(), tmp_path / "out", layout=layout, workers=2, shard_images=5)
+    assert len(checked) >= 2
 
 
 def test_another_plan_in_the_same_place_is_refused(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
