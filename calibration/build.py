@@ -14,7 +14,7 @@ is taken in is measured again. The memory is that of a few frames whatever the s
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from acquisition.session import FrameRecord, Session
 from calibration.choices import Choices
 from calibration.darkness import DarkFigures, additivity, drift_gains
 from calibration.frames import (
+    Decoded,
     Progress,
     accepted_lights,
     ahead,
@@ -33,6 +34,7 @@ from calibration.frames import (
     chosen_frames,
     decode,
     listed,
+    pure_frames,
     session_sha256,
 )
 from calibration.growing import Checkpoint, Growing, growing
@@ -40,6 +42,7 @@ from calibration.linearity import read_linearity
 from calibration.lut import SAMPLES as SAMPLES_FILE
 from calibration.lut import LutWriter, Provenance
 from calibration.measuring import FrameFigures, Measured, MeasuredDark, Measurement
+from calibration.primaries import pure_lights
 from calibration.radiometry import Field, corrections
 from calibration.references import NAME as REFERENCES_FILE
 from calibration.references import references_csv
@@ -55,7 +58,7 @@ REPORT_FILES = ("report.html", "report.json")
 CHECKPOINT_EVERY = 16
 """Frames from one checkpoint to the next: what a build that is killed has to do again."""
 
-METHOD = 4
+METHOD = 5
 """Raised when samples or ground truth come out otherwise than before, so that no table is made by two methods."""
 
 PLAIN = Choices()
@@ -223,7 +226,7 @@ class _Work:
     ) -> None:
         self._session, self._making, self._chosen, self._told = session, making, chosen, told
         self._choices, self._series = choices, series
-        self._best = best_frame(session)
+        self._best, self._pure = best_frame(session), pure_frames(session, chosen)
         self._keys = [f"{record.kind},{record.illumination},{record.sha256}" for record in chosen]
         self._identity = {
             "software": _software(),
@@ -232,6 +235,7 @@ class _Work:
             "chart": session.chart.sha256,
             "lights": hashlib.sha256(repr(session.illuminations).encode()).hexdigest(),
             "registered": self._best.sha256,
+            "primaries": [record.sha256 for record in self._pure],
         }
         self._before = self._usable(making.load())
         self._figures: list[FrameFigures | DarkFigures] = []
@@ -267,7 +271,7 @@ class _Work:
         self._told(0, len(self._chosen), "finding the chart")
         first = decode(session, self._best)
         self._camera = first.mosaic.camera
-        self._measurement = Measurement(chart, first, self._choices.window)
+        self._measurement = Measurement(chart, first, self._choices.window, primaries=self._primaries())
         self._stretch = self._measurement.first
         self._tally = Tally(chart, self._choices.samples, self._stretch)
         self._limit = first.saturation
@@ -286,6 +290,13 @@ class _Work:
             if (len(self._figures) - saved) % CHECKPOINT_EVERY == 0:
                 self.save()
             self._told(len(self._figures), len(self._chosen), record.file)
+
+    def _primaries(self) -> tuple[tuple[int, int, int], Iterator[Decoded]] | None:
+        """Return the lights of the primaries alone and their frames; None where they are not among the chosen."""
+        lights = pure_lights(self._session.illuminations)
+        if lights is None or not self._pure:
+            return None
+        return lights, (decode(self._session, record) for record in self._pure)
 
     def _recall(self, before: Checkpoint) -> None:
         """Go on where an earlier program stopped."""
@@ -420,6 +431,7 @@ class _Work:
             subtracted=subtracted if self._choices.subtract_dark else None,
             at_zero=at_zero,
             linearity=self._linearity,
+            primaries=work.primaries,
         )
         records = [figures.record for figures in self._figures]
         self._writer.finish(
@@ -438,7 +450,8 @@ class _Work:
                     gains=None if full_white is None else gains,
                     subtracted=result.subtracted,
                     at_zero=at_zero,
-                ),
+                )
+                + ([] if work.primaries is None else [work.primaries.correction(white)]),
                 session_sha256=session_sha256(records),
                 chart_sha256=chart.sha256,
                 software=_software(),

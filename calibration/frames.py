@@ -23,6 +23,7 @@ import numpy.typing as npt
 from acquisition.planes import CHANNELS, Channel, frame_black, phases
 from acquisition.session import FrameRecord, Session
 from calibration.lut import Frame, Lut, frames_sha256
+from calibration.primaries import pure_lights
 from calibration.radiometry import saturation
 from drivers.errors import FormatError
 from drivers.rawfile import Mosaic, decode_raw
@@ -110,6 +111,13 @@ def best_frame(session: Session) -> FrameRecord:
         return min(colour.red, colour.green, colour.blue)
 
     return max(lights, key=brightness)
+
+
+def pure_frames(session: Session, chosen: Sequence[FrameRecord]) -> list[FrameRecord]:
+    """Return those of the chosen frames that show red, green and blue alone; none where one of the three is lacking."""
+    lights = pure_lights(session.illuminations) or ()
+    found = {record.illumination: record for record in chosen if record.kind == "light"}
+    return [found[light] for light in lights] if all(light in found for light in lights) else []
 
 
 def decode(session: Session, record: FrameRecord) -> Decoded:

@@ -10,6 +10,7 @@ Laws that hold inside:
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,12 +27,13 @@ from calibration.darkness import DarkFigures, read_dark
 from calibration.frames import Decoded
 from calibration.likeness import Expectation, Likeness
 from calibration.noise import PhotonTransfer, photon_transfer
+from calibration.primaries import Primaries
 from calibration.radiometry import CLIPPED, Field, Paper, PaperReader
 from calibration.references import Levels
 from calibration.registration import Registration, register
 from calibration.sampling import WINDOW, Sites, gather, gather_values, noise_of, patch_means, sites_at, table_values
 from calibration.subtraction import DarkLight, Subtraction, quiet_means, reflectances
-from drivers.errors import FormatError
+from drivers.errors import FormatError, RegistrationError
 from drivers.rawfile import Mosaic
 
 STILL_PX = 0.1
@@ -226,10 +228,22 @@ class Measurement:
         Pixels along the side of a cell's window.
     corners
         As in `calibration.registration.register`, of the first frame; near enough for others.
+    primaries
+        The lights of red, green and blue alone, and their frames; they are gone through once.
+
+    Attributes
+    ----------
+    primaries
+        What they say; None where they were not given or cannot be told.
     """
 
     def __init__(
-        self, chart: Chart, first: Decoded, window: int = WINDOW, corners: npt.ArrayLike | None = None
+        self,
+        chart: Chart,
+        first: Decoded,
+        window: int = WINDOW,
+        corners: npt.ArrayLike | None = None,
+        primaries: tuple[tuple[int, int, int], Iterable[Decoded]] | None = None,
     ) -> None:
         self._chart, self._window = chart, window
         whites = [reference for reference in chart.references if reference.is_white]
@@ -264,6 +278,9 @@ class Measurement:
         self._first_means = np.concatenate([level, samples.mean(axis=1, dtype=np.float64)])
         self._first_seen = seen
         self._expected = Expectation(codes, self.cells_mm, level / base.at(self.cells_mm), there)
+        self.primaries: Primaries | None = None
+        if primaries is not None:
+            self.primaries = self._read_primaries(*primaries)
 
     def register(self, decoded: Decoded) -> Stretch:
         """Find the chart in a frame, which begins a stretch."""
@@ -273,6 +290,21 @@ class Measurement:
             channel: gauges_of(decoded.mosaic, channel, decoded.black, registration.framing) for channel in CHANNELS
         }
         return Stretch(decoded.record.file, registration, cells, references, planes)
+
+    def _read_primaries(self, lights: tuple[int, int, int], frames: Iterable[Decoded]) -> Primaries | None:
+        """Return what the primaries' own frames say, wherever the chart lay in them; None if it is not found in one."""
+        papers: list[Paper] = []
+        cells: list[_Array] = []
+        for decoded in frames:
+            measured = self.measure(decoded, self.first, even=False)
+            if isinstance(measured, Shift):
+                try:
+                    measured = self.measure_first(decoded, self.register(decoded), measured, even=False)
+                except RegistrationError:
+                    return None
+            papers.append(measured.figures.paper)
+            cells.append(patch_means(measured.values))
+        return Primaries.of(lights, papers, cells, self.cells_mm)
 
     def _sites(self, registration: Registration) -> tuple[Sites, Sites]:
         """Return the sites of the cells and of the references."""
@@ -419,6 +451,8 @@ class Measurement:
         dark_cells = None if dark is None else dark.patches[:count]
         whites = len(self._white_mm)
         paper, shape = self._paper.read(seen[:whites], decoded.record.file)
+        if self.primaries is not None:
+            shape = shape * self.primaries.beside_paper(paper.white)
         greys, grey_errors = self.levels.read(seen[whites:], paper.field.at(self._grey_mm))
         if even:
             kept, highest = gather(decoded.mosaic, decoded.black, cells)

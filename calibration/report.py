@@ -78,7 +78,7 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
         (
             "The light on the print",
             "Shape of the light under the frame that was registered, from its white references; it is divided out of "
-            "samples and ground truth. Each contour is 2 %.",
+            f"samples and ground truth. Each contour is 2 %. {_primaries_told(result)}",
             _drawn(_field, chart, result),
         ),
         (
@@ -455,6 +455,15 @@ def _residuals(figure: Any, chart: Chart, registration: Registration) -> None:
         right.legend(frameon=False, fontsize=8)
     right.set_title("blocks of cells, left over", loc="left")
     right.set(xlabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal")
+
+
+def _primaries_told(result: BuildResult) -> str:
+    if result.primaries is None:
+        return "No frames of red, green and blue alone tell whether these light the print alike."
+    return (
+        f"Red, green and blue differ by up to {result.primaries.difference:.1%} in how they light it; what that is for "
+        "each cell by its colour is divided out too."
+    )
 
 
 def _field(figure: Any, chart: Chart, result: BuildResult) -> None:

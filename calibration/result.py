@@ -13,6 +13,7 @@ from calibration.linearity import Linearity
 from calibration.lut import Unfit
 from calibration.measuring import FrameFigures
 from calibration.noise import PhotonTransfer
+from calibration.primaries import Primaries
 from calibration.radiometry import black_drift
 from calibration.registration import Registration
 from calibration.sampling import WINDOW
@@ -76,6 +77,9 @@ class BuildResult:
         (L,) share of each light's samples that are 0 in the table.
     linearity
         What a series of exposures said; None where none was given.
+    primaries
+        The primaries each alone, by which the field of coloured cells was told from that of paper; None where the plan
+        has no light of each alone, or it is too dim.
     """
 
     session: Path
@@ -104,6 +108,7 @@ class BuildResult:
     subtracted: _Array | None = None
     at_zero: _Array = field(default_factory=lambda: np.zeros(0))
     linearity: Linearity | None = None
+    primaries: Primaries | None = None
 
     @property
     def verdict(self) -> Verdict:

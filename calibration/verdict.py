@@ -281,6 +281,7 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "camera": result.camera,
         "lights": result.lights,
         "channels": _channels(result),
+        "primaries_differ": None if result.primaries is None else float(f"{result.primaries.difference:.3g}"),
         "figures": {name: float(f"{value:.6g}") for name, value in figures.items()},
         "limits": [asdict(row.threshold) | {"outcome": row.outcome} for row in verdict.rows],
     }

@@ -19,6 +19,7 @@ from calibration.build import build, check
 from calibration.cli import main
 from calibration.frames import session_sha256
 from calibration.lut import Lut, open_lut
+from calibration.radiometry import order_of, polynomial
 from calibration.report import summary, write_report
 from calibration.result import BuildResult
 from drivers.camera import ExposureSettings
@@ -104,7 +105,7 @@ def test_nothing_is_unfit_in_a_healthy_session(built: BuildResult) -> None:
 def test_the_field_can_be_undone(table: Lut, built: BuildResult, session: Session, lab: Lab) -> None:
     """Multiplied by the field of `lut.json`, the table gives the counts of the frame again."""
     told = {correction["name"]: correction for correction in table.provenance.corrections}
-    assert list(told) == ["black", "half size", "saturation", "field", "rounding", "drift"]
+    assert list(told) == ["black", "half size", "saturation", "field", "rounding", "drift", "primaries"]
     assert len(told["field"]["per_light"]) == len(told["black"]["per_light"]) == len(LIGHTS)
     figures = next(f for f in built.frames if f.record.illumination == 5)
     field = figures.paper.field.at(lab.chart.centres_mm[lab.chart.cell_of_colour])
@@ -115,6 +116,26 @@ def test_the_field_can_be_undone(table: Lut, built: BuildResult, session: Sessio
     assert (
         np.corrcoef(raw[:, 1], white[:, 1])[0, 1] < np.corrcoef(table.samples[5].mean(axis=1)[:, 1], white[:, 1])[0, 1]
     )
+
+
+def test_the_primaries_correction_can_be_undone(table: Lut, built: BuildResult, lab: Lab) -> None:
+    """What `lut.json` tells of it, and the table's own samples of the primaries, give the factor of every cell."""
+    told = next(done for done in table.provenance.corrections if done["name"] == "primaries")
+    assert built.primaries is not None
+    places = lab.chart.centres_mm[lab.chart.cell_of_colour]
+    fields = [
+        np.prod([polynomial(places, lab.chart.page_mm, order_of(len(f))) @ np.array(f) for f in factors], axis=0)
+        for factors in told["field"]
+    ]
+    alone = [table.samples[light].mean(axis=1) for light in told["lights"]]
+    for light, amounts in enumerate(told["per_light"]):
+        parts = [amount * cells for amount, cells in zip(amounts, alone, strict=True)]
+        paper = [amount * np.array(white) for amount, white in zip(amounts, told["paper"], strict=True)]
+        cell = sum(field[:, None] * part for field, part in zip(fields, parts, strict=True)) / sum(parts)
+        plain = sum(field[:, None] * white for field, white in zip(fields, paper, strict=True)) / sum(paper)
+        lit = sum(parts) > 50
+        factor = built.primaries.beside_paper(table.white[light])
+        assert (cell / plain)[lit] == pytest.approx(factor[lit], abs=1e-4)
 
 
 def test_dark_frames_tell_the_projector_s_black(built: BuildResult, lab: Lab) -> None:
