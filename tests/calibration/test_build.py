@@ -131,9 +131,12 @@ def test_the_primaries_correction_can_be_undone(table: Lut, built: BuildResult, 
     for light, amounts in enumerate(told["per_light"]):
         parts = [amount * cells for amount, cells in zip(amounts, alone, strict=True)]
         paper = [amount * np.array(white) for amount, white in zip(amounts, told["paper"], strict=True)]
-        cell = sum(field[:, None] * part for field, part in zip(fields, parts, strict=True)) / sum(parts)
-        plain = sum(field[:, None] * white for field, white in zip(fields, paper, strict=True)) / sum(paper)
-        lit = sum(parts) > 50
+        cell = np.sum([f[:, None] * part for f, part in zip(fields, parts, strict=True)], axis=0) / np.sum(
+            parts, axis=0
+        )
+        plain = np.sum([f[:, None] * white for f, white in zip(fields, paper, strict=True)], axis=0)
+        plain /= np.sum(paper, axis=0)
+        lit = np.sum(parts, axis=0) > 50
         factor = built.primaries.beside_paper(table.white[light])
         assert (cell / plain)[lit] == pytest.approx(factor[lit], abs=1e-4)
 

@@ -35,10 +35,10 @@ def test_a_cells_field_is_what_it_reflects() -> None:
     at_paper = shapes(PLACES) / shapes(CENTRES).mean(axis=0)
     # What paper, and each cell, reflects of each primary into each channel.
     paper = np.array([[3000.0, 600, 100], [500, 5000, 700], [80, 900, 4000]])
-    cells = paper[:, None] * (0.02 + RANDOM.random((3, 1000, 1)) ** 2)
+    cells: _Array = paper[:, None] * (0.02 + RANDOM.random((3, 1000, 1)) ** 2)
     reader = PaperReader(PLACES, CENTRES, PAGE)
     alone = [reader.read(at_paper[:, [p]] * paper[p])[0] for p in range(3)]
-    known = Primaries.of((0, 1, 2), alone, list(cells), CENTRES)
+    known = Primaries.of((0, 1, 2), alone, [*cells], CENTRES)
     assert known is not None
     assert known.difference == pytest.approx((fields.max(axis=1) / fields.min(axis=1)).max() - 1, abs=0.01)
     amounts = np.array([0.7, 0.3, 0.9])
@@ -60,7 +60,7 @@ def test_one_primary_has_papers_field() -> None:
     known = Primaries.of((0, 1, 2), alone, [RANDOM.random((1000, 3)) * 900 for _ in range(3)], CENTRES)
     assert known is not None
     pure = Primaries.of(
-        (0, 1, 2), [replace(p, white=np.eye(3)[n] * 1000) for n, p in enumerate(alone)], known.cells, CENTRES
+        (0, 1, 2), [replace(p, white=np.eye(3)[n] * 1000) for n, p in enumerate(alone)], [*known.cells], CENTRES
     )
     assert pure is not None
     assert pure.beside_paper(np.array([0, 800.0, 0])) == pytest.approx(1, abs=1e-12)
@@ -70,7 +70,7 @@ def test_a_dim_primary_tells_nothing() -> None:
     even = Field(PAGE, ((), (), ()))
     dim = [Paper(even, np.array([1000.0, 10, 10]), np.ones(3), 9, np.zeros(3)) for _ in range(2)]
     dim.append(Paper(even, np.array([1.0, 10, 200]), np.ones(3), 9, np.zeros(3)))
-    assert Primaries.of((0, 1, 2), dim, [np.ones((10, 3))] * 3, RANDOM.random((10, 2))) is None
+    assert Primaries.of((0, 1, 2), dim, [np.ones((10, 3)) for _ in range(3)], RANDOM.random((10, 2))) is None
 
 
 def test_the_brightest_pure_lights_are_chosen() -> None:
