@@ -2,7 +2,7 @@
 
 `python -m benchmarks.accuracy` prints one JSON object a line for each figure: for both cameras in the default room, for
 one where the lamp fades by 3 % and the projector's light falls off by 30 %, and there again with primaries that fall
-off differently, which a field measured on white paper cannot tell. Takes some ten minutes.
+off differently, of which white paper alone does not tell. Takes some ten minutes.
 
 A mean of 25 samples has noise of its own, 1 % at 300 counts, which no table can be without. What is asked for is the
 error beyond it. So the noise that light and sensor must have is predicted for every cell, and the systematic error is
