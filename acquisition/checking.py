@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from acquisition.chart import Chart, load_chart
 from acquisition.config import LabSettings
+from acquisition.corners import Corners
 from acquisition.exposure import measure_exposure, refusal
 from acquisition.framing import MIN_MODULE_PX, Framing, find_chart
 from acquisition.health import make_ready
@@ -48,7 +49,10 @@ class CheckReport:
 
 
 def check_lab(
-    settings: LabSettings, picture: Path | None, announce: Callable[[str], None] = lambda sentence: None
+    settings: LabSettings,
+    picture: Path | None,
+    announce: Callable[[str], None] = lambda sentence: None,
+    corners: Corners | None = None,
 ) -> CheckReport:
     """Look through the rig that the settings name; record nothing.
 
@@ -58,6 +62,8 @@ def check_lab(
         Where to draw what was found on the white frame, PNG; None for nowhere.
     announce
         Called with a sentence when a long wait begins.
+    corners
+        Of the field of a chart without tags, as told by hand; `acquisition.corners`.
 
     Raises
     ------
@@ -96,7 +102,7 @@ def check_lab(
     white = mosaics["white"]
     _judge_exposure(white, settings, lines)
     try:
-        framing = find_chart(white, chart, "the white frame")
+        framing = find_chart(white, chart, "the white frame", corners)
     except RegistrationError as error:
         faults.append(str(error))
         framing = None

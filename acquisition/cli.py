@@ -151,6 +151,14 @@ def check(
     lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
     picture: Annotated[Path | None, typer.Option(help="Save the frame with what was found on it as PNG.")] = None,
     identify: Annotated[bool, typer.Option(help="First show on every display its number for ten seconds.")] = False,
+    corners: Annotated[
+        tuple[str, str, str, str] | None,
+        typer.Option(
+            metavar="X,Y X,Y X,Y X,Y",
+            help="As in build-lut: the corners of the field of a chart without tags that is not found by itself.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Talk to every device, find the chart, judge focus, framing and exposure; records nothing.
 
@@ -160,11 +168,16 @@ def check(
     from acquisition.config import load_lab
 
     settings = load_lab(lab)
+    told = None
+    if corners is not None:
+        from acquisition.corners import parse_corners
+
+        told = parse_corners(corners)
     if identify:
         from acquisition.rig import identify_displays
 
         identify_displays(10.0)
-    report = check_lab(settings, picture, lambda sentence: print(sentence, file=sys.stderr))
+    report = check_lab(settings, picture, lambda sentence: print(sentence, file=sys.stderr), told)
     for line in report.lines:
         print(line)
     if report.faults:

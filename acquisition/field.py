@@ -23,10 +23,11 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart import Chart
+from acquisition.corners import corners_text, require_corners
 from acquisition.homography import fit_homography, project
 from acquisition.outline import SAME_PX, Outline, View, alike, follow
 from acquisition.planes import MIN_SIGNAL, Plane, paper_level
-from drivers.errors import RegistrationError
+from drivers.errors import InputError, RegistrationError
 
 MIN_EXPLAINED = 0.5
 """Share of the cells' variation that the chart's colours must explain; another order of cells explains none."""
@@ -100,6 +101,8 @@ def find_field(
 
     Raises
     ------
+    InputError
+        The corners told cannot be such, or begin at another corner.
     RegistrationError
         The frame is dark; no field is found; its colours are not the chart's; it is mirrored, or it cannot be told
         which way up it hangs.
@@ -136,8 +139,9 @@ def find_field(
     if 1 - unexplained < MIN_EXPLAINED:
         raise RegistrationError(
             f"{what}: {looked_for} was looked for, and the rectangle likest to it has its corners at "
-            f"{_at(placed.corners_px)}, but the chart's colours explain {max(1 - unexplained, 0):.0%} of what is seen "
-            f"there, {MIN_EXPLAINED:.0%} expected; name the chart.json of this print, uncover it, or tell its corners"
+            f"{corners_text(placed.corners_px)}, but the chart's colours explain {max(1 - unexplained, 0):.0%} of "
+            f"what is seen there, {MIN_EXPLAINED:.0%} expected; name the chart.json of this print, uncover it, or tell "
+            "its corners"
         )
     near = 0.05 * float(np.ptp(placed.corners_px, axis=0).max())
     rivals = [
@@ -147,8 +151,8 @@ def find_field(
     ]
     if min(rivals, default=1.0) < MIN_ADVANTAGE * misfit:
         raise RegistrationError(
-            f"{what}: a field of cells has its corners at {_at(placed.corners_px)}, but this light does not tell which "
-            "way up it hangs; take a white frame, or tell its corners, clockwise from the printed top-left"
+            f"{what}: a field of cells has its corners at {corners_text(placed.corners_px)}, but this light does not "
+            "tell which way up it hangs; take a white frame, or tell its corners, clockwise from the printed top-left"
         )
     if way >= 4:
         raise RegistrationError(
@@ -159,37 +163,37 @@ def find_field(
 
 
 def _told_field(view: View, chart: Chart, corners_px: _Points, what: str) -> Field:
-    """Return the field whose corners are told; where no outline is near them they are taken as they are."""
-    height, width = view.shape
-    text = _at(corners_px)
-    if corners_px.shape != (4, 2) or not cv2.isContourConvex(corners_px.astype(np.float32)[:, None]):
+    """Return the field whose corners are told."""
+    require_corners(corners_px, view.shape)
+    text = corners_text(corners_px)
+    outline = follow(view, corners_px)
+    if outline is None:
         raise RegistrationError(
-            f"{what}: the corners told, {text}, are no quadrilateral; give four places X,Y, clockwise from the printed "
-            "top-left corner of the field of cells"
+            f"{what}: near the corners told, {text}, no edge is seen between cells and bare paper on all four sides; "
+            "give the corners of the field of cells (not of the sheet) to some 40 pixels, and uncover its margin"
         )
-    if (corners_px < -0.5).any() or (corners_px > (width - 0.5, height - 0.5)).any():
+    ways = [_Placed.of(outline, chart, way) for way in range(8)]
+    misfits = [_misfit(view, placed, chart) for placed in ways]
+    explained = 1 - misfits[0][1]
+    likely = int(np.argmin([misfit for misfit, _ in misfits]))
+    other = likely > 0 and MIN_ADVANTAGE * misfits[likely][0] < misfits[0][0]
+    if explained >= MIN_EXPLAINED and not other:
+        return ways[0].field(explained)
+    if 1 - misfits[likely][1] < MIN_EXPLAINED or not other:
         raise RegistrationError(
-            f"{what}: the corners told, {text}, do not lie in the picture of {width}×{height} half-size pixels; read "
-            "them off in the picture of the check, or halve what a viewer of the raw file tells"
+            f"{what}: within the corners told, {text}, the chart's colours explain {max(explained, 0):.0%} of what "
+            f"is seen, {MIN_EXPLAINED:.0%} expected; give the corners of the field of cells (not of the sheet) "
+            "clockwise from the printed top-left, and name the chart.json of this print"
         )
-    if cv2.contourArea(corners_px.astype(np.float32), oriented=True) < 0:
+    if likely >= 4:
         raise RegistrationError(
-            f"{what}: the corners told, {text}, run counter-clockwise; give them clockwise from the printed top-left, "
-            "and take the frame without a mirror"
+            f"{what} is mirrored: within the corners told, {text}, the chart's colours fit only in a mirror; "
+            "take the frame without a mirror, or print the chart unmirrored"
         )
-    placed = _Placed.of(follow(view, corners_px) or Outline.straight(corners_px), chart, 0)
-    explained = 1 - _misfit(view, placed, chart)[1]
-    if explained < MIN_EXPLAINED:
-        raise RegistrationError(
-            f"{what}: within the corners told, {text}, the chart's colours explain {max(explained, 0):.0%} of what is "
-            f"seen, {MIN_EXPLAINED:.0%} expected; give the corners of the field of cells (not of the sheet) clockwise "
-            "from the printed top-left, and name the chart.json of this print"
-        )
-    return placed.field(explained)
-
-
-def _at(corners_px: _Points) -> str:
-    return " ".join(f"{x:.0f},{y:.0f}" for x, y in np.asarray(corners_px).reshape(-1, 2))
+    raise InputError(
+        f"{what}: the corners told, {text}, do not begin at the printed top-left: the chart's colours fit if they are "
+        f"{corners_text(np.roll(corners_px, -likely, axis=0))}; give them in this order"
+    )
 
 
 def _ways(outline: Outline, chart: Chart, near_px: npt.ArrayLike | None) -> list[tuple[int, _Placed]]:

@@ -21,10 +21,11 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart import Chart
+from acquisition.corners import corners_text
 from acquisition.field import Field, find_field
 from acquisition.homography import project, rms, robust_homography
 from acquisition.planes import CHANNELS, MIN_SIGNAL, Plane, frame_black, paper_level, plane_of, strongest_plane
-from drivers.errors import RegistrationError
+from drivers.errors import InputError, RegistrationError
 from drivers.rawfile import Mosaic
 
 MIN_MODULE_PX = 3.0
@@ -166,9 +167,16 @@ def find_chart(
 
     Raises
     ------
+    InputError
+        Corners are told that cannot be, or of a chart with tags.
     RegistrationError
         None of the chart is seen; it is mirrored, too small, another chart, or too little of it fits.
     """
+    if chart.tags and corners is not None:
+        raise InputError(
+            f"corners are told ({corners_text(corners)}), and this chart has {len(chart.tags)} tags by which it is "
+            "found; leave the corners out, or name the chart.json of the print that hangs before the camera"
+        )
     if not chart.tags and isinstance(frame, Mosaic):
         return _find_field(frame, chart, what, corners, near)
     if len(chart.tags) < MIN_TAGS:

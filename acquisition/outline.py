@@ -164,14 +164,6 @@ class Outline:
     sides_px: tuple[_Points, ...]
     normals: tuple[_Points, ...]
 
-    @classmethod
-    def straight(cls, corners_px: _Points) -> Outline:
-        """Return the quadrilateral itself."""
-        along = np.linspace(0.02, 0.98, 25)[:, None]
-        pairs = list(zip(corners_px, np.roll(corners_px, -1, axis=0), strict=True))
-        sides = tuple(start + along * (end - start) for start, end in pairs)
-        return cls(corners_px, sides, tuple(np.tile(_outwards(start, end), (25, 1)) for start, end in pairs))
-
 
 def alike(one: _Points, other: _Points, tolerance: float) -> bool:
     """Return whether two quadrilaterals are one, whichever corner they begin with."""

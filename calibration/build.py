@@ -92,7 +92,7 @@ def check(session: Session, choices: Choices = PLAIN, linearity: Path | None = N
     _require_darks(session, choices)
     best = best_frame(session)
     decoded = decode(session, best)
-    work = Measurement(session.chart, decoded, choices.window)
+    work = Measurement(session.chart, decoded, choices.window, choices.corners)
     tally = Tally(session.chart, choices.samples, work.first)
     measured = work.measure_first(decoded, work.first, Shift(0.0, 0.0, 0.0, 0), even=True)
     tally.add(measured)
@@ -271,7 +271,9 @@ class _Work:
         self._told(0, len(self._chosen), "finding the chart")
         first = decode(session, self._best)
         self._camera = first.mosaic.camera
-        self._measurement = Measurement(chart, first, self._choices.window, primaries=self._primaries())
+        self._measurement = Measurement(
+            chart, first, self._choices.window, self._choices.corners, self._primaries()
+        )
         self._stretch = self._measurement.first
         self._tally = Tally(chart, self._choices.samples, self._stretch)
         self._limit = first.saturation

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from acquisition.corners import Corners
 from calibration.sampling import WINDOW
 from drivers.errors import InputError
 
@@ -21,6 +22,9 @@ class Choices:
         Pixels along the side of a cell's window: one of `WINDOWS`.
     subtract_dark
         Whether the light of the dark frames is subtracted from samples and ground truth.
+    corners
+        Four corners (x, y) of the field of cells in the frame that is registered, half-size px, clockwise from the
+        printed top-left, for a chart without tags; None to have it found.
 
     Raises
     ------
@@ -30,6 +34,7 @@ class Choices:
 
     window: int = WINDOW
     subtract_dark: bool = False
+    corners: Corners | None = None
 
     def __post_init__(self) -> None:
         if self.window not in WINDOWS:
@@ -45,4 +50,4 @@ class Choices:
 
     def told(self) -> dict[str, Any]:
         """Return the choices as JSON holds them."""
-        return asdict(self)
+        return asdict(self) | {"corners": None if self.corners is None else [list(corner) for corner in self.corners]}

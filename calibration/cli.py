@@ -71,6 +71,16 @@ def build_lut(
             "from the ground truth.",
         ),
     ] = False,
+    corners: Annotated[
+        tuple[str, str, str, str] | None,
+        typer.Option(
+            "--corners",
+            metavar="X,Y X,Y X,Y X,Y",
+            help="For a chart without tags that is not found by itself: the corners of its field of cells in the frame "
+            "that is registered, pixels of the raw file, clockwise from the printed top-left.",
+            show_default=False,
+        ),
+    ] = None,
     linearity: Annotated[
         Path | None,
         typer.Option(
@@ -131,7 +141,12 @@ def build_lut(
     given = [name for name, value in asked.items() if value]
     if len(given) > 1:
         raise InputError(f"{' and '.join(given)} are two commands; give one of them")
-    made = {"--window": window is not None, "--subtract-dark": subtract_dark, "--linearity": linearity is not None}
+    made = {
+        "--window": window is not None,
+        "--subtract-dark": subtract_dark,
+        "--corners": corners is not None,
+        "--linearity": linearity is not None,
+    }
     if any(reading.values()) and any(made.values()):
         raise InputError(
             f"{next(name for name, value in made.items() if value)} tells how a table is made, and {given[0]} reads "
@@ -150,9 +165,11 @@ def build_lut(
     elif fetch is not None:
         _fetch(*fetch)
     else:
+        from acquisition.corners import parse_corners
         from calibration.choices import Choices
 
-        _make(session, lut, check, append, Choices(5 if window is None else window, subtract_dark), linearity)
+        told = None if corners is None else parse_corners(corners)
+        _make(session, lut, check, append, Choices(5 if window is None else window, subtract_dark, told), linearity)
 
 
 def _make(

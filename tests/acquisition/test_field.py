@@ -17,13 +17,13 @@ import pytest
 from acquisition.chart import Chart
 from acquisition.field import field_mm, find_field
 from acquisition.framing import find_chart
-from acquisition.layout import paper_chart
+from acquisition.layout import design_chart, paper_chart
 from acquisition.outline import refined
 from acquisition.planes import CHANNELS, Plane, plane_of
 from acquisition.printing import drawing
 from acquisition.sharpness import blur_px
 from drivers.camera import ExposureSettings
-from drivers.errors import RegistrationError
+from drivers.errors import CropError, InputError, RegistrationError
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.rawfile import Mosaic, read_raw
 from sim.bodies import BODIES
@@ -147,20 +147,37 @@ def test_told_corners_are_drawn_onto_the_outline(white: Mosaic) -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "message"),
+    ("told", "fault", "message"),
     [
-        ([(10, 10), (20, 20), (30, 30), (40, 40)], "no quadrilateral"),
-        ([(10, 10), (300, 10), (300, 200)], "no quadrilateral"),
-        ([(10, 10), (2000, 10), (2000, 1200), (10, 1200)], "halve what a viewer"),
-        ([(36, 25), (34, 247), (358, 248), (361, 30)], "counter-clockwise"),
-        ([(100, 80), (200, 80), (200, 180), (100, 180)], "the corners of the field of cells"),
-        ([(361, 30), (358, 248), (34, 247), (36, 25)], "clockwise from the printed top-left"),
+        ([(10, 10), (120, 120), (230, 230), (340, 340)], InputError, "no convex quadrilateral"),
+        ([(10, 10), (300, 10), (300, 200)], InputError, "no convex quadrilateral"),
+        ([(10, 10), (2000, 10), (2000, 1200), (10, 1200)], InputError, r"do not lie in the picture of \d+×\d+ pixels"),
+        ([(36, 25), (34, 247), (358, 248), (361, 30)], InputError, "counter-clockwise"),
+        ([(100, 80), (180, 80), (180, 180), (100, 180)], InputError, "too near to each other: 160 pixels"),
+        ([(361, 30), (358, 248), (34, 247), (36, 25)], InputError, "fit if they are 72,50 722,60 716,496 68,494"),
+        ([(100, 60), (260, 60), (260, 200), (100, 200)], RegistrationError, "corners of the field of cells"),
     ],
 )
-def test_wrong_corners_are_refused(white: Mosaic, told: Sequence[tuple[float, float]], message: str) -> None:
-    with pytest.raises(RegistrationError, match=message) as caught:
+def test_wrong_corners_are_refused(
+    white: Mosaic, told: Sequence[tuple[float, float]], fault: type[CropError], message: str
+) -> None:
+    with pytest.raises(fault, match=message) as caught:
         find_chart(white, CHART, corners=np.array(told, dtype=np.float64))
     assert "\n" not in str(caught.value)
+
+
+def test_corners_of_a_mirrored_chart_say_so(white: Mosaic) -> None:
+    mirrored = [replace(plane, values=np.ascontiguousarray(plane.values[:, ::-1])) for plane in planes_of(white)]
+    width = mirrored[0].values.shape[1]
+    corners = truth(UPRIGHT, white, field_mm(CHART))
+    told = np.column_stack([width - 1 - corners[:, 0], corners[:, 1]])[[1, 0, 3, 2]]
+    with pytest.raises(RegistrationError, match="fit only in a mirror"):
+        find_field(mirrored, CHART, "the frame", told)
+
+
+def test_a_chart_with_tags_needs_no_corners(white: Mosaic) -> None:
+    with pytest.raises(InputError, match="tags by which it is found"):
+        find_chart(white, design_chart(1), corners=truth(UPRIGHT, white, field_mm(CHART)))
 
 
 def test_a_bright_sheet_of_something_else_is_no_chart() -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from acquisition.field import field_mm
 from acquisition.illuminations import Illumination
 from acquisition.layout import paper_chart
-from acquisition.session import Step
+from acquisition.session import ACCEPTED, Step
 from calibration.build import build
+from calibration.cli import main
 from calibration.lut import open_lut
 from calibration.report import write_report
 from drivers.presenter import Colour
@@ -93,3 +96,48 @@ def test_nothing_is_registered_anew_where_nothing_moves(plain: Lab, tmp_path: Pa
     assert result.largest_shift_px < 0.05
     assert min(figures.shift.tags for figures in result.frames) >= 16
     assert worst_error(plain, tmp_path / "lut") < 0.05
+
+
+Command = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    def run(*arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr("sys.argv", ["build-lut", *map(str, arguments)])
+        code = main()
+        said = capsys.readouterr()
+        return code, said.out + said.err
+
+    return run
+
+
+def test_corners_by_hand_tell_what_the_light_does_not(plain: Lab, tmp_path: Path, command: Command) -> None:
+    """Of red light alone nobody can say which way up the chart hangs; white frames are all refused here."""
+    lights = renumbered([RED])
+    with take(
+        plain, tmp_path / "session", lights, verdict=lambda step: "refused" if step.kind == "white" else ACCEPTED
+    ):
+        pass
+    code, said = command("--check", tmp_path / "session")
+    assert code == 4
+    assert "which way up it hangs" in said
+    raw = 2 * plain.truth_px(field_mm(plain.chart), plain.mosaic(tmp_path)) + 0.5
+    corners = [f"{x:.0f},{y:.0f}" for x, y in raw + np.array([(9, -7), (-8, 6), (5, 8), (-9, -6)])]
+    code, said = command(tmp_path / "session", tmp_path / "lut", "--corners", *corners)
+    assert code == 0, said
+    assert worst_error(plain, tmp_path / "lut") < 0.05
+
+
+def test_corners_that_cannot_be_are_refused_on_the_command_line(plain: Lab, tmp_path: Path, command: Command) -> None:
+    with take(plain, tmp_path / "session", renumbered(LIGHTS[4:6])):
+        pass
+    for corners, expected in (
+        (["0,0", "9000,0", "9000,6000", "0,6000"], "do not lie in the picture"),
+        (["1,1", "2,2", "x", "3,3"], "'x' is no corner"),
+        (["716,496", "68,494", "72,50", "722,60"], "give them in this order"),
+    ):
+        code, said = command(tmp_path / "session", tmp_path / "lut", "--corners", *corners)
+        assert code == 2
+        assert expected in said
+    assert not (tmp_path / "lut").exists()
