@@ -57,7 +57,7 @@ def key_of(seed: int) -> tuple[int, int]:
 
 
 def words(
-    seed: int, a: npt.ArrayLike, b: npt.ArrayLike, number: int, purpose: int
+    seed: int, a: npt.ArrayLike, b: npt.ArrayLike, number: npt.ArrayLike, purpose: int
 ) -> tuple[Words, Words, Words, Words]:
     """Return the four random words of each place.
 
@@ -65,20 +65,19 @@ def words(
     ----------
     seed
         0 … 2⁶⁴ − 1.
-    a, b
-        The two place words, 0 … 2³² − 1 each, of shapes that broadcast.
-    number, purpose
-        The other two counter words, 0 … 2³² − 1.
+    a, b, number
+        The first three counter words, 0 … 2³² − 1 each, of shapes that broadcast.
+    purpose
+        The fourth.
 
     Returns
     -------
     tuple of four ndarray
-        uint32, of the broadcast shape of `a` and `b`.
+        uint32, of the broadcast shape of `a`, `b` and `number`.
     """
     keys = list(key_of(seed))
-    place_a, place_b = np.broadcast_arrays(np.asarray(a, dtype=np.uint64), np.asarray(b, dtype=np.uint64))
-    c0, c1 = place_a, place_b
-    c2, c3 = np.full_like(c0, number), np.full_like(c0, purpose)
+    c0, c1, c2 = np.broadcast_arrays(*(np.asarray(counter, dtype=np.uint64) for counter in (a, b, number)))
+    c3 = np.full_like(c0, purpose)
     low, half = np.uint64(_WORD), np.uint64(32)
     m0, m1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
     for _ in range(ROUNDS):

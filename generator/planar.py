@@ -29,7 +29,7 @@ from generator.arguments import (
 )
 from generator.choice import OFFSETS, choose_group, row_keys
 from generator.compiled import compiled
-from generator.vector import GROUP, LANES, offset_at, plane1, planes8, prefetch
+from generator.vector import GROUP, LANES, mirrored8, offset_at, plane1, planes8, prefetch
 
 Window = tuple[int, int, int, int]
 
@@ -63,7 +63,6 @@ def _crop(
         samples = last if light == lights - 1 else tables + light * light_bytes
         scale = scales[item]
         low, high = x0 // GROUP, (x0 + width - 1) // GROUP
-        step = -4 if flip else 4
         for y in range(height + 1):
             if y < height:
                 keys = row_keys(y0 + y, 0, image, seeds[item])
@@ -80,17 +79,20 @@ def _crop(
                 offsets += 4 * (width - 1)
             red = target + item * pitches[0] + (y - 1) * pitches[2]
             green, blue = red + pitches[1], red + 2 * pitches[1]
-            for start in range(0, width, LANES):
-                if width < LANES:
-                    for x in range(width):
-                        sample = samples + offset_at(offsets + step * x)
-                        plane1(sample, scale, red + 4 * x)
-                        plane1(sample + 2, scale, green + 4 * x)
-                        plane1(sample + 4, scale, blue + 4 * x)
-                else:
+            if width < LANES:
+                for x in range(width):
+                    sample = samples + offset_at(offsets - 4 * x if flip else offsets + 4 * x)
+                    plane1(sample, scale, red + 4 * x)
+                    plane1(sample + 2, scale, green + 4 * x)
+                    plane1(sample + 4, scale, blue + 4 * x)
+            else:
+                for start in range(0, width, LANES):
                     # The last eight may be some of the ones before again.
                     x = min(start, width - LANES)
-                    planes8(samples, offsets + step * x, step, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
+                    if flip:
+                        mirrored8(samples, offsets - 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
+                    else:
+                        planes8(samples, offsets + 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
 
 
 def _checked_window(window: Sequence[int], picture: npt.NDArray[np.uint8]) -> Window:
@@ -248,16 +250,21 @@ def draw_batch(
     if not tables[0].flags.c_contiguous:
         tables = np.ascontiguousarray(tables)
     last = readable(tables[-1])
-    sources: list[npt.NDArray[np.uint8]] = []
-    plan = np.empty((count, 9), np.int64)
-    plan[:, 0], plan[:, 4:6], plan[:, 7], plan[:, 8] = numbers, frames[:, :2], imaged, len(tables)
-    plan[:, 6] = np.broadcast_to(flips, count)
-    for item, picture in enumerate(pictures):
+    # Most batches show a picture more than once: each is looked at once.
+    distinct = {id(picture): picture for picture in pictures}
+    for picture in distinct.values():
         check_picture(picture)
-        _, y0, _, _ = _checked_window(frames[item], picture)
-        source = packed(picture)
-        sources.append(source)
-        plan[item, 1:4] = source.ctypes.data + y0 * source.strides[0], source.strides[0], source.shape[1]
+    sources = [packed(picture) for picture in distinct.values()]
+    facts = np.array([(one.ctypes.data, one.strides[0], one.shape[1], one.shape[0]) for one in sources], np.int64)
+    places = {identity: place for place, identity in enumerate(distinct)}
+    shown = facts[[places[id(picture)] for picture in pictures]]
+    outside = (frames[:, :2] < 0).any(axis=1) | (frames[:, :2] + frames[:, 2:] > shown[:, 2:]).any(axis=1)
+    for item in np.flatnonzero(outside | (min(width, height) < 1))[:1]:
+        _checked_window(frames[item].tolist(), pictures[int(item)])
+    plan = np.empty((count, 9), np.int64)
+    plan[:, 0], plan[:, 1], plan[:, 2:4] = numbers, shown[:, 0] + frames[:, 1] * shown[:, 1], shown[:, 1:3]
+    plan[:, 4:6], plan[:, 6] = frames[:, :2], np.broadcast_to(flips, count)
+    plan[:, 7], plan[:, 8] = imaged, len(tables)
     scales = (gained / white_level).astype(np.float32)
 
     def fill(first: int, end: int) -> None:
@@ -288,7 +295,10 @@ def draw_batch(
 
 def _whole(numbers: npt.ArrayLike, count: int, bits: int, name: str) -> npt.NDArray[np.uint64]:
     """Return `count` whole numbers 0 … 2**bits − 1, one for all repeated."""
-    values = [int(number) for number in np.broadcast_to(np.asarray(numbers, dtype=object), count)]
-    if min(values) < 0 or max(values) >= 1 << bits:
-        raise InputError(f"a {name} is {min(values)} or {max(values)}, expected 0 to 2^{bits} - 1")
-    return np.array(values, np.uint64)
+    given = np.asarray(numbers)
+    if given.dtype.kind not in "iu":
+        given = np.asarray(numbers, dtype=object)
+    least, most = int(given.min()), int(given.max())
+    if least < 0 or most >= 1 << bits:
+        raise InputError(f"a {name} is {least} or {most}, expected 0 to 2^{bits} - 1")
+    return np.ascontiguousarray(np.broadcast_to(given.astype(np.uint64), count))

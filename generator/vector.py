@@ -246,46 +246,28 @@ def copy1(typing: Any, source: Any, target: Any) -> Any:
     return void(emit, ADDRESS, ADDRESS)
 
 
-def joined(builder: Builder, parts: Sequence[Value]) -> Value:
-    """Return vectors as one; there are a power of two."""
-    while len(parts) > 1:
-        kind = ir.VectorType(I32, 2 * parts[0].type.count)
-        parts = [
-            builder.shuffle_vector(first, second, constant(kind, range(kind.count)))
-            for first, second in zip(parts[::2], parts[1::2], strict=True)
-        ]
-    return parts[0]
-
-
-def _channels(builder: Builder, samples: Value, offsets: Value, step: Value) -> list[Value]:
+def _channels(builder: Builder, samples: Value, offsets: Value, step: int) -> list[Value]:
     """Return red, green and blue, eight float32 each, of the samples whose offsets are `step` bytes apart."""
-    quads = ir.VectorType(I16, 4)
-    parts = [
-        load(
-            builder,
-            builder.add(
-                samples,
-                builder.zext(
-                    load(builder, builder.add(offsets, builder.mul(step, ir.Constant(I64, lane))), 0, I32), I64
-                ),
-            ),
-            0,
-            quads,
-        )
-        for lane in range(LANES)
+    pairs = [
+        [
+            load(
+                builder,
+                builder.add(samples, builder.zext(load(builder, offsets, step * pixel, I32), I64)),
+                0,
+                ir.VectorType(I32, 2),
+            )
+            for pixel in couple
+        ]
+        for couple in ((0, 1), (4, 5), (2, 3), (6, 7))
     ]
-    everything = joined(builder, parts)
-    lanes = ir.VectorType(I32, LANES)
-    return [
-        builder.sitofp(
-            builder.zext(
-                builder.shuffle_vector(everything, everything, constant(lanes, range(channel, 4 * LANES, 4))),
-                WORDS,
-            ),
-            FLOATS,
-        )
-        for channel in range(3)
-    ]
+    fours = [builder.shuffle_vector(*pair, constant(ir.VectorType(I32, 4), range(4))) for pair in pairs]
+    # Pixels 0, 1, 4, 5 and 2, 3, 6, 7, 32 bits of red and green, 32 of blue and what follows.
+    halves = [builder.shuffle_vector(*fours[i : i + 2], constant(WORDS, range(LANES))) for i in (0, 2)]
+    front = builder.shuffle_vector(*halves, constant(WORDS, (0, 2, 8, 10, 4, 6, 12, 14)))
+    back = builder.shuffle_vector(*halves, constant(WORDS, (1, 3, 9, 11, 5, 7, 13, 15)))
+    low = constant(WORDS, 0xFFFF)
+    numbers = (builder.and_(front, low), builder.lshr(front, constant(WORDS, 16)), builder.and_(back, low))
+    return [builder.sitofp(number, FLOATS) for number in numbers]
 
 
 def least(builder: Builder, first: Value, second: Value) -> Value:
@@ -293,26 +275,31 @@ def least(builder: Builder, first: Value, second: Value) -> Value:
     return builder.select(builder.fcmp_ordered("<", first, second), first, second)
 
 
-@intrinsic
-def planes8(typing: Any, samples: Any, offsets: Any, step: Any, scale: Any, red: Any, green: Any, blue: Any) -> Any:
-    """Write eight pixels as float32 to three planes: sample times `scale`, at most 1; offsets `step` bytes apart."""
-    del typing, samples, offsets, step, scale, red, green, blue
+def _planes8(step: int) -> Callable[..., None]:
+    """Return what emits the writing of eight pixels whose offsets are `step` bytes apart."""
 
     def emit(
-        builder: Builder,
-        samples: Value,
-        offsets: Value,
-        step: Value,
-        scale: Value,
-        red: Value,
-        green: Value,
-        blue: Value,
+        builder: Builder, samples: Value, offsets: Value, scale: Value, red: Value, green: Value, blue: Value
     ) -> None:
         factor, one = spread(builder, scale, FLOATS), ir.Constant(FLOATS, [1.0] * LANES)
         for channel, target in zip(_channels(builder, samples, offsets, step), (red, green, blue), strict=True):
             store(builder, least(builder, builder.fmul(channel, factor), one), target, 0)
 
-    return void(emit, ADDRESS, ADDRESS, ADDRESS, types.float32, ADDRESS, ADDRESS, ADDRESS)
+    return emit
+
+
+@intrinsic
+def planes8(typing: Any, samples: Any, offsets: Any, scale: Any, red: Any, green: Any, blue: Any) -> Any:
+    """Write eight pixels as float32 to three planes: sample times `scale`, at most 1."""
+    del typing, samples, offsets, scale, red, green, blue
+    return void(_planes8(4), ADDRESS, ADDRESS, types.float32, ADDRESS, ADDRESS, ADDRESS)
+
+
+@intrinsic
+def mirrored8(typing: Any, samples: Any, offsets: Any, scale: Any, red: Any, green: Any, blue: Any) -> Any:
+    """Do `planes8` from right to left: `offsets` leads to the first pixel's, those of the others stand before it."""
+    del typing, samples, offsets, scale, red, green, blue
+    return void(_planes8(-4), ADDRESS, ADDRESS, types.float32, ADDRESS, ADDRESS, ADDRESS)
 
 
 @intrinsic

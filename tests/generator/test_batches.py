@@ -86,6 +86,17 @@ def test_seeds_and_epochs_differ_and_threads_do_not(make_lut: MakeLut, gallery: 
     )
 
 
+def test_a_batch_fills_the_memory_it_is_given(make_lut: MakeLut, gallery: Gallery) -> None:
+    crops = Crops(make_lut(bits=BITS), gallery, (5, 6), length=40, threads=2)
+    memory = np.full((12, 3, 5, 6), np.nan, np.float32)
+    batch = crops.batch(np.arange(9, 20), out=memory[1:])
+    assert np.shares_memory(batch.images, memory)
+    np.testing.assert_array_equal(memory[1:], crops.batch(np.arange(9, 20)).images)
+    assert np.isnan(memory[0]).all()
+    with pytest.raises(InputError, match="the target is float32"):
+        crops.batch(np.arange(9, 20), out=memory)
+
+
 def test_choices_are_even(make_lut: MakeLut) -> None:
     gallery = gallery_of([ramp(12, 13)] * 5)
     count = 6000

@@ -106,6 +106,12 @@ def test_faults_are_named(make_lut: Callable[..., Lut], picture: npt.NDArray[np.
     with pytest.raises(InputError, match="the white level is 65536"):
         draw_planar(samples[0], picture, white_level=65536)
     ok = (0, 0, 4, 4)
+    # Of pictures shown more than once each window is looked at.
+    with pytest.raises(InputError, match=r"the window 4x4 at \(1050, 2\) is not inside"):
+        draw_batch(samples, [0, 0, 0], [picture] * 3, [ok, (1050, 2, 4, 4), ok], white_level=WHITE)
+    for seed in (-1, 1 << 64, np.array([3, -2])):
+        with pytest.raises(InputError, match="a seed is"):
+            draw_batch(samples, [0, 0], [picture] * 2, [ok, ok], white_level=WHITE, seeds=seed)
     with pytest.raises(InputError, match="the windows of a batch differ in size"):
         draw_batch(samples, [0, 0], [picture] * 2, [ok, (0, 0, 4, 5)], white_level=WHITE)
     with pytest.raises(InputError, match="expected 1 from 0 to 3"):
