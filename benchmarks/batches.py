@@ -63,7 +63,9 @@ def measure(lut: Lut) -> None:
         threads: Crops(lut, gallery, (SIDE, SIDE), exposure=(0.5, 1.0), threads=threads)
         for threads in sorted({1, default_workers()})
     }
-    spent: dict[int, list[float]] = {threads: [] for threads in ours}
+    memory = np.empty((BATCH, 3, SIDE, SIDE), np.float32)
+    targets = {"": None, ", into the same memory": memory}
+    spent: dict[tuple[int, str], list[float]] = {(threads, target): [] for threads in ours for target in targets}
     peer: list[float] = []
     for turn in range(ROUNDS + 1):
         start = time.perf_counter()
@@ -71,15 +73,16 @@ def measure(lut: Lut) -> None:
         peer.append(time.perf_counter() - start)
         for threads, crops in ours.items():
             items = np.arange(turn * BATCH, (turn + 1) * BATCH)
-            start = time.perf_counter()
-            crops.batch(items)
-            spent[threads].append(time.perf_counter() - start)
+            for target, out in targets.items():
+                start = time.perf_counter()
+                crops.batch(items, out)
+                spent[threads, target].append(time.perf_counter() - start)
     slow = rate(peer[1:], BATCH // 4)
     report("numpy take, one thread", slow, "crops/s", what)
-    for threads, seconds in spent.items():
+    for (threads, target), seconds in spent.items():
         fast = rate(seconds[1:], BATCH)
-        report(f"batches, {threads} threads", fast, "crops/s", what)
-        report(f"batches, {threads} threads", fast / slow, "ratio", "numpy take, one thread")
+        report(f"batches, {threads} threads{target}", fast, "crops/s", what)
+        report(f"batches, {threads} threads{target}", fast / slow, "ratio", "numpy take, one thread")
 
 
 def main() -> None:

@@ -4,6 +4,8 @@ The limit is a streaming copy of the same picture, 3 bytes in and 6 out, in as m
 by band of the picture; of each band the fastest turn counts, and the bands are added up. With one thread the time is
 the processor's, else the clock's. So ratios hold on a machine with other work to do, the clock's less so.
 
+Two lights are mixed by random weights in each pixel, which is the most work, and by masks of two kinds.
+
 The bound of fetching is a compiled loop that does nothing but load the samples which the kernel loads, their places
 being known: what the caches allow, whoever chooses.
 """
@@ -32,6 +34,7 @@ from drivers.presenter import Colour
 from generator.choice import SCRATCH, choose_group, row_keys
 from generator.compiled import compiled
 from generator.kernel import draw_mosaic, draw_samples
+from generator.masks import parse_masks
 from generator.mixing import mix_samples
 from generator.planar import draw_planar
 from generator.vector import GROUP, offset_at
@@ -87,6 +90,11 @@ def noisy_table(folder: Path, lights: int) -> Lut:
     plan = [Illumination(light, "uniform", None, Colour(255, 255, 255)) for light in range(lights)]
     writer.finish(plan, np.full((lights, 3), 4000.0), known)
     return open_lut(folder)
+
+
+def mask_weights(kind: str, height: int, width: int) -> npt.NDArray[np.float32]:
+    """Return how two lights share a picture (height, width, 2) by masks of a kind that `generate` makes."""
+    return parse_masks(kind, 2, 1).maker(0).weights(height, width, 2)
 
 
 def photograph(width: int, height: int) -> npt.NDArray[np.uint8]:
@@ -159,6 +167,7 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
     sites = np.empty(picture.shape[:2], np.uint16)
     planes = np.empty((3, height, width), np.float32)
     weights = np.random.default_rng(4).random((height, width, 2), dtype=np.float32)
+    masks = {kind: mask_weights(kind, height, width) for kind in ("soft-edge", "half-plane")}
     calls: dict[str, Bands] = {
         "streaming copy": lambda band: np.copyto(out[band], picture[band]),
         "bound of fetching": fetching(samples, picture),
@@ -175,12 +184,16 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
             tables, picture[band], weights[band], white_level=WHITE, first_row=band.start, out=out[band]
         ),
     }
+    for kind, mask in masks.items():
+        calls[f"two lights, {kind}"] = lambda band, mask=mask: mix_samples(
+            tables, picture[band], mask[band], white_level=WHITE, first_row=band.start, out=out[band]
+        )
     seconds = in_turns(calls, height, 8, time.thread_time)
     seconds |= in_turns({"numpy take": lambda band: by_numpy(samples, picture[band])}, height, 8, time.thread_time, 2)
     for call, took in seconds.items():
         report(f"{call}, {name}, one thread", pixels / took, "Mpx/s")
     limit = seconds["streaming copy"]
-    for call in ("bound of fetching", "kernel", "mosaic", "planes", "two lights"):
+    for call in ("bound of fetching", "kernel", "mosaic", "planes", *(name for name in calls if "two lights" in name)):
         report(f"{call}, {name}, one thread", limit / seconds[call], "ratio", "streaming copy, 3 bytes in and 6 out")
     report(f"kernel, {name}, one thread", seconds["numpy take"] / seconds["kernel"], "ratio", "numpy take")
 
