@@ -10,17 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
-from acquisition.chart import Chart, load_chart
+from acquisition.annotated import annotated_png
+from acquisition.chart import load_chart
 from acquisition.config import LabSettings
 from acquisition.corners import Corners
 from acquisition.exposure import measure_exposure, refusal
 from acquisition.framing import MIN_MODULE_PX, Framing, find_chart
 from acquisition.health import make_ready
-from acquisition.homography import project
-from acquisition.planes import Plane, strongest_plane
 from acquisition.rig import open_rig
 from acquisition.sequencer import Devices
 from acquisition.session import FrameKind
@@ -104,12 +100,12 @@ def check_lab(
     try:
         framing = find_chart(white, chart, "the white frame", corners)
     except RegistrationError as error:
-        faults.append(str(error))
+        faults.append(f"{error}; see {picture}" if picture is not None else str(error))
         framing = None
     else:
         _judge_framing(framing, lines, faults)
     if picture is not None:
-        write_whole(picture, annotated_png(framing.plane if framing else strongest_plane(white), framing, chart))
+        write_whole(picture, annotated_png(white, chart, framing))
         lines.append(f"picture     {picture}")
     return CheckReport(tuple(lines), tuple(faults))
 
@@ -134,12 +130,11 @@ def _judge_exposure(white: Mosaic, settings: LabSettings, lines: list[str]) -> N
 
 def _judge_framing(framing: Framing, lines: list[str], faults: list[str]) -> None:
     total = len(framing.tags) + len(framing.missing)
-    lines.append(
-        f"chart       {len(framing.tags)} of {total} tags, turned by {framing.rotation_deg:+.1f}°, fills "
-        f"{framing.fill:.0%} of the frame"
-    )
+    found = f"{len(framing.tags)} of {total} tags" if framing.field is None else "no tags, field of cells found"
+    lines.append(f"chart       {found}, turned by {framing.rotation_deg:+.1f}°, fills {framing.fill:.0%} of the frame")
     blur = blur_px(framing)
-    lines.append(f"sharpness   blur σ {blur:.2f} px, tag modules {framing.module_px:.1f} px (half-size pixels)")
+    module = "" if framing.field is not None else f", tag modules {framing.module_px:.1f} px"
+    lines.append(f"sharpness   blur σ {blur:.2f} px{module} (half-size pixels)")
     if not framing.inside:
         faults.append("the sheet does not lie in the frame with all four corners; move the camera back or turn it")
     if framing.module_px < MIN_MODULE_PX:
@@ -148,23 +143,3 @@ def _judge_framing(framing: Framing, lines: list[str], faults: list[str]) -> Non
         )
     if not blur <= MAX_BLUR_PX:
         faults.append(f"the picture is soft: blur σ {blur:.2f} px, {MAX_BLUR_PX:g} allowed; focus the lens")
-
-
-def annotated_png(plane: Plane, framing: Framing | None, chart: Chart) -> bytes:
-    """Return a plane, stretched to be seen, with the page's outline and the tags drawn on it, as PNG bytes."""
-    import cv2
-
-    white = max(float(np.percentile(plane.values[::4, ::4], 99.5)), 1.0)
-    grey = np.clip(plane.values / white, 0, 1) ** (1 / 2.2) * 255
-    image: npt.NDArray[np.uint8] = cv2.cvtColor(grey.astype(np.uint8), cv2.COLOR_GRAY2BGR).astype(np.uint8)
-    if framing is not None:
-        width, height = chart.page_mm
-        page = project(framing.homography, [(0, 0), (width, 0), (width, height), (0, height)])
-        cv2.polylines(image, [page.round().astype(np.int32)], True, (60, 200, 60), 3, cv2.LINE_AA)
-        for tag in framing.tags:
-            corners = tag.corners_px.round().astype(np.int32)
-            cv2.polylines(image, [corners], True, (40, 40, 255), 2, cv2.LINE_AA)
-            cv2.putText(
-                image, str(tag.id), corners[0].tolist(), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (40, 200, 255), 2, cv2.LINE_AA
-            )
-    return cv2.imencode(".png", image)[1].tobytes()

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.annotated import annotated_png
 from acquisition.movement import Shift
 from acquisition.session import FrameRecord, Session
 from calibration.choices import Choices
@@ -50,7 +51,7 @@ from calibration.result import BuildResult, Growth
 from calibration.subtraction import DarkLight
 from calibration.tally import Tally
 from calibration.verdict import refusal
-from drivers.errors import FormatError, QualityError
+from drivers.errors import FormatError, QualityError, RegistrationError
 from drivers.storage import write_whole
 
 REPORT_FILES = ("report.html", "report.json")
@@ -68,8 +69,10 @@ _Array = npt.NDArray[np.float64]
 _Report = Callable[[BuildResult, Session, Path], None]
 
 
-def check(session: Session, choices: Choices = PLAIN, linearity: Path | None = None) -> BuildResult:
-    """Register a session's best frame and judge it; write nothing.
+def check(
+    session: Session, choices: Choices = PLAIN, linearity: Path | None = None, picture: Path | None = None
+) -> BuildResult:
+    """Register a session's best frame and judge it; write nothing but a picture.
 
     Parameters
     ----------
@@ -79,6 +82,8 @@ def check(session: Session, choices: Choices = PLAIN, linearity: Path | None = N
         How the table would be made; a window that is too large is told.
     linearity
         A folder of exposures that tell the sensor's linearity; `calibration.linearity.read_linearity`.
+    picture
+        Where to draw what was found on the frame, or looked for, PNG; None for nowhere.
 
     Raises
     ------
@@ -92,7 +97,15 @@ def check(session: Session, choices: Choices = PLAIN, linearity: Path | None = N
     _require_darks(session, choices)
     best = best_frame(session)
     decoded = decode(session, best)
-    work = Measurement(session.chart, decoded, choices.window, choices.corners)
+    try:
+        work = Measurement(session.chart, decoded, choices.window, choices.corners)
+    except RegistrationError as error:
+        if picture is None:
+            raise RegistrationError(f"{error}; see what is there with --picture PNG") from error
+        write_whole(picture, annotated_png(decoded.mosaic, session.chart, None))
+        raise RegistrationError(f"{error}; see {picture}") from error
+    if picture is not None:
+        write_whole(picture, annotated_png(decoded.mosaic, session.chart, work.first.registration.framing))
     tally = Tally(session.chart, choices.samples, work.first)
     measured = work.measure_first(decoded, work.first, Shift(0.0, 0.0, 0.0, 0), even=True)
     tally.add(measured)
@@ -271,9 +284,7 @@ class _Work:
         self._told(0, len(self._chosen), "finding the chart")
         first = decode(session, self._best)
         self._camera = first.mosaic.camera
-        self._measurement = Measurement(
-            chart, first, self._choices.window, self._choices.corners, self._primaries()
-        )
+        self._measurement = Measurement(chart, first, self._choices.window, self._choices.corners, self._primaries())
         self._stretch = self._measurement.first
         self._tally = Tally(chart, self._choices.samples, self._stretch)
         self._limit = first.saturation

@@ -57,6 +57,15 @@ def build_lut(
     append: Annotated[
         bool, typer.Option("--append", help="Take in what has come of a session that is being taken.")
     ] = False,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            "--picture",
+            metavar="PNG",
+            help="With --check, save the frame with what of the chart was found on it, or was looked for.",
+            show_default=False,
+        ),
+    ] = None,
     window: Annotated[
         int | None,
         typer.Option(
@@ -168,12 +177,21 @@ def build_lut(
         from acquisition.corners import parse_corners
         from calibration.choices import Choices
 
+        if picture is not None and not check:
+            raise InputError("--picture goes with --check; a table that is built has its report")
         told = None if corners is None else parse_corners(corners)
-        _make(session, lut, check, append, Choices(5 if window is None else window, subtract_dark, told), linearity)
+        choices = Choices(5 if window is None else window, subtract_dark, told)
+        _make(session, lut, check, append, choices, linearity, picture)
 
 
 def _make(
-    session: Path | None, lut: Path | None, check: bool, append: bool, choices: Choices, linearity: Path | None
+    session: Path | None,
+    lut: Path | None,
+    check: bool,
+    append: bool,
+    choices: Choices,
+    linearity: Path | None,
+    picture: Path | None,
 ) -> None:
     if check and lut is not None:
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
@@ -187,7 +205,7 @@ def _make(
         if lut is None:
             from calibration.build import check as judge
 
-            result = judge(opened, choices, linearity)
+            result = judge(opened, choices, linearity, picture)
         else:
             result = _build(opened, lut, append, choices, linearity)
     from calibration.result import Growth

@@ -11,7 +11,7 @@ import pytest
 
 from acquisition.field import field_mm
 from acquisition.illuminations import Illumination
-from acquisition.layout import paper_chart
+from acquisition.layout import A_SERIES_MM, design_chart, paper_chart
 from acquisition.session import ACCEPTED, Step
 from calibration.build import build
 from calibration.cli import main
@@ -141,3 +141,20 @@ def test_corners_that_cannot_be_are_refused_on_the_command_line(plain: Lab, tmp_
         assert code == 2
         assert expected in said
     assert not (tmp_path / "lut").exists()
+
+
+def test_a_check_that_fails_shows_what_was_looked_for(plain: Lab, tmp_path: Path, command: Command) -> None:
+    with take(plain, tmp_path / "session", renumbered(LIGHTS[4:6])):
+        pass
+    found = tmp_path / "found.png"
+    assert command("--check", tmp_path / "session", "--picture", found)[0] == 0
+    assert found.read_bytes().startswith(b"\x89PNG")
+    design_chart(3, A_SERIES_MM["A5"]).save(tmp_path / "session" / "chart.json")
+    missed = tmp_path / "missed.png"
+    code, said = command("--check", tmp_path / "session", "--picture", missed)
+    assert code == 4
+    assert f"see {missed}" in said
+    assert missed.read_bytes().startswith(b"\x89PNG")
+    code, said = command(tmp_path / "session", tmp_path / "lut", "--picture", missed)
+    assert code == 2
+    assert "--picture goes with --check" in said
