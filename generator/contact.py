@@ -13,7 +13,6 @@ from drivers.storage import write_whole
 from generator.dataset import Dataset
 from generator.lighting import parse_mixture
 from generator.records import Entry, Light, Triple
-from generator.shards import preview_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,6 +57,8 @@ def _load(dataset: Dataset, entry: Entry) -> npt.NDArray[np.uint8]:
         picture = cv2.imdecode(np.frombuffer(preview, np.uint8), cv2.IMREAD_COLOR_RGB)
         if picture is not None:
             return np.asarray(picture, dtype=np.uint8)
+    from generator.preview import preview_of
+
     return preview_of(dataset.read_image(entry), dataset.description.table.white_level)
 
 

@@ -54,7 +54,7 @@ from generator.records import (
     Triple,
     shard_key,
 )
-from generator.shards import OnImage, OnSkip, preview_of
+from generator.shards import OnImage, OnSkip
 from generator.store import Store, open_store
 from generator.workplace import DESCRIPTION, Workplace, finished, stored_identity, workplace
 
@@ -72,7 +72,6 @@ __all__ = [
     "make_dataset",
     "make_share",
     "open_dataset",
-    "preview_of",
 ]
 
 OnDone = Callable[[int], None]

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,9 +43,6 @@ from generator.workplace import Workplace
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
-
-PREVIEW_SIDE: Final = 512
-"""Longest side of a preview, px."""
 
 _threads = threading.local()
 
@@ -239,6 +236,7 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _Read:
 
 def _make(job: ShardJob, lut: Lut, writer: ShardWriter, number: int, got: _Read, lighting: Lighting) -> Sample:
     from generator.encode import Shot, encode_pieces, encode_preview, suffix_of
+    from generator.preview import preview_of
 
     height, width = got.picture.shape[:2]
     white_level = lut.provenance.white_level
@@ -290,33 +288,3 @@ def chromaticity(white: npt.NDArray[np.float64]) -> Triple:
     """Return (r, g, b) of sum 1 of linear RGB (3,)."""
     red, green, blue = (float(part) for part in white / white.sum())
     return red, green, blue
-
-
-def preview_of(image: npt.NDArray[np.uint16], white_level: int, side: int = PREVIEW_SIDE) -> Picture:
-    """Return the raw look of an image: made small, then tone mapped; colours are the camera's and the light's.
-
-    Parameters
-    ----------
-    image
-        (H, W, 3) uint16, linear camera RGB.
-    white_level
-        Value of saturation.
-    side
-        Longest side allowed, px.
-
-    Returns
-    -------
-    ndarray
-        (h, w, 3) uint8.
-    """
-    import cv2
-
-    from generator.tonemap import flash
-
-    height, width = image.shape[:2]
-    scale = side / max(height, width)
-    if scale < 1:
-        # In whole numbers: floats of the full size would take more memory than all else.
-        size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint16)
-    return flash(image.astype(np.float32) / np.float32(white_level))

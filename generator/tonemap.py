@@ -6,6 +6,7 @@ VISAPP 2018; used for the previews as the paper uses it in its figure of the gen
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,8 +79,12 @@ def fit_flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2
             f"tone mapping wants an image and parameters above 0; got {linear.shape}, a={a}, gamma={gamma}"
         )
     brightness = _brightness(np.asarray(linear))
-    k = float(a * np.exp(np.log(brightness).mean(dtype=np.float64)))
-    peak = float(brightness.max())
+    return flash_of(float(np.log(brightness).mean(dtype=np.float64)), float(brightness.max()), a, gamma)
+
+
+def flash_of(mean_log: float, peak: float, a: float = 5.0, gamma: float = 2.2) -> Flash:
+    """Return the operator for an image of such brightness: the mean of its logarithm, and the largest."""
+    k = a * math.exp(mean_log)
     return Flash(k, 255.0 / (peak / (peak + k)) ** (1 / gamma), gamma)
 
 
