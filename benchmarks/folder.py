@@ -32,13 +32,14 @@ from generator.engines import default_workers
 from generator.scene import find_pictures
 from generator.store import LocalStore
 
-REPEATS = 5
+LARGE_REPEATS = 3
+SMALL_REPEATS = 10
 
 
-def fastest(calls: Mapping[str, Callable[[], object]]) -> dict[str, tuple[float, float]]:
+def fastest(calls: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, tuple[float, float]]:
     """Return the least seconds, and the least processor seconds, of some calls of each, taken in turn."""
     took = dict.fromkeys(calls, (float("inf"), float("inf")))
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         for name, call in calls.items():
             start, busy = time.perf_counter(), time.process_time()
             call()
@@ -72,7 +73,7 @@ def images_of(folder: Path) -> list[npt.NDArray[np.uint16]]:
     return images
 
 
-def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.uint8]]) -> None:
+def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.uint8]], repeats: int) -> None:
     sources, usual, ours, written = (scratch / folder for folder in ("sources", "usual", "ours", "written"))
     sources.mkdir()
     for number, picture in enumerate(pictures):
@@ -113,7 +114,8 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
                 "files": write,
                 "previews": lambda: by_suite(previews=True),
                 "ours": by_suite,
-            }
+            },
+            repeats,
         )
     wall, busy = ({call: times[which] for call, times in took.items()} for which in (0, 1))
     sizes = [sum(path.stat().st_size for path in folder.iterdir()) for folder in (usual, ours / "images")]
@@ -139,10 +141,12 @@ def main() -> None:
         scratch = Path(folder)
         lut = noisy_table(scratch / "lut", 1)
         large = photograph(5184, 3456)
-        compare(scratch, lut, "18 Mpx", [large, large[::-1], large[:, ::-1], large[::-1, ::-1]])
+        compare(scratch, lut, "18 Mpx", [large, large[::-1], large[:, ::-1], large[::-1, ::-1]], LARGE_REPEATS)
         small = [np.ascontiguousarray(large[512 * (n // 10) :][:512, 512 * (n % 10) :][:, :512]) for n in range(60)]
         photo = photograph(512, 512)
-        compare(scratch, lut, "512 px", [*small[:30], *(np.roll(photo, 17 * n, axis=1) for n in range(30))])
+        compare(
+            scratch, lut, "512 px", [*small[:30], *(np.roll(photo, 17 * n, axis=1) for n in range(30))], SMALL_REPEATS
+        )
 
 
 if __name__ == "__main__":

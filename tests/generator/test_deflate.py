@@ -1,4 +1,4 @@
-"""Packed rows are deflate that zlib, libdeflate and ISA-L unpack, in the best codes; files are no larger than usual."""
+"""Packed rows are deflate that zlib, libdeflate and ISA-L unpack, in good codes; files are no larger than usual."""
 
 from __future__ import annotations
 
