@@ -187,6 +187,8 @@ def summary(result: BuildResult) -> list[tuple[str, str, str]]:
     """Return the figures that say how good a table is: name, value, what is usual."""
     registration = result.registration
     tags = len(registration.framing.tags)
+    plain = registration.framing.field is not None
+    found = "the chart has none" if plain else f"{tags} of {tags + len(registration.framing.missing)}"
     share = result.white_error / np.maximum(result.white, 1e-9)
     brightest = result.white.max(axis=1) if len(result.white) else np.zeros(1)
     black = np.mean([figures.black for figures in result.frames], axis=0)
@@ -194,12 +196,20 @@ def summary(result: BuildResult) -> list[tuple[str, str, str]]:
     return [
         ("Lights", str(result.lights), "every one with an accepted frame"),
         ("Frame registered", result.registered_file, ""),
-        ("Tags found", f"{tags} of {tags + len(registration.framing.missing)}", ""),
+        ("Tags found", found, ""),
         ("Cell", f"{registration.cell_px:.1f} px", "at least 8 for 25 pixels inside it"),
         ("Window", f"{result.window}×{result.window} samples", _window_note(result)),
         ("Blur", f"σ {registration.blur_px:.2f} px", "about 0.6 is sharp"),
-        ("Tags' corners", f"{registration.marks_rms_px:.3f} px RMS", "0.09 is the detector's own error"),
-        ("Waviness", f"{registration.lens_residual_px:.2f} px RMS", "of the tags against a plane seen through a lens"),
+        (
+            "Outline of the field" if plain else "Tags' corners",
+            f"{registration.marks_rms_px:.3f} px RMS",
+            "across, against the final map" if plain else "0.09 is the detector's own error",
+        ),
+        (
+            "Waviness",
+            f"{registration.lens_residual_px:.2f} px RMS",
+            f"of the {'outline' if plain else 'tags'} against a plane seen through a lens",
+        ),
         ("Blocks of cells", f"{registration.block_rms_px:.3f} px RMS", "movement they still ask for"),
         ("Colours agree", f"{registration.agreement:.4f}", "correlation of cells and chart; another chart has about 0"),
         ("Chart moved", f"{result.largest_shift_px:.3f} px at most", f"{moved} frames registered anew"),
