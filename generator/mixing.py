@@ -61,11 +61,13 @@ def _mix_table(samples: Any, weight: float, seed: Any, place: int, shuffled: boo
     """Add one light to `total` (C, S, 3) float64, each colour's samples in the order of a shuffle of its own."""
     colours, count = samples.shape[0], samples.shape[1]
     root = np.sqrt(weight)
-    order = np.empty(count, np.int64)
+    order = np.empty(count, np.uint32)
     for i in range(count):
         order[i] = i
     words = np.empty(count + 3, np.uint32)
+    rest = np.empty(3)
     for colour in range(colours):
+        drawn, sums = samples[colour], total[colour]
         if shuffled:
             for i in range(0, count, 4):
                 words[i], words[i + 1], words[i + 2], words[i + 3] = four_words(
@@ -76,13 +78,15 @@ def _mix_table(samples: Any, weight: float, seed: Any, place: int, shuffled: boo
             for i in range(count - 1):
                 j = i + np.int64((np.uint64(words[i]) * np.uint64(count - i)) >> np.uint64(32))
                 order[i], order[j] = order[j], order[i]
-        for channel in range(3):
-            mean = 0.0
-            for i in range(count):
-                mean += samples[colour, i, channel]
-            mean /= count
-            for i in range(count):
-                total[colour, i, channel] += root * samples[colour, order[i], channel] + (weight - root) * mean
+        red = green = blue = 0
+        for i in range(count):
+            red, green, blue = red + drawn[i, 0], green + drawn[i, 1], blue + drawn[i, 2]
+        for channel, mean in enumerate((red / count, green / count, blue / count)):
+            rest[channel] = (weight - root) * mean
+        for i in range(count):
+            sample = drawn[order[i]]
+            for channel in range(3):
+                sums[i, channel] += root * sample[channel] + rest[channel]
 
 
 @compiled
