@@ -30,6 +30,7 @@ from generator import philox
 from generator.lighting import Mixture
 from generator.palette import fit_picture
 from generator.planar import draw_batch
+from generator.recycling import Recycled
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
@@ -141,6 +142,7 @@ class Crops:
         self.seed = seed
         self.epoch = self._checked_epoch(epoch)
         self.threads = threads
+        self._memory = Recycled()
         self._truths = (whites / whites.sum(axis=1, keepdims=True)).astype(np.float32)
         self._prepare()
 
@@ -157,7 +159,8 @@ class Crops:
         ]
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = {name: value for name, value in vars(self).items() if name not in ("_tables", "_rows", "_pictures")}
+        made = ("_tables", "_rows", "_pictures", "_memory")
+        kept = {name: value for name, value in vars(self).items() if name not in made}
         # The table is gigabytes; its folder is enough to map it again.
         kept["lut"] = self.lut.folder
         return kept
@@ -167,6 +170,7 @@ class Crops:
 
         vars(self).update(state)
         self.lut = open_lut(state["lut"])
+        self._memory = Recycled()
         self._prepare()
 
     @staticmethod
@@ -197,8 +201,8 @@ class Crops:
         items
             (N,) int, 0 … length − 1, in any order, N ≥ 1.
         out
-            (N, 3, height, width) float32 to fill instead of a new array: the batch's images. Memory that is used again
-            and again need not be cleared by the system each time.
+            (N, 3, height, width) float32 to fill: the batch's images. None: memory of a former batch of which nothing
+            is left, or new memory.
 
         Raises
         ------
@@ -228,7 +232,7 @@ class Crops:
             gains=np.exp2(least + (most - least) * (stops / 2.0**32)),
             seeds=low.astype(np.uint64) | high.astype(np.uint64) << _HALF,
             threads=self.threads,
-            out=out,
+            out=self._memory.array((numbers.size, 3, height, width)) if out is None else out,
         )
         return Batch(images, self._truths[lights], lights, pictures)
 
