@@ -46,12 +46,16 @@ class Shift:
         The largest movement of a tag, or of a corner of the field, so that a rotation shows.
     tags
         Tags, or strips, that could be measured; 0 leaves the rest 0 and means unknown.
+    softer_px2
+        How much more blurred the later frame is: the difference of the blurs' variances, half-size px², negative when
+        it is sharper; median. Linear in the difference, so read low from about 1 px² on.
     """
 
     dx: float
     dy: float
     largest_px: float
     tags: int
+    softer_px2: float = 0.0
 
     @property
     def length_px(self) -> float:
@@ -72,7 +76,7 @@ def gauge_boxes(framing: Framing) -> list[tuple[int, int, int, int]]:
 
 
 def shift_between(reference: Plane, framing: Framing, plane: Plane) -> Shift:
-    """Return how far the chart has moved in `plane` since `reference`, of the same channel.
+    """Return how far the chart has moved, and how much softer it is, in `plane` since `reference`, of the same channel.
 
     By Lucas and Kanade's method, gain and offset free, up to about 3 px: below that, good to 0.005 px where paper has
     some hundred counts. Costs some milliseconds.
@@ -93,7 +97,8 @@ def shift_between(reference: Plane, framing: Framing, plane: Plane) -> Shift:
         return Shift(0.0, 0.0, 0.0, 0)
     table = np.array(shifts)
     median = np.median(table, axis=0)
-    return Shift(float(median[0]), float(median[1]), float(np.linalg.norm(table, axis=1).max()), len(shifts))
+    largest = float(np.linalg.norm(table[:, :2], axis=1).max())
+    return Shift(float(median[0]), float(median[1]), largest, len(shifts), float(median[2]))
 
 
 def _gauge_tags(framing: Framing) -> list[FoundTag]:
@@ -104,7 +109,7 @@ def _gauge_tags(framing: Framing) -> list[FoundTag]:
 
 
 def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
-    """Return the movement (2,) of one tag, or None where it cannot be told."""
+    """Return the movement of one tag and how much softer it is, (3,), or None where they cannot be told."""
     margin = int(np.ceil(MAX_SHIFT_PX)) + 2
     height, width = reference.values.shape
     corners = tag.corners_px - reference.offset_px
@@ -119,18 +124,20 @@ def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
     inner = np.s_[margin:-margin, margin:-margin]
     gy, gx = (np.asarray(gradient)[inner].ravel() for gradient in np.gradient(before))
     template = before[inner].ravel()
+    # A little more of Gaussian blur adds half the variance's growth times the Laplacian (the heat equation).
+    bend = np.asarray(cv2.Laplacian(before, cv2.CV_64F))[inner].ravel()
     now = template
     rows, columns = np.mgrid[margin : before.shape[0] - margin, margin : before.shape[1] - margin].astype(np.float32)
-    shift = np.zeros(2)
+    shift, softer = np.zeros(2), 0.0
     for _ in range(_STEPS):
         moved = cv2.remap(after, columns + np.float32(shift[0]), rows + np.float32(shift[1]), cv2.INTER_CUBIC)
         now = np.asarray(moved, dtype=np.float64).ravel()
-        # now = gain · (template + g · step) + offset, linear in (gain, offset, gain · step).
-        design = np.column_stack([template, np.ones_like(template), gx, gy])
+        # now = gain · (template + g · step + bend · growth / 2) + offset, linear in the products.
+        design = np.column_stack([template, np.ones_like(template), gx, gy, bend])
         solution, _, rank, _ = np.linalg.lstsq(design, now, rcond=None)
-        if rank < 4 or solution[0] <= 0:
+        if rank < 5 or solution[0] <= 0:
             return None
-        step = solution[2:] / solution[0]
+        step, softer = solution[2:4] / solution[0], 2 * float(solution[4] / solution[0])
         # The crop read at x + shift shows the tag as it was at x + shift − movement.
         shift -= np.clip(step, -1, 1)
         if np.abs(shift).max() > MAX_SHIFT_PX + 1:
@@ -138,7 +145,7 @@ def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
         if np.abs(step).max() < 1e-3:
             break
     correlation = np.corrcoef(now, template)[0, 1]
-    return shift if correlation > 0.5 else None
+    return np.append(shift, softer) if correlation > 0.5 else None
 
 
 def _strips(field: Field) -> tuple[_Points, _Points]:
@@ -168,14 +175,17 @@ def _field_shift(reference: Plane, plane: Plane, field: Field) -> Shift:
     if len(middles) < _MIN_STRIPS:
         return unknown
     before = _sampled(reference, places)
-    slope = np.gradient(before, axis=2)
+    slope = np.asarray(np.gradient(before, axis=2))
+    # As for a tag, but blur along an edge shows nothing.
+    bend = np.zeros_like(before)
+    bend[:, :, 1:-1] = np.diff(before, 2, axis=2)
     # A strip's ends have no neighbours to tell the slope from.
     seen = np.s_[:, :, 1:-1]
-    template, slope = (picture[seen].reshape(len(middles), -1) for picture in (before, slope))
-    design = np.stack([template, np.ones_like(template), slope], axis=-1)
-    gram = np.einsum("kni,knj->kij", design, design) + 1e-9 * np.eye(3)
+    template, slope, bend = (picture[seen].reshape(len(middles), -1) for picture in (before, slope, bend))
+    design = np.stack([template, np.ones_like(template), slope, bend], axis=-1)
+    gram = np.einsum("kni,knj->kij", design, design) + 1e-9 * np.eye(4)
     moved: _Points = np.zeros(len(middles))
-    solution: _Points = np.zeros((len(middles), 3))
+    solution: _Points = np.zeros((len(middles), 4))
     now = template
     for _ in range(_STEPS):
         later = _sampled(plane, places + moved[:, None, None, None] * normals[:, None, None])
@@ -196,7 +206,8 @@ def _field_shift(reference: Plane, plane: Plane, field: Field) -> Shift:
     left = now - np.einsum("kni,ki->kn", design, solution)
     known = 1 / np.asarray(np.linalg.inv(gram), dtype=np.float64)[:, 2, 2]
     weights = known * solution[:, 0] ** 2 / np.maximum((left**2).mean(axis=1), 1e-9)
-    return _rigid(middles[good], normals[good], moved[good], weights[good], field)
+    softer = 2 * float(np.median(solution[good, 3] / solution[good, 0]))
+    return _rigid(middles[good], normals[good], moved[good], weights[good], field, softer)
 
 
 def _sampled(plane: Plane, places: _Points) -> _Points:
@@ -206,7 +217,7 @@ def _sampled(plane: Plane, places: _Points) -> _Points:
     return (np.roll(found, 1, axis=1) + 2 * found + np.roll(found, -1, axis=1)) / 4
 
 
-def _rigid(middles: _Points, normals: _Points, moved: _Points, weights: _Points, field: Field) -> Shift:
+def _rigid(middles: _Points, normals: _Points, moved: _Points, weights: _Points, field: Field, softer: float) -> Shift:
     """Return the shift, turn and growth that movements (K,) across strips tell of, robustly."""
     centre = field.corners_px.mean(axis=0)
     x, y = ((middles - centre) / np.abs(field.corners_px - centre).max()).T
@@ -226,4 +237,4 @@ def _rigid(middles: _Points, normals: _Points, moved: _Points, weights: _Points,
     u, v = corners.T
     at_corners = np.stack([dx - turn * v + growth * u, dy + turn * u + growth * v], axis=-1)
     largest = max(float(np.linalg.norm(at_corners, axis=1).max()), float(np.hypot(dx, dy)))
-    return Shift(dx, dy, largest, len(moved))
+    return Shift(dx, dy, largest, len(moved), softer)

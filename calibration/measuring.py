@@ -68,6 +68,8 @@ class FrameFigures:
         (3,) float64 counts, dark light of bare paper that was subtracted; zeros where none was.
     at_zero
         Share of the table's samples that are 0.
+    blur_px
+        How soft the frame is: that of the frame registered last, and what tags or outline are softer than in it.
     """
 
     record: FrameRecord
@@ -81,6 +83,7 @@ class FrameFigures:
     grey_errors: _Array = field(default_factory=lambda: np.zeros((0, 3)))
     dark: _Array = field(default_factory=lambda: np.zeros(3))
     at_zero: float = 0.0
+    blur_px: float = 0.0
 
     def told(self) -> dict[str, Any]:
         """Return the figures as JSON holds them; `recall` makes them again to the last bit."""
@@ -99,6 +102,7 @@ class FrameFigures:
             "grey_errors": self.grey_errors.tolist(),
             "dark": self.dark.tolist(),
             "at_zero": self.at_zero,
+            "blur": self.blur_px,
         }
 
     @staticmethod
@@ -120,6 +124,7 @@ class FrameFigures:
             np.array(told["grey_errors"]).reshape(-1, 3),
             np.array(told["dark"]),
             told["at_zero"],
+            told["blur"],
         )
 
 
@@ -462,6 +467,7 @@ class Measurement:
             kept = noise = None
         mean = patch_means(values[self._expected.cells])
         likeness = self._expected.held_against(mean, self.transfer.variance(mean) / self._window**2)
+        softer = 0.0 if registered else shift.softer_px2
         figures = FrameFigures(
             decoded.record,
             decoded.black,
@@ -474,6 +480,7 @@ class Measurement:
             grey_errors,
             np.zeros(3) if dark is None else dark.paper,
             1 - int(np.count_nonzero(values)) / values.size,
+            float(np.sqrt(max(stretch.registration.blur_px**2 + softer, 0.0))),
         )
         return Measured(figures, stretch, dark, decoded.saturation, values, highest, cells.inside, kept, noise)
 

@@ -121,6 +121,13 @@ THRESHOLDS: tuple[Threshold, ...] = (
         SIMULATED + ": none on a clean flat print", "clean the print, hang it flatter, and look for shadows on it",
     ),
     Threshold(
+        "softer_bleed", "More of the neighbours' light in the softest frame", "share", "at most", 0.003, 0.012,
+        "a frame is out of focus, or was shaken; only white frames are looked at cell by cell for bleeding",
+        SIMULATED + ": 0.9 px of blur in one frame of a session with 0.5 px give 0.8 % and cells 1.2 % off, "
+        "1.1 px 2 % and cells 4 % off",
+        "switch off autofocus and stabilisation, see that nothing shakes the camera",
+    ),
+    Threshold(
         "unlike_scatter", "Cells about what their codes give, worst frame", "share", "at most", 0.012, 0.03,
         "the frame is out of focus, or shows another print: its samples are not its colours'",
         SIMULATED + ": to 0.8 % without noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",

@@ -24,6 +24,7 @@ from calibration.sampling import WINDOW
 from calibration.thresholds import THRESHOLDS, Threshold
 
 if TYPE_CHECKING:
+    from calibration.registration import Registration
     from calibration.result import BuildResult
 
 SAFE_BLEED = 0.002
@@ -138,6 +139,9 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "agreement": registration.agreement,
         "unfit_share": len(result.unfit) / max(len(registration.strangers), 1),
         "doubtful_share": float(result.stains.doubtful.mean()),
+        "softer_bleed": max(
+            (_bleed_beyond(registration, frame.blur_px, result.window) for frame in result.frames), default=0.0
+        ),
         "unlike_scatter": max((frame.likeness.scatter for frame in result.frames), default=0.0),
         "unlike_block": max((frame.likeness.block for frame in result.frames), default=0.0),
         "moved_anew": float(sum(frame.registered for frame in result.frames)),
@@ -191,6 +195,11 @@ def bleed(cell_px: float, blur_px: float, window: int = WINDOW) -> float:
     return float(ndtr(-(cell_px / 2 - window // 2 - 0.75) / max(blur_px, 1e-3)))
 
 
+def _bleed_beyond(registration: Registration, blur_px: float, window: int) -> float:
+    """Return how much more light a frame's worst sample has from beyond its cell than that of the registered frame."""
+    return bleed(registration.cell_px, blur_px, window) - bleed(registration.cell_px, registration.blur_px, window)
+
+
 def largest_window(cell_px: float, blur_px: float) -> int:
     """Return the largest window of which no sample has more than 0.2 % of its light from elsewhere; 0 if there is none.
 
@@ -221,7 +230,7 @@ def refusal(verdict: Verdict, result: BuildResult) -> str:
     remedy = worst.threshold.remedy
     more = f" (and {len(verdict.refused) - 1} more)" if len(verdict.refused) > 1 else ""
     detail = ""
-    if worst.threshold.name in ("unlike_scatter", "unlike_block"):
+    if worst.threshold.name in ("softer_bleed", "unlike_scatter", "unlike_block"):
         detail = f", {_most_unlike(result, worst.threshold.name)}"
     if worst.threshold.name == "unfit_share":
         causes: dict[str, int] = {}
@@ -235,6 +244,9 @@ def refusal(verdict: Verdict, result: BuildResult) -> str:
 
 def _most_unlike(result: BuildResult, name: str) -> str:
     """Return in which frame the worst of a figure is, and where on the print."""
+    if name == "softer_bleed":
+        softest = max(result.frames, key=lambda frame: frame.blur_px)
+        return f"in {softest.record.file}, blurred by {softest.blur_px:.2f} px"
     if name == "unlike_scatter":
         return f"in {max(result.frames, key=lambda frame: frame.likeness.scatter).record.file}"
     frame = max(result.frames, key=lambda frame: frame.likeness.block)

@@ -1,4 +1,4 @@
-"""How far a chart without tags has moved between two frames, by the outline of its field."""
+"""How far a chart has moved between two frames, and how much softer it is: by the outline of its field, or its tags."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from acquisition.planes import Plane, plane_of, strongest_plane
 from drivers.presenter import WHITE, Colour
 from drivers.rawfile import Mosaic
 from sim.world import Room
-from tests.calibration.lab import Lab, hang_chart
+from tests.calibration.lab import Lab, hang, hang_chart
 
 CHART = paper_chart("A6", 3)
 FILL = Room(waviness_mm=0.5)
@@ -105,3 +105,19 @@ def test_only_the_boxes_are_looked_at(white: Mosaic, framing: Framing) -> None:
         parts.append(replace(whole, values=values))
     one, other = shift_between(parts[0], framing, parts[1]), shift_between(plane, framing, later)
     assert (one.dx, one.dy, one.largest_px, one.tags) == (other.dx, other.dy, other.largest_px, other.tags)
+
+
+@pytest.mark.parametrize("colour", [WHITE, Colour(0, 0, 255)])
+@pytest.mark.parametrize("blur_px", [0.4, 0.5, 0.7, 0.85])
+@pytest.mark.parametrize("tags", [True, False])
+def test_a_softer_frame_is_measured(tmp_path: Path, colour: Colour, blur_px: float, tags: bool) -> None:
+    """Photosites and lens add by their variances, so the difference is that of the lens alone."""
+    room = replace(FILL, blur_px=0.5)
+    sharp, soft = (
+        hang(room=each) if tags else hang_chart(CHART, "Test", each) for each in (room, replace(room, blur_px=blur_px))
+    )
+    before = sharp.mosaic(tmp_path)
+    later = strongest_plane(soft.mosaic(tmp_path, colour, key=2))
+    shift = shift_between(plane_of(before, later.channel), find_chart(before, sharp.chart), later)
+    true = blur_px**2 - 0.5**2
+    assert shift.softer_px2 == pytest.approx(true, rel=0.35, abs=0.03)
