@@ -29,6 +29,7 @@ _STRIP_ALONG, _STRIP_ACROSS = 30, 8
 _STRIP_REACH_PX = 6
 _MIN_STRIPS = 8
 _LEAST_ALIKE = 0.5
+_LEAST_INDEPENDENT = 1e-6
 
 _Points = npt.NDArray[np.float64]
 
@@ -128,14 +129,20 @@ def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
     bend = np.asarray(cv2.Laplacian(before, cv2.CV_64F))[inner].ravel()
     now = template
     rows, columns = np.mgrid[margin : before.shape[0] - margin, margin : before.shape[1] - margin].astype(np.float32)
+    design = np.column_stack([template - template.mean(), np.ones_like(template), gx, gy, bend])
+    # By the normal equations: a linear-algebra library would start threads beside those that decode frames.
+    gram = np.asarray(np.einsum("ni,nj->ij", design, design), dtype=np.float64)
+    scale = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-9))
+    if np.linalg.eigvalsh(gram * scale * scale[:, None])[0] < _LEAST_INDEPENDENT:
+        return None
+    inverse = np.asarray(np.linalg.inv(gram), dtype=np.float64)
     shift, softer = np.zeros(2), 0.0
     for _ in range(_STEPS):
         moved = cv2.remap(after, columns + np.float32(shift[0]), rows + np.float32(shift[1]), cv2.INTER_CUBIC)
         now = np.asarray(moved, dtype=np.float64).ravel()
         # now = gain · (template + g · step + bend · growth / 2) + offset, linear in the products.
-        design = np.column_stack([template, np.ones_like(template), gx, gy, bend])
-        solution, _, rank, _ = np.linalg.lstsq(design, now, rcond=None)
-        if rank < 5 or solution[0] <= 0:
+        solution = inverse @ np.asarray(np.einsum("ni,n->i", design, now), dtype=np.float64)
+        if solution[0] <= 0:
             return None
         step, softer = solution[2:4] / solution[0], 2 * float(solution[4] / solution[0])
         # The crop read at x + shift shows the tag as it was at x + shift − movement.
