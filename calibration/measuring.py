@@ -28,7 +28,7 @@ from calibration.frames import Decoded
 from calibration.likeness import Expectation, Likeness
 from calibration.noise import PhotonTransfer, photon_transfer
 from calibration.primaries import Primaries
-from calibration.radiometry import CLIPPED, Field, Paper, PaperReader
+from calibration.radiometry import AROUND, CLIPPED, ORDERS, Field, Paper, PaperReader
 from calibration.references import Levels
 from calibration.registration import Registration, register
 from calibration.sampling import WINDOW, Sites, gather, gather_values, noise_of, patch_means, sites_at, table_values
@@ -277,7 +277,8 @@ class Measurement:
         if not chart.tags:
             # Its references are in the margin, and do not tell what light there is in the middle.
             base = field_of_cells(codes, self.cells_mm, level, there, self._white_mm, seen, chart.page_mm)
-        self._paper = PaperReader(self._white_mm, self.cells_mm, chart.page_mm, base)
+        order = ORDERS[-1] if chart.tags else AROUND
+        self._paper = PaperReader(self._white_mm, self.cells_mm, chart.page_mm, base, order)
         self._base_at_whites = base.at(self._white_mm)
         self.transfer: PhotonTransfer = photon_transfer(level, cells.var(axis=1, ddof=1), window**2)
         self._first_means = np.concatenate([level, samples.mean(axis=1, dtype=np.float64)])

@@ -31,6 +31,7 @@ MAX_BLACK_DRIFT = 1.0
 """Counts that the black level may drift over a session before it is said aloud."""
 
 ORDERS = (0, 1, 2, 3, 4, 5, 6)
+AROUND = 3
 MIN_REFERENCES = 6
 _PLATEAU = 64
 _ROUNDS = 4
@@ -170,13 +171,21 @@ class PaperReader:
         Width and height of the page.
     base
         The shape of a brighter frame, to which other frames add what they can tell; none for the brightest itself.
+    order
+        The highest order that a frame may tell by itself. References that lie around the cells and not among them
+        tell no more than `AROUND`: from order 4 on there are shapes that vanish in all the margin.
     """
 
     def __init__(
-        self, places_mm: _Array, centres_mm: _Array, page_mm: tuple[float, float], base: Field | None = None
+        self,
+        places_mm: _Array,
+        centres_mm: _Array,
+        page_mm: tuple[float, float],
+        base: Field | None = None,
+        order: int = ORDERS[-1],
     ) -> None:
         self.base = even_field(page_mm) if base is None else base
-        self._page_mm = page_mm
+        self._page_mm, self._order = page_mm, order
         self._at_places, self._base_at_places = polynomial(places_mm, page_mm, ORDERS[-1]), self.base.at(places_mm)
         self._base_at_centres = self.base.at(centres_mm)
         # Term by term, so that the compiled loop runs along the cells.
@@ -206,7 +215,7 @@ class PaperReader:
                 "the chart, bring all of it into the picture, and expose so that bare paper stays below saturation"
             )
         basis, values, known = self._at_places[there], seen[there], self._base_at_places[there]
-        fits = [_best_fit(basis, known[:, channel], values[:, channel]) for channel in range(3)]
+        fits = [_best_fit(basis, known[:, channel], values[:, channel], self._order) for channel in range(3)]
         solutions = np.zeros((3, basis.shape[1]))
         for channel, (solution, _) in enumerate(fits):
             solutions[channel, : len(solution)] = solution
@@ -234,12 +243,12 @@ class PaperReader:
         return Paper(field, white, error, int(there.sum()), spread), np.maximum(shape, _LEAST_FIELD)
 
 
-def _best_fit(basis: _Array, known: _Array, values: _Array) -> tuple[_Array, _Array]:
+def _best_fit(basis: _Array, known: _Array, values: _Array, highest: int) -> tuple[_Array, _Array]:
     """Return solution (terms,) and weights (N,) of the order that says most with least (BIC), shape `known` given."""
     from calibration import loops
 
     best: tuple[float, _Array, _Array] | None = None
-    for order in ORDERS:
+    for order in ORDERS[: highest + 1]:
         count = len(terms(order))
         if 3 * count > len(values):
             break

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibration.radiometry import (
+    AROUND,
     Field,
     Paper,
     PaperReader,
@@ -150,3 +151,21 @@ def test_a_stain_is_ignored_by_the_white_and_told_by_the_spread() -> None:
     assert found.white == pytest.approx(clean.white, rel=0.003)
     assert (clean.spread < 0.004).all()
     assert (found.spread > 0.02).all()
+
+
+def test_references_in_the_margin_tell_no_shape_that_vanishes_there() -> None:
+    """The light bends by 4 % in the middle, which the base knows; noise in the margin must not undo it."""
+    side = RANDOM.random((300, 2)) * PAGE
+    side[:150, 1] = np.where(RANDOM.random(150) < 0.5, 0.02, 0.98) * PAGE[1]
+    side[150:, 0] = np.where(RANDOM.random(150) < 0.5, 0.02, 0.98) * PAGE[0]
+    base = PaperReader(PLACES, CENTRES, PAGE).read(falloff(PLACES) * 5000)[0].field
+    x, y = (2 * side / PAGE - 1).T
+    seen = falloff(side) * 3000 * (1 + 0.02 * x - 0.01 * y * y)[:, None] * RANDOM.normal(1, 0.002, (300, 3))
+    # A smear on some, as margins have them.
+    seen[:12] *= 0.97
+    u, v = (2 * CENTRES / PAGE - 1).T
+    true = falloff(CENTRES) * (1 + 0.02 * u - 0.01 * v * v)[:, None]
+    true /= true.mean(axis=0)
+    field = PaperReader(side, CENTRES, PAGE, base, AROUND).read(seen)[0].field
+    assert max(field.orders()) <= AROUND
+    assert np.abs(field.at(CENTRES) / true - 1).max() < 0.01
