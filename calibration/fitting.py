@@ -10,6 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 
+def product(matrix: npt.NDArray[np.float64], vector: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return matrix (N, K) times vector (K,), or (K, M) columns, in this thread alone."""
+    return np.asarray(np.einsum("nk,k...->n...", matrix, vector), dtype=np.float64)
+
+
 def least_squares(
     design: npt.NDArray[np.float64], values: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:

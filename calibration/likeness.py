@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.fitting import least_squares
+from calibration.fitting import least_squares, product
 
 DEGREE = 4
 LEAST_COUNTS = 60.0
@@ -133,12 +133,12 @@ class Expectation:
         weights = 1 / sigma**2
         solution = least_squares(design, seen, weights)
         for _ in range(_ROUNDS):
-            residual = np.abs(seen - design @ solution) / sigma
+            residual = np.abs(seen - product(design, solution)) / sigma
             usual = max(1.4826 * float(np.median(residual)), 1e-9)
             solution = least_squares(
                 design, seen, weights * np.minimum(1, 2 * usual / np.maximum(residual, 1e-12)) ** 2
             )
-        expected, there = known.terms @ solution * known.level, known.there
+        expected, there = product(known.terms, solution) * known.level, known.there
         there = there[expected[there] > LEAST_COUNTS]
         if len(there) < LEAST_CELLS:
             return Likeness()

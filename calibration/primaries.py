@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.illuminations import Illumination
+from calibration.fitting import product
 from calibration.radiometry import Field, Paper
 
 LEAST_PAPER = 300.0
@@ -110,7 +111,7 @@ class Primaries:
         amounts = self.amounts(white)
         shares = amounts[:, None] * self.paper
         total = shares.sum(axis=0)
-        of_paper = np.where(total > 1, self.at_cells.T @ shares / np.maximum(total, 1), 1.0)
+        of_paper = np.where(total > 1, product(self.at_cells.T, shares) / np.maximum(total, 1), 1.0)
         plain, lit = np.zeros(self.cells.shape[1:]), np.zeros(self.cells.shape[1:])
         for amount, at_cells, cells in zip(amounts, self.at_cells, self.cells, strict=True):
             if amount > 0:

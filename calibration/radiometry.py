@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from calibration.fitting import product
 from drivers.errors import QualityError
 from drivers.rawfile import Mosaic
 
@@ -108,7 +109,7 @@ class Field:
         shape = np.ones((len(points), 3))
         for channel, factors in enumerate(self.coefficients):
             for factor in factors:
-                shape[:, channel] *= polynomial(points, self.page_mm, order_of(len(factor))) @ factor
+                shape[:, channel] *= product(polynomial(points, self.page_mm, order_of(len(factor))), factor)
         return np.maximum(shape, _LEAST_FIELD)
 
     def orders(self) -> tuple[int, ...]:
