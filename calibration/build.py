@@ -14,7 +14,7 @@ is taken in is measured again. The memory is that of a few frames whatever the s
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -27,7 +27,6 @@ from acquisition.session import FrameRecord, Session
 from calibration.choices import Choices
 from calibration.darkness import DarkFigures, additivity, drift_gains
 from calibration.frames import (
-    Decoded,
     Progress,
     accepted_lights,
     ahead,
@@ -43,7 +42,6 @@ from calibration.linearity import read_linearity
 from calibration.lut import SAMPLES as SAMPLES_FILE
 from calibration.lut import LutWriter, Provenance
 from calibration.measuring import FrameFigures, Measured, MeasuredDark, Measurement
-from calibration.primaries import pure_lights
 from calibration.radiometry import Field, corrections
 from calibration.references import NAME as REFERENCES_FILE
 from calibration.references import references_csv
@@ -284,7 +282,8 @@ class _Work:
         self._told(0, len(self._chosen), "finding the chart")
         first = decode(session, self._best)
         self._camera = first.mosaic.camera
-        self._measurement = Measurement(chart, first, self._choices.window, self._choices.corners, self._primaries())
+        primaries = (decode(session, record) for record in self._pure)
+        self._measurement = Measurement(chart, first, self._choices.window, self._choices.corners, primaries)
         self._stretch = self._measurement.first
         self._tally = Tally(chart, self._choices.samples, self._stretch)
         self._limit = first.saturation
@@ -303,13 +302,6 @@ class _Work:
             if (len(self._figures) - saved) % CHECKPOINT_EVERY == 0:
                 self.save()
             self._told(len(self._figures), len(self._chosen), record.file)
-
-    def _primaries(self) -> tuple[tuple[int, int, int], Iterator[Decoded]] | None:
-        """Return the lights of the primaries alone and their frames; None where they are not among the chosen."""
-        lights = pure_lights(self._session.illuminations)
-        if lights is None or not self._pure:
-            return None
-        return lights, (decode(self._session, record) for record in self._pure)
 
     def _recall(self, before: Checkpoint) -> None:
         """Go on where an earlier program stopped."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from calibration.colours import code_polynomial, code_powers
 from calibration.fitting import least_squares
 from calibration.radiometry import Field, polynomial
 
@@ -58,11 +59,11 @@ def field_of_cells(
         Width and height of the page.
     """
     degree = CODE_DEGREE
-    while degree > 1 and len(cells_mm) < _LEAST_CELLS_A_TERM * len(_powers(degree)):
+    while degree > 1 and len(cells_mm) < _LEAST_CELLS_A_TERM * len(code_powers(degree)):
         degree -= 1
     # Few cells in few blocks cannot tell more light apart from a colour that reacts to another ink.
     order = LIGHT_ORDER if degree == CODE_DEGREE else min(2, degree)
-    codes = _terms(rgb, degree)
+    codes = code_polynomial(rgb, degree)
     light, at_paper = polynomial(cells_mm, page_mm, order), polynomial(paper_mm, page_mm, order)
     # Light's constant is the colours' too; bare paper need not be what ink of code 255 is.
     design = np.block(
@@ -92,14 +93,3 @@ def field_of_cells(
         factors.append((smooth / float((light @ smooth).mean()),))
     red, green, blue = factors
     return Field(page_mm, (red, green, blue))
-
-
-def _powers(degree: int) -> list[tuple[int, int, int]]:
-    return [(i, j, k) for i in range(degree + 1) for j in range(degree + 1 - i) for k in range(degree + 1 - i - j)]
-
-
-def _terms(rgb: npt.ArrayLike, degree: int) -> _Array:
-    """Return the polynomials (C, terms) of printed codes (C, 3): products of Legendre's, of total degree `degree`."""
-    unit = 2 * np.asarray(rgb, dtype=np.float64) / 255 - 1
-    axes = [np.asarray(np.polynomial.legendre.legvander(unit[:, axis], degree), dtype=np.float64) for axis in (0, 1, 2)]
-    return np.stack([axes[0][:, i] * axes[1][:, j] * axes[2][:, k] for i, j, k in _powers(degree)], axis=-1)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from calibration.colours import code_polynomial
 from calibration.fitting import least_squares, product
 
 DEGREE = 4
@@ -99,7 +100,7 @@ class Expectation:
 
     def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, level: _Array, usable: _Mask) -> None:
         self.cells = slice(None, None, max(1, len(cells_mm) // CELLS))
-        terms = _terms(np.asarray(rgb)[self.cells], DEGREE if len(cells_mm) >= 200 else 1)
+        terms = code_polynomial(np.asarray(rgb)[self.cells], DEGREE if len(cells_mm) >= 200 else 1)
         self._usable = usable[self.cells]
         self._channels = [_Channel.of(terms, level[self.cells, channel], self._usable) for channel in range(3)]
         self._block, self._middles = _blocks(cells_mm[self.cells])
@@ -156,17 +157,6 @@ class Expectation:
         worst = full[int(np.argmax(off))]
         x, y = self._middles[worst].tolist()
         return Likeness(scatter, max(float(off.max()), 0.0), (x, y))
-
-
-def _terms(rgb: npt.ArrayLike, degree: int) -> _Array:
-    """Return the polynomials (C, terms) of printed codes (C, 3): products of Legendre's, of total degree `degree`."""
-    unit = 2 * np.asarray(rgb, dtype=np.float64) / 255 - 1
-    axes = [np.asarray(np.polynomial.legendre.legvander(unit[:, axis], degree), dtype=np.float64) for axis in range(3)]
-    powers = [(i, j, k) for i in range(degree + 1) for j in range(degree + 1 - i) for k in range(degree + 1 - i - j)]
-    terms = np.empty((len(unit), len(powers)))
-    for number, (i, j, k) in enumerate(powers):
-        terms[:, number] = axes[0][:, i] * axes[1][:, j] * axes[2][:, k]
-    return terms
 
 
 def _blocks(cells_mm: _Array) -> tuple[npt.NDArray[np.int64], _Array]:

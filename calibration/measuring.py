@@ -11,7 +11,7 @@ Laws that hold inside:
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -90,7 +90,7 @@ class FrameFigures:
         return {
             "black": self.black.tolist(),
             "channel": self.channel,
-            "shift": [self.shift.dx, self.shift.dy, self.shift.largest_px, self.shift.tags],
+            "shift": list(astuple(self.shift)),
             "registered": self.registered,
             "field": [[factor.tolist() for factor in factors] for factors in self.paper.field.coefficients],
             "white": self.paper.white.tolist(),
@@ -234,7 +234,7 @@ class Measurement:
     corners
         As in `calibration.registration.register`, of the first frame; near enough for others.
     primaries
-        The lights of red, green and blue alone, and their frames; they are gone through once.
+        The frames of red, green and blue alone, as `calibration.frames.pure_frames` has them; gone through once.
 
     Attributes
     ----------
@@ -248,7 +248,7 @@ class Measurement:
         first: Decoded,
         window: int = WINDOW,
         corners: npt.ArrayLike | None = None,
-        primaries: tuple[tuple[int, int, int], Iterable[Decoded]] | None = None,
+        primaries: Iterable[Decoded] = (),
     ) -> None:
         self._chart, self._window = chart, window
         whites = [reference for reference in chart.references if reference.is_white]
@@ -285,8 +285,7 @@ class Measurement:
         self._first_seen = seen
         self._expected = Expectation(codes, self.cells_mm, level / base.at(self.cells_mm), there)
         self.primaries: Primaries | None = None
-        if primaries is not None:
-            self.primaries = self._read_primaries(*primaries)
+        self.primaries = self._read_primaries(primaries)
 
     def register(self, decoded: Decoded) -> Stretch:
         """Find the chart in a frame, which begins a stretch."""
@@ -297,8 +296,9 @@ class Measurement:
         }
         return Stretch(decoded.record.file, registration, cells, references, planes)
 
-    def _read_primaries(self, lights: tuple[int, int, int], frames: Iterable[Decoded]) -> Primaries | None:
+    def _read_primaries(self, frames: Iterable[Decoded]) -> Primaries | None:
         """Return what the primaries' own frames say, wherever the chart lay in them; None if it is not found in one."""
+        lights: list[int] = []
         papers: list[Paper] = []
         cells: list[_Array] = []
         for decoded in frames:
@@ -308,9 +308,12 @@ class Measurement:
                     measured = self.measure_first(decoded, self.register(decoded), measured, even=False)
                 except RegistrationError:
                     return None
+            light = decoded.record.illumination
+            assert light is not None
+            lights.append(light)
             papers.append(measured.figures.paper)
             cells.append(patch_means(measured.values))
-        return Primaries.of(lights, papers, cells, self.cells_mm)
+        return Primaries.of(lights, papers, cells, self.cells_mm) if lights else None
 
     def _sites(self, registration: Registration) -> tuple[Sites, Sites]:
         """Return the sites of the cells and of the references."""

@@ -69,7 +69,7 @@ class Primaries:
 
     @staticmethod
     def of(
-        lights: tuple[int, int, int], papers: Sequence[Paper], cells: Sequence[_Array], cells_mm: _Array
+        lights: Sequence[int], papers: Sequence[Paper], cells: Sequence[_Array], cells_mm: _Array
     ) -> Primaries | None:
         """Return the primaries, None where one is too dim to tell.
 
@@ -92,7 +92,10 @@ class Primaries:
             _for_all_channels(paper.field, int(channel)) for paper, channel in zip(papers, best, strict=True)
         )
         at_cells = np.array([shape.at(cells_mm)[:, 0] for shape in (red, green, blue)])
-        return Primaries(lights, (red, green, blue), np.maximum(white, 0), at_cells, np.maximum(np.array(cells), 0))
+        one, two, three = lights
+        return Primaries(
+            (one, two, three), (red, green, blue), np.maximum(white, 0), at_cells, np.maximum(np.array(cells), 0)
+        )
 
     def amounts(self, white: _Array) -> _Array:
         """Return how much of each primary (3,) a light is made of, given its paper (3,) in counts; ≥ 0."""
