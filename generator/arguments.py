@@ -130,9 +130,9 @@ def readable(samples: Samples) -> Samples:
 
 
 def writable(target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
-    """Return `target` if the pixels of its rows lie in one piece, else an array of its shape to be `delivered`."""
+    """Return `target` if its rows are pieces at even addresses, else an array of its shape to be `delivered`."""
     piece = (6, 2) if target.ndim == 3 else (2,)
-    return target if target.strides[1:] == piece else np.empty(target.shape, target.dtype)
+    return target if target.strides[1:] == piece and target.flags.aligned else np.empty(target.shape, target.dtype)
 
 
 def delivered(work: npt.NDArray[np.uint16], target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:

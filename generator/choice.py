@@ -29,12 +29,14 @@ from numba import uint32, uint64
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES
 from generator.vector import GROUP, LANES, choose, copy1
 
-AHEAD: Final = 2
+AHEAD: Final = 4
 """Groups of pixels whose offsets are chosen before the first one's samples are fetched."""
 OFFSETS: Final = 4 * GROUP
 """Bytes of a group's offsets."""
-SCRATCH: Final = 64 + 4 * OFFSETS
-"""Bytes of scratch memory a thread needs: a row's last pixels, and four groups' offsets."""
+SOON: Final = 2048
+"""Bytes of a picture that are asked for before they are read."""
+SCRATCH: Final = 64 + 8 * OFFSETS
+"""Bytes of scratch memory a thread needs: a row's last pixels, and eight groups' offsets."""
 
 _P0: Final = np.uint64(MULTIPLIERS[0])
 _P1: Final = np.uint64(MULTIPLIERS[1])
@@ -70,7 +72,7 @@ def row_keys(y: Any, place: Any, image: Any, seed: Any) -> Any:
 @numba.njit(inline="always")
 def slot(scratch: int, group: int) -> int:
     """Return where in a thread's scratch memory the offsets of `group` stand until they are used."""
-    return scratch + 64 + OFFSETS * (group & 3)
+    return scratch + 64 + OFFSETS * (group & 7)
 
 
 @numba.njit(inline="always")

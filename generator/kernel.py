@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
+import numba
 import numpy as np
 import numpy.typing as npt
 from numba import uint32
@@ -31,10 +32,24 @@ from generator.arguments import (
     share,
     writable,
 )
-from generator.choice import AHEAD, SCRATCH, choose_group, row_keys, slot
+from generator.choice import AHEAD, SCRATCH, SOON, choose_group, row_keys, slot
 from generator.compiled import compiled
 from generator.palette import fit_picture
-from generator.vector import GROUP, LANES, SAMPLE_BYTES, choose, copy2, copy6, copy8, offset_at
+from generator.vector import (
+    GROUP,
+    LANES,
+    LINE,
+    SAMPLE_BYTES,
+    choose,
+    copy2,
+    copy6,
+    copy8,
+    copy_line,
+    offset_at,
+    prefetch_once,
+    settle,
+    stream_line,
+)
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
@@ -42,8 +57,44 @@ if TYPE_CHECKING:
 _WHOLE_LIGHT: Final = 1 << 20
 """Pixels from which reading a light's samples in one go is cheaper than touching their pages at random."""
 
+STREAMED_BYTES: Final = 24 << 20
+"""Bytes of an image from which it passes by the caches, which could not keep it, and leaves them to the table."""
+_STRETCH: Final = 32
+"""Groups of pixels that are put together before they are streamed."""
+_LINES: Final = SAMPLE_BYTES * GROUP * _STRETCH + 3 * LINE
+"""Bytes of scratch memory for a stretch that begins anywhere in a line, and a line behind it."""
+
 PATTERNS: Final = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
 """The channel of each site of a 2x2 Bayer block, in reading order."""
+
+
+@numba.njit(inline="always")
+def _fetch_group(samples: int, offsets: int, pixels: int, target: int) -> None:
+    """Write the samples of a group's first pixels and not a byte more."""
+    for i in range(pixels):
+        copy6(samples + offset_at(offsets + 4 * i), target + SAMPLE_BYTES * i)
+
+
+@numba.njit(inline="always")
+def _pass_on(lines: int, begin: int, stop: int, last: bool) -> int:
+    """Stream what `lines` holds, which is to stand from the line of `begin` up to `stop`.
+
+    Nothing is written before `begin`. Returns the bytes of the last line, which are kept but for the row's `last`.
+    """
+    source, to = lines, begin & -LINE
+    if begin > to:
+        for i in range(begin - to, min(LINE, stop - to), 2):
+            copy2(source + i, to + i)
+        source, to = source + LINE, to + LINE
+    while to + LINE <= stop:
+        stream_line(source, to)
+        source, to = source + LINE, to + LINE
+    if last:
+        for i in range(0, stop - to, 2):
+            copy2(source + i, to + i)
+    else:
+        copy_line(source, lines)
+    return stop - to
 
 
 @compiled
@@ -60,34 +111,51 @@ def _gather(
     first_row: int,
     target: int,
     target_pitch: int,
+    streamed: bool,
     scratch: int,
 ) -> None:
     """Fill rows of 3-channel pixels; numbers are addresses, and bytes from row to row.
 
-    Offsets are chosen two groups ahead of the samples they lead to, so that the processor multiplies while it waits.
+    Offsets are chosen some groups ahead of the samples they lead to, so that the processor multiplies while it waits.
+    Picture and image leave the caches to the samples: the one is asked for as what is read once, the other, if
+    `streamed`, put together in scratch memory and written a line at a time.
     """
     groups, whole = (width + GROUP - 1) // GROUP, width // GROUP
+    lines = (scratch + SCRATCH + LINE - 1) & -LINE
     for y in range(rows):
         keys = row_keys(first_row + y, 0, image, seed)
         row, to = picture + y * pitch, target + y * target_pitch
-        group = 0
-        while group < groups + AHEAD:
-            while AHEAD <= group < whole:
-                source, word = row + 3 * GROUP * group, uint32(LANES * group)
-                choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, group))
-                offsets, begin = slot(scratch, group - AHEAD), to + SAMPLE_BYTES * GROUP * (group - AHEAD)
-                # Each copy's last two bytes are the next one's first two.
-                for i in range(GROUP):
-                    copy8(samples + offset_at(offsets + 4 * i), begin + SAMPLE_BYTES * i)
-                group += 1
-            # The first groups of a row have none to fetch yet, the last ones none to choose or fewer pixels.
-            if group < groups:
-                choose_group(row, width, group, keys, count, bits, scratch, slot(scratch, group))
-            done = group - AHEAD
-            if done >= 0:
-                for i in range(min(GROUP, width - GROUP * done)):
-                    copy6(samples + offset_at(slot(scratch, done) + 4 * i), to + SAMPLE_BYTES * (GROUP * done + i))
-            group += 1
+        begin, held = to, to & (LINE - 1)
+        for group in range(min(AHEAD, groups)):
+            choose_group(row, width, group, keys, count, bits, scratch, slot(scratch, group))
+        done = 0
+        while done < groups:
+            end, into = groups, to
+            if streamed:
+                end, into = min(done + _STRETCH, groups), lines + held - SAMPLE_BYTES * GROUP * done
+            while done < end:
+                while done < min(end, whole - AHEAD):
+                    source, word = row + 3 * GROUP * (done + AHEAD), uint32(LANES * (done + AHEAD))
+                    prefetch_once(source + SOON)
+                    choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, done + AHEAD))
+                    offsets, at = slot(scratch, done), into + SAMPLE_BYTES * GROUP * done
+                    # Each copy's last two bytes are the next one's first two.
+                    for i in range(GROUP):
+                        copy8(samples + offset_at(offsets + 4 * i), at + SAMPLE_BYTES * i)
+                    done += 1
+                # The last groups of a row have none to choose ahead, or fewer pixels.
+                if done < end:
+                    if done + AHEAD < groups:
+                        choose_group(row, width, done + AHEAD, keys, count, bits, scratch, slot(scratch, done + AHEAD))
+                    pixels = min(GROUP, width - GROUP * done)
+                    _fetch_group(samples, slot(scratch, done), pixels, into + SAMPLE_BYTES * GROUP * done)
+                    done += 1
+            if streamed:
+                stop = to + SAMPLE_BYTES * min(GROUP * end, width)
+                held = _pass_on(lines, begin, stop, end == groups)
+                begin = stop - held
+    if streamed:
+        settle()
 
 
 @compiled
@@ -118,6 +186,7 @@ def _gather_mosaic(
         while group < groups + AHEAD:
             while AHEAD <= group < whole:
                 source, word = row + 3 * GROUP * group, uint32(LANES * group)
+                prefetch_once(source + SOON)
                 choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, group))
                 offsets, begin = slot(scratch, group - AHEAD), to + 2 * GROUP * (group - AHEAD)
                 for i in range(0, GROUP, 2):
@@ -180,7 +249,7 @@ def draw_samples(
     source, table, work = packed(picture), readable(samples), writable(target)
 
     def fill(top: int, bottom: int) -> None:
-        scratch = np.empty(SCRATCH, np.uint8)
+        scratch = np.empty(SCRATCH + _LINES, np.uint8)
         _gather(
             source[top:].ctypes.data,
             source.strides[0],
@@ -194,6 +263,7 @@ def draw_samples(
             first_row + top,
             work[top:].ctypes.data,
             work.strides[0],
+            work.nbytes >= STREAMED_BYTES,
             scratch.ctypes.data,
         )
 

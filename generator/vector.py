@@ -21,11 +21,14 @@ LANES: Final = 8
 GROUP: Final = 2 * LANES
 """Pixels that share a vector of words; `choice.py`."""
 SAMPLE_BYTES: Final = 6
+LINE: Final = 64
+"""Bytes that memory gives and takes at once."""
 
 I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 F32 = ir.FloatType()
 FLOATS = ir.VectorType(F32, LANES)
 WORDS = ir.VectorType(I32, LANES)
+_LINE = ir.VectorType(I32, LINE // 4)
 _PAIRS = ir.VectorType(I64, LANES // 2)
 ADDRESS = types.int64
 _MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
@@ -236,6 +239,41 @@ def copy2(typing: Any, source: Any, target: Any) -> Any:
 
 
 @intrinsic
+def copy_line(typing: Any, source: Any, target: Any) -> Any:
+    """Copy a line's bytes."""
+    del typing, source, target
+
+    def emit(builder: Builder, source: Value, target: Value) -> None:
+        store(builder, load(builder, source, 0, _LINE), target, 0)
+
+    return void(emit, ADDRESS, ADDRESS)
+
+
+@intrinsic
+def stream_line(typing: Any, source: Any, target: Any) -> Any:
+    """Copy a line's bytes past the caches to `target`, a multiple of `LINE`; others see them after `settle`."""
+    del typing, source, target
+
+    def emit(builder: Builder, source: Value, target: Value) -> None:
+        written = builder.store(load(builder, source, 0, _LINE), at(builder, target, 0, _LINE))
+        written.align = LINE
+        written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(I32, 1)]))
+
+    return void(emit, ADDRESS, ADDRESS)
+
+
+@intrinsic
+def settle(typing: Any) -> Any:
+    """Wait until what was streamed can be seen by all."""
+    del typing
+
+    def emit(builder: Builder) -> None:
+        builder.fence("seq_cst")
+
+    return void(emit)
+
+
+@intrinsic
 def copy1(typing: Any, source: Any, target: Any) -> Any:
     """Copy one byte."""
     del typing, source, target
@@ -314,16 +352,28 @@ def plane1(typing: Any, source: Any, scale: Any, target: Any) -> Any:
     return void(emit, ADDRESS, types.float32, ADDRESS)
 
 
-@intrinsic
-def prefetch(typing: Any, address: Any) -> Any:
-    """Ask for the memory at `address` to be at hand soon."""
-    del typing, address
+def _asking(locality: int) -> Callable[..., None]:
+    """Return what emits the asking for memory that is to be kept near (3) or not at all (0)."""
 
     def emit(builder: Builder, address: Value) -> None:
         pointer = I8.as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [pointer, I32, I32, I32])
         function = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
-        numbers = [ir.Constant(I32, number) for number in (0, 3, 1)]  # to read, keep close, data
+        numbers = [ir.Constant(I32, number) for number in (0, locality, 1)]  # to read, how near, data
         builder.call(function, [at(builder, address, 0, I8), *numbers])
 
-    return void(emit, ADDRESS)
+    return emit
+
+
+@intrinsic
+def prefetch(typing: Any, address: Any) -> Any:
+    """Ask for the memory at `address` to be at hand soon; nothing happens where there is none."""
+    del typing, address
+    return void(_asking(3), ADDRESS)
+
+
+@intrinsic
+def prefetch_once(typing: Any, address: Any) -> Any:
+    """Do `prefetch` for what is read once, so that it takes no place in the larger caches."""
+    del typing, address
+    return void(_asking(0), ADDRESS)

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import InputError
+from generator import kernel
 from generator.kernel import PATTERNS, draw_mosaic, draw_samples, render
 from generator.palette import bits_of
 
@@ -90,6 +91,25 @@ def test_bands_threads_memory_order_and_a_given_target_change_nothing(
     target = np.zeros((37, 2 * 1053, 3), np.uint16)[:, ::2]
     assert draw_samples(samples, fortran, seed=4, image=2, out=target) is target
     np.testing.assert_array_equal(target, whole)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.one_of(st.integers(1, 40), st.integers(480, 1100)), st.integers(1, 4), st.integers(0, 100), st.booleans())
+def test_an_image_too_large_for_the_caches_is_the_same_and_nothing_beside_it_is_written(
+    width: int, height: int, margin: int, odd: bool
+) -> None:
+    rng = np.random.default_rng(width)
+    samples = rng.integers(0, 65536, (512, 25, 3)).astype(np.uint16)
+    picture = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
+    memory = np.full(2 * height * 3 * (width + 2 * margin) + 1, 171, np.uint8)
+    whole = memory[odd : memory.size - (not odd)].view(np.uint16).reshape(height, width + 2 * margin, 3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernel, "STREAMED_BYTES", 0)
+        draw_samples(samples, picture, out=whole[:, margin : margin + width])
+    np.testing.assert_array_equal(whole[:, margin : margin + width], draw_samples(samples, picture))
+    beside = np.concatenate([whole[:, :margin], whole[:, margin + width :]], axis=1)
+    np.testing.assert_array_equal(beside, np.full_like(beside, 171 << 8 | 171))
+    assert memory[-1 if not odd else 0] == 171
 
 
 def choices(seed: int, image: int, height: int, width: int) -> npt.NDArray[np.uint16]:
