@@ -31,13 +31,13 @@ import skimage.data
 
 from calibration.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
-from generator.choice import SCRATCH, SOON, choose_group, row_keys
+from generator.choice import SCRATCH, choose_group, row_keys
 from generator.compiled import compiled
 from generator.kernel import draw_mosaic, draw_samples
 from generator.masks import parse_masks
 from generator.mixing import mix_samples
 from generator.planar import draw_planar
-from generator.vector import GROUP, copy8, offset_at, prefetch_once
+from generator.vector import GROUP, LINE, copy8, offset_at, prefetch_once
 
 SAMPLES = 25
 REPEATS = 7
@@ -125,7 +125,8 @@ def _choose_all(picture: int, width: int, height: int, count: Any, bits: Any, ta
 @compiled
 def _fetch(samples: int, places: int, count: int, target: int) -> None:
     for i in range(0, count, GROUP):
-        prefetch_once(places + 4 * i + SOON)
+        prefetch_once(places + 4 * i + 2048)
+        prefetch_once(places + 4 * i + 2048 + LINE)
         for k in range(GROUP):
             copy8(samples + offset_at(places + 4 * (i + k)), target + 8 * k)
 

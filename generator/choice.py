@@ -27,16 +27,18 @@ import numpy as np
 from numba import uint32, uint64
 
 from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES
-from generator.vector import GROUP, LANES, choose, copy1
+from generator.vector import GROUP, LANES, LINE, choose, copy1, prefetch_once
 
-AHEAD: Final = 4
+AHEAD: Final = 2
 """Groups of pixels whose offsets are chosen before the first one's samples are fetched."""
 OFFSETS: Final = 4 * GROUP
 """Bytes of a group's offsets."""
-SOON: Final = 2048
+_SOON: Final = 2048
 """Bytes of a picture that are asked for before they are read."""
-SCRATCH: Final = 64 + 8 * OFFSETS
-"""Bytes of scratch memory a thread needs: a row's last pixels, and eight groups' offsets."""
+EDGE: Final = 128
+"""Bytes of scratch memory for the last pixels of a row."""
+SCRATCH: Final = EDGE + 4 * OFFSETS
+"""Bytes of scratch memory a thread needs: a row's last pixels, and four groups' offsets."""
 
 _P0: Final = np.uint64(MULTIPLIERS[0])
 _P1: Final = np.uint64(MULTIPLIERS[1])
@@ -72,12 +74,12 @@ def row_keys(y: Any, place: Any, image: Any, seed: Any) -> Any:
 @numba.njit(inline="always")
 def slot(scratch: int, group: int) -> int:
     """Return where in a thread's scratch memory the offsets of `group` stand until they are used."""
-    return scratch + 64 + OFFSETS * (group & 7)
+    return scratch + EDGE + OFFSETS * (group & 3)
 
 
 @numba.njit(inline="always")
 def group_of(row: int, width: int, group: int, scratch: int) -> int:
-    """Return where the pixels from x = 16 `group` on can be read; `row` is the address of a row's first pixel.
+    """Return where the pixels from x = 32 `group` on can be read; `row` is the address of a row's first pixel.
 
     Of a group that reaches beyond the row only the pixels in the row are copied to scratch memory.
     """
@@ -90,7 +92,15 @@ def group_of(row: int, width: int, group: int, scratch: int) -> int:
 
 
 @numba.njit(inline="always")
+def ask_group(row: int, group: int) -> None:
+    """Ask for pixels that will be read soon: the lines of one group, in turn for every group."""
+    soon = row + 3 * GROUP * group + _SOON
+    prefetch_once(soon)
+    prefetch_once(soon + LINE)
+
+
+@numba.njit(inline="always")
 def choose_group(row: int, width: int, group: int, keys: Any, count: Any, bits: Any, scratch: int, target: int) -> None:
-    """Write the offsets of a row's pixels from x = 16 `group` on."""
+    """Write the offsets of a row's pixels from x = 32 `group` on."""
     source = group_of(row, width, group, scratch)
     choose(source, uint32(LANES * group), keys[0], keys[1], keys[2], count, bits, target)

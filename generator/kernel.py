@@ -21,6 +21,7 @@ import numpy.typing as npt
 from numba import uint32
 
 from drivers.errors import InputError
+from generator import streaming
 from generator.arguments import (
     check_picture,
     check_place,
@@ -32,9 +33,10 @@ from generator.arguments import (
     share,
     writable,
 )
-from generator.choice import AHEAD, SCRATCH, SOON, choose_group, row_keys, slot
+from generator.choice import AHEAD, SCRATCH, ask_group, choose_group, row_keys, slot
 from generator.compiled import compiled
 from generator.palette import fit_picture
+from generator.streaming import line_at, line_room, pass_on
 from generator.vector import (
     GROUP,
     LANES,
@@ -44,11 +46,8 @@ from generator.vector import (
     copy2,
     copy6,
     copy8,
-    copy_line,
     offset_at,
-    prefetch_once,
     settle,
-    stream_line,
 )
 
 if TYPE_CHECKING:
@@ -57,13 +56,8 @@ if TYPE_CHECKING:
 _WHOLE_LIGHT: Final = 1 << 20
 """Pixels from which reading a light's samples in one go is cheaper than touching their pages at random."""
 
-STREAMED_BYTES: Final = 24 << 20
-"""Bytes of an image from which it passes by the caches, which could not keep it, and leaves them to the table."""
-_STRETCH: Final = 32
+_STRETCH: Final = 16
 """Groups of pixels that are put together before they are streamed."""
-_LINES: Final = SAMPLE_BYTES * GROUP * _STRETCH + 3 * LINE
-"""Bytes of scratch memory for a stretch that begins anywhere in a line, and a line behind it."""
-
 PATTERNS: Final = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
 """The channel of each site of a 2x2 Bayer block, in reading order."""
 
@@ -73,28 +67,6 @@ def _fetch_group(samples: int, offsets: int, pixels: int, target: int) -> None:
     """Write the samples of a group's first pixels and not a byte more."""
     for i in range(pixels):
         copy6(samples + offset_at(offsets + 4 * i), target + SAMPLE_BYTES * i)
-
-
-@numba.njit(inline="always")
-def _pass_on(lines: int, begin: int, stop: int, last: bool) -> int:
-    """Stream what `lines` holds, which is to stand from the line of `begin` up to `stop`.
-
-    Nothing is written before `begin`. Returns the bytes of the last line, which are kept but for the row's `last`.
-    """
-    source, to = lines, begin & -LINE
-    if begin > to:
-        for i in range(begin - to, min(LINE, stop - to), 2):
-            copy2(source + i, to + i)
-        source, to = source + LINE, to + LINE
-    while to + LINE <= stop:
-        stream_line(source, to)
-        source, to = source + LINE, to + LINE
-    if last:
-        for i in range(0, stop - to, 2):
-            copy2(source + i, to + i)
-    else:
-        copy_line(source, lines)
-    return stop - to
 
 
 @compiled
@@ -121,7 +93,7 @@ def _gather(
     `streamed`, put together in scratch memory and written a line at a time.
     """
     groups, whole = (width + GROUP - 1) // GROUP, width // GROUP
-    lines = (scratch + SCRATCH + LINE - 1) & -LINE
+    lines = line_at(scratch + SCRATCH)
     for y in range(rows):
         keys = row_keys(first_row + y, 0, image, seed)
         row, to = picture + y * pitch, target + y * target_pitch
@@ -136,7 +108,7 @@ def _gather(
             while done < end:
                 while done < min(end, whole - AHEAD):
                     source, word = row + 3 * GROUP * (done + AHEAD), uint32(LANES * (done + AHEAD))
-                    prefetch_once(source + SOON)
+                    ask_group(row, done + AHEAD)
                     choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, done + AHEAD))
                     offsets, at = slot(scratch, done), into + SAMPLE_BYTES * GROUP * done
                     # Each copy's last two bytes are the next one's first two.
@@ -152,7 +124,7 @@ def _gather(
                     done += 1
             if streamed:
                 stop = to + SAMPLE_BYTES * min(GROUP * end, width)
-                held = _pass_on(lines, begin, stop, end == groups)
+                held = pass_on(lines, begin, stop, end == groups)
                 begin = stop - held
     if streamed:
         settle()
@@ -186,7 +158,7 @@ def _gather_mosaic(
         while group < groups + AHEAD:
             while AHEAD <= group < whole:
                 source, word = row + 3 * GROUP * group, uint32(LANES * group)
-                prefetch_once(source + SOON)
+                ask_group(row, group)
                 choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, group))
                 offsets, begin = slot(scratch, group - AHEAD), to + 2 * GROUP * (group - AHEAD)
                 for i in range(0, GROUP, 2):
@@ -249,7 +221,7 @@ def draw_samples(
     source, table, work = packed(picture), readable(samples), writable(target)
 
     def fill(top: int, bottom: int) -> None:
-        scratch = np.empty(SCRATCH + _LINES, np.uint8)
+        scratch = np.empty(SCRATCH + line_room(SAMPLE_BYTES * GROUP * _STRETCH), np.uint8)
         _gather(
             source[top:].ctypes.data,
             source.strides[0],
@@ -263,7 +235,7 @@ def draw_samples(
             first_row + top,
             work[top:].ctypes.data,
             work.strides[0],
-            work.nbytes >= STREAMED_BYTES,
+            work.nbytes >= streaming.STREAMED_BYTES,
             scratch.ctypes.data,
         )
 

@@ -26,7 +26,7 @@ import numpy.typing as npt
 from numba import uint32
 
 from drivers.errors import InputError
-from generator import philox
+from generator import philox, streaming
 from generator.arguments import (
     Picture,
     Samples,
@@ -39,21 +39,48 @@ from generator.arguments import (
     readable,
     share,
 )
-from generator.choice import OFFSETS, four_words, group_of, row_keys
+from generator.choice import EDGE, OFFSETS, ask_group, four_words, group_of, row_keys
 from generator.compiled import compiled
 from generator.palette import bits_of
-from generator.vector import GROUP, LANES, SAMPLE_BYTES, choose_named, copy6, name_colours, offset_at
-from generator.vector_mixing import MEAN_BYTES, PLAN, copy_least, full8, line_up8, mean4, mix, part8
+from generator.streaming import line_at, line_room, pass_on
+from generator.vector import (
+    GROUP,
+    LANES,
+    LINE,
+    SAMPLE_BYTES,
+    choose_named,
+    copy6,
+    name_colours,
+    offset_at,
+    prefetch_once,
+    settle,
+)
+from generator.vector_mixing import (
+    BLOCK,
+    FAULTS,
+    FIRST,
+    MEAN_BYTES,
+    PLAN,
+    SECOND,
+    copy_least,
+    full8,
+    line_up8,
+    mean4,
+    mix,
+    part8,
+)
 
 MIXTURES: Final = np.uint32(philox.MIXTURES)
 STRETCH: Final = 512
 """Pixels of a row whose offsets are chosen before their samples are fetched, a whole number of groups."""
-FAULTS: Final = 4 * LANES
-"""Bytes that tell faulty weights."""
+_SOON: Final = 4096
+"""Bytes of the weights that are asked for before they are read."""
 ROOM: Final = OFFSETS * (STRETCH // GROUP + 1)
 """Bytes of a stretch's offsets or weights; the last one of a row may be longer by up to seven pixels."""
 PAIR_ROOM: Final = 4 * ROOM
 """Bytes of a stretch's weights and offsets of two lights."""
+_LINES: Final = line_room(SAMPLE_BYTES * (STRETCH + BLOCK))
+"""Bytes of a stretch that is put together before it is streamed."""
 
 
 @compiled
@@ -108,8 +135,8 @@ def _fill_means(samples: int, colours: int, count: int, means: int, step: int) -
 def _all_full(line: int, light: int, pixels: int) -> bool:
     """Return whether all weights of a pair's light in a stretch are 1."""
     full = True
-    for block in range((pixels + LANES - 1) // LANES):
-        full &= full8(line + 8 * LANES * block, light)
+    for block in range((pixels + BLOCK - 1) // BLOCK):
+        full &= full8(line + 8 * BLOCK * block, light)
     return full
 
 
@@ -137,6 +164,7 @@ def _mix_pixels(
     keys: Any,
     lit: Any,
     nothing: int,
+    streamed: bool,
 ) -> None:
     """Fill rows of at least eight pixels. `weight_steps` are the bytes from row to row, pixel to pixel, light to light.
 
@@ -147,22 +175,26 @@ def _mix_pixels(
     """
     lights = len(tables)
     pairs = (lights + 1) // 2
-    faults = scratch + 64
+    faults = scratch + EDGE
     mean_places = faults + FAULTS
     colours = mean_places + ROOM
     lines = colours + ROOM
+    held_lines = line_at(lines + PAIR_ROOM * pairs)
     alternating = lights == 2 and weight_steps[1] == 8 and weight_steps[2] == 4
     alike = weight_steps[0] == 0 and weight_steps[1] == 0
     for y in range(rows):
         row, start = picture + y * pitch, 0
+        begin = target + y * target_pitch
+        held = begin & (LINE - 1)
         for light in range(lights):
             keys[light, 0], keys[light, 1], keys[light, 2] = row_keys(first_row + y, light, image, seed)
         while start < width:
             # What is left after a stretch must not be fewer than eight pixels.
-            end = width if width - start < STRETCH + LANES else start + STRETCH
+            end = width if width - start < STRETCH + BLOCK else start + STRETCH
             low, high = start // GROUP, (end + GROUP - 1) // GROUP
             for group in range(low, high):
                 place = OFFSETS * (group - low)
+                ask_group(row, group)
                 source = group_of(row, width, group, scratch)
                 name_colours(
                     source,
@@ -176,25 +208,26 @@ def _mix_pixels(
             for pair in range(pairs):
                 line, light = lines + PAIR_ROOM * pair, 2 * pair
                 if not alike or (y == 0 and start == 0):
-                    lit[pair] = 0
-                    blocks = STRETCH // LANES + 1 if alike else (end - start + LANES - 1) // LANES
+                    blocks = STRETCH // BLOCK + 1 if alike else (end - start + BLOCK - 1) // BLOCK
+                    first, step = weights + y * weight_steps[0] + light * weight_steps[2], weight_steps[1]
+                    found = 0
                     for block in range(blocks):
-                        x = min(start + LANES * block, end - LANES)
-                        first = weights + y * weight_steps[0] + x * weight_steps[1] + light * weight_steps[2]
-                        at = line + 8 * LANES * block
+                        at = first + step * min(start + BLOCK * block, end - BLOCK)
+                        prefetch_once(at + _SOON)
                         if alternating:
-                            lit[pair] |= part8(first, at)
+                            found |= part8(at, line + 8 * BLOCK * block)
                         elif light + 1 < lights:
-                            second = first + weight_steps[2]
-                            lit[pair] |= line_up8(first, weight_steps[1], second, weight_steps[1], at)
+                            found |= line_up8(at, step, at + weight_steps[2], step, line + 8 * BLOCK * block)
                         else:
                             # A light too few for the pair: its partner never has a weight.
-                            lit[pair] |= line_up8(first, weight_steps[1], nothing, 0, at)
+                            found |= line_up8(at, step, nothing, 0, line + 8 * BLOCK * block)
+                    lit[pair] = found
                 if not lit[pair]:
                     continue
+                shines = (lit[pair] & FIRST != 0) + 2 * (lit[pair] & SECOND != 0)
                 for member in range(2):
                     # In the place of a light without weight stands its partner.
-                    it = member if lit[pair] >> member & 1 else 1 - member
+                    it = member if shines >> member & 1 else 1 - member
                     plan[lit_pairs, 1 + member] = line + ROOM * (2 + it)
                     plan[lit_pairs, 3 + member] = tables[light + it]
                     if it != member:
@@ -207,17 +240,26 @@ def _mix_pixels(
                 plan[lit_pairs, 0], plan[lit_pairs, 5] = line, means + 2 * MEAN_BYTES * pair
                 lit_pairs += 1
             to, line = target + y * target_pitch + SAMPLE_BYTES * start, lines + PAIR_ROOM * (alone // 2)
+            stop = to + SAMPLE_BYTES * (end - start)
+            if streamed:
+                to = held_lines + held
             if shining == 1 and _all_full(line, alone & 1, end - start):
                 offsets = line + ROOM * (2 + (alone & 1))
+                samples = tables[alone]
                 for i in range(end - start - 1):
-                    copy_least(tables[alone] + offset_at(offsets + 4 * i), white, to + SAMPLE_BYTES * i)
+                    copy_least(samples + offset_at(offsets + 4 * i), white, to + SAMPLE_BYTES * i)
                 # Of the last pixel not more than its own bytes are written.
                 i = end - start - 1
-                copy_least(tables[alone] + offset_at(offsets + 4 * i), white, scratch)
+                copy_least(samples + offset_at(offsets + 4 * i), white, scratch)
                 copy6(scratch, to + SAMPLE_BYTES * i)
             else:
                 mix(plan_at, lit_pairs, end - start, mean_places, faults, np.float32(white), to)
+            if streamed:
+                held = pass_on(held_lines, begin, stop, end == width)
+                begin = stop - held
             start = end
+    if streamed:
+        settle()
 
 
 def _checked_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float64]:
@@ -335,11 +377,11 @@ def mix_samples(
     if each.shape not in (shape, shape[2:]):
         raise InputError(f"the weights are {each.shape}, expected {shape} or {shape[2:]}")
     source, each = packed(picture), np.broadcast_to(each, shape)
-    if picture.shape[1] < LANES:
-        source = np.pad(source, ((0, 0), (0, LANES), (0, 0)))
-        each = np.pad(each, ((0, 0), (0, LANES), (0, 0)))
+    if picture.shape[1] < BLOCK:
+        source = np.pad(source, ((0, 0), (0, BLOCK), (0, 0)))
+        each = np.pad(each, ((0, 0), (0, BLOCK), (0, 0)))
     work = target
-    if source.shape != picture.shape or target.strides[1:] != (6, 2):
+    if source.shape != picture.shape or target.strides[1:] != (6, 2) or not target.flags.aligned:
         work = np.empty(source.shape, np.uint16)
     pieces = [readable(samples) for samples in lights]
     addresses = np.array([piece.ctypes.data for piece in pieces])
@@ -354,7 +396,7 @@ def mix_samples(
     no_weight = np.zeros(1, np.float32)
 
     def fill(top: int, bottom: int) -> None:
-        scratch = np.zeros(64 + FAULTS + 2 * ROOM + PAIR_ROOM * pairs, np.uint8)
+        scratch = np.zeros(EDGE + FAULTS + 2 * ROOM + PAIR_ROOM * pairs + _LINES, np.uint8)
         plan = np.zeros((pairs, PLAN), np.int64)
         _mix_pixels(
             source[top:].ctypes.data,
@@ -379,8 +421,9 @@ def mix_samples(
             np.zeros((len(lights), 3), np.uint32),
             np.zeros(pairs, np.int64),
             no_weight.ctypes.data,
+            work.nbytes >= streaming.STREAMED_BYTES,
         )
-        faults.append(bool(np.isnan(scratch[64 : 64 + FAULTS].view(np.float32)).any()))
+        faults.append(bool(np.isnan(scratch[EDGE : EDGE + FAULTS].view(np.float32)).any()))
 
     share(fill, len(picture), threads)
     if any(faults):

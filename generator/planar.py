@@ -27,9 +27,9 @@ from generator.arguments import (
     readable,
     share,
 )
-from generator.choice import OFFSETS, choose_group, row_keys
+from generator.choice import EDGE, OFFSETS, choose_group, row_keys
 from generator.compiled import compiled
-from generator.vector import GROUP, LANES, mirrored8, offset_at, plane1, planes8, prefetch
+from generator.vector import EIGHT, GROUP, mirrored8, offset_at, plane1, planes8, prefetch
 
 Window = tuple[int, int, int, int]
 
@@ -66,7 +66,7 @@ def _crop(
         for y in range(height + 1):
             if y < height:
                 keys = row_keys(y0 + y, 0, image, seeds[item])
-                chosen = scratch + 64 + row_bytes * (y & 1)
+                chosen = scratch + EDGE + row_bytes * (y & 1)
                 for group in range(low, high + 1):
                     to = chosen + OFFSETS * (group - low)
                     choose_group(picture + y * pitch, picture_width, group, keys, count, bits, scratch, to)
@@ -74,21 +74,21 @@ def _crop(
                         prefetch(samples + offset_at(to + 4 * i))
             if y == 0:
                 continue
-            offsets = scratch + 64 + row_bytes * ((y - 1) & 1) + 4 * (x0 - GROUP * low)
+            offsets = scratch + EDGE + row_bytes * ((y - 1) & 1) + 4 * (x0 - GROUP * low)
             if flip:
                 offsets += 4 * (width - 1)
             red = target + item * pitches[0] + (y - 1) * pitches[2]
             green, blue = red + pitches[1], red + 2 * pitches[1]
-            if width < LANES:
+            if width < EIGHT:
                 for x in range(width):
                     sample = samples + offset_at(offsets - 4 * x if flip else offsets + 4 * x)
                     plane1(sample, scale, red + 4 * x)
                     plane1(sample + 2, scale, green + 4 * x)
                     plane1(sample + 4, scale, blue + 4 * x)
             else:
-                for start in range(0, width, LANES):
+                for start in range(0, width, EIGHT):
                     # The last eight may be some of the ones before again.
-                    x = min(start, width - LANES)
+                    x = min(start, width - EIGHT)
                     if flip:
                         mirrored8(samples, offsets - 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
                     else:
@@ -268,7 +268,7 @@ def draw_batch(
     scales = (gained / white_level).astype(np.float32)
 
     def fill(first: int, end: int) -> None:
-        scratch = np.empty(64 + 2 * OFFSETS * (width // GROUP + 2), np.uint8)
+        scratch = np.empty(EDGE + 2 * OFFSETS * (width // GROUP + 2), np.uint8)
         _crop(
             plan,
             seeded,

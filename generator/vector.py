@@ -1,8 +1,8 @@
-"""Steps of the kernels written in LLVM's own terms: vectors of eight 32-bit numbers, and loads and stores by address.
+"""Steps of the kernels written in LLVM's own terms: vectors of 16 32-bit numbers, and loads and stores by address.
 
-numba compiles loops well, but does not put eight pixels into one vector where bytes must be shuffled, and knows no load
+numba compiles loops well, but does not put many pixels into one vector where bytes must be shuffled, and knows no load
 of eight bytes from any address. These functions can be called from compiled functions only. LLVM makes of them whatever
-the processor has: AVX2, AVX-512 and NEON need no word here.
+the processor has: one vector of AVX-512, two of AVX2, four of NEON. Bytes change places within 16, which all can do.
 
 Addresses are plain integers; whoever calls must keep them inside arrays. What may be read or written beyond is said
 with each function.
@@ -17,9 +17,10 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-LANES: Final = 8
+LANES: Final = 16
 GROUP: Final = 2 * LANES
 """Pixels that share a vector of words; `choice.py`."""
+EIGHT: Final = 8
 SAMPLE_BYTES: Final = 6
 LINE: Final = 64
 """Bytes that memory gives and takes at once."""
@@ -28,8 +29,9 @@ I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 F32 = ir.FloatType()
 FLOATS = ir.VectorType(F32, LANES)
 WORDS = ir.VectorType(I32, LANES)
-_LINE = ir.VectorType(I32, LINE // 4)
 _PAIRS = ir.VectorType(I64, LANES // 2)
+_EIGHT_FLOATS, _EIGHT_WORDS = ir.VectorType(F32, EIGHT), ir.VectorType(I32, EIGHT)
+_LINE = ir.VectorType(I32, LINE // 4)
 ADDRESS = types.int64
 _MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
 
@@ -66,16 +68,26 @@ def store(builder: Builder, value: Value, address: Value, offset: int) -> None:
     builder.store(value, at(builder, address, offset, value.type)).align = 1
 
 
+def joined(builder: Builder, parts: Sequence[Value]) -> Value:
+    """Return one vector of some of a size, a power of two of them."""
+    while len(parts) > 1:
+        lanes = constant(ir.VectorType(I32, 2 * parts[0].type.count), range(2 * parts[0].type.count))
+        parts = [builder.shuffle_vector(*parts[i : i + 2], lanes) for i in range(0, len(parts), 2)]
+    return parts[0]
+
+
 def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
-    """Return the colour indices of the eight pixels (24 bytes) at `picture`."""
-    bytes_ = ir.VectorType(I8, 16)
-    first, second = load(builder, picture, 0, bytes_), load(builder, picture, 8, bytes_)
-    both = builder.shuffle_vector(first, second, constant(ir.VectorType(I32, 32), range(32)))
+    """Return the colour indices of the 16 pixels (48 bytes) at `picture`."""
+    # Four pixels for each 16 bytes of the vector; the last four are loaded so that nothing behind them is.
+    starts = (0, 12, 24, 32)
+    loaded = joined(builder, [load(builder, picture, start, ir.VectorType(I8, 16)) for start in starts])
     lanes: list[int] = []
-    for pixel in range(LANES):
-        start = 3 * pixel if pixel < 4 else 3 * pixel - 8 + 16
-        lanes += [start + 2, start + 1, start, 32]
-    laid = builder.shuffle_vector(both, constant(ir.VectorType(I8, 32), 0), constant(ir.VectorType(I32, 32), lanes))
+    for four, start in enumerate(starts):
+        for pixel in range(4):
+            first = 16 * four + 12 * four - start + 3 * pixel
+            lanes += [first + 2, first + 1, first, 4 * LANES]
+    nothing = constant(loaded.type, 0)
+    laid = builder.shuffle_vector(loaded, nothing, constant(ir.VectorType(I32, 4 * LANES), lanes))
     codes = builder.bitcast(laid, WORDS)  # blue | green << 8 | red << 16
 
     def field(place: int) -> Value:
@@ -87,8 +99,8 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
     return builder.or_(builder.or_(field(0), field(1)), field(2))
 
 
-def _digits(builder: Builder, word: Value, keys: Sequence[Value], count: Value) -> tuple[Value, Value]:
-    """Return the choices of the pixels in the first and second half of a group; the rule is that of `choice.py`."""
+def _digits(builder: Builder, word: Value, keys: Sequence[Value], count: Value) -> tuple[Value, ...]:
+    """Return the choices of the first and the second 16 pixels of a group; the rule is that of `choice.py`."""
     numbers = builder.add(spread(builder, word, WORDS), constant(WORDS, range(LANES)))
     h = builder.xor(numbers, spread(builder, keys[0], WORDS))
     h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
@@ -107,7 +119,14 @@ def _digits(builder: Builder, word: Value, keys: Sequence[Value], count: Value) 
         odd = builder.and_(odd, constant(_PAIRS, 0xFFFFFFFF << 32))
         return builder.bitcast(builder.or_(even, odd), WORDS)
 
-    return upper(h), upper(builder.mul(h, counts))
+    first, second = upper(h), upper(builder.mul(h, counts))
+    # Eight words serve eight pixels by their first digits and the next eight by their second.
+    return tuple(
+        builder.shuffle_vector(
+            first, second, constant(WORDS, [*range(half, half + EIGHT), *range(LANES + half, LANES + half + EIGHT)])
+        )
+        for half in (0, EIGHT)
+    )
 
 
 def void(emit: Callable[..., None], *kinds: Any) -> Any:
@@ -123,9 +142,9 @@ def void(emit: Callable[..., None], *kinds: Any) -> Any:
 
 @intrinsic
 def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, bits: Any, target: Any) -> Any:
-    """Write where in a light's samples the 16 pixels at `picture` find theirs: uint32 offsets in bytes, at `target`.
+    """Write where in a light's samples the 32 pixels at `picture` find theirs: uint32 offsets in bytes, at `target`.
 
-    `word` is the number of the group's first word; reads 48 bytes, writes 64.
+    `word` is the number of the group's first word; reads 96 bytes, writes 128.
     """
     del typing, picture, word, k0, k1, k2, count, bits, target
     number = types.uint32
@@ -155,7 +174,7 @@ def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, coun
 def name_colours(
     typing: Any, picture: Any, bits: Any, stride: Any, target: Any, other_stride: Any, other_target: Any
 ) -> Any:
-    """Write the colours of the 16 pixels at `picture` as uint32: their indices times each stride, at each target."""
+    """Write the colours of the 32 pixels at `picture` as uint32: their indices times each stride, at each target."""
     del typing, picture, bits, stride, target, other_stride, other_target
 
     def emit(
@@ -177,7 +196,7 @@ def name_colours(
 
 @intrinsic
 def choose_named(typing: Any, colours: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, target: Any) -> Any:
-    """Write what `choose` writes for the 16 pixels whose colours stand at `colours`, times the bytes of a colour."""
+    """Write what `choose` writes for the 32 pixels whose colours stand at `colours`, times the bytes of a colour."""
     del typing, colours, word, k0, k1, k2, count, target
     number = types.uint32
 
@@ -300,12 +319,12 @@ def _channels(builder: Builder, samples: Value, offsets: Value, step: int) -> li
     ]
     fours = [builder.shuffle_vector(*pair, constant(ir.VectorType(I32, 4), range(4))) for pair in pairs]
     # Pixels 0, 1, 4, 5 and 2, 3, 6, 7, 32 bits of red and green, 32 of blue and what follows.
-    halves = [builder.shuffle_vector(*fours[i : i + 2], constant(WORDS, range(LANES))) for i in (0, 2)]
-    front = builder.shuffle_vector(*halves, constant(WORDS, (0, 2, 8, 10, 4, 6, 12, 14)))
-    back = builder.shuffle_vector(*halves, constant(WORDS, (1, 3, 9, 11, 5, 7, 13, 15)))
-    low = constant(WORDS, 0xFFFF)
-    numbers = (builder.and_(front, low), builder.lshr(front, constant(WORDS, 16)), builder.and_(back, low))
-    return [builder.sitofp(number, FLOATS) for number in numbers]
+    halves = [builder.shuffle_vector(*fours[i : i + 2], constant(_EIGHT_WORDS, range(EIGHT))) for i in (0, 2)]
+    front = builder.shuffle_vector(*halves, constant(_EIGHT_WORDS, (0, 2, 8, 10, 4, 6, 12, 14)))
+    back = builder.shuffle_vector(*halves, constant(_EIGHT_WORDS, (1, 3, 9, 11, 5, 7, 13, 15)))
+    low = constant(_EIGHT_WORDS, 0xFFFF)
+    numbers = (builder.and_(front, low), builder.lshr(front, constant(_EIGHT_WORDS, 16)), builder.and_(back, low))
+    return [builder.sitofp(number, _EIGHT_FLOATS) for number in numbers]
 
 
 def least(builder: Builder, first: Value, second: Value) -> Value:
@@ -319,7 +338,7 @@ def _planes8(step: int) -> Callable[..., None]:
     def emit(
         builder: Builder, samples: Value, offsets: Value, scale: Value, red: Value, green: Value, blue: Value
     ) -> None:
-        factor, one = spread(builder, scale, FLOATS), ir.Constant(FLOATS, [1.0] * LANES)
+        factor, one = spread(builder, scale, _EIGHT_FLOATS), ir.Constant(_EIGHT_FLOATS, [1.0] * EIGHT)
         for channel, target in zip(_channels(builder, samples, offsets, step), (red, green, blue), strict=True):
             store(builder, least(builder, builder.fmul(channel, factor), one), target, 0)
 

@@ -23,6 +23,7 @@ from generator.vector import (
     Builder,
     Value,
     constant,
+    joined,
     least,
     load,
     spread,
@@ -30,15 +31,23 @@ from generator.vector import (
     void,
 )
 
+BLOCK: Final = 8
+"""Pixels that are mixed at a time."""
 MEAN_BYTES: Final = 16
 """Of a colour's mean under one light: red, green, blue and nothing, float32."""
 PLAN: Final = 6
 """Addresses that `mix` wants of a pair of lights."""
+FAULTS: Final = 4 * LANES
+"""Bytes that tell faulty weights."""
+FIRST: Final = 0x0F0F
+"""Of the lanes of a block's weights those of the pair's first light, four pixels after four; see `line_up8`."""
+SECOND: Final = 0xF0F0
+"""Those of the second."""
 
-_HALF: Final = LANES // 2
+_FOUR: Final = 4
 _SHORTS: Final = ir.VectorType(I16, 2 * LANES)
-_PAIRS: Final = ((0, 2), (1, 3), (4, 6), (5, 7))
-"""Which two of eight pixels share a vector: so pixels are packed without crossing its halves."""
+_COUPLES: Final = ((0, 2), (4, 6), (1, 3), (5, 7))
+"""Which two of eight pixels share a vector: so pixels are packed without crossing its quarters."""
 
 
 @intrinsic
@@ -47,53 +56,45 @@ def mean4(typing: Any, source: Any, count: Any, target: Any) -> Any:
     del typing, source, count, target
 
     def emit(builder: Builder, source: Value, count: Value, target: Value) -> None:
-        wide, real = ir.VectorType(I64, _HALF), ir.VectorType(ir.DoubleType(), _HALF)
-        total = cgutils.alloca_once_value(builder, ir.Constant(wide, [0] * _HALF))
+        wide, real = ir.VectorType(I64, _FOUR), ir.VectorType(ir.DoubleType(), _FOUR)
+        total = cgutils.alloca_once_value(builder, ir.Constant(wide, [0] * _FOUR))
         with cgutils.for_range(builder, count) as loop:
             at = builder.add(source, builder.mul(loop.index, ir.Constant(I64, SAMPLE_BYTES)))
-            sample = builder.zext(load(builder, at, 0, ir.VectorType(I16, _HALF)), wide)
+            sample = builder.zext(load(builder, at, 0, ir.VectorType(I16, _FOUR)), wide)
             builder.store(builder.add(builder.load(total), sample), total)
         mean = builder.fdiv(
             builder.sitofp(builder.load(total), real), spread(builder, builder.sitofp(count, ir.DoubleType()), real)
         )
-        store(builder, builder.fptrunc(mean, ir.VectorType(F32, _HALF)), target, 0)
+        store(builder, builder.fptrunc(mean, ir.VectorType(F32, _FOUR)), target, 0)
 
     return void(emit, ADDRESS, types.int64, ADDRESS)
 
 
-def _keep(builder: Builder, lines: Sequence[Value], target: Value) -> Value:
-    """Write two lights' weights of twice four pixels; return 1 if any of the first is not 0, plus 2 for the second."""
-    for four, line in enumerate(lines):
-        store(builder, line, target, 4 * LANES * four)
-    kind = ir.IntType(16 * LANES)
-    both = builder.bitcast(builder.or_(*(builder.bitcast(line, WORDS) for line in lines)), ir.VectorType(kind, 2))
-    lit: list[Value] = []
-    for light in range(2):
-        bits = builder.extract_element(both, ir.Constant(I32, light))
-        lit.append(builder.zext(builder.icmp_unsigned("!=", bits, ir.Constant(kind, 0)), I64))
-    return builder.add(lit[0], builder.shl(lit[1], ir.Constant(I64, 1)))
+def _keep(builder: Builder, line: Value, target: Value) -> Value:
+    """Write a line of weights; return which of its lanes are not 0, a bit a lane."""
+    store(builder, line, target, 0)
+    other = builder.icmp_unsigned("!=", builder.bitcast(line, WORDS), constant(WORDS, 0))
+    return builder.zext(builder.bitcast(other, ir.IntType(LANES)), I64)
 
 
 @intrinsic
 def line_up8(typing: Any, first: Any, first_step: Any, second: Any, second_step: Any, target: Any) -> Any:
-    """Write eight pixels' weights of a pair of lights as `mix` takes them: 64 bytes.
+    """Write eight pixels' weights of a pair of lights as `mix` takes them, 64 bytes.
 
-    The float32 of each light are so many bytes apart. Returns 1 if any of the first light is not 0, plus 2 for the
-    second.
+    The float32 of each light are so many bytes apart. They come to stand as four pixels of the first light, the same of
+    the second, and so on. Returns which are not 0, a bit for each, the first one's lowest.
     """
     del typing, first, first_step, second, second_step, target
 
     def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
         del context, signature
-        lines: list[Value] = []
-        for four in range(2):
-            line = ir.Constant(FLOATS, ir.Undefined)
-            for lane in range(LANES):
-                weights, step = arguments[2 * (lane // _HALF)], arguments[2 * (lane // _HALF) + 1]
-                at = builder.add(weights, builder.mul(step, ir.Constant(I64, _HALF * four + lane % _HALF)))
-                line = builder.insert_element(line, load(builder, at, 0, F32), ir.Constant(I32, lane))
-            lines.append(line)
-        return _keep(builder, lines, arguments[4])
+        line = ir.Constant(FLOATS, ir.Undefined)
+        for lane in range(LANES):
+            light, pixel = lane // _FOUR % 2, lane // (2 * _FOUR) * _FOUR + lane % _FOUR
+            weights, step = arguments[2 * light], arguments[2 * light + 1]
+            at = builder.add(weights, builder.mul(step, ir.Constant(I64, pixel)))
+            line = builder.insert_element(line, load(builder, at, 0, F32), ir.Constant(I32, lane))
+        return _keep(builder, line, arguments[4])
 
     return types.int64(ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS), generate
 
@@ -105,12 +106,9 @@ def part8(typing: Any, weights: Any, target: Any) -> Any:
 
     def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
         del context, signature
-        lanes = [2 * pixel + light for light in range(2) for pixel in range(_HALF)]
-        lines: list[Value] = []
-        for four in range(2):
-            both = load(builder, arguments[0], 4 * LANES * four, FLOATS)
-            lines.append(builder.shuffle_vector(both, both, constant(WORDS, lanes)))
-        return _keep(builder, lines, arguments[1])
+        both = load(builder, arguments[0], 0, FLOATS)
+        lanes = [8 * four + 2 * pixel + light for four in range(2) for light in range(2) for pixel in range(_FOUR)]
+        return _keep(builder, builder.shuffle_vector(both, both, constant(WORDS, lanes)), arguments[1])
 
     return types.int64(ADDRESS, ADDRESS), generate
 
@@ -122,73 +120,71 @@ def full8(typing: Any, weights: Any, light: Any) -> Any:
 
     def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
         del context, signature
-        kind, bits = ir.VectorType(F32, _HALF), ir.IntType(_HALF)
-        at = builder.add(arguments[0], builder.mul(arguments[1], ir.Constant(I64, 4 * _HALF)))
-        full = ir.Constant(ir.IntType(1), 1)
-        for four in range(2):
-            line = load(builder, at, 4 * LANES * four, kind)
-            other = builder.fcmp_unordered("!=", line, ir.Constant(kind, [1.0] * _HALF))
-            full = builder.and_(full, builder.icmp_unsigned("==", builder.bitcast(other, bits), ir.Constant(bits, 0)))
-        return full
+        line = load(builder, arguments[0], 0, FLOATS)
+        other = builder.fcmp_unordered("!=", line, ir.Constant(FLOATS, [1.0] * LANES))
+        kind = ir.IntType(LANES)
+        lanes = builder.shl(ir.Constant(I64, FIRST), builder.mul(arguments[1], ir.Constant(I64, _FOUR)))
+        found = builder.and_(builder.bitcast(other, kind), builder.trunc(lanes, kind))
+        return builder.icmp_unsigned("==", found, ir.Constant(kind, 0))
 
     return types.boolean(ADDRESS, types.int64), generate
 
 
-def _store_pixels(builder: Builder, pairs: Sequence[Value], target: Value) -> None:
-    """Write the red, green and blue of eight pixels as uint16; each pair has those of two pixels as 32 bits."""
-    couples: list[Value] = []
-    for low, high in (pairs[:2], pairs[2:]):
-        both = builder.or_(low, builder.shl(high, constant(WORDS, 16)))
-        couples.append(builder.bitcast(both, _SHORTS))
-    # Of each half: red, red, green, green, blue, blue of two pixels, and two without meaning.
-    lanes = [LANES * half + lane for half in range(2 * 2) for lane in (0, 2, 4, 1, 3, 5)]
-    kind = ir.VectorType(I32, len(lanes))
-    store(builder, builder.shuffle_vector(*couples, constant(kind, lanes)), target, 0)
+def _store_pixels(builder: Builder, even: Value, odd: Value, target: Value) -> None:
+    """Write the red, green and blue of eight pixels as uint16, given those of even and of odd places as 32 bits."""
+    both = builder.bitcast(builder.or_(even, builder.shl(odd, constant(WORDS, 16))), _SHORTS)
+    # Of each quarter: red, red, green, green, blue, blue of two pixels, and two without meaning.
+    lanes = [8 * quarter + lane for quarter in range(_FOUR) for lane in (0, 2, 4, 1, 3, 5)]
+    for part in (slice(0, 16), slice(16, 24)):
+        kind = ir.VectorType(I32, len(lanes[part]))
+        store(builder, builder.shuffle_vector(both, both, constant(kind, lanes[part])), target, 2 * part.start)
 
 
 def _pair(
     builder: Builder, addresses: Sequence[Value], block: Value, place: Value, means: Value
 ) -> tuple[list[Value], Value]:
-    """Return what a pair of lights gives eight pixels, by `_PAIRS`, and what tells faulty weights.
+    """Return what a pair of lights gives the pixels of even and of odd places, and what tells faulty weights.
 
-    The latter is eight float32 that are 0, but for faulty weights no numbers.
+    The latter is 16 float32 that are 0, but for faulty weights no numbers.
     """
     weights, *rest = addresses
     offsets, samples, mean_base = rest[:2], rest[2:4], rest[4]
     name = f"llvm.sqrt.v{LANES}f32"
     kind = ir.FunctionType(FLOATS, [FLOATS])
     root_of = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
-    fault = zero = ir.Constant(FLOATS, [0.0] * LANES)
+    at = builder.add(weights, builder.mul(block, ir.Constant(I64, 4 * LANES)))
+    weight = load(builder, at, 0, FLOATS)
+    root = builder.call(root_of, [weight])
+    remainder = builder.fsub(weight, root)
+    # The root of what is negative, and nothing times infinity, are no numbers.
+    fault = builder.fmul(root, ir.Constant(FLOATS, [0.0] * LANES))
     sums: list[Value] = []
-    at = builder.add(weights, builder.mul(block, ir.Constant(I64, 8 * LANES)))
-    for four in range(2):
-        weight = load(builder, at, 4 * LANES * four, FLOATS)
-        root = builder.call(root_of, [weight])
-        remainder = builder.fsub(weight, root)
-        # The root of what is negative, and nothing times infinity, are no numbers.
-        fault = builder.fadd(fault, builder.fmul(root, zero)) if four else builder.fmul(root, zero)
-        for pixel in range(_HALF):
-            begin = 4 * (_HALF * four + pixel)
+    for couple in _COUPLES:
 
-            def found(base: Value, places: Value, kind: Any, begin: int = begin) -> Value:
-                offset = builder.zext(load(builder, builder.add(places, place), begin, I32), I64)
-                return load(builder, builder.add(base, offset), 0, kind)
+        def found(base: Value, places: Value, pixel: int, kind: Any) -> Value:
+            offset = builder.zext(load(builder, builder.add(places, place), 4 * pixel, I32), I64)
+            return load(builder, builder.add(base, offset), 0, kind)
 
-            def each(numbers: Value, pixel: int = pixel) -> Value:
-                lanes = [pixel] * _HALF + [_HALF + pixel] * _HALF
-                return builder.shuffle_vector(numbers, numbers, constant(WORDS, lanes))
+        def each(numbers: Value, couple: tuple[int, int] = couple) -> Value:
+            """Return the numbers of two pixels under both lights, four times each."""
+            first = [8 * (pixel // _FOUR) + _FOUR * light + pixel % _FOUR for pixel in couple for light in range(2)]
+            return builder.shuffle_vector(numbers, numbers, constant(WORDS, [lane for lane in first for _ in range(4)]))
 
-            both = [found(base, places, ir.VectorType(I16, 4)) for base, places in zip(samples, offsets, strict=True)]
-            drawn = builder.zext(builder.shuffle_vector(*both, constant(WORDS, range(LANES))), WORDS)
-            drawn = builder.fmul(builder.sitofp(drawn, FLOATS), each(root))
-            mean = builder.fmul(found(mean_base, means, FLOATS), each(remainder))
-            sums.append(builder.fadd(drawn, mean))
+        drawn = [
+            found(base, places, pixel, ir.VectorType(I16, 4))
+            for pixel in couple
+            for base, places in zip(samples, offsets, strict=True)
+        ]
+        mean = [found(mean_base, means, pixel, ir.VectorType(F32, 2 * _FOUR)) for pixel in couple]
+        noisy = builder.fmul(builder.sitofp(builder.zext(joined(builder, drawn), WORDS), FLOATS), each(root))
+        sums.append(builder.fadd(noisy, builder.fmul(joined(builder, mean), each(remainder))))
     totals: list[Value] = []
-    low = [*range(_HALF), *range(LANES, LANES + _HALF)]
-    for pair in _PAIRS:
+    for two in (sums[:2], sums[2:]):
         parts = [
-            builder.shuffle_vector(*(sums[pixel] for pixel in pair), constant(WORDS, [lane + shift for lane in low]))
-            for shift in (0, _HALF)
+            builder.shuffle_vector(
+                *two, constant(WORDS, [8 * pixel + _FOUR * light + i for pixel in range(4) for i in range(4)])
+            )
+            for light in range(2)
         ]
         totals.append(builder.fadd(*parts))
     return totals, fault
@@ -201,7 +197,7 @@ def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any,
     `plan` leads to `PLAN` addresses a pair: of the weights, of the first and second light's offsets in their samples,
     of the first and second light's samples, and of the means; `means` leads to the offsets in the means. The pixels are
     taken eight by eight, the last eight being some of the ones before again where `count` is not whole eights; so are
-    the weights, but each eight stand on their own. The eight float32 at `faults` are no numbers from the moment that a
+    the weights, but each eight stand on their own. Some float32 at `faults` are no numbers from the moment that a
     weight was negative, infinite or no number.
     """
     del typing, plan, pairs, count, means, faults, white, target
@@ -226,9 +222,9 @@ def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any,
         zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
         most = spread(builder, white, FLOATS)
         fault = cgutils.alloca_once_value(builder, load(builder, faults, 0, FLOATS))
-        sums = [cgutils.alloca_once(builder, FLOATS) for _ in range(_HALF)]
-        blocks = builder.lshr(builder.add(count, number(LANES - 1)), number(3))
-        last = builder.sub(count, number(LANES))
+        sums = [cgutils.alloca_once(builder, FLOATS) for _ in range(2)]
+        blocks = builder.lshr(builder.add(count, number(BLOCK - 1)), number(3))
+        last = builder.sub(count, number(BLOCK))
 
         def fill(total: Callable[[Value, Value], Sequence[Value]]) -> None:
             with cgutils.for_range(builder, blocks) as loop:
@@ -239,7 +235,9 @@ def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any,
                     lifted = builder.fadd(value, half)
                     lifted = builder.select(builder.fcmp_ordered(">", lifted, zero), lifted, zero)
                     rounded.append(builder.fptosi(least(builder, lifted, most), WORDS))
-                _store_pixels(builder, rounded, builder.add(target, builder.mul(begin, number(SAMPLE_BYTES))))
+                _store_pixels(
+                    builder, rounded[0], rounded[1], builder.add(target, builder.mul(begin, number(SAMPLE_BYTES)))
+                )
 
         def of_pair(entries: Sequence[Value], block: Value, place: Value) -> Sequence[Value]:
             totals, nothing = _pair(builder, entries, block, place, means)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import InputError
-from generator import kernel
+from generator import streaming
 from generator.kernel import PATTERNS, draw_mosaic, draw_samples, render
 from generator.palette import bits_of
 
@@ -104,7 +104,7 @@ def test_an_image_too_large_for_the_caches_is_the_same_and_nothing_beside_it_is_
     memory = np.full(2 * height * 3 * (width + 2 * margin) + 1, 171, np.uint8)
     whole = memory[odd : memory.size - (not odd)].view(np.uint16).reshape(height, width + 2 * margin, 3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernel, "STREAMED_BYTES", 0)
+        patch.setattr(streaming, "STREAMED_BYTES", 0)
         draw_samples(samples, picture, out=whole[:, margin : margin + width])
     np.testing.assert_array_equal(whole[:, margin : margin + width], draw_samples(samples, picture))
     beside = np.concatenate([whole[:, :margin], whole[:, margin + width :]], axis=1)

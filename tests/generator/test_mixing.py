@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from drivers.errors import InputError
+from generator import streaming
 from generator.kernel import draw_samples
 from generator.mixing import mix_samples, mixed_table
 
@@ -137,11 +138,20 @@ def test_mixed_pixels_follow_the_formula(
     assert (mixed == 3000).any()
 
 
+@pytest.mark.parametrize("streamed", [False, True])
 @pytest.mark.parametrize("lights", [2, 3, 4])
 @pytest.mark.parametrize("width", [1, 7, 8, 9, 519, 520, 521, 1053])
 def test_rows_in_which_lights_are_alone_or_missing_follow_the_formula(
-    rule: Rule, make_lut: Callable[..., Lut], picture: npt.NDArray[np.uint8], lights: int, width: int
+    rule: Rule,
+    make_lut: Callable[..., Lut],
+    picture: npt.NDArray[np.uint8],
+    monkeypatch: pytest.MonkeyPatch,
+    lights: int,
+    width: int,
+    streamed: bool,
 ) -> None:
+    if streamed:
+        monkeypatch.setattr(streaming, "STREAMED_BYTES", 0)
     tables = make_lut().samples[:lights]
     part = picture[:12, :width]
     weights = np.random.default_rng(8).uniform(0, 1.2, (12, width, lights)).astype(np.float32)
