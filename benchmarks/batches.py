@@ -18,8 +18,8 @@ import numpy.typing as npt
 from benchmarks.generator import natural_picture, noisy_table, report
 from calibration.lut import Lut, open_lut
 from generator.batches import Crops
-from generator.engines import default_workers
 from generator.gallery import Gallery, gallery_of
+from generator.production.engines import default_workers
 
 SIDE = 128
 BATCH = 512

@@ -28,7 +28,7 @@ from benchmarks.generator import SAMPLES, noisy_table, report
 from calibration.lut import Lut
 from generator.dataset import generate_dataset
 from generator.encode import encode_image, encode_pieces
-from generator.engines import default_workers
+from generator.production.engines import default_workers
 from generator.scene import find_pictures
 from generator.store import LocalStore
 

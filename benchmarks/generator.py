@@ -31,13 +31,13 @@ import skimage.data
 
 from calibration.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
-from generator.choice import SCRATCH, choose_group, row_keys
-from generator.compiled import compiled
 from generator.kernel import draw_mosaic, draw_samples
-from generator.masks import parse_masks
-from generator.mixing import mix_samples
-from generator.planar import draw_planar
-from generator.vector import GROUP, LINE, copy8, offset_at, prefetch_once
+from generator.kernels.choice import SCRATCH, choose_group, row_keys
+from generator.kernels.compiled import compiled
+from generator.kernels.mixing import mix_samples
+from generator.kernels.planar import draw_planar
+from generator.kernels.vector import GROUP, LINE, copy8, offset_at, prefetch_once
+from generator.masks.making import parse_masks
 
 SAMPLES = 25
 REPEATS = 7

@@ -32,7 +32,7 @@ from acquisition.session import Session
 from acquisition.taking import run_session
 from calibration.build import build
 from calibration.lut import Lut, open_lut
-from generator.gamut import Gamut, Match, OutsideGamutError, angles_between
+from generator.lights.gamut import Gamut, Match, OutsideGamutError, angles_between
 
 _Array = npt.NDArray[np.float64]
 WELL_LIT_DN = 300

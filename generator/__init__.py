@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from calibration.lut import Lut
     from generator.dataset import generate_dataset, open_dataset
     from generator.kernel import draw_mosaic, draw_samples, render
-    from generator.mixing import mix_samples, mixed_table
+    from generator.kernels.mixing import mix_samples, mixed_table
+    from generator.kernels.planar import draw_batch, draw_planar
     from generator.picture import read_picture
-    from generator.planar import draw_batch, draw_planar
     from generator.scene import find_pictures
     from generator.tonemap import flash
 
@@ -43,15 +43,15 @@ __all__ = [
 ]
 
 _HOMES = {
-    "draw_batch": "generator.planar",
+    "draw_batch": "generator.kernels.planar",
     "draw_mosaic": "generator.kernel",
-    "draw_planar": "generator.planar",
+    "draw_planar": "generator.kernels.planar",
     "draw_samples": "generator.kernel",
     "find_pictures": "generator.scene",
     "flash": "generator.tonemap",
     "generate_dataset": "generator.dataset",
-    "mix_samples": "generator.mixing",
-    "mixed_table": "generator.mixing",
+    "mix_samples": "generator.kernels.mixing",
+    "mixed_table": "generator.kernels.mixing",
     "open_dataset": "generator.dataset",
     "read_picture": "generator.picture",
     "render": "generator.kernel",

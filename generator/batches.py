@@ -26,11 +26,11 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import InputError
-from generator import philox
-from generator.lighting import Mixture
-from generator.palette import fit_picture
-from generator.planar import draw_batch
-from generator.recycling import Recycled
+from generator.kernels import philox
+from generator.kernels.palette import fit_picture
+from generator.kernels.planar import draw_batch
+from generator.kernels.recycling import Recycled
+from generator.lights.lighting import Mixture
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

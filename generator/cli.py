@@ -279,11 +279,11 @@ def generate(
     from calibration.lut import open_lut
     from drivers.errors import InputError
     from generator.dataset import make_dataset, make_share
-    from generator.engines import check_workers, default_workers
     from generator.light_request import LightRequest
     from generator.picture import Preparation
-    from generator.plan import Options, Plan, parse_share, parse_split
-    from generator.workplace import require_free_place
+    from generator.production.engines import check_workers, default_workers
+    from generator.production.plan import Options, Plan, parse_share, parse_split
+    from generator.production.workplace import require_free_place
 
     if lut is None or out is None:
         raise InputError("the table and the place of the dataset are missing; write generate LUT OUT --sources DIR")
@@ -410,8 +410,8 @@ def _tell(dataset: Dataset, out: str) -> None:
 def _verify(out: str) -> None:
     """Print every fault of a dataset; a QualityError if there is one."""
     from drivers.errors import QualityError
-    from generator.assembly import damage
     from generator.dataset import open_dataset
+    from generator.production.assembly import damage
 
     dataset = open_dataset(out)
     faults = 0

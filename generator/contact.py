@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from drivers.storage import write_whole
 from generator.dataset import Dataset
-from generator.lighting import parse_mixture
-from generator.records import Entry, Light, Triple
+from generator.lights.lighting import parse_mixture
+from generator.production.records import Entry, Light, Triple
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,7 +1,7 @@
 """A dataset: its reader, and the call that makes one.
 
     images/NNNNNN.png    linear camera RGB in the units of the table; the number is the one that was planned
-    masks/, ground_truth/  where several lights fall on an image; see `mask_files`
+    masks/, ground_truth/  where several lights fall on an image; see `masks.files`
     previews/NNNNNN.jpg  the same, tone mapped, at most 512 px: the look of the raw, no white balance
     ground_truth.csv     image,source,illumination,r,g,b with r + g + b = 1, one row a light
     gt.txt               r g b a line in image order: the mean of the lights over the image
@@ -35,14 +35,21 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from drivers.errors import FormatError, InputError
-from generator.assembly import GROUND_TRUTH, GROUND_TRUTH_COLUMNS, SOURCES, TRUTHS, NothingMadeError, assemble
 from generator.encode import Format, decode_image
-from generator.engines import check_workers, default_workers, make_shards
 from generator.illuminant import ListedLights
-from generator.layouts import read_member
-from generator.lighting import LightChoice, parse_mixture
-from generator.plan import SHARD_IMAGES, Options, Plan
-from generator.records import (
+from generator.lights.lighting import LightChoice, parse_mixture
+from generator.production.assembly import (
+    GROUND_TRUTH,
+    GROUND_TRUTH_COLUMNS,
+    SOURCES,
+    TRUTHS,
+    NothingMadeError,
+    assemble,
+)
+from generator.production.engines import check_workers, default_workers, make_shards
+from generator.production.layouts import read_member
+from generator.production.plan import SHARD_IMAGES, Options, Plan
+from generator.production.records import (
     FORMAT,
     SPLITS,
     VERSION,
@@ -54,9 +61,9 @@ from generator.records import (
     Triple,
     shard_key,
 )
-from generator.shards import OnImage, OnSkip
+from generator.production.shards import OnImage, OnSkip
+from generator.production.workplace import DESCRIPTION, Workplace, finished, stored_identity, workplace
 from generator.store import Store, open_store
-from generator.workplace import DESCRIPTION, Workplace, finished, stored_identity, workplace
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
@@ -306,9 +313,9 @@ def generate_dataset(
     seed
         0 … 2⁶⁴ − 1; chooses the samples of every pixel.
     form, layout, previews, split, shard_images, reading
-        See `plan.Options`; `reading` is its `sources`.
+        See `production.plan.Options`; `reading` is its `sources`.
     engine
-        Who does the work; see `engines.parse_engine`. No byte depends on it.
+        Who does the work; see `production.engines.parse_engine`. No byte depends on it.
     workers
         Threads, or processes of a cluster on this machine; at most about three pictures are in memory for each.
     on_image, on_skip

@@ -16,16 +16,16 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import InputError
-from generator import philox
-from generator.distributions import Distribution
-from generator.gamut import Gamut, Match, Outside, OutsideGamutError, black_body, rgb_of
-from generator.ground_truths import load_ground_truths
-from generator.lighting import LightChoice, Lighting, Mixture, parse_mixture, plain
-from generator.options import parse_numbers
+from generator.kernels import philox
+from generator.lights.distributions import Distribution
+from generator.lights.gamut import Gamut, Match, Outside, OutsideGamutError, black_body, rgb_of
+from generator.lights.ground_truths import load_ground_truths
+from generator.lights.lighting import LightChoice, Lighting, Mixture, parse_mixture, plain
+from generator.lights.options import parse_numbers
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
-    from generator.masks import MaskPlan
+    from generator.masks.making import MaskPlan
 
 __all__ = [
     "DrawnLights",
@@ -277,7 +277,7 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
     """Return the light that a text names.
 
     ``12`` and ``12:0.25+40:0.75`` are lights of the table, ``cct=4500`` or ``4500K`` a black body in kelvin
-    (`gamut.black_body`), ``r=.3,b=.25`` a chromaticity in linear RGB of the table's camera.
+    (`lights.gamut.black_body`), ``r=.3,b=.25`` a chromaticity in linear RGB of the table's camera.
 
     Parameters
     ----------

@@ -4,8 +4,8 @@ Paper, section 3.4. With n the table's bits (5 in the paper), a pixel R, G, B at
 
     samples[((R >> (8 - n)) << 2n) | ((G >> (8 - n)) << n) | (B >> (8 - n)), choice(seed, image, x, y)]
 
-where the choice is that of `choice.py`. Here are whole images, as camera RGB and as Bayer mosaics; `planar.py` has
-crops for training and `mixing.py` several lights.
+where the choice is that of `kernels/choice.py`. Here are whole images, as camera RGB and as Bayer mosaics;
+`kernels/planar.py` has crops for training and `kernels/mixing.py` several lights.
 
 Compiled loops are not split by numba's own threads: their pool cannot be entered from two Python threads at once and
 does not survive a fork. Rows are split by plain threads instead.
@@ -21,8 +21,8 @@ import numpy.typing as npt
 from numba import uint32
 
 from drivers.errors import InputError
-from generator import streaming
-from generator.arguments import (
+from generator.kernels import streaming
+from generator.kernels.arguments import (
     check_picture,
     check_place,
     check_samples,
@@ -33,11 +33,11 @@ from generator.arguments import (
     share,
     writable,
 )
-from generator.choice import AHEAD, SCRATCH, ask_group, choose_group, row_keys, slot
-from generator.compiled import compiled
-from generator.palette import fit_picture
-from generator.streaming import line_at, line_room, pass_on
-from generator.vector import (
+from generator.kernels.choice import AHEAD, SCRATCH, ask_group, choose_group, row_keys, slot
+from generator.kernels.compiled import compiled
+from generator.kernels.palette import fit_picture
+from generator.kernels.streaming import line_at, line_room, pass_on
+from generator.kernels.vector import (
     GROUP,
     LANES,
     LINE,
@@ -330,7 +330,7 @@ def render(
 ) -> npt.NDArray[np.uint16]:
     """Return the raw linear image of `picture` printed, lit by the table's light `light` and photographed.
 
-    Colours that the table lists as unfit are replaced by the nearest fit one; see `palette.fit_picture`.
+    Colours that the table lists as unfit are replaced by the nearest fit one; see `kernels.palette.fit_picture`.
 
     Parameters
     ----------

@@ -7,9 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from drivers.errors import InputError
-from generator.distributions import parse_distribution
-from generator.gamut import Gamut, Outside
-from generator.ground_truths import load_ground_truths
 from generator.illuminant import (
     DrawnLights,
     ListedLights,
@@ -20,7 +17,10 @@ from generator.illuminant import (
     parse_light,
     parse_lights,
 )
-from generator.lighting import LightChoice
+from generator.lights.distributions import parse_distribution
+from generator.lights.gamut import Gamut, Outside
+from generator.lights.ground_truths import load_ground_truths
+from generator.lights.lighting import LightChoice
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
@@ -42,7 +42,7 @@ class LightRequest:
     random
         Images of each picture under lights of its own: of the table, or of `distribution`. One if not said.
     distribution
-        Where those lights are drawn from; see `distributions.parse_distribution`.
+        Where those lights are drawn from; see `lights.distributions.parse_distribution`.
     nearest, match
         Files of ground truths, for which the table's nearest lights are taken, or mixtures that match them.
     outside
@@ -50,7 +50,7 @@ class LightRequest:
     lights_per_image
         Lights that fall on one image: that many, in the order of the lists, share each image.
     masks
-        Where each falls; see `masks.parse_masks`.
+        Where each falls; see `masks.making.parse_masks`.
     """
 
     illuminations: str | None = None
@@ -82,7 +82,7 @@ class LightRequest:
         choice = self._lights(lut, seed, together)
         if together == 1:
             return choice
-        from generator.masks import parse_masks
+        from generator.masks.making import parse_masks
 
         return TogetherLights(choice, together, parse_masks(self.masks or MASKS, together, seed))
 

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import FormatError, InputError
-from generator import philox
+from generator.kernels import philox
 from generator.profile import ASSUMED, to_srgb
 
 Picture = npt.NDArray[np.uint8]

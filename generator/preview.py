@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import uint8, uint16, uint64
 
-from generator.compiled import compiled
+from generator.kernels.compiled import compiled
 from generator.tonemap import DARK, flash_of
 
 PREVIEW_SIDE: Final = 512

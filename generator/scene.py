@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from drivers.errors import FormatError, InputError
-from generator import philox
+from generator.kernels import philox
 from generator.picture import AS_THEY_ARE, LARGEST_SIDE, Picture, Preparation, open_picture
 from generator.store import filesystem, is_remote, local_path
 

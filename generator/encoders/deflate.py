@@ -26,7 +26,6 @@ import numpy as np
 import numpy.typing as npt
 from numba import uint16, uint32, uint64
 
-from generator.compiled import compiled
 from generator.encoders.huffman import (
     DISTANCES,
     END,
@@ -38,6 +37,7 @@ from generator.encoders.huffman import (
     put,
     put_head,
 )
+from generator.kernels.compiled import compiled
 
 WIDEST: Final = 1 << 28
 """Pixels of a row that positions are counted for."""

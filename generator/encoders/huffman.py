@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numba import uint8, uint32, uint64
 
-from generator.compiled import compiled
+from generator.kernels.compiled import compiled
 
 LITERALS: Final = 286
 """Symbols for literals, the end of a block and lengths."""

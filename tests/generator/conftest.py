@@ -12,7 +12,7 @@ import pytest
 from acquisition.illuminations import Illumination
 from calibration.lut import Lut, LutWriter, Provenance, Unfit, open_lut
 from drivers.presenter import Colour
-from generator import philox
+from generator.kernels import philox
 
 SAMPLES = 25
 MakeLut = Callable[..., Lut]
@@ -80,7 +80,7 @@ Rule = Callable[..., npt.NDArray[np.int64]]
 def sample_numbers(
     seed: int, image: int, height: int, width: int, *, first_row: int = 0, place: int = 0, count: int = SAMPLES
 ) -> npt.NDArray[np.int64]:
-    """Return the sample number (H, W) of each pixel by the rule at the head of `generator/choice.py`, in numpy."""
+    """Return the sample numbers (H, W) by the rule at the head of `generator/kernels/choice.py`, in numpy."""
     y, x = np.arange(first_row, first_row + height), np.arange(width)
     keys = [key.astype(np.uint64)[:, None] for key in philox.words(seed, y, place, image, philox.SAMPLES)[:3]]
     word, low = np.uint64(0xFFFFFFFF), np.uint64(32)

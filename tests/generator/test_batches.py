@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from drivers.errors import FormatError, InputError
 from generator.batches import Crops
 from generator.gallery import Gallery, gallery_of, open_gallery, save_gallery
-from generator.lighting import Mixture
+from generator.lights.lighting import Mixture
 from generator.picture import Picture
 from generator.scene import random_scenes
 from tests.generator.conftest import MakeLut
@@ -130,7 +130,7 @@ def test_unfit_colours_take_their_stand_ins(make_lut: MakeLut) -> None:
     lut = make_lut(bits=BITS, unfit=(63,))
     white = np.full((8, 8, 3), 255, np.uint8)
     images = Crops(lut, gallery_of([white]), (4, 4), lights=[1], flip=False, length=9).batch(np.arange(9)).images
-    from generator.palette import stand_ins
+    from generator.kernels.palette import stand_ins
 
     wanted = lut.samples[1, int(stand_ins([63], BITS)[0])].astype(np.float32) / lut.provenance.white_level
     values = images.transpose(0, 2, 3, 1).reshape(-1, 1, 3)

@@ -15,8 +15,8 @@ import pytest
 
 from drivers.errors import InputError
 from generator.dataset import generate_dataset
-from generator.engines import parse_engine
 from generator.illuminant import RandomLights
+from generator.production.engines import parse_engine
 from generator.scene import random_scenes
 
 if TYPE_CHECKING:
@@ -173,7 +173,7 @@ def test_an_unknown_engine_is_refused(name: str) -> None:
 def test_a_scheduler_that_does_not_answer(
     make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("generator.engines.CONNECT_S", 0.2)
+    monkeypatch.setattr("generator.production.engines.CONNECT_S", 0.2)
     with pytest.raises(InputError, match=r"no Dask scheduler answers at 127\.0\.0\.1:1: .*; start one with dask"):
         generate_dataset(make_lut(), tmp_path / "out", random_scenes(2, 24, 16), [0], engine="dask://127.0.0.1:1")
     assert [path.name for path in tmp_path.iterdir()] == ["lut"]

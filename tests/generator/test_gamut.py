@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import InputError
-from generator.gamut import (
+from generator.lights.gamut import (
     TOLERANCE_DEG,
     Gamut,
     OutsideGamutError,
@@ -24,7 +24,7 @@ from generator.gamut import (
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
-    from generator.lighting import Mixture
+    from generator.lights.lighting import Mixture
 
 PRIMARIES = np.array([[5000.0, 900.0, 300.0], [900.0, 6000.0, 1000.0], [150.0, 1100.0, 4800.0]])
 

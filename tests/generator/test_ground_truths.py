@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import FormatError
-from generator.ground_truths import load_ground_truths
+from generator.lights.ground_truths import load_ground_truths
 
 GT = Path(__file__).parents[2].parent / "shared" / "data" / "gt"
 

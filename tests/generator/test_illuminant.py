@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from drivers.errors import InputError
-from generator.gamut import Gamut
 from generator.illuminant import (
     ListedLights,
     RandomLights,
@@ -21,8 +20,9 @@ from generator.illuminant import (
     parse_light,
     parse_lights,
 )
-from generator.lighting import LightChoice, Lighting, Mixture, plain
-from generator.masks import parse_masks
+from generator.lights.gamut import Gamut
+from generator.lights.lighting import LightChoice, Lighting, Mixture, plain
+from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import InputError
-from generator import streaming
 from generator.kernel import PATTERNS, draw_mosaic, draw_samples, render
-from generator.palette import bits_of
+from generator.kernels import streaming
+from generator.kernels.palette import bits_of
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

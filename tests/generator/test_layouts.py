@@ -19,12 +19,12 @@ import numpy.typing as npt
 import pytest
 
 from drivers.errors import FormatError, InputError
-from generator.assembly import damage
 from generator.dataset import Dataset, generate_dataset, open_dataset
 from generator.illuminant import ListedLights, TogetherLights
-from generator.mask_files import read_ground_truth_map, read_weights
-from generator.masks import parse_masks
-from generator.records import Layout
+from generator.masks.files import read_ground_truth_map, read_weights
+from generator.masks.making import parse_masks
+from generator.production.assembly import damage
+from generator.production.records import Layout
 from generator.scene import random_scenes
 
 if TYPE_CHECKING:
@@ -234,7 +234,7 @@ def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.M
     def find_spec(name: str) -> None:
         del name
 
-    monkeypatch.setattr("generator.parquet.find_spec", find_spec)
+    monkeypatch.setattr("generator.production.parquet.find_spec", find_spec)
     with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install croplab\[parquet\]"):
         make("parquet")
 

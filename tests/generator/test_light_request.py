@@ -12,7 +12,7 @@ import pytest
 from drivers.errors import InputError
 from generator.illuminant import DrawnLights, FollowedLights, ListedLights, RandomLights, TogetherLights
 from generator.light_request import LightRequest
-from generator.lighting import Mixture, plain
+from generator.lights.lighting import Mixture, plain
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import InputError
-from generator.lighting import Lighting, Mixture, mixture_of, parse_mixture, plain
+from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixture, plain
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

@@ -13,10 +13,10 @@ import PIL.Image
 import pytest
 
 from drivers.errors import FormatError
-from generator.gamut import angles_between
-from generator.lighting import FULL, Lighting, plain
-from generator.mask_files import encode_maps, find_masks, read_ground_truth_map, read_weights
-from generator.masks import parse_masks
+from generator.lights.gamut import angles_between
+from generator.lights.lighting import FULL, Lighting, plain
+from generator.masks.files import encode_maps, find_masks, read_ground_truth_map, read_weights
+from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import InputError
-from generator.lighting import FULL, MaskMaker
-from generator.mask_shapes import HalfPlanes, SmoothFields, Spots, Windows, smoothstep
-from generator.masks import MadeMaskPlan, parse_masks, whole_parts
+from generator.lights.lighting import FULL, MaskMaker
+from generator.masks.making import MadeMaskPlan, parse_masks, whole_parts
+from generator.masks.shapes import HalfPlanes, SmoothFields, Spots, Windows, smoothstep
 
 KINDS = ("half-plane", "soft-edge", "spots", "smooth", "window")
 Map = npt.NDArray[np.float32]

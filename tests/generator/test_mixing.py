@@ -10,9 +10,9 @@ import numpy.typing as npt
 import pytest
 
 from drivers.errors import InputError
-from generator import streaming
 from generator.kernel import draw_samples
-from generator.mixing import mix_samples, mixed_table
+from generator.kernels import streaming
+from generator.kernels.mixing import mix_samples, mixed_table
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
@@ -110,7 +110,7 @@ def by_formula(
     weights: npt.NDArray[np.float32],
     white: int,
 ) -> npt.NDArray[np.uint16]:
-    """Return the image of seed 5 and number 9 by the formula at the head of `generator/mixing.py`."""
+    """Return the image of seed 5 and number 9 by the formula at the head of `generator/kernels/mixing.py`."""
     upper = (picture >> 6).astype(np.int64)
     colour = upper[..., 0] << 4 | upper[..., 1] << 2 | upper[..., 2]
     total = np.zeros(picture.shape, np.float32)

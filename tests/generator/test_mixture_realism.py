@@ -15,8 +15,8 @@ from acquisition.illuminations import Illumination
 from calibration.build import build
 from calibration.lut import Lut, open_lut
 from drivers.presenter import Colour
-from generator.gamut import Gamut, angles_between
-from generator.lighting import Mixture, plain
+from generator.lights.gamut import Gamut, angles_between
+from generator.lights.lighting import Mixture, plain
 from sim.world import Room
 from tests.calibration.lab import SETTINGS, Lab, hang, take
 

@@ -15,11 +15,11 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import norm
 
-from generator.gamut import angles_between
 from generator.kernel import draw_samples
-from generator.lighting import Lighting, Mixture, plain
-from generator.masks import parse_masks
-from generator.mixing import mix_samples
+from generator.kernels.mixing import mix_samples
+from generator.lights.gamut import angles_between
+from generator.lights.lighting import Lighting, Mixture, plain
+from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from drivers.errors import InputError
 from generator.kernel import draw_samples
-from generator.planar import draw_batch, draw_planar
+from generator.kernels.planar import draw_batch, draw_planar
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from drivers.errors import FormatError, InputError
-from generator import layouts
 from generator.dataset import Dataset, finish_dataset, generate_dataset, make_dataset, make_share
 from generator.illuminant import ListedLights, RandomLights
-from generator.plan import Options, Plan
-from generator.records import ShardRecord
+from generator.production import layouts
+from generator.production.plan import Options, Plan
+from generator.production.records import ShardRecord
+from generator.production.workplace import Workplace, workplace
 from generator.scene import random_scenes
-from generator.workplace import Workplace, workplace
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from drivers.errors import InputError
 from generator.dataset import generate_dataset
-from generator.plan import parse_share, parse_split, split_of
+from generator.production.plan import parse_share, parse_split, split_of
 from generator.scene import find_pictures
 
 if TYPE_CHECKING:

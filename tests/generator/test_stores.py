@@ -14,10 +14,10 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from drivers.errors import FormatError, InputError, StorageError
-from generator.assembly import damage
 from generator.dataset import finish_dataset, generate_dataset, make_share, open_dataset
 from generator.illuminant import ListedLights
-from generator.plan import Options, Plan
+from generator.production.assembly import damage
+from generator.production.plan import Options, Plan
 from generator.scene import find_pictures, random_scenes
 from generator.store import LocalStore, RemoteStore, open_store
 

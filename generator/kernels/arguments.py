@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import InputError
-from generator.palette import bits_of
-from generator.philox import key_of
+from generator.kernels.palette import bits_of
+from generator.kernels.philox import key_of
 
 Samples = npt.NDArray[np.uint16]
 Picture = npt.NDArray[np.uint8]

@@ -10,7 +10,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from generator.vector import (
+from generator.kernels.vector import (
     ADDRESS,
     F32,
     FLOATS,

@@ -19,11 +19,11 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 
 from drivers.errors import FormatError, InputError
-from generator.layouts import Fault, Sample, hold
-from generator.plan import ShardJob
-from generator.records import FileSum, shard_key
+from generator.production.layouts import Fault, Sample, hold
+from generator.production.plan import ShardJob
+from generator.production.records import FileSum, shard_key
+from generator.production.webdataset import Hashed, about
 from generator.store import Store
-from generator.webdataset import Hashed, about
 
 if TYPE_CHECKING:
     import pyarrow as pa

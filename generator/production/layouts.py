@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Final, Protocol, Self
 
-from generator.plan import ShardJob
-from generator.records import FileSum, ImageRecord, Split, image_key
+from generator.production.plan import ShardJob
+from generator.production.records import FileSum, ImageRecord, Split, image_key
 from generator.store import Pieces, Store, gathered
 
 _SETTLED_IMAGES: Final = 32
@@ -145,11 +145,11 @@ def open_writer(job: ShardJob, store: Store) -> ShardWriter:
         case "folder":
             return FolderWriter(store)
         case "webdataset":
-            from generator.webdataset import TarWriter
+            from generator.production.webdataset import TarWriter
 
             return TarWriter(store, job)
         case "parquet":
-            from generator.parquet import ParquetWriter
+            from generator.production.parquet import ParquetWriter
 
             return ParquetWriter(store, job)
 
@@ -163,9 +163,9 @@ def read_member(layout: str, store: Store, container: str, file: str) -> bytes:
         The file is missing or damaged, or there is no such image in it.
     """
     if layout == "webdataset":
-        from generator import webdataset
+        from generator.production import webdataset
 
         return webdataset.read_member(store, container, file)
-    from generator import parquet
+    from generator.production import parquet
 
     return parquet.read_member(store, container, file)

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import InputError
-from generator.arguments import (
+from generator.kernels.arguments import (
     check_picture,
     check_samples,
     check_target,
@@ -27,9 +27,9 @@ from generator.arguments import (
     readable,
     share,
 )
-from generator.choice import EDGE, OFFSETS, choose_group, row_keys
-from generator.compiled import compiled
-from generator.vector import EIGHT, GROUP, mirrored8, offset_at, plane1, planes8, prefetch
+from generator.kernels.choice import EDGE, OFFSETS, choose_group, row_keys
+from generator.kernels.compiled import compiled
+from generator.kernels.vector import EIGHT, GROUP, mirrored8, offset_at, plane1, planes8, prefetch
 
 Window = tuple[int, int, int, int]
 

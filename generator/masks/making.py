@@ -21,10 +21,10 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import InputError
-from generator.compiled import compiled
-from generator.lighting import FULL, MaskMaker
-from generator.mask_shapes import Array, Dice, HalfPlanes, Shape, SmoothFields, Spots, Windows
-from generator.options import Range, parse_numbers
+from generator.kernels.compiled import compiled
+from generator.lights.lighting import FULL, MaskMaker
+from generator.lights.options import Range, parse_numbers
+from generator.masks.shapes import Array, Dice, HalfPlanes, Shape, SmoothFields, Spots, Windows
 
 Weights = npt.NDArray[np.float32]
 _ROWS: Final = 64
@@ -128,7 +128,7 @@ def parse_masks(text: str, lights: int, seed: int) -> MaskPlan:
 
     ``half-plane``, ``soft-edge``, ``spots``, ``smooth`` or ``window``, with numbers where wanted, as in
     ``soft-edge:angle=30,width=.2``, ``spots:count=3,radius=.1,softness=.5``, ``smooth:scale=.3,contrast=8`` and
-    ``window:columns=2,rows=3,softness=.05``; anything else is a folder of masks as `mask_files` reads it.
+    ``window:columns=2,rows=3,softness=.05``; anything else is a folder of masks as `files` reads it.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def parse_masks(text: str, lights: int, seed: int) -> MaskPlan:
     if kind not in _OPTIONS:
         if not text.strip() or not Path(text).is_dir():
             raise InputError(f"{text!r} is neither a folder of masks nor a kind of them: {', '.join(_OPTIONS)}")
-        from generator.mask_files import find_masks
+        from generator.masks.files import find_masks
 
         return find_masks(Path(text), lights)
     numbers = parse_numbers(rest, _OPTIONS[kind], f"the masks {kind}")

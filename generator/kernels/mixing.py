@@ -26,8 +26,8 @@ import numpy.typing as npt
 from numba import uint32
 
 from drivers.errors import InputError
-from generator import philox, streaming
-from generator.arguments import (
+from generator.kernels import philox, streaming
+from generator.kernels.arguments import (
     Picture,
     Samples,
     check_picture,
@@ -39,11 +39,11 @@ from generator.arguments import (
     readable,
     share,
 )
-from generator.choice import EDGE, OFFSETS, ask_group, four_words, group_of, row_keys
-from generator.compiled import compiled
-from generator.palette import bits_of
-from generator.streaming import line_at, line_room, pass_on
-from generator.vector import (
+from generator.kernels.choice import EDGE, OFFSETS, ask_group, four_words, group_of, row_keys
+from generator.kernels.compiled import compiled
+from generator.kernels.palette import bits_of
+from generator.kernels.streaming import line_at, line_room, pass_on
+from generator.kernels.vector import (
     GROUP,
     LANES,
     LINE,
@@ -55,7 +55,7 @@ from generator.vector import (
     prefetch_once,
     settle,
 )
-from generator.vector_mixing import (
+from generator.kernels.vector_mixing import (
     BLOCK,
     FAULTS,
     FIRST,

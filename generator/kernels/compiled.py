@@ -15,7 +15,7 @@ from typing import Any, Final, TypeVar, cast
 
 import numba
 
-_ROOT: Final = Path(__file__).parent.parent
+_ROOT: Final = Path(__file__).parents[2]
 _IMPORT: Final = re.compile(r"^from (generator[.\w]*) import (\([^)]*\)|.*)", re.MULTILINE)
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])

@@ -100,7 +100,7 @@ class Mixture:
             The table has no such light.
         """
         from generator.kernel import read_light
-        from generator.mixing import mixed_table
+        from generator.kernels.mixing import mixed_table
 
         self._require(lut)
         if len(self.lights) == 1:

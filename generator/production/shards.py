@@ -25,11 +25,11 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import FormatError, InputError
-from generator.layouts import Sample, ShardWriter, open_writer
-from generator.lighting import Lighting
+from generator.lights.lighting import Lighting
 from generator.picture import Picture
-from generator.plan import ShardJob, light_of, split_of, versions
-from generator.records import (
+from generator.production.layouts import Sample, ShardWriter, open_writer
+from generator.production.plan import ShardJob, light_of, split_of, versions
+from generator.production.records import (
     ImageRecord,
     LightRow,
     ShardRecord,
@@ -37,9 +37,9 @@ from generator.records import (
     SourceRecord,
     Triple,
 )
+from generator.production.workplace import Workplace
 from generator.scene import Source
 from generator.store import Pieces
-from generator.workplace import Workplace
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
@@ -215,7 +215,7 @@ def _wanted(job: ShardJob, position: int) -> list[tuple[int, Lighting]]:
 
 
 def _read(job: ShardJob, lut: Lut, place: int) -> _Read:
-    from generator.palette import fit_picture
+    from generator.kernels.palette import fit_picture
 
     source: Source = job.sources[place]
     scene = source.read()
@@ -260,8 +260,8 @@ def _photograph(
 ) -> tuple[npt.NDArray[np.uint16], Triple, list[tuple[str, str, bytes]]]:
     """Return the raw image, the mean of its lights, and the files that say where each of several lights falls."""
     from generator.kernel import draw_samples
-    from generator.mask_files import encode_maps
-    from generator.mixing import mix_samples
+    from generator.kernels.mixing import mix_samples
+    from generator.masks.files import encode_maps
 
     height, width = picture.shape[:2]
     tables = [mixture.samples(lut, seed, height * width) for mixture in lighting.mixtures]

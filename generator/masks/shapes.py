@@ -1,7 +1,7 @@
 """Kinds of masks: half planes and soft edges, spots, random smooth fields, windows.
 
 A shape draws its places from an image's dice, and gives a function from places in the picture to the lights' shares.
-Pixels see +, −, ×, ÷ and √ alone; see `masks`.
+Pixels see +, −, ×, ÷ and √ alone; see `making`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from generator import philox
+from generator.kernels import philox
 
 Array = npt.NDArray[np.floating[Any]]
 """float32: what is computed from float32 arrays and Python's own numbers stays float32."""

@@ -22,11 +22,11 @@ from pydantic import BaseModel, ConfigDict
 
 from drivers.errors import InputError
 from generator.encode import Format, libraries_of
-from generator.records import SPLITS, Layout, Light, Split, Table
+from generator.production.records import SPLITS, Layout, Light, Split, Table
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
-    from generator.lighting import LightChoice
+    from generator.lights.lighting import LightChoice
     from generator.scene import Source
 
 SHARD_IMAGES: Final = 256
@@ -114,7 +114,7 @@ class Plan:
     options: Options
 
     def __post_init__(self) -> None:
-        from generator.philox import key_of
+        from generator.kernels.philox import key_of
 
         key_of(self.seed)
         if not self.sources or not self.choice.lights_each:
@@ -126,7 +126,7 @@ class Plan:
         if self.options.shard_images < 1:
             raise InputError(f"shards of {self.options.shard_images} images were asked for, expected 1 or more")
         if self.options.layout == "parquet":
-            from generator.parquet import require_pyarrow
+            from generator.production.parquet import require_pyarrow
 
             require_pyarrow()
         check_shares(self.options.split)

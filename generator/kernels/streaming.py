@@ -9,7 +9,7 @@ from typing import Final
 
 import numba
 
-from generator.vector import LINE, copy2, copy_line, stream_line
+from generator.kernels.vector import LINE, copy2, copy_line, stream_line
 
 STREAMED_BYTES: Final = 24 << 20
 """Bytes of an image from which it is streamed: what a processor's last cache may have."""

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import InputError
-from generator.lighting import Mixture, mixture_of
+from generator.lights.lighting import Mixture, mixture_of
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

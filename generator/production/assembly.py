@@ -17,8 +17,8 @@ from typing import Any, BinaryIO
 
 from drivers.errors import FormatError
 from generator.encode import suffix_of
-from generator.plan import software
-from generator.records import (
+from generator.production.plan import software
+from generator.production.records import (
     SPLITS,
     Description,
     ImageRecord,
@@ -29,8 +29,8 @@ from generator.records import (
     Table,
     image_key,
 )
+from generator.production.workplace import DESCRIPTION, Workplace
 from generator.store import Store, open_store
-from generator.workplace import DESCRIPTION, Workplace
 
 GROUND_TRUTH = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS = ("image", "source", "illumination", "r", "g", "b")

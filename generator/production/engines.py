@@ -18,9 +18,9 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING, Final
 
 from drivers.errors import CropError, DeviceError, InputError
-from generator.plan import Plan
-from generator.shards import Done, OnImage, OnSkip, Stopped, make_elsewhere, make_shard
-from generator.workplace import Workplace
+from generator.production.plan import Plan
+from generator.production.shards import Done, OnImage, OnSkip, Stopped, make_elsewhere, make_shard
+from generator.production.workplace import Workplace
 
 if TYPE_CHECKING:
     import distributed

@@ -19,9 +19,9 @@ from contextlib import ExitStack
 from typing import Any, BinaryIO, Final, Self, cast
 
 from drivers.errors import FormatError
-from generator.layouts import Fault, Sample, hold
-from generator.plan import ShardJob
-from generator.records import FileSum, shard_key
+from generator.production.layouts import Fault, Sample, hold
+from generator.production.plan import ShardJob
+from generator.production.records import FileSum, shard_key
 from generator.store import Store
 
 _ENDINGS: Final = {"images": "", "previews": ".preview", "masks": ".masks", "ground_truth": ".ground_truth"}

@@ -26,8 +26,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import FormatError
-from generator.lighting import FULL, Lighting, MaskMaker
-from generator.masks import whole_parts
+from generator.lights.lighting import FULL, Lighting, MaskMaker
+from generator.masks.making import whole_parts
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

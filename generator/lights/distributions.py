@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import FormatError, InputError
-from generator.gamut import rb_of
-from generator.options import parse_numbers
-from generator.philox import Words
+from generator.kernels.philox import Words
+from generator.lights.gamut import rb_of
+from generator.lights.options import parse_numbers
 
 _Array = npt.NDArray[np.float64]
 _WORD = float(1 << 32)
@@ -171,7 +171,7 @@ def parse_distribution(text: str) -> Distribution:
     FormatError
         The file cannot be read or fitted.
     """
-    from generator.ground_truths import load_ground_truths
+    from generator.lights.ground_truths import load_ground_truths
 
     kind, _, rest = text.strip().partition(":")
     if kind == "uniform" and not rest:

@@ -1,0 +1,1 @@
+"""From codes to samples: what is compiled, and the arithmetic it rests on."""

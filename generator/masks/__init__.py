@@ -1,0 +1,1 @@
+"""How several lights share an image."""

@@ -1,0 +1,1 @@
+"""A dataset made piece by piece, by any number of workers, and put together."""
