@@ -353,6 +353,7 @@ def render(
     InputError
         The table has no such light, or the picture is not of that shape and type.
     """
+    check_picture(picture)
     samples = read_light(lut, light, picture.shape[0] * picture.shape[1])
     fit, _ = fit_picture(picture, lut.provenance)
     return draw_samples(samples, fit, seed=seed, image=image, threads=threads)

@@ -84,17 +84,17 @@ _LINES: Final = line_room(SAMPLE_BYTES * (STRETCH + BLOCK))
 
 
 @compiled
-def _mix_table(samples: Any, weight: float, seed: Any, place: int, shuffled: bool, total: Any) -> None:
-    """Add one light to `total` (C, S, 3) float64, each colour's samples in the order of a shuffle of its own."""
-    colours, count = samples.shape[0], samples.shape[1]
+def _mix_table(samples: Any, weight: float, seed: Any, place: int, shuffled: bool, chosen: Any, total: Any) -> None:
+    """Add one light to `total` (N, S, 3) float64, each chosen colour's samples in the order of a shuffle of its own."""
+    count = samples.shape[1]
     root = np.sqrt(weight)
     order = np.empty(count, np.uint32)
     for i in range(count):
         order[i] = i
     words = np.empty(count + 3, np.uint32)
     rest = np.empty(3)
-    for colour in range(colours):
-        drawn, sums = samples[colour], total[colour]
+    for number, colour in enumerate(chosen):
+        drawn, sums = samples[colour], total[number]
         if shuffled:
             for i in range(0, count, 4):
                 words[i], words[i + 1], words[i + 2], words[i + 3] = four_words(
@@ -117,11 +117,11 @@ def _mix_table(samples: Any, weight: float, seed: Any, place: int, shuffled: boo
 
 
 @compiled
-def _round_table(total: Any, white: float, out: Any) -> None:
-    for colour in range(total.shape[0]):
+def _round_table(total: Any, white: float, chosen: Any, out: Any) -> None:
+    for number, colour in enumerate(chosen):
         for i in range(total.shape[1]):
             for channel in range(3):
-                out[colour, i, channel] = np.uint16(min(max(total[colour, i, channel] + 0.5, 0.0), white))
+                out[colour, i, channel] = np.uint16(min(max(total[number, i, channel] + 0.5, 0.0), white))
 
 
 @compiled
@@ -277,7 +277,12 @@ def _checked_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.floa
 
 
 def mixed_table(
-    tables: Samples | Sequence[Samples], weights: npt.ArrayLike, *, white_level: int = 65535, seed: int = 0
+    tables: Samples | Sequence[Samples],
+    weights: npt.ArrayLike,
+    *,
+    white_level: int = 65535,
+    seed: int = 0,
+    colours: npt.NDArray[np.bool_] | None = None,
 ) -> Samples:
     """Return the samples of a light that is the mixture of some lights; the formula stands at the head of this file.
 
@@ -295,6 +300,9 @@ def mixed_table(
         Saturation of the sensor: larger values are cut to it.
     seed
         Of the shuffles, 0 … 2⁶⁴ − 1.
+    colours
+        (8**bits,) which colours are wanted, if not all, such as `palette.colours_in` has them: for a small picture much
+        less work. The samples of the others are 0; those of the wanted ones do not depend on it.
 
     Returns
     -------
@@ -310,14 +318,18 @@ def mixed_table(
     checked = _checked_weights(weights, len(lights))
     check_white(white_level)
     key = check_place(seed, 0)
-    total = np.zeros(lights[0].shape, np.float64)
+    shape = lights[0].shape
+    if colours is not None and (colours.shape != shape[:1] or colours.dtype != np.bool_):
+        raise InputError(f"the colours are {colours.dtype} {colours.shape}, expected bool ({shape[0]},)")
+    chosen = np.flatnonzero(np.ones(shape[0], np.bool_) if colours is None else colours)
+    total = np.zeros((len(chosen), *shape[1:]), np.float64)
     shuffled = False
     for place, (samples, weight) in enumerate(zip(lights, checked, strict=True)):
         if weight > 0:
-            _mix_table(np.asarray(samples), float(weight), key, place, shuffled, total)
+            _mix_table(np.asarray(samples), float(weight), key, place, shuffled, chosen, total)
             shuffled = True
-    out = np.empty(total.shape, np.uint16)
-    _round_table(total, float(white_level), out)
+    out = np.zeros(shape, np.uint16)
+    _round_table(total, float(white_level), chosen, out)
     return out
 
 

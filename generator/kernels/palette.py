@@ -6,12 +6,14 @@ number of those pixels is told and recorded with the dataset; nothing is replace
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import InputError, QualityError
+from generator.kernels.compiled import compiled
 
 if TYPE_CHECKING:
     from calibration.lut import Provenance
@@ -88,20 +90,50 @@ def fit_picture(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple
     tuple
         (H, W, 3) uint8, the same array if nothing had to be replaced; and the count.
     """
-    unfit = np.unique([cell.colour for cell in provenance.unfit]).astype(np.int64)
-    if not unfit.size:
-        return picture, 0
     bits = provenance.bits
-    shift = 8 - bits
-    top = (picture >> shift).astype(np.uint16)
-    colours = (top[..., 0] << 2 * bits) | (top[..., 1] << bits) | top[..., 2]
-    is_unfit = np.zeros(8**bits, dtype=bool)
-    is_unfit[unfit] = True
-    rows, columns = np.nonzero(is_unfit[colours])
-    if not rows.size:
+    unfit = tuple(sorted({cell.colour for cell in provenance.unfit}))
+    if not unfit or not colours_in(picture, bits)[list(unfit)].any():
         return picture, 0
-    instead = np.zeros(8**bits, dtype=np.int64)
-    instead[unfit] = stand_ins(unfit, bits)
-    replaced = picture.copy()
-    replaced[rows, columns] = channels_of(instead[colours[rows, columns]], bits) << shift
-    return replaced, int(rows.size)
+    is_unfit, instead = _replacements(unfit, bits)
+    replaced = np.array(picture, order="C")
+    return replaced, int(_replace(replaced, np.uint32(bits), is_unfit, instead))
+
+
+@lru_cache(maxsize=4)
+def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.uint8]]:
+    """Return which of a table's colours are unfit, and the codes (8**bits, 3) to stand in for those."""
+    is_unfit, instead = np.zeros(8**bits, np.bool_), np.zeros((8**bits, 3), np.uint8)
+    is_unfit[list(unfit)] = True
+    instead[list(unfit)] = channels_of(stand_ins(unfit, bits), bits) << (8 - bits)
+    return is_unfit, instead
+
+
+def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool_]:
+    """Return which of the (8**bits,) colours of a table are in a picture (H, W, 3) uint8."""
+    found = np.zeros(8**bits, np.bool_)
+    _find(np.ascontiguousarray(picture), np.uint32(bits), found)
+    return found
+
+
+@compiled
+def _find(picture: Any, bits: Any, found: Any) -> None:
+    low, middle = np.uint32(8) - bits, np.uint32(2) * bits
+    for y in range(picture.shape[0]):
+        for x in range(picture.shape[1]):
+            red, green, blue = picture[y, x, 0] >> low, picture[y, x, 1] >> low, picture[y, x, 2] >> low
+            found[red << middle | green << bits | blue] = True
+
+
+@compiled
+def _replace(picture: Any, bits: Any, is_unfit: Any, instead: Any) -> int:
+    low, middle = np.uint32(8) - bits, np.uint32(2) * bits
+    count = 0
+    for y in range(picture.shape[0]):
+        for x in range(picture.shape[1]):
+            red, green, blue = picture[y, x, 0] >> low, picture[y, x, 1] >> low, picture[y, x, 2] >> low
+            colour = red << middle | green << bits | blue
+            if is_unfit[colour]:
+                for channel in range(3):
+                    picture[y, x, channel] = instead[colour, channel]
+                count += 1
+    return count

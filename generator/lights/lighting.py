@@ -82,7 +82,9 @@ class Mixture:
         self._require(lut)
         return np.asarray(self.weights) @ lut.white[list(self.lights)]
 
-    def samples(self, lut: Lut, seed: int = 0, pixels: int | None = None) -> npt.NDArray[np.uint16]:
+    def samples(
+        self, lut: Lut, seed: int = 0, pixels: int | None = None, colours: npt.NDArray[np.bool_] | None = None
+    ) -> npt.NDArray[np.uint16]:
         """Return the samples (8**bits, S, 3) uint16 of this light, as `kernel.draw_samples` takes them.
 
         Parameters
@@ -93,6 +95,8 @@ class Mixture:
             Decides which samples of the mixed lights meet.
         pixels
             How many pixels are to be made of them; see `kernel.read_light`. None: many.
+        colours
+            Which colours are wanted, (8**bits,) bool; None is all. Others may be 0; see `mixing.mixed_table`.
 
         Raises
         ------
@@ -106,7 +110,7 @@ class Mixture:
         if len(self.lights) == 1:
             return read_light(lut, self.lights[0]) if pixels is None else read_light(lut, self.lights[0], pixels)
         tables = [lut.samples[light] for light in self.lights]
-        return mixed_table(tables, self.weights, white_level=lut.provenance.white_level, seed=seed)
+        return mixed_table(tables, self.weights, white_level=lut.provenance.white_level, seed=seed, colours=colours)
 
     def _require(self, lut: Lut) -> None:
         if self.lights[-1] >= len(lut.white):

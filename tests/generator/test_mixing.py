@@ -71,6 +71,17 @@ def test_noise_of_the_lights_meets_by_chance(make_lut: Callable[..., Lut]) -> No
     assert not np.array_equal(mixed_table([samples, samples], (0.5, 0.5), seed=2), mixed)
 
 
+def test_colours_that_are_not_wanted_change_no_other(make_lut: Callable[..., Lut]) -> None:
+    samples = make_lut().samples[:3]
+    whole = mixed_table(samples, (0.2, 0.5, 0.3), seed=8)
+    wanted = np.arange(64) % 5 == 2
+    part = mixed_table(samples, (0.2, 0.5, 0.3), seed=8, colours=wanted)
+    np.testing.assert_array_equal(part[wanted], whole[wanted])
+    assert (part[~wanted] == 0).all()
+    with pytest.raises(InputError, match=r"the colours are bool \(63,\), expected bool \(64,\)"):
+        mixed_table(samples, (0.2, 0.5, 0.3), colours=wanted[1:])
+
+
 def test_saturation_is_kept(noisy: npt.NDArray[np.uint16]) -> None:
     mixed = mixed_table(noisy, (3, 3), white_level=4095)
     assert mixed.max() == 4095
