@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import tempfile
@@ -9,14 +10,17 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
-from drivers.errors import FormatError, InputError
+from drivers.errors import FormatError, InputError, StorageError
 from generator.kernels import philox
 from generator.picture import AS_THEY_ARE, LARGEST_SIDE, Picture, Preparation, open_picture
 from generator.store import filesystem, is_remote, local_path
+
+if TYPE_CHECKING:
+    from fsspec.spec import AbstractFileSystem
 
 SUFFIXES: Final = frozenset(
     {".avif", ".bmp", ".dpx", ".exr", ".gif", ".hdr", ".heic", ".heif", ".j2k", ".jp2", ".jpe", ".jpeg", ".jpg"}
@@ -100,7 +104,10 @@ class PictureFile:
         Raises
         ------
         FormatError
-            It cannot be read.
+            It is no picture, may not be read, or is gone from among others.
+        StorageError
+            Its bytes cannot be had for a reason that is not its own: a disk that is not mounted, a store that does not
+            answer. Then no picture may be passed over as if it were damaged.
         """
         with _at_hand(self.location) as path:
             digest = hashlib.sha256()
@@ -108,9 +115,11 @@ class PictureFile:
                 with path.open("rb") as stream:
                     while chunk := stream.read(1 << 20):
                         digest.update(chunk)
+                reading = open_picture(path, self.preparation, self.name)
+            except FormatError as error:
+                raise FormatError(str(error).replace(str(path), self.location)) from error
             except OSError as error:
-                raise FormatError(f"cannot read {self.location}: {error.strerror}; name a picture") from error
-            reading = open_picture(path, self.preparation, self.name)
+                raise _unread(self.location, error, _is_of_the_file(path, error)) from error
         return Scene(reading.picture, digest.hexdigest(), reading.profile)
 
 
@@ -121,13 +130,50 @@ def _at_hand(location: str) -> Generator[Path]:
         yield Path(location)
         return
     store, path = filesystem(location)
-    with tempfile.NamedTemporaryFile(prefix="crop-", suffix=PurePosixPath(location).suffix) as copy:
+    try:
+        copy = tempfile.NamedTemporaryFile(prefix="crop-", suffix=PurePosixPath(location).suffix)  # noqa: SIM115
+    except OSError as error:
+        raise _unread(location, error, own=False) from error
+    with copy:
         try:
             store.get_file(path, copy.name)
         except Exception as error:
             # Every store raises errors of its own.
-            raise FormatError(f"cannot read {location}: {error}; name a picture that the store has") from error
+            gone = isinstance(error, FileNotFoundError)
+            raise _unread(location, error, own=gone and _folder_is_there(store, path)) from error
         yield Path(copy.name)
+
+
+def _is_of_the_file(path: Path, error: OSError) -> bool:
+    """Return whether a file cannot be read for what it is itself, and not for where it lies."""
+    if error.errno != errno.ENOENT:
+        # A library that finds fault with a picture gives no number.
+        return error.errno in (None, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG)
+    # The folder of a disk that is not mounted is missing or empty.
+    try:
+        return any(path.parent.iterdir())
+    except OSError:
+        return False
+
+
+def _folder_is_there(store: AbstractFileSystem, path: str) -> bool:
+    """Return whether the folder of an object is there without it."""
+    try:
+        store.invalidate_cache()
+        return bool(store.isdir(path.rpartition("/")[0]))
+    except Exception:
+        return False
+
+
+def _unread(location: str, error: Exception, own: bool) -> FormatError | StorageError:
+    """Return what to raise where a picture's bytes cannot be had, be it for a reason of its `own` or not."""
+    reason = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split()).rstrip(".")
+    if own:
+        return FormatError(f"cannot read {location}: {reason}; name a picture")
+    return StorageError(
+        f"cannot read {location}: {reason}; see that every machine that works on the dataset can read it, then run the "
+        "same command again"
+    )
 
 
 @dataclass(frozen=True, slots=True)

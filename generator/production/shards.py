@@ -115,7 +115,7 @@ def make_shard(
                 ahead.append(pool.submit(_read, job, lut, row + len(ahead)))
             try:
                 got = ahead.popleft().result()
-            except (FormatError, OSError) as error:
+            except FormatError as error:
                 skipped.append(Skipped(position=job.position + row, name=source.name))
                 if on_skip:
                     on_skip(source.name, str(error), len(_wanted(job, job.position + row)))

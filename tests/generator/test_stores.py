@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -142,6 +143,44 @@ def test_sources_in_a_store(make_lut: Callable[..., Lut], tmp_path: Path) -> Non
         generate_dataset(lut, tmp_path / out, find_pictures([place]), [0, 1])
     assert contents(tmp_path / "there") == contents(tmp_path / "here")
     assert len(open_dataset(tmp_path / "here").description.skipped) == 1
+
+
+def test_a_source_out_of_reach_ends_the_work_and_leaves_no_picture_out(
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lut = make_lut()
+    data = cv2.imencode(".png", np.zeros((9, 8, 3), np.uint8))[1].tobytes()
+    for name in ("a.png", "b.png"):
+        RemoteStore("failing://bucket/pictures").put(name, data)
+    pictures = find_pictures(["failing://bucket/pictures"])
+
+    def hang_up(*_: object, **__: object) -> None:
+        raise ConnectionResetError("the store hung up")
+
+    with monkeypatch.context() as outage:
+        outage.setattr(FailingFileSystem, "get_file", hang_up)
+        with pytest.raises(StorageError, match=r"cannot read failing://bucket/pictures/a.png: the store hung up; see"):
+            generate_dataset(lut, tmp_path / "out", pictures, [0])
+    assert generate_dataset(lut, tmp_path / "out", pictures, [0]).description.sources == 2
+
+
+@pytest.mark.parametrize("unmounted", ["gone", "empty"])
+def test_a_disk_that_is_not_mounted_is_told_from_a_picture_that_is_gone(
+    make_lut: Callable[..., Lut], tmp_path: Path, unmounted: str
+) -> None:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for name in ("a.png", "b.png"):
+        (folder / name).write_bytes(cv2.imencode(".png", np.zeros((9, 8, 3), np.uint8))[1].tobytes())
+    pictures = find_pictures([folder])
+    (folder / "a.png").unlink()
+    made = generate_dataset(make_lut(), tmp_path / "one", pictures, [0])
+    assert (made.description.sources, [left.name for left in made.description.skipped]) == (1, ["a.png"])
+    shutil.rmtree(folder)
+    if unmounted == "empty":
+        folder.mkdir()
+    with pytest.raises(StorageError, match=r"a\.png: No such file or directory; see that every machine"):
+        generate_dataset(make_lut(name="again"), tmp_path / "none", pictures, [0])
 
 
 def test_a_place_that_holds_something_else_is_left_alone(make_lut: Callable[..., Lut]) -> None:
