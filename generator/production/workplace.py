@@ -1,13 +1,14 @@
 """The place where a dataset is made, so that it can be gone on with, and appears when it is complete.
 
-On a disk everything happens in the hidden folder `.OUT.partial`: `dataset/` fills with files, `plan/` holds the plan
-and the records of the shards that are done. At the end `dataset/` gets its name by one rename, then the rest is
-removed. An object store has no rename: the files lie where they stay, the notes below `OUT/.plan/`, and `dataset.json`,
-written last, makes a dataset of them.
+On a disk everything happens in the hidden folder `.OUT.partial`: `dataset-MARK/` fills with files, `plan/` holds the
+plan and the records of the shards that are done. At the end `dataset-MARK/` gets its name by one rename, then the rest
+is removed. An object store has no rename: the files lie where they stay, the notes below `OUT/.plan/`, and
+`dataset.json`, written last, makes a dataset of them.
 
 Laws that hold inside:
 
-- A place belongs to one plan. Another plan is refused, and told in what it differs.
+- A place belongs to one plan. Another plan is refused, and told in what it differs. A worker of a plan that was removed
+  from here may still be alive: its records bear the mark of its plan, so they are never taken for ours.
 - Whoever makes the whole dataset holds the folder alone; those who make a share each hold it together.
 - What holds no finished shard is not worth keeping and is removed when the work fails.
 """
@@ -17,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import hashlib
 import json
 import os
 import shutil
@@ -55,19 +57,24 @@ class Workplace:
         The plan and the shards' records, which will be thrown away.
     out
         The dataset's place.
+    mark
+        Of the plan.
     """
 
     files: Store
     notes: Store
     out: str
+    mark: str
 
     def done(self) -> set[int]:
         """Return the shards that are done."""
-        return {int(PurePosixPath(name).stem) for name in self.notes.names(RECORDS) if name.endswith(".json")}
+        ending = f".{self.mark}.json"
+        found = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
+        return {int(name.removesuffix(ending)) for name in found if name.endswith(ending)}
 
     def has(self, shard: int) -> bool:
         """Return whether a shard is done."""
-        return self.notes.has(_record_name(shard))
+        return self.notes.has(self._record_name(shard))
 
     def load(self, shard: int) -> ShardRecord:
         """Return the record of a shard that is done.
@@ -77,7 +84,7 @@ class Workplace:
         FormatError
             There is none, or it is damaged.
         """
-        name = _record_name(shard)
+        name = self._record_name(shard)
         try:
             return ShardRecord.model_validate_json(self.notes.get(name))
         except ValidationError as error:
@@ -87,7 +94,7 @@ class Workplace:
 
     def commit(self, record: ShardRecord) -> None:
         """Bring the record of a shard to the disk whose files are there: from here on it is done."""
-        name = _record_name(record.shard)
+        name = self._record_name(record.shard)
         self.notes.put(name, record.model_dump_json().encode())
         self.notes.settle([name])
 
@@ -116,9 +123,8 @@ class Workplace:
             sync_folder(out.parent)
         _remove_notes(self.notes)
 
-
-def _record_name(shard: int) -> str:
-    return f"{RECORDS}/{shard_key(shard)}.json"
+    def _record_name(self, shard: int) -> str:
+        return f"{RECORDS}/{shard_key(shard)}.{self.mark}.json"
 
 
 def finished(out: str | Path, identity: Identity) -> bool:
@@ -184,10 +190,11 @@ def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Genera
     folder = partial_path(path)
     with _held(folder, path, alone) as lock:
         notes = LocalStore(folder / "plan")
-        place = Workplace(LocalStore(folder / "dataset"), notes, str(path))
+        mark = _mark(identity)
+        place = Workplace(LocalStore(folder / f"dataset-{mark}"), notes, str(path), mark)
         try:
             if not notes.has(PLAN):
-                _begin(folder)
+                _begin(folder, mark)
                 notes.put(PLAN, _text(identity))
                 notes.settle([PLAN])
             _require_same(notes, identity, path, f"remove {folder}")
@@ -195,7 +202,7 @@ def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Genera
                 lock.share()
             yield place
         except BaseException:
-            if alone and folder.is_dir() and not place.done():
+            if alone and folder.is_dir() and not any(notes.names(RECORDS)):
                 shutil.rmtree(folder, ignore_errors=True)
             raise
 
@@ -222,7 +229,7 @@ def _notes(out: str | Path) -> Store:
 
 def _remote(out: str, identity: Identity) -> Generator[Workplace]:
     files, notes = RemoteStore(out), RemoteStore(f"{out.rstrip('/')}/{_NOTES}")
-    place = Workplace(files, notes, out)
+    place = Workplace(files, notes, out, _mark(identity))
     if files.has(DESCRIPTION):
         raise InputError(f"{out} already holds a dataset; name another place, or remove what is there")
     begun = notes.has(PLAN)
@@ -235,12 +242,12 @@ def _remote(out: str, identity: Identity) -> Generator[Workplace]:
         yield place
     except BaseException:
         with contextlib.suppress(Exception):
-            if not begun and not place.done():
+            if not begun and not any(notes.names(RECORDS)):
                 files.remove("")
         raise
 
 
-def _begin(folder: Path) -> None:
+def _begin(folder: Path, mark: str) -> None:
     """Make the folder's rooms; what lies there without a plan is a leftover from before the plan was written."""
     try:
         for path in folder.iterdir():
@@ -248,7 +255,7 @@ def _begin(folder: Path) -> None:
                 shutil.rmtree(path)
             else:
                 path.unlink()
-        for room in ("plan", "dataset"):
+        for room in ("plan", f"dataset-{mark}"):
             (folder / room).mkdir()
     except OSError as error:
         raise storage_error(folder, error) from error
@@ -256,6 +263,11 @@ def _begin(folder: Path) -> None:
 
 def _text(identity: Identity) -> bytes:
     return (json.dumps(identity, indent=1) + "\n").encode()
+
+
+def _mark(identity: Identity) -> str:
+    """Return by what a plan is known in names."""
+    return hashlib.sha256(json.dumps(_plain(identity), sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _plain(identity: Identity) -> Any:

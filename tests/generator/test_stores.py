@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +16,12 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from drivers.errors import FormatError, InputError, StorageError
-from generator.dataset import finish_dataset, generate_dataset, make_share, open_dataset
+from generator.dataset import finish_dataset, generate_dataset, make_dataset, make_share, open_dataset
 from generator.illuminant import ListedLights
 from generator.production.assembly import damage
 from generator.production.plan import Options, Plan
+from generator.production.shards import make_elsewhere
+from generator.production.workplace import workplace
 from generator.scene import find_pictures, random_scenes
 from generator.store import LocalStore, RemoteStore, open_store
 
@@ -143,6 +146,24 @@ def test_sources_in_a_store(make_lut: Callable[..., Lut], tmp_path: Path) -> Non
         generate_dataset(lut, tmp_path / out, find_pictures([place]), [0, 1])
     assert contents(tmp_path / "there") == contents(tmp_path / "here")
     assert len(open_dataset(tmp_path / "here").description.skipped) == 1
+
+
+@pytest.mark.parametrize("remote", [True, False])
+def test_a_late_worker_of_a_plan_that_was_removed_is_not_believed(
+    make_lut: Callable[..., Lut], tmp_path: Path, remote: bool
+) -> None:
+    lut = make_lut()
+    out = "memory://bucket/out" if remote else str(tmp_path / "out")
+    old, new = (Plan(lut, SCENES, ListedLights((0, 2)), seed, Options(shard_images=3)) for seed in (3, 4))
+    with workplace(out, old.identity()) as late:
+        pass
+    RemoteStore(out).remove("") if remote else shutil.rmtree(tmp_path / ".out.partial")
+    make_share(new, out, (1, 2))
+    with nullcontext() if remote else pytest.raises(StorageError, match="is gone"):
+        make_elsewhere(old.job(0), late)
+    make_dataset(new, out)
+    make_dataset(new, tmp_path / "undisturbed")
+    assert contents(out) == contents(tmp_path / "undisturbed")
 
 
 def test_a_source_out_of_reach_ends_the_work_and_leaves_no_picture_out(
