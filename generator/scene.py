@@ -245,9 +245,10 @@ def find_pictures(places: Sequence[Path | str], preparation: Preparation = AS_TH
     found: list[PictureFile] = []
     for place in places:
         remote = is_remote(str(place))
-        root = str(place) if remote else str(local_path(place))
+        # Whole, since a worker may have been started in another folder.
+        root = str(place) if remote else os.path.abspath(local_path(place))  # noqa: PTH100  keeps no link's target
         if not remote and not os.path.lexists(root):
-            raise InputError(f"there is no {root}; name a picture or a folder of pictures")
+            raise InputError(f"there is no {place}; name a picture or a folder of pictures")
         if not remote and not Path(root).is_dir():
             found.append(PictureFile(root, "", preparation))
             continue

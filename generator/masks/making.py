@@ -152,7 +152,7 @@ def parse_masks(text: str, lights: int, seed: int) -> MaskPlan:
             raise InputError(f"{text!r} is neither a folder of masks nor a kind of them: {', '.join(_OPTIONS)}")
         from generator.masks.files import find_masks
 
-        return find_masks(Path(text), lights)
+        return find_masks(Path(text).absolute(), lights)
     numbers = parse_numbers(rest, _OPTIONS[kind], f"the masks {kind}")
     whole = {name: _whole(numbers[name], name, kind) for name in ("count", "columns", "rows") if name in numbers}
     match kind:

@@ -187,7 +187,8 @@ def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Genera
         return
     path = local_path(out)
     require_free(path, "the dataset")
-    folder = partial_path(path)
+    # Whole, since a worker may have been started in another folder.
+    folder = partial_path(path).absolute()
     with _held(folder, path, alone) as lock:
         notes = LocalStore(folder / "plan")
         mark = _mark(identity)

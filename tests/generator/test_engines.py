@@ -17,7 +17,7 @@ from drivers.errors import InputError
 from generator.dataset import generate_dataset
 from generator.illuminant import RandomLights
 from generator.production.engines import parse_engine
-from generator.scene import random_scenes
+from generator.scene import find_pictures, random_scenes
 
 if TYPE_CHECKING:
     from distributed import LocalCluster
@@ -155,6 +155,17 @@ def test_a_cluster_by_its_address(
     path.write_text(path.read_text().replace("Test camera", "Another"))
     with pytest.raises(InputError, match="of a worker is not that of the plan; give every machine the same table"):
         generate_dataset(other, tmp_path / "refused", random_scenes(2, 24, 16), [0], engine=address)
+
+
+def test_workers_that_were_started_in_another_folder(
+    make_lut: Callable[..., Lut], tmp_path: Path, cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("pictures").mkdir()
+    Path("pictures/a.pgm").write_bytes(b"P5 2 2 255 abcd")
+    address = cluster.scheduler_address.replace("tcp://", "dask://")
+    made = generate_dataset(make_lut(), Path("out"), find_pictures(["pictures"]), [0], engine=address)
+    assert made.description.images == 1
 
 
 @pytest.mark.parametrize(
