@@ -41,7 +41,7 @@ from generator.kernels.arguments import (
 )
 from generator.kernels.choice import EDGE, OFFSETS, ask_group, four_words, group_of, row_keys
 from generator.kernels.compiled import compiled
-from generator.kernels.palette import bits_of
+from generator.kernels.palette import bits_of, colours_in
 from generator.kernels.streaming import line_at, line_room, pass_on
 from generator.kernels.vector import (
     GROUP,
@@ -125,9 +125,9 @@ def _round_table(total: Any, white: float, chosen: Any, out: Any) -> None:
 
 
 @compiled
-def _fill_means(samples: int, colours: int, count: int, means: int, step: int) -> None:
-    """Write each colour's mean, `step` bytes from one to the next."""
-    for colour in range(colours):
+def _fill_means(samples: int, chosen: Any, count: int, means: int, step: int) -> None:
+    """Write the mean of each chosen colour, `step` bytes from one colour to the next."""
+    for colour in chosen:
         mean4(samples + SAMPLE_BYTES * count * colour, count, means + step * colour)
 
 
@@ -402,8 +402,11 @@ def mix_samples(
     # A pair's means, 32 bytes, are to lie in one line of the cache.
     room = np.zeros(8 * pairs * colours + 15, np.float32)
     means = room[-room.ctypes.data % 64 // 4 :][: 8 * pairs * colours].reshape(colours, 2 * pairs, MEAN_BYTES // 4)
+    # To go through a whole light takes longer than to make a small picture.
+    small = picture.shape[0] * picture.shape[1] < 10 * colours
+    chosen = np.flatnonzero(colours_in(picture, bits) if small else np.ones(colours, np.bool_))
     for light, samples in enumerate(pieces):
-        _fill_means(samples.ctypes.data, colours, count, means[:, light].ctypes.data, means.strides[0])
+        _fill_means(samples.ctypes.data, chosen, count, means[:, light].ctypes.data, means.strides[0])
     faults: list[bool] = []
     no_weight = np.zeros(1, np.float32)
 

@@ -203,7 +203,9 @@ class Lighting:
         weights
             (H, W, lights) float32 ≥ 0, as `weights_of` returns them.
         """
-        return np.asarray(weights.mean(axis=(0, 1), dtype=np.float64)) @ self.whites(lut)
+        from generator.kernels.whites import mean_weights
+
+        return np.asarray(mean_weights(weights) @ self.whites(lut))
 
     def ground_truth_map(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Return the ground truth of each pixel.
@@ -221,11 +223,9 @@ class Lighting:
             (H, W, 3) float32, r + g + b = 1: the chromaticity of the sum of the lights' whites, each times its weight
             in the pixel.
         """
-        white = np.zeros((*weights.shape[:2], 3), np.float32)
-        for light, truth in enumerate(self.whites(lut).astype(np.float32)):
-            white += weights[..., light, None] * truth
-        white /= white.sum(axis=2, keepdims=True)
-        return white
+        from generator.kernels.whites import chromaticities
+
+        return chromaticities(weights, self.whites(lut))
 
 
 @runtime_checkable

@@ -222,7 +222,9 @@ def _png(image: npt.NDArray[np.uint16]) -> bytes:
     import cv2
 
     ordered = image if image.ndim == 2 else image[..., ::-1]
-    done, data = cv2.imencode(".png", np.ascontiguousarray(ordered), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    # Rows as differences from the rows above suit what is smooth, and trying all filters takes three times as long.
+    how = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]
+    done, data = cv2.imencode(".png", np.ascontiguousarray(ordered), how)
     if not done:
         raise FormatError(f"a map of {image.shape[1]}×{image.shape[0]} px cannot be written as PNG")
     return data.tobytes()
