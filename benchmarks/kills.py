@@ -31,8 +31,8 @@ from generator.scene import random_scenes
 
 IMAGES = 10_000
 LIGHTS = 2
-MEAN_S = 6.0
-"""Mean time between kills, s."""
+KILLS = 8
+"""So many times as long as between two kills, on the average, the undisturbed run takes."""
 
 
 def report(name: str, value: float, unit: str, against: str = "") -> None:
@@ -86,8 +86,10 @@ def start(lut: Path, out: Path, images: int, workers: int) -> subprocess.Popen[b
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
 
 
-def disturbed(lut: Path, out: Path, images: int, workers: int, chance: random.Random) -> tuple[int, int, int]:
-    """Make the data set while killing.
+def disturbed(
+    lut: Path, out: Path, images: int, workers: int, mean_s: float, chance: random.Random
+) -> tuple[int, int, int]:
+    """Make the data set while killing, every `mean_s` seconds on the average.
 
     Returns how many workers and how many programs were killed, and how many programs gave up by themselves, because a
     cluster whose worker is killed while it starts does not start.
@@ -98,7 +100,7 @@ def disturbed(lut: Path, out: Path, images: int, workers: int, chance: random.Ra
         try:
             while True:
                 try:
-                    code = program.wait(chance.expovariate(1 / MEAN_S))
+                    code = program.wait(chance.expovariate(1 / mean_s))
                     if code not in (0, DeviceError.exit_code):
                         raise RuntimeError(f"the program ended with {code} and not by a kill")
                     gave_up += code != 0
@@ -153,7 +155,7 @@ def main() -> None:
             out = Path(scratch) / f"out-{workers}"
             name = f"{images} images by {workers} Dask workers with kills"
             begun = time.perf_counter()
-            killed, programs, gave_up = disturbed(lut.folder, out, images, workers, chance)
+            killed, programs, gave_up = disturbed(lut.folder, out, images, workers, undisturbed / KILLS, chance)
             report(f"{name}: time", (time.perf_counter() - begun) / undisturbed, "ratio", "undisturbed, two threads")
             report(f"{name}: workers killed", killed, "kills")
             report(f"{name}: programs killed", programs, "kills")
