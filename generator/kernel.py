@@ -58,6 +58,7 @@ _WHOLE_LIGHT: Final = 1 << 20
 
 _STRETCH: Final = 16
 """Groups of pixels that are put together before they are streamed."""
+
 PATTERNS: Final = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
 """The channel of each site of a 2x2 Bayer block, in reading order."""
 
