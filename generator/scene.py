@@ -28,6 +28,11 @@ SUFFIXES: Final = frozenset(
 )
 """What a folder is searched for, in lower or upper case; a file that is named itself may end as it likes."""
 
+_OF_THE_MACHINE: Final = frozenset(
+    {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN}
+)
+"""Errors of reading that say nothing of a file."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Scene:
@@ -145,11 +150,10 @@ def _at_hand(location: str) -> Generator[Path]:
 
 
 def _is_of_the_file(path: Path, error: OSError) -> bool:
-    """Return whether a file cannot be read for what it is itself, and not for where it lies."""
-    if error.errno != errno.ENOENT:
-        # A library that finds fault with a picture gives no number.
-        return error.errno in (None, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG)
-    # The folder of a disk that is not mounted is missing or empty.
+    """Return whether a file cannot be read for what it is itself, and not for where it lies or who reads it."""
+    if error.errno in _OF_THE_MACHINE:
+        return False
+    # The folder of a disk that is not mounted, or fails, is missing, empty or cannot be listed.
     try:
         return any(path.parent.iterdir())
     except OSError:

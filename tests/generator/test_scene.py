@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import OpenImageIO as oiio  # noqa: N813
 import pytest
 import tifffile
 
-from drivers.errors import FormatError, InputError
+from drivers.errors import FormatError, InputError, StorageError
 from generator.picture import Preparation, read_picture
 from generator.scene import RandomScene, find_pictures, random_scenes
 from generator.store import filesystem
@@ -172,6 +174,24 @@ def test_links_to_folders_are_not_followed_and_links_to_files_are(tmp_path: Path
     (tmp_path / "in/again").symlink_to(tmp_path / "in")
     (tmp_path / "in/b.png").symlink_to(tmp_path / "in/deep/a.png")
     assert [source.name for source in find_pictures([tmp_path / "in"])] == ["b.png", "deep/a.png"]
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [(errno.EACCES, FormatError), (errno.EIO, FormatError), (errno.EMFILE, StorageError), (errno.ESTALE, StorageError)],
+)
+def test_what_a_file_is_itself_is_told_from_what_the_machine_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, kind: type[Exception]
+) -> None:
+    (tmp_path / "a.png").write_bytes(b"any")
+    (source,) = find_pictures([tmp_path])
+
+    def fail(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "open", fail)
+    with pytest.raises(kind, match=rf"cannot read .*a\.png: {os.strerror(number)};"):
+        source.read()
 
 
 def test_pictures_of_a_store_are_those_of_a_folder(tmp_path: Path, colours: npt.NDArray[np.uint8]) -> None:
