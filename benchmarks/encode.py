@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import skimage.data
 
-from benchmarks.generator import natural_picture, noisy_table, report
+from benchmarks.generator import in_turns, natural_picture, noisy_table, report
 from generator.encode import FORMATS, Shot, encode_image
 from generator.encoders.png import encode_png
 from generator.kernel import draw_samples
@@ -39,17 +39,6 @@ def photograph(width: int, height: int) -> npt.NDArray[np.uint8]:
     larger = np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC), dtype=np.float32)
     grain = np.random.default_rng(3).normal(0, GRAIN, larger.shape)
     return np.clip(np.rint(larger + grain), 0, 255).astype(np.uint8)
-
-
-def fastest(calls: Mapping[str, Callable[[], object]], repeats: int = REPEATS) -> dict[str, float]:
-    """Return the seconds of the fastest of some calls of each, taken in turn."""
-    times = {name: float("inf") for name in calls}
-    for _ in range(repeats):
-        for name, call in calls.items():
-            start = time.perf_counter()
-            call()
-            times[name] = min(times[name], time.perf_counter() - start)
-    return times
 
 
 def at_once(pool: ThreadPoolExecutor, calls: Sequence[Callable[[], object]]) -> None:
@@ -81,7 +70,7 @@ def main() -> None:
             }
             if form == "png":
                 calls["shared"] = partial(encode_png, image, SHOT, threads=2)
-            took = fastest(calls, REPEATS if picture.size > 10**7 else 20)
+            took = in_turns(calls, time.perf_counter, REPEATS if picture.size > 10**7 else 20)
         pixels = picture.size / 3e6
         report(f"{form}, {name}, one thread", pixels / took["ours"], "Mpx/s")
         report(f"{form}, {name}, one thread", took["cv2"] / took["ours"], "ratio", "PNG by cv2.imencode")

@@ -125,8 +125,8 @@ def _choose_all(picture: int, width: int, height: int, count: Any, bits: Any, ta
 @compiled
 def _fetch(samples: int, places: int, count: int, target: int) -> None:
     for i in range(0, count, GROUP):
-        prefetch_once(places + 4 * i + 2048)
-        prefetch_once(places + 4 * i + 2048 + LINE)
+        for line in range(0, 4 * GROUP, LINE):
+            prefetch_once(places + 4 * i + 2048 + line)
         for k in range(GROUP):
             copy8(samples + offset_at(places + 4 * (i + k)), target + 8 * k)
 

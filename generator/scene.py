@@ -155,7 +155,8 @@ def _is_of_the_file(path: Path, error: OSError) -> bool:
         return False
     # The folder of a disk that is not mounted, or fails, is missing, empty or cannot be listed.
     try:
-        return any(path.parent.iterdir())
+        with os.scandir(path.parent) as entries:
+            return next(entries, None) is not None
     except OSError:
         return False
 

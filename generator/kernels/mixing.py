@@ -38,6 +38,7 @@ from generator.kernels.arguments import (
     packed,
     readable,
     share,
+    writable,
 )
 from generator.kernels.choice import EDGE, OFFSETS, ask_group, four_words, group_of, row_keys
 from generator.kernels.compiled import compiled
@@ -61,7 +62,6 @@ from generator.kernels.vector_mixing import (
     FIRST,
     MEAN_BYTES,
     PLAN,
-    SECOND,
     copy_least,
     full8,
     line_up8,
@@ -224,10 +224,9 @@ def _mix_pixels(
                     lit[pair] = found
                 if not lit[pair]:
                     continue
-                shines = (lit[pair] & FIRST != 0) + 2 * (lit[pair] & SECOND != 0)
                 for member in range(2):
                     # In the place of a light without weight stands its partner.
-                    it = member if shines >> member & 1 else 1 - member
+                    it = member if lit[pair] >> 4 * member & FIRST else 1 - member
                     plan[lit_pairs, 1 + member] = line + ROOM * (2 + it)
                     plan[lit_pairs, 3 + member] = tables[light + it]
                     if it != member:
@@ -392,9 +391,7 @@ def mix_samples(
     if picture.shape[1] < BLOCK:
         source = np.pad(source, ((0, 0), (0, BLOCK), (0, 0)))
         each = np.pad(each, ((0, 0), (0, BLOCK), (0, 0)))
-    work = target
-    if source.shape != picture.shape or target.strides[1:] != (6, 2) or not target.flags.aligned:
-        work = np.empty(source.shape, np.uint16)
+    work = writable(target) if source.shape == picture.shape else np.empty(source.shape, np.uint16)
     pieces = [readable(samples) for samples in lights]
     addresses = np.array([piece.ctypes.data for piece in pieces])
     pairs = (len(lights) + 1) // 2

@@ -9,6 +9,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -115,23 +116,26 @@ def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool
     return found
 
 
+@numba.njit(inline="always")
+def _colour_at(picture: Any, y: int, x: int, bits: Any) -> Any:
+    low = np.uint32(8) - bits
+    red, green, blue = picture[y, x, 0] >> low, picture[y, x, 1] >> low, picture[y, x, 2] >> low
+    return red << np.uint32(2) * bits | green << bits | blue
+
+
 @compiled
 def _find(picture: Any, bits: Any, found: Any) -> None:
-    low, middle = np.uint32(8) - bits, np.uint32(2) * bits
     for y in range(picture.shape[0]):
         for x in range(picture.shape[1]):
-            red, green, blue = picture[y, x, 0] >> low, picture[y, x, 1] >> low, picture[y, x, 2] >> low
-            found[red << middle | green << bits | blue] = True
+            found[_colour_at(picture, y, x, bits)] = True
 
 
 @compiled
 def _replace(picture: Any, bits: Any, is_unfit: Any, instead: Any) -> int:
-    low, middle = np.uint32(8) - bits, np.uint32(2) * bits
     count = 0
     for y in range(picture.shape[0]):
         for x in range(picture.shape[1]):
-            red, green, blue = picture[y, x, 0] >> low, picture[y, x, 1] >> low, picture[y, x, 2] >> low
-            colour = red << middle | green << bits | blue
+            colour = _colour_at(picture, y, x, bits)
             if is_unfit[colour]:
                 for channel in range(3):
                     picture[y, x, channel] = instead[colour, channel]

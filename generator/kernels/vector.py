@@ -223,49 +223,42 @@ def offset_at(typing: Any, source: Any) -> Any:
     return types.int64(ADDRESS), generate
 
 
+def _copying(*parts: tuple[int, Any]) -> Callable[..., None]:
+    """Return what emits the copying of values, each given by its offset in bytes and its kind."""
+
+    def emit(builder: Builder, source: Value, target: Value) -> None:
+        for offset, kind in parts:
+            store(builder, load(builder, source, offset, kind), target, offset)
+
+    return emit
+
+
 @intrinsic
 def copy8(typing: Any, source: Any, target: Any) -> Any:
     """Copy a sample and the two bytes behind it."""
     del typing, source, target
-
-    def emit(builder: Builder, source: Value, target: Value) -> None:
-        store(builder, load(builder, source, 0, I64), target, 0)
-
-    return void(emit, ADDRESS, ADDRESS)
+    return void(_copying((0, I64)), ADDRESS, ADDRESS)
 
 
 @intrinsic
 def copy6(typing: Any, source: Any, target: Any) -> Any:
     """Copy a sample."""
     del typing, source, target
-
-    def emit(builder: Builder, source: Value, target: Value) -> None:
-        store(builder, load(builder, source, 0, I32), target, 0)
-        store(builder, load(builder, source, 4, I16), target, 4)
-
-    return void(emit, ADDRESS, ADDRESS)
+    return void(_copying((0, I32), (4, I16)), ADDRESS, ADDRESS)
 
 
 @intrinsic
 def copy2(typing: Any, source: Any, target: Any) -> Any:
     """Copy one channel of a sample."""
     del typing, source, target
-
-    def emit(builder: Builder, source: Value, target: Value) -> None:
-        store(builder, load(builder, source, 0, I16), target, 0)
-
-    return void(emit, ADDRESS, ADDRESS)
+    return void(_copying((0, I16)), ADDRESS, ADDRESS)
 
 
 @intrinsic
 def copy_line(typing: Any, source: Any, target: Any) -> Any:
     """Copy a line's bytes."""
     del typing, source, target
-
-    def emit(builder: Builder, source: Value, target: Value) -> None:
-        store(builder, load(builder, source, 0, _LINE), target, 0)
-
-    return void(emit, ADDRESS, ADDRESS)
+    return void(_copying((0, _LINE)), ADDRESS, ADDRESS)
 
 
 @intrinsic
@@ -296,11 +289,7 @@ def settle(typing: Any) -> Any:
 def copy1(typing: Any, source: Any, target: Any) -> Any:
     """Copy one byte."""
     del typing, source, target
-
-    def emit(builder: Builder, source: Value, target: Value) -> None:
-        store(builder, load(builder, source, 0, I8), target, 0)
-
-    return void(emit, ADDRESS, ADDRESS)
+    return void(_copying((0, I8)), ADDRESS, ADDRESS)
 
 
 def _channels(builder: Builder, samples: Value, offsets: Value, step: int) -> list[Value]:

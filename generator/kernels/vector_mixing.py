@@ -40,9 +40,7 @@ PLAN: Final = 6
 FAULTS: Final = 4 * LANES
 """Bytes that tell faulty weights."""
 FIRST: Final = 0x0F0F
-"""Of the lanes of a block's weights those of the pair's first light, four pixels after four; see `line_up8`."""
-SECOND: Final = 0xF0F0
-"""Those of the second."""
+"""Of the lanes of a block's weights those of the pair's first light; four higher stand the second's. See `line_up8`."""
 
 _FOUR: Final = 4
 _SHORTS: Final = ir.VectorType(I16, 2 * LANES)
