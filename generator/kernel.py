@@ -53,7 +53,7 @@ from generator.kernels.vector import (
 if TYPE_CHECKING:
     from calibration.lut import Lut
 
-_WHOLE_LIGHT: Final = 1 << 20
+WHOLE_LIGHT: Final = 1 << 20
 """Pixels from which reading a light's samples in one go is cheaper than touching their pages at random."""
 
 _STRETCH: Final = 16
@@ -312,7 +312,7 @@ def draw_mosaic(
     return delivered(work, target)
 
 
-def read_light(lut: Lut, light: int, pixels: int = _WHOLE_LIGHT) -> npt.NDArray[np.uint16]:
+def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT) -> npt.NDArray[np.uint16]:
     """Return the samples (8**bits, S, 3) uint16 of light number `light`, in memory if `pixels` are worth the copy.
 
     Raises
@@ -323,7 +323,7 @@ def read_light(lut: Lut, light: int, pixels: int = _WHOLE_LIGHT) -> npt.NDArray[
     if not 0 <= light < len(lut.samples):
         raise InputError(f"there is no light {light}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
     mapped = lut.samples[light]
-    return np.array(mapped) if pixels >= _WHOLE_LIGHT else mapped
+    return np.array(mapped) if pixels >= WHOLE_LIGHT else mapped
 
 
 def render(

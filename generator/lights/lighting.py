@@ -82,9 +82,7 @@ class Mixture:
         self._require(lut)
         return np.asarray(self.weights) @ lut.white[list(self.lights)]
 
-    def samples(
-        self, lut: Lut, seed: int = 0, pixels: int | None = None, colours: npt.NDArray[np.bool_] | None = None
-    ) -> npt.NDArray[np.uint16]:
+    def samples(self, lut: Lut, seed: int = 0, picture: npt.NDArray[np.uint8] | None = None) -> npt.NDArray[np.uint16]:
         """Return the samples (8**bits, S, 3) uint16 of this light, as `kernel.draw_samples` takes them.
 
         Parameters
@@ -93,22 +91,27 @@ class Mixture:
             The table.
         seed
             Decides which samples of the mixed lights meet.
-        pixels
-            How many pixels are to be made of them; see `kernel.read_light`. None: many.
-        colours
-            Which colours are wanted, (8**bits,) bool; None is all. Others may be 0; see `mixing.mixed_table`.
+        picture
+            (H, W, 3) uint8, the picture they are for: of a small one, samples of other colours may be 0, and a light
+            alone is not read whole. None: any pictures, of any size.
 
         Raises
         ------
         InputError
             The table has no such light.
         """
-        from generator.kernel import read_light
+        from generator.kernel import WHOLE_LIGHT, read_light
         from generator.kernels.mixing import mixed_table
+        from generator.kernels.palette import colours_in
 
         self._require(lut)
+        pixels = WHOLE_LIGHT if picture is None else picture.shape[0] * picture.shape[1]
         if len(self.lights) == 1:
-            return read_light(lut, self.lights[0]) if pixels is None else read_light(lut, self.lights[0], pixels)
+            return read_light(lut, self.lights[0], pixels)
+        colours = None
+        if picture is not None and pixels < WHOLE_LIGHT:
+            # To find the colours of a large picture takes as long as to mix all.
+            colours = colours_in(picture, lut.provenance.bits)
         tables = [lut.samples[light] for light in self.lights]
         return mixed_table(tables, self.weights, white_level=lut.provenance.white_level, seed=seed, colours=colours)
 

@@ -261,17 +261,13 @@ def _photograph(
     """Return the raw image, the mean of its lights, and the files that say where each of several lights falls."""
     from generator.kernel import draw_samples
     from generator.kernels.mixing import mix_samples
-    from generator.kernels.palette import colours_in
     from generator.masks.files import encode_maps
 
-    height, width = picture.shape[:2]
-    mixed = any(len(mixture.lights) > 1 for mixture in lighting.mixtures)
-    colours = colours_in(picture, lut.provenance.bits) if mixed else None
-    tables = [mixture.samples(lut, seed, height * width, colours) for mixture in lighting.mixtures]
+    tables = [mixture.samples(lut, seed, picture) for mixture in lighting.mixtures]
     if lighting.masks is None:
         image = draw_samples(tables[0], picture, seed=seed, image=number, out=_room(picture.shape))
         return image, chromaticity(lighting.whites(lut)[0]), []
-    weights = lighting.weights_of(height, width)
+    weights = lighting.weights_of(*picture.shape[:2])
     white_level = lut.provenance.white_level
     image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
     return image, chromaticity(lighting.overall(lut, weights)), encode_maps(lut, lighting, weights)
