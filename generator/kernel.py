@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
 from numba import uint32
@@ -35,6 +34,7 @@ from generator.kernels.arguments import (
 )
 from generator.kernels.choice import AHEAD, SCRATCH, ask_group, choose_group, row_keys, slot
 from generator.kernels.compiled import compiled
+from generator.kernels.drawing import choose_first, draw_groups
 from generator.kernels.palette import fit_picture
 from generator.kernels.streaming import line_at, line_room, pass_on
 from generator.kernels.vector import (
@@ -44,8 +44,6 @@ from generator.kernels.vector import (
     SAMPLE_BYTES,
     choose,
     copy2,
-    copy6,
-    copy8,
     offset_at,
     settle,
 )
@@ -61,13 +59,6 @@ _STRETCH: Final = 16
 
 PATTERNS: Final = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
 """The channel of each site of a 2x2 Bayer block, in reading order."""
-
-
-@numba.njit(inline="always")
-def _fetch_group(samples: int, offsets: int, pixels: int, target: int) -> None:
-    """Write the samples of a group's first pixels and not a byte more."""
-    for i in range(pixels):
-        copy6(samples + offset_at(offsets + 4 * i), target + SAMPLE_BYTES * i)
 
 
 @compiled
@@ -89,44 +80,27 @@ def _gather(
 ) -> None:
     """Fill rows of 3-channel pixels; numbers are addresses, and bytes from row to row.
 
-    Offsets are chosen some groups ahead of the samples they lead to, so that the processor multiplies while it waits.
     Picture and image leave the caches to the samples: the one is asked for as what is read once, the other, if
     `streamed`, put together in scratch memory and written a line at a time.
     """
-    groups, whole = (width + GROUP - 1) // GROUP, width // GROUP
+    groups = (width + GROUP - 1) // GROUP
     lines = line_at(scratch + SCRATCH)
     for y in range(rows):
         keys = row_keys(first_row + y, 0, image, seed)
         row, to = picture + y * pitch, target + y * target_pitch
         begin, held = to, to & (LINE - 1)
-        for group in range(min(AHEAD, groups)):
-            choose_group(row, width, group, keys, count, bits, scratch, slot(scratch, group))
+        choose_first(row, width, keys, count, bits, scratch, 0, groups)
         done = 0
         while done < groups:
-            end, into = groups, to
+            end, base = groups, to
             if streamed:
-                end, into = min(done + _STRETCH, groups), lines + held - SAMPLE_BYTES * GROUP * done
-            while done < end:
-                while done < min(end, whole - AHEAD):
-                    source, word = row + 3 * GROUP * (done + AHEAD), uint32(LANES * (done + AHEAD))
-                    ask_group(row, done + AHEAD)
-                    choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, done + AHEAD))
-                    offsets, at = slot(scratch, done), into + SAMPLE_BYTES * GROUP * done
-                    # Each copy's last two bytes are the next one's first two.
-                    for i in range(GROUP):
-                        copy8(samples + offset_at(offsets + 4 * i), at + SAMPLE_BYTES * i)
-                    done += 1
-                # The last groups of a row have none to choose ahead, or fewer pixels.
-                if done < end:
-                    if done + AHEAD < groups:
-                        choose_group(row, width, done + AHEAD, keys, count, bits, scratch, slot(scratch, done + AHEAD))
-                    pixels = min(GROUP, width - GROUP * done)
-                    _fetch_group(samples, slot(scratch, done), pixels, into + SAMPLE_BYTES * GROUP * done)
-                    done += 1
+                end, base = min(done + _STRETCH, groups), lines + held - SAMPLE_BYTES * GROUP * done
+            draw_groups(row, width, keys, samples, count, bits, scratch, done, end, groups, 0, 0, base)
             if streamed:
                 stop = to + SAMPLE_BYTES * min(GROUP * end, width)
                 held = pass_on(lines, begin, stop, end == groups)
                 begin = stop - held
+            done = end
     if streamed:
         settle()
 

@@ -40,8 +40,9 @@ from generator.kernels.arguments import (
     share,
     writable,
 )
-from generator.kernels.choice import EDGE, OFFSETS, ask_group, four_words, group_of, row_keys
+from generator.kernels.choice import OFFSETS, SCRATCH, ask_group, four_words, group_of, row_keys
 from generator.kernels.compiled import compiled
+from generator.kernels.drawing import choose_first, draw_groups
 from generator.kernels.palette import bits_of, colours_in
 from generator.kernels.streaming import line_at, line_room, pass_on
 from generator.kernels.vector import (
@@ -50,35 +51,31 @@ from generator.kernels.vector import (
     LINE,
     SAMPLE_BYTES,
     choose_named,
-    copy6,
     name_colours,
-    offset_at,
-    prefetch_once,
+    prefetch,
     settle,
 )
 from generator.kernels.vector_mixing import (
     BLOCK,
     FAULTS,
-    FIRST,
     MEAN_BYTES,
     PLAN,
-    copy_least,
-    full8,
-    line_up8,
+    interleave8,
+    line_up,
+    look,
     mean4,
     mix,
-    part8,
 )
 
 MIXTURES: Final = np.uint32(philox.MIXTURES)
 STRETCH: Final = 512
 """Pixels of a row whose offsets are chosen before their samples are fetched, a whole number of groups."""
 _SOON: Final = 4096
-"""Bytes of the weights that are asked for before they are read."""
+"""Pixels of a row whose weights are asked for before they are read: they come from memory while others are drawn."""
 ROOM: Final = OFFSETS * (STRETCH // GROUP + 1)
-"""Bytes of a stretch's offsets or weights; the last one of a row may be longer by up to seven pixels."""
-PAIR_ROOM: Final = 4 * ROOM
-"""Bytes of a stretch's weights and offsets of two lights."""
+"""Bytes of a stretch's offsets, or of one light's weights; a row's last may be longer by up to seven pixels."""
+PAIR_ROOM: Final = 6 * ROOM
+"""Bytes of a stretch's weights, as they are looked at and as they are mixed, and of its offsets, for two lights."""
 _LINES: Final = line_room(SAMPLE_BYTES * (STRETCH + BLOCK))
 """Bytes of a stretch that is put together before it is streamed."""
 
@@ -125,19 +122,111 @@ def _round_table(total: Any, white: float, chosen: Any, out: Any) -> None:
 
 
 @compiled
-def _fill_means(samples: int, chosen: Any, count: int, means: int, step: int) -> None:
-    """Write the mean of each chosen colour, `step` bytes from one colour to the next."""
+def _fill_means(samples: int, chosen: Any, count: int, means: int, step: int) -> int:
+    """Write each chosen colour's mean, `step` bytes from one to the next; return the largest number of the samples."""
+    most = 0
     for colour in chosen:
-        mean4(samples + SAMPLE_BYTES * count * colour, count, means + step * colour)
+        most = max(most, mean4(samples + SAMPLE_BYTES * count * colour, count, means + step * colour))
+    return most
 
 
 @numba.njit(inline="always")
-def _all_full(line: int, light: int, pixels: int) -> bool:
-    """Return whether all weights of a pair's light in a stretch are 1."""
-    full = True
-    for block in range((pixels + BLOCK - 1) // BLOCK):
-        full &= full8(line + 8 * BLOCK * block, light)
-    return full
+def _alone(couples: Any, count: int) -> int:
+    """Return the one light that has weights other than 0 in a stretch's first pixels, all 1; -1 if there is none."""
+    shining, alone = 0, -1
+    for pair in range(len(couples)):
+        seen = look(couples[pair], count)
+        for member in range(2):
+            if seen >> member & 1:
+                shining += 1
+                if not seen >> 2 + member & 1:
+                    alone = 2 * pair + member
+    return alone if shining == 1 else -1
+
+
+@compiled
+def _draw_stretch(
+    row: int,
+    width: int,
+    low: int,
+    high: int,
+    keys: Any,
+    samples: int,
+    count: Any,
+    bits: Any,
+    scratch: int,
+    soon: int,
+    lines: int,
+    base: int,
+) -> None:
+    """Fill the groups `low` … `high` − 1 of a row under one light; the row's first pixel would go to `base`.
+
+    With each group so many `lines` of what is read `soon` are asked for.
+    """
+    choose_first(row, width, keys, count, bits, scratch, low, high)
+    draw_groups(row, width, keys, samples, count, bits, scratch, low, high, high, soon, lines, base)
+
+
+@compiled
+def _mix_stretch(
+    row: int,
+    width: int,
+    low: int,
+    high: int,
+    pixels: int,
+    keys: Any,
+    tables: Any,
+    means: int,
+    count: Any,
+    bits: Any,
+    couples: Any,
+    white: Any,
+    scratch: int,
+    soon: int,
+    asked: int,
+    plan: Any,
+    plan_at: int,
+    target: int,
+) -> None:
+    """Fill the groups `low` … `high` − 1 of a row, `pixels` in all, by weights of which `couples` holds each pair's.
+
+    In scratch memory stand a row's last pixels, what tells faulty weights, the colours' offsets in means and in
+    samples, and each pair's weights and offsets. Weights that are all 0 add nothing, so that such a light needs no
+    offsets. With each group so many lines of what is read `soon` are `asked` for.
+    """
+    pairs = len(couples)
+    faults = scratch + SCRATCH
+    mean_places = faults + FAULTS
+    colours = mean_places + ROOM
+    lines = colours + ROOM
+    for group in range(low, high):
+        place = OFFSETS * (group - low)
+        ask_group(row, group)
+        for line in range(asked):
+            prefetch(soon + LINE * (asked * (group - low) + line))
+        source = group_of(row, width, group, scratch)
+        mean_stride, stride = uint32(2 * MEAN_BYTES * pairs), uint32(SAMPLE_BYTES * count)
+        name_colours(source, bits, mean_stride, mean_places + place, stride, colours + place)
+    lit_pairs = 0
+    for pair in range(pairs):
+        line, light = lines + PAIR_ROOM * pair + 2 * ROOM, 2 * pair
+        lit = line_up(couples[pair], pixels, line)
+        if not lit:
+            continue
+        plan[lit_pairs, 0], plan[lit_pairs, 5] = line, means + 2 * MEAN_BYTES * pair
+        for member in range(2):
+            # In the place of a light without weight stands its partner.
+            it = member if lit >> member & 1 else 1 - member
+            offsets = line + ROOM * (2 + it)
+            plan[lit_pairs, 1 + member], plan[lit_pairs, 3 + member] = offsets, tables[light + it]
+            if it != member:
+                continue
+            k0, k1, k2 = keys[light + it, 0], keys[light + it, 1], keys[light + it, 2]
+            for group in range(low, high):
+                place, word = OFFSETS * (group - low), uint32(LANES * group)
+                choose_named(colours + place, word, k0, k1, k2, count, offsets + place)
+        lit_pairs += 1
+    mix(plan_at, lit_pairs, pixels, mean_places, faults, np.float32(white), target)
 
 
 @compiled
@@ -153,6 +242,7 @@ def _mix_pixels(
     weights: int,
     weight_steps: Any,
     white: Any,
+    within: Any,
     seed: Any,
     image: int,
     first_row: int,
@@ -162,26 +252,21 @@ def _mix_pixels(
     plan: Any,
     plan_at: int,
     keys: Any,
-    lit: Any,
+    couples: Any,
     nothing: int,
     streamed: bool,
 ) -> None:
     """Fill rows of at least eight pixels. `weight_steps` are the bytes from row to row, pixel to pixel, light to light.
 
-    A stretch of a row at a time: weights and offsets of all lights first, then the sums, two lights at once. In scratch
-    memory stand a row's last pixels, what tells faulty weights, the colours' offsets in means and in samples, and each
-    pair's weights and offsets. Weights that are all 0 in a stretch add nothing there, so that such a light needs no
-    offsets; where only one light is left and all its weights are 1, its samples stand as they are.
+    A stretch of a row at a time. Where only one light has weights in it, all of them 1, and its samples are `within`
+    the white level, no more is done than for one light.
     """
-    lights = len(tables)
-    pairs = (lights + 1) // 2
-    faults = scratch + EDGE
-    mean_places = faults + FAULTS
-    colours = mean_places + ROOM
-    lines = colours + ROOM
+    lights, pairs = len(tables), len(couples)
+    lines = scratch + SCRATCH + FAULTS + 2 * ROOM
     held_lines = line_at(lines + PAIR_ROOM * pairs)
-    alternating = lights == 2 and weight_steps[1] == 8 and weight_steps[2] == 4
     alike = weight_steps[0] == 0 and weight_steps[1] == 0
+    # Lines of the weights of a group, where those of a pixel lie together.
+    asked = GROUP * weight_steps[1] // LINE if weight_steps[1] == 4 * lights else 0
     for y in range(rows):
         row, start = picture + y * pitch, 0
         begin = target + y * target_pitch
@@ -191,68 +276,54 @@ def _mix_pixels(
         while start < width:
             # What is left after a stretch must not be fewer than eight pixels.
             end = width if width - start < STRETCH + BLOCK else start + STRETCH
-            low, high = start // GROUP, (end + GROUP - 1) // GROUP
-            for group in range(low, high):
-                place = OFFSETS * (group - low)
-                ask_group(row, group)
-                source = group_of(row, width, group, scratch)
-                name_colours(
-                    source,
-                    bits,
-                    uint32(2 * MEAN_BYTES * pairs),
-                    mean_places + place,
-                    uint32(SAMPLE_BYTES * count),
-                    colours + place,
-                )
-            shining, lit_pairs, alone = 0, 0, 0
+            pixels, low, high = end - start, start // GROUP, (end + GROUP - 1) // GROUP
             for pair in range(pairs):
                 line, light = lines + PAIR_ROOM * pair, 2 * pair
-                if not alike or (y == 0 and start == 0):
-                    blocks = STRETCH // BLOCK + 1 if alike else (end - start + BLOCK - 1) // BLOCK
-                    first, step = weights + y * weight_steps[0] + light * weight_steps[2], weight_steps[1]
-                    found = 0
-                    for block in range(blocks):
-                        at = first + step * min(start + BLOCK * block, end - BLOCK)
-                        prefetch_once(at + _SOON)
-                        if alternating:
-                            found |= part8(at, line + 8 * BLOCK * block)
-                        elif light + 1 < lights:
-                            found |= line_up8(at, step, at + weight_steps[2], step, line + 8 * BLOCK * block)
-                        else:
-                            # A light too few for the pair: its partner never has a weight.
-                            found |= line_up8(at, step, nothing, 0, line + 8 * BLOCK * block)
-                    lit[pair] = found
-                if not lit[pair]:
+                first, step = weights + y * weight_steps[0] + light * weight_steps[2], weight_steps[1]
+                # Where lights are odd in number, the last one's partner never has a weight.
+                second, second_step = (first + weight_steps[2], step) if light + 1 < lights else (nothing, 0)
+                if step == 8 and second == first + 4:
+                    couples[pair] = first + step * start
                     continue
-                for member in range(2):
-                    # In the place of a light without weight stands its partner.
-                    it = member if lit[pair] >> 4 * member & FIRST else 1 - member
-                    plan[lit_pairs, 1 + member] = line + ROOM * (2 + it)
-                    plan[lit_pairs, 3 + member] = tables[light + it]
-                    if it != member:
-                        continue
-                    shining, alone = shining + 1, light + it
-                    k0, k1, k2 = keys[light + it, 0], keys[light + it, 1], keys[light + it, 2]
-                    for group in range(low, high):
-                        place, word = OFFSETS * (group - low), uint32(LANES * group)
-                        choose_named(colours + place, word, k0, k1, k2, count, line + ROOM * (2 + it) + place)
-                plan[lit_pairs, 0], plan[lit_pairs, 5] = line, means + 2 * MEAN_BYTES * pair
-                lit_pairs += 1
-            to, line = target + y * target_pitch + SAMPLE_BYTES * start, lines + PAIR_ROOM * (alone // 2)
-            stop = to + SAMPLE_BYTES * (end - start)
+                couples[pair] = line
+                if not alike or (y == 0 and start == 0):
+                    for i in range(0, STRETCH + BLOCK if alike else pixels, BLOCK):
+                        x = i if alike else min(i, pixels - BLOCK)
+                        at, other = first + step * (start + x), second + second_step * (start + x)
+                        interleave8(at, step, other, second_step, line + 8 * x)
+            soon = weights + y * weight_steps[0] + (end + _SOON) * weight_steps[1]
+            to = target + y * target_pitch + SAMPLE_BYTES * start
+            stop = to + SAMPLE_BYTES * pixels
             if streamed:
                 to = held_lines + held
-            if shining == 1 and _all_full(line, alone & 1, end - start):
-                offsets = line + ROOM * (2 + (alone & 1))
-                samples = tables[alone]
-                for i in range(end - start - 1):
-                    copy_least(samples + offset_at(offsets + 4 * i), white, to + SAMPLE_BYTES * i)
-                # Of the last pixel not more than its own bytes are written.
-                i = end - start - 1
-                copy_least(samples + offset_at(offsets + 4 * i), white, scratch)
-                copy6(scratch, to + SAMPLE_BYTES * i)
+            # The first pixels tell in most cases that no light is alone.
+            alone = _alone(couples, BLOCK)
+            if alone >= 0:
+                alone = _alone(couples, pixels)
+            if alone >= 0 and within[alone]:
+                its, base = (keys[alone, 0], keys[alone, 1], keys[alone, 2]), to - SAMPLE_BYTES * start
+                _draw_stretch(row, width, low, high, its, tables[alone], count, bits, scratch, soon, asked, base)
             else:
-                mix(plan_at, lit_pairs, end - start, mean_places, faults, np.float32(white), to)
+                _mix_stretch(
+                    row,
+                    width,
+                    low,
+                    high,
+                    pixels,
+                    keys,
+                    tables,
+                    means,
+                    count,
+                    bits,
+                    couples,
+                    white,
+                    scratch,
+                    soon,
+                    asked,
+                    plan,
+                    plan_at,
+                    to,
+                )
             if streamed:
                 held = pass_on(held_lines, begin, stop, end == width)
                 begin = stop - held
@@ -402,13 +473,16 @@ def mix_samples(
     # To go through a whole light takes longer than to make a small picture.
     small = picture.shape[0] * picture.shape[1] < 10 * colours
     chosen = np.flatnonzero(colours_in(picture, bits) if small else np.ones(colours, np.bool_))
-    for light, samples in enumerate(pieces):
+    most = [
         _fill_means(samples.ctypes.data, chosen, count, means[:, light].ctypes.data, means.strides[0])
+        for light, samples in enumerate(pieces)
+    ]
+    within = np.array(most) <= white_level
     faults: list[bool] = []
     no_weight = np.zeros(1, np.float32)
 
     def fill(top: int, bottom: int) -> None:
-        scratch = np.zeros(EDGE + FAULTS + 2 * ROOM + PAIR_ROOM * pairs + _LINES, np.uint8)
+        scratch = np.zeros(SCRATCH + FAULTS + 2 * ROOM + PAIR_ROOM * pairs + _LINES, np.uint8)
         plan = np.zeros((pairs, PLAN), np.int64)
         _mix_pixels(
             source[top:].ctypes.data,
@@ -422,6 +496,7 @@ def mix_samples(
             each[top:].ctypes.data,
             np.array(each.strides),
             np.uint16(white_level),
+            within,
             key,
             image,
             first_row + top,
@@ -435,7 +510,7 @@ def mix_samples(
             no_weight.ctypes.data,
             work.nbytes >= streaming.STREAMED_BYTES,
         )
-        faults.append(bool(np.isnan(scratch[EDGE : EDGE + FAULTS].view(np.float32)).any()))
+        faults.append(bool(np.isnan(scratch[SCRATCH : SCRATCH + FAULTS].view(np.float32)).any()))
 
     share(fill, len(picture), threads)
     if any(faults):

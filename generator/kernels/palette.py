@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numba
 import numpy as np
 import numpy.typing as npt
+from numba import uint32
 
 from drivers.errors import InputError, QualityError
+from generator.kernels.choice import EDGE, OFFSETS, group_of
 from generator.kernels.compiled import compiled
+from generator.kernels.vector import GROUP, copy1, name_colours, offset_at
 
 if TYPE_CHECKING:
     from calibration.lut import Provenance
@@ -112,8 +115,22 @@ def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.boo
 def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool_]:
     """Return which of the (8**bits,) colours of a table are in a picture (H, W, 3) uint8."""
     found = np.zeros(8**bits, np.bool_)
-    _find(np.ascontiguousarray(picture), np.uint32(bits), found)
+    pixels = np.ascontiguousarray(picture)
+    scratch = np.ones(EDGE + 2 * OFFSETS + 1, np.uint8)
+    _find(pixels.ctypes.data, pixels.size // 3, np.uint32(bits), found.ctypes.data, scratch.ctypes.data)
     return found
+
+
+@compiled
+def _find(pixels: int, count: int, bits: Any, found: int, scratch: int) -> None:
+    """Set the byte of each colour that is among the pixels to the last one of scratch memory."""
+    places, others = scratch + EDGE, scratch + EDGE + OFFSETS
+    one = others + OFFSETS
+    for group in range((count + GROUP - 1) // GROUP):
+        source = group_of(pixels, count, group, scratch)
+        name_colours(source, bits, uint32(1), places, uint32(0), others)
+        for i in range(min(GROUP, count - GROUP * group)):
+            copy1(one, found + offset_at(places + 4 * i))
 
 
 @numba.njit(inline="always")
@@ -121,13 +138,6 @@ def _colour_at(picture: Any, y: int, x: int, bits: Any) -> Any:
     low = np.uint32(8) - bits
     red, green, blue = picture[y, x, 0] >> low, picture[y, x, 1] >> low, picture[y, x, 2] >> low
     return red << np.uint32(2) * bits | green << bits | blue
-
-
-@compiled
-def _find(picture: Any, bits: Any, found: Any) -> None:
-    for y in range(picture.shape[0]):
-        for x in range(picture.shape[1]):
-            found[_colour_at(picture, y, x, bits)] = True
 
 
 @compiled

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from typing import Any, Final
 
 from llvmlite import ir
@@ -14,6 +15,7 @@ from generator.kernels.vector import (
     ADDRESS,
     F32,
     FLOATS,
+    I8,
     I16,
     I32,
     I64,
@@ -39,93 +41,150 @@ PLAN: Final = 6
 """Addresses that `mix` wants of a pair of lights."""
 FAULTS: Final = 4 * LANES
 """Bytes that tell faulty weights."""
-FIRST: Final = 0x0F0F
-"""Of the lanes of a block's weights those of the pair's first light; four higher stand the second's. See `line_up8`."""
 
 _FOUR: Final = 4
 _SHORTS: Final = ir.VectorType(I16, 2 * LANES)
+_EIGHT_WORDS: Final = ir.VectorType(I32, BLOCK)
 _COUPLES: Final = ((0, 2), (4, 6), (1, 3), (5, 7))
 """Which two of eight pixels share a vector: so pixels are packed without crossing its quarters."""
+_ORDER: Final = tuple((_COUPLES[lane % _FOUR][lane // (2 * _FOUR)], lane // _FOUR % 2) for lane in range(LANES))
+"""Pixel and light of each of a block's weights as they are lined up: in the quarters where a couple is mixed."""
 
 
 @intrinsic
 def mean4(typing: Any, source: Any, count: Any, target: Any) -> Any:
-    """Write the mean of `count` ≥ 1 samples in a row as four float32, the fourth without meaning."""
+    """Write the mean of `count` ≥ 1 samples in a row as four float32, the fourth without meaning.
+
+    Returns the largest number of the samples.
+    """
     del typing, source, count, target
 
-    def emit(builder: Builder, source: Value, count: Value, target: Value) -> None:
+    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
+        del context, signature
+        source, count, target = arguments
         wide, real = ir.VectorType(I64, _FOUR), ir.VectorType(ir.DoubleType(), _FOUR)
-        total = cgutils.alloca_once_value(builder, ir.Constant(wide, [0] * _FOUR))
+        total, most = (cgutils.alloca_once_value(builder, ir.Constant(wide, [0] * _FOUR)) for _ in range(2))
         with cgutils.for_range(builder, count) as loop:
             at = builder.add(source, builder.mul(loop.index, ir.Constant(I64, SAMPLE_BYTES)))
             sample = builder.zext(load(builder, at, 0, ir.VectorType(I16, _FOUR)), wide)
             builder.store(builder.add(builder.load(total), sample), total)
+            before = builder.load(most)
+            builder.store(builder.select(builder.icmp_unsigned(">", sample, before), sample, before), most)
         mean = builder.fdiv(
             builder.sitofp(builder.load(total), real), spread(builder, builder.sitofp(count, ir.DoubleType()), real)
         )
         store(builder, builder.fptrunc(mean, ir.VectorType(F32, _FOUR)), target, 0)
+        largest = ir.Constant(I64, 0)
+        for channel in range(3):
+            value = builder.extract_element(builder.load(most), ir.Constant(I32, channel))
+            largest = builder.select(builder.icmp_unsigned(">", value, largest), value, largest)
+        return largest
 
-    return void(emit, ADDRESS, types.int64, ADDRESS)
+    return types.int64(ADDRESS, types.int64, ADDRESS), generate
 
 
-def _keep(builder: Builder, line: Value, target: Value) -> Value:
-    """Write a line of weights; return which of its lanes are not 0, a bit a lane."""
-    store(builder, line, target, 0)
-    other = builder.icmp_unsigned("!=", builder.bitcast(line, WORDS), constant(WORDS, 0))
-    return builder.zext(builder.bitcast(other, ir.IntType(LANES)), I64)
+def _each_line(builder: Builder, weights: Value, count: Value, do: Callable[[Value, Value], None]) -> None:
+    """Do something with each eight pixels' weights of a pair of lights and their number; with the last ones twice."""
+    blocks = builder.lshr(builder.add(count, ir.Constant(I64, BLOCK - 1)), ir.Constant(I64, 3))
+    with cgutils.for_range(builder, builder.lshr(count, ir.Constant(I64, 3))) as loop:
+        at = builder.add(weights, builder.shl(loop.index, ir.Constant(I64, 6)))
+        do(load(builder, at, 0, WORDS), loop.index)
+    at = builder.add(weights, builder.shl(builder.sub(count, ir.Constant(I64, BLOCK)), ir.Constant(I64, 3)))
+    do(load(builder, at, 0, WORDS), builder.sub(blocks, ir.Constant(I64, 1)))
+
+
+def _some(builder: Builder, words: Value) -> Value:
+    """Return two bits: whether one of the even lanes, and whether one of the odd lanes, is not 0."""
+    answer = ir.Constant(I64, 0)
+    for light in range(2):
+        lanes = constant(_EIGHT_WORDS, range(light, LANES, 2))
+        its = builder.shuffle_vector(words, words, lanes)
+        other = builder.bitcast(builder.icmp_unsigned("!=", its, constant(_EIGHT_WORDS, 0)), I8)
+        other = builder.zext(builder.icmp_unsigned("!=", other, ir.Constant(I8, 0)), I64)
+        answer = builder.or_(answer, builder.shl(other, ir.Constant(I64, light)))
+    return answer
 
 
 @intrinsic
-def line_up8(typing: Any, first: Any, first_step: Any, second: Any, second_step: Any, target: Any) -> Any:
-    """Write eight pixels' weights of a pair of lights as `mix` takes them, 64 bytes.
+def look(typing: Any, weights: Any, count: Any) -> Any:
+    """Return which of two lights' weights, two float32 for each of `count` ≥ 8 pixels, are not all 0 and not all 1.
 
-    The float32 of each light are so many bytes apart. They come to stand as four pixels of the first light, the same of
-    the second, and so on. Returns which are not 0, a bit for each, the first one's lowest.
+    Bits 0 and 1 are set where some weight of the first and of the second light is not 0, bits 2 and 3 where one of
+    theirs is not 1.
     """
+    del typing, weights, count
+
+    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
+        del context, signature
+        ones = builder.bitcast(ir.Constant(FLOATS, [1.0] * LANES), WORDS)
+        found = [cgutils.alloca_once_value(builder, constant(WORDS, 0)) for _ in range(2)]
+
+        def see(line: Value, block: Value) -> None:
+            del block
+            for seen, other in zip(found, (line, builder.xor(line, ones)), strict=True):
+                builder.store(builder.or_(builder.load(seen), other), seen)
+
+        _each_line(builder, arguments[0], arguments[1], see)
+        lit, less = (_some(builder, builder.load(seen)) for seen in found)
+        return builder.or_(lit, builder.shl(less, ir.Constant(I64, 2)))
+
+    return types.int64(ADDRESS, types.int64), generate
+
+
+@intrinsic
+def interleave8(typing: Any, first: Any, first_step: Any, second: Any, second_step: Any, target: Any) -> Any:
+    """Write eight pixels' weights of a pair of lights as `look` takes them; each light's are so many bytes apart."""
     del typing, first, first_step, second, second_step, target
 
-    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
-        del context, signature
+    def emit(
+        builder: Builder, first: Value, first_step: Value, second: Value, second_step: Value, target: Value
+    ) -> None:
         line = ir.Constant(FLOATS, ir.Undefined)
         for lane in range(LANES):
-            light, pixel = lane // _FOUR % 2, lane // (2 * _FOUR) * _FOUR + lane % _FOUR
-            weights, step = arguments[2 * light], arguments[2 * light + 1]
-            at = builder.add(weights, builder.mul(step, ir.Constant(I64, pixel)))
+            weights, step = ((first, first_step), (second, second_step))[lane % 2]
+            at = builder.add(weights, builder.mul(step, ir.Constant(I64, lane // 2)))
             line = builder.insert_element(line, load(builder, at, 0, F32), ir.Constant(I32, lane))
-        return _keep(builder, line, arguments[4])
+        store(builder, line, target, 0)
 
-    return types.int64(ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS), generate
-
-
-@intrinsic
-def part8(typing: Any, weights: Any, target: Any) -> Any:
-    """Do `line_up8` for two lights whose weights alternate."""
-    del typing, weights, target
-
-    def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
-        del context, signature
-        both = load(builder, arguments[0], 0, FLOATS)
-        lanes = [8 * four + 2 * pixel + light for four in range(2) for light in range(2) for pixel in range(_FOUR)]
-        return _keep(builder, builder.shuffle_vector(both, both, constant(WORDS, lanes)), arguments[1])
-
-    return types.int64(ADDRESS, ADDRESS), generate
+    return void(emit, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
 
 
 @intrinsic
-def full8(typing: Any, weights: Any, light: Any) -> Any:
-    """Return whether the eight weights of the pair's first or second (1) light are all 1."""
-    del typing, weights, light
+def line_up(typing: Any, weights: Any, count: Any, target: Any) -> Any:
+    """Write the weights that `look` takes as `mix` takes them: 64 bytes for each eight pixels that it takes at a time.
+
+    Returns the first two bits that `look` does.
+    """
+    del typing, weights, count, target
 
     def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
         del context, signature
-        line = load(builder, arguments[0], 0, FLOATS)
-        other = builder.fcmp_unordered("!=", line, ir.Constant(FLOATS, [1.0] * LANES))
-        kind = ir.IntType(LANES)
-        lanes = builder.shl(ir.Constant(I64, FIRST), builder.mul(arguments[1], ir.Constant(I64, _FOUR)))
-        found = builder.and_(builder.bitcast(other, kind), builder.trunc(lanes, kind))
-        return builder.icmp_unsigned("==", found, ir.Constant(kind, 0))
+        weights, count, target = arguments
+        lanes = constant(WORDS, [2 * pixel + light for pixel, light in _ORDER])
+        seen = cgutils.alloca_once_value(builder, constant(WORDS, 0))
 
-    return types.boolean(ADDRESS, types.int64), generate
+        def put(line: Value, block: Value) -> None:
+            builder.store(builder.or_(builder.load(seen), line), seen)
+            to = builder.add(target, builder.shl(block, ir.Constant(I64, 6)))
+            store(builder, builder.shuffle_vector(line, line, lanes), to, 0)
+
+        _each_line(builder, weights, count, put)
+        return _some(builder, builder.load(seen))
+
+    return types.int64(ADDRESS, types.int64, ADDRESS), generate
+
+
+@contextmanager
+def _blocks(builder: Builder, count: Value) -> Generator[tuple[Value, Value]]:
+    """Go through `count` ≥ 8 pixels eight by eight: give the number of each eight, and the first of its pixels.
+
+    The last eight are some of the ones before again where `count` is not whole eights.
+    """
+    blocks = builder.lshr(builder.add(count, ir.Constant(I64, BLOCK - 1)), ir.Constant(I64, 3))
+    last = builder.sub(count, ir.Constant(I64, BLOCK))
+    with cgutils.for_range(builder, blocks) as loop:
+        begin = builder.shl(loop.index, ir.Constant(I64, 3))
+        yield loop.index, builder.select(builder.icmp_signed("<", begin, last), begin, last)
 
 
 def _store_pixels(builder: Builder, even: Value, odd: Value, target: Value) -> None:
@@ -150,23 +209,22 @@ def _pair(
     name = f"llvm.sqrt.v{LANES}f32"
     kind = ir.FunctionType(FLOATS, [FLOATS])
     root_of = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
-    at = builder.add(weights, builder.mul(block, ir.Constant(I64, 4 * LANES)))
-    weight = load(builder, at, 0, FLOATS)
+    weight = load(builder, builder.add(weights, builder.shl(block, ir.Constant(I64, 6))), 0, FLOATS)
     root = builder.call(root_of, [weight])
     remainder = builder.fsub(weight, root)
     # The root of what is negative, and nothing times infinity, are no numbers.
     fault = builder.fmul(root, ir.Constant(FLOATS, [0.0] * LANES))
     sums: list[Value] = []
-    for couple in _COUPLES:
+    for lane, couple in enumerate(_COUPLES):
 
         def found(base: Value, places: Value, pixel: int, kind: Any) -> Value:
             offset = builder.zext(load(builder, builder.add(places, place), 4 * pixel, I32), I64)
             return load(builder, builder.add(base, offset), 0, kind)
 
-        def each(numbers: Value, couple: tuple[int, int] = couple) -> Value:
-            """Return the numbers of two pixels under both lights, four times each."""
-            first = [8 * (pixel // _FOUR) + _FOUR * light + pixel % _FOUR for pixel in couple for light in range(2)]
-            return builder.shuffle_vector(numbers, numbers, constant(WORDS, [lane for lane in first for _ in range(4)]))
+        def each(numbers: Value, lane: int = lane) -> Value:
+            """Return the numbers of a couple under both lights, four times each."""
+            lanes = [_FOUR * (place // _FOUR) + lane for place in range(LANES)]
+            return builder.shuffle_vector(numbers, numbers, constant(WORDS, lanes))
 
         drawn = [
             found(base, places, pixel, ir.VectorType(I16, 4))
@@ -192,10 +250,9 @@ def _pair(
 def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any, white: Any, target: Any) -> Any:
     """Write `count` ≥ 8 pixels under pairs of lights as uint16, rounded, from 0 to `white`; see `mixing.py`.
 
-    `plan` leads to `PLAN` addresses a pair: of the weights, of the first and second light's offsets in their samples,
-    of the first and second light's samples, and of the means; `means` leads to the offsets in the means. The pixels are
-    taken eight by eight, the last eight being some of the ones before again where `count` is not whole eights; so are
-    the weights, but each eight stand on their own. Some float32 at `faults` are no numbers from the moment that a
+    `plan` leads to `PLAN` addresses a pair: of the weights as `line_up` has them, of the first and second light's
+    offsets in their samples, of the first and second light's samples, and of the means; `means` leads to the offsets in
+    the means. Some float32 at `faults` are no numbers from the moment that a
     weight was negative, infinite or no number.
     """
     del typing, plan, pairs, count, means, faults, white, target
@@ -221,15 +278,11 @@ def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any,
         most = spread(builder, white, FLOATS)
         fault = cgutils.alloca_once_value(builder, load(builder, faults, 0, FLOATS))
         sums = [cgutils.alloca_once(builder, FLOATS) for _ in range(2)]
-        blocks = builder.lshr(builder.add(count, number(BLOCK - 1)), number(3))
-        last = builder.sub(count, number(BLOCK))
 
         def fill(total: Callable[[Value, Value], Sequence[Value]]) -> None:
-            with cgutils.for_range(builder, blocks) as loop:
-                begin = builder.shl(loop.index, number(3))
-                begin = builder.select(builder.icmp_signed("<", begin, last), begin, last)
+            with _blocks(builder, count) as (block, begin):
                 rounded: list[Value] = []
-                for value in total(loop.index, builder.shl(begin, number(2))):
+                for value in total(block, builder.shl(begin, number(2))):
                     lifted = builder.fadd(value, half)
                     lifted = builder.select(builder.fcmp_ordered(">", lifted, zero), lifted, zero)
                     rounded.append(builder.fptosi(least(builder, lifted, most), WORDS))
@@ -259,17 +312,3 @@ def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any,
         store(builder, builder.load(fault), faults, 0)
 
     return void(emit, ADDRESS, types.int64, types.int64, ADDRESS, ADDRESS, types.float32, ADDRESS)
-
-
-@intrinsic
-def copy_least(typing: Any, source: Any, white: Any, target: Any) -> Any:
-    """Copy a sample and the two bytes behind it, each number at most `white` (uint16)."""
-    del typing, source, white, target
-
-    def emit(builder: Builder, source: Value, white: Value, target: Value) -> None:
-        kind = ir.VectorType(I16, 4)
-        sample, most = load(builder, source, 0, kind), spread(builder, white, kind)
-        least = builder.select(builder.icmp_unsigned("<", sample, most), sample, most)
-        store(builder, least, target, 0)
-
-    return void(emit, ADDRESS, types.uint16, ADDRESS)
