@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -327,6 +328,7 @@ def generate(
                 on_done=told.done,
                 on_image=told.image,
                 on_skip=told.skip,
+                on_wait=told.wait,
             )
         rest = f"make a dataset of them with generate --finish {out}" if done == shards else "others are to be made yet"
         print(f"{done} of {shards} shards of {out} are done; {rest}")
@@ -340,6 +342,7 @@ def generate(
             on_done=told.done,
             on_image=told.image,
             on_skip=told.skip,
+            on_wait=told.wait,
         )
     _tell(dataset, out)
     if contact_sheet is not None:
@@ -363,31 +366,37 @@ class _Told:
             self.progress.console.print(f"{images} images were there already", highlight=False)
 
     def image(self) -> None:
-        """Show that one more image is made."""
-        speed = self.progress.tasks[0].speed
-        self.progress.update(self.task, advance=1, rate=f"{speed:.1f}/s" if speed else "")
+        """Show that one more image is made, at which rate since the beginning: a cluster tells of a shard at once."""
+        shown = self.progress.tasks[0]
+        made, took = shown.completed + 1, max(shown.elapsed or 0, 0.1)
+        left = timedelta(seconds=round(max((shown.total or 0) - made, 0) * took / made))
+        self.progress.update(self.task, advance=1, rate=f"{made / took:.1f}/s", left=f"{left} left")
 
     def skip(self, name: str, reason: str, images: int) -> None:
         """Show that a picture cannot be read."""
         self.progress.update(self.task, total=(self.progress.tasks[0].total or 0) - images)
         self.progress.console.print(f"passed over {name}: {reason}", style="yellow", markup=False, highlight=False)
 
+    def wait(self, sentence: str) -> None:
+        """Show what the work waits for."""
+        self.progress.console.print(sentence, style="yellow", markup=False, highlight=False)
+
 
 @contextmanager
 def _progress(images: int) -> Generator[_Told]:
     """Show how many images are made, how fast, and the time left, on stderr while the block runs."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     columns = (
         TextColumn("[progress.description]{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
+        TextColumn("{task.fields[left]}"),
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
-        yield _Told(progress, progress.add_task("images", total=images, rate=""))
+        yield _Told(progress, progress.add_task("images", total=images, rate="", left=""))
 
 
 def _tell(dataset: Dataset, out: str) -> None:

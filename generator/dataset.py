@@ -46,7 +46,7 @@ from generator.production.assembly import (
     NothingMadeError,
     assemble,
 )
-from generator.production.engines import check_workers, default_workers, make_shards
+from generator.production.engines import OnWait, check_workers, default_workers, make_shards
 from generator.production.layouts import read_member
 from generator.production.plan import SHARD_IMAGES, Options, Plan
 from generator.production.records import (
@@ -296,6 +296,7 @@ def generate_dataset(
     workers: int = 1,
     on_image: OnImage | None = None,
     on_skip: OnSkip | None = None,
+    on_wait: OnWait | None = None,
 ) -> Dataset:
     """Make a dataset: every source picture under its lights.
 
@@ -320,6 +321,8 @@ def generate_dataset(
         Threads, or processes of a cluster on this machine; at most about three pictures are in memory for each.
     on_image, on_skip
         Called after each image, and for each source that cannot be read, from the calling thread.
+    on_wait
+        Called with a sentence for the user when nothing is made until somebody does something.
 
     Raises
     ------
@@ -340,7 +343,7 @@ def generate_dataset(
         sources=dict(reading or {}),
     )
     plan = Plan(lut, sources, choice, seed, options)
-    return make_dataset(plan, out, engine=engine, workers=workers, on_image=on_image, on_skip=on_skip)
+    return make_dataset(plan, out, engine=engine, workers=workers, on_image=on_image, on_skip=on_skip, on_wait=on_wait)
 
 
 def make_dataset(
@@ -352,6 +355,7 @@ def make_dataset(
     on_done: OnDone | None = None,
     on_image: OnImage | None = None,
     on_skip: OnSkip | None = None,
+    on_wait: OnWait | None = None,
 ) -> Dataset:
     """Make the dataset of a plan, or go on with it; parameters and errors as of `generate_dataset`.
 
@@ -361,7 +365,7 @@ def make_dataset(
     identity = plan.identity()
     if not finished(out, identity):
         with workplace(out, identity) as place:
-            _make(plan, place, range(plan.shards), engine, workers, on_done, on_image, on_skip)
+            _make(plan, place, range(plan.shards), engine, workers, on_done, on_image, on_skip, on_wait)
             try:
                 assemble(place, identity)
             except NothingMadeError:
@@ -380,6 +384,7 @@ def make_share(
     on_done: OnDone | None = None,
     on_image: OnImage | None = None,
     on_skip: OnSkip | None = None,
+    on_wait: OnWait | None = None,
 ) -> tuple[int, int]:
     """Make one of several shares of a dataset, beside other programs that make theirs; `finish_dataset` ends it.
 
@@ -398,7 +403,7 @@ def make_share(
     if not 0 <= index < count:
         raise InputError(f"share {index} of {count} was asked for, expected 0 to {count - 1}")
     with workplace(out, plan.identity(), alone=False) as place:
-        _make(plan, place, range(index, plan.shards, count), engine, workers, on_done, on_image, on_skip)
+        _make(plan, place, range(index, plan.shards, count), engine, workers, on_done, on_image, on_skip, on_wait)
         return len(place.done()), plan.shards
 
 
@@ -433,12 +438,13 @@ def _make(
     on_done: OnDone | None,
     on_image: OnImage | None,
     on_skip: OnSkip | None,
+    on_wait: OnWait | None,
 ) -> None:
     done = place.done()
     missing = [shard for shard in wanted if shard not in done]
     if on_done is not None:
         on_done(sum(plan.images_of(shard) for shard in wanted if shard in done))
-    make_shards(engine, plan, missing, place, workers, on_image or _ignore, on_skip or _ignore)
+    make_shards(engine, plan, missing, place, workers, on_image or _ignore, on_skip or _ignore, on_wait or _ignore)
 
 
 def _ignore(*told: object) -> None:

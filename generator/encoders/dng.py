@@ -76,14 +76,13 @@ def encode_dng(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
         50728: rationals(*neutral),  # AsShotNeutral
         50778: (Kind.SHORT, [_D65]),  # CalibrationIlluminant1
     }
-    counts = mosaic_of(image)
     try:
-        start = head(tags, counts.nbytes)
+        start = head(tags, 2 * height * width)
     except ValueError as error:
         raise InputError(
             f"an image of {width}x{height} px is too large for DNG: {error}; choose png, or make it smaller"
         ) from error
-    return b"".join([start, counts.data])
+    return b"".join([start, mosaic_of(image).data])
 
 
 def mosaic_of(image: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:

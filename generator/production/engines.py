@@ -31,6 +31,9 @@ ATTEMPTS: Final = 5
 CONNECT_S: Final = 10.0
 """How long a scheduler may take to answer, s."""
 
+OnWait = Callable[[str], None]
+"""Takes a sentence for the user on what the work waits for."""
+
 _Event = Callable[[], None]
 
 
@@ -83,6 +86,7 @@ def make_shards(
     workers: int,
     on_image: OnImage,
     on_skip: OnSkip,
+    on_wait: OnWait,
 ) -> None:
     """Make shards that are not done, on an engine.
 
@@ -98,6 +102,8 @@ def make_shards(
         Threads, or processes of a cluster on this machine; a cluster that is named has its own.
     on_image, on_skip
         Called after each image, and for each source that cannot be read, from the calling thread.
+    on_wait
+        Called with a sentence for the user when a scheduler that was named has no worker.
 
     Raises
     ------
@@ -114,7 +120,7 @@ def make_shards(
     if address is None:
         _by_threads(plan, shards, place, workers, on_image, on_skip)
     else:
-        _by_dask(address, plan, shards, place, workers, on_image, on_skip)
+        _by_dask(address, plan, shards, place, workers, on_image, on_skip, on_wait)
 
 
 def _by_threads(
@@ -168,6 +174,7 @@ def _by_dask(
     workers: int,
     on_image: OnImage,
     on_skip: OnSkip,
+    on_wait: OnWait,
 ) -> None:
     try:
         from distributed import KilledWorker, as_completed
@@ -183,6 +190,8 @@ def _by_dask(
             key = f"crop-shard-{shard}-{attempts[shard]}-{plan.seed}-{id(plan)}"
             return client.submit(make_elsewhere, plan.job(shard), place, key=key, pure=False)
 
+        if not client.nthreads():
+            on_wait(f"the Dask scheduler has no worker yet; start some with: dask worker {address}")
         # A few tasks a thread are handed out at a time: a plan may have more of them than memory has room for.
         at_once = max(4, 3 * sum(client.nthreads().values()))
         running = {submit(shard): shard for shard in islice(waiting, at_once)}

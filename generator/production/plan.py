@@ -288,8 +288,8 @@ def sources_sha256(sources: Sequence[Source]) -> str:
 
 @lru_cache
 def versions(form: Format, layout: Layout) -> dict[str, str]:
-    """Return the versions of what decodes sources and encodes images: other versions may give other bytes."""
-    names = ["numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "simplejpeg"]
+    """Return the versions of what decodes sources, finds lights and encodes images: others may give other bytes."""
+    names = ["numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "scipy", "simplejpeg"]
     if layout == "parquet":
         names.append("pyarrow")
     return {name: importlib.metadata.version(name) for name in (*names, *libraries_of(form))}

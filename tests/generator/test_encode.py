@@ -172,6 +172,16 @@ def test_other_arrays_are_refused(form: Format) -> None:
         encode_image(np.zeros((0, 4, 3), np.uint16), form, SHOT)
 
 
+@pytest.mark.parametrize(("form", "width", "height"), [("tiff", 30000, 24000), ("dng", 60000, 36000)])
+def test_what_a_format_of_32_bit_offsets_cannot_hold_is_refused_unwritten(
+    form: Format, width: int, height: int
+) -> None:
+    # One count seen everywhere: an image of 4 GiB that takes no memory.
+    image = np.broadcast_to(np.uint16(7), (height, width, 3))
+    with pytest.raises(InputError, match=rf"an image of {width}x{height} px is too large for {form.upper()}: .* 4 GiB"):
+        encode_image(image, form, SHOT)
+
+
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("keep", [0, 10, 1000])
 def test_damaged_files_are_refused_by_name(form: Format, keep: int) -> None:

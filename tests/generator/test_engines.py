@@ -124,14 +124,14 @@ def test_a_killed_program_is_gone_on_with(undisturbed: tuple[Lut, dict[str, str]
 
 
 @pytest.fixture
-def cluster() -> Iterator[LocalCluster]:
-    """Return a cluster of one process that is somebody else's."""
+def cluster(request: pytest.FixtureRequest) -> Iterator[LocalCluster]:
+    """Return a cluster that is somebody else's, of one process, or of as many as are asked for."""
     import logging
 
     from distributed import LocalCluster
 
     with LocalCluster(
-        n_workers=1,
+        n_workers=getattr(request, "param", 1),
         threads_per_worker=2,
         host="127.0.0.1",
         dashboard_address="127.0.0.1:0",
@@ -155,6 +155,23 @@ def test_a_cluster_by_its_address(
     path.write_text(path.read_text().replace("Test camera", "Another"))
     with pytest.raises(InputError, match="of a worker is not that of the plan; give every machine the same table"):
         generate_dataset(other, tmp_path / "refused", random_scenes(2, 24, 16), [0], engine=address)
+
+
+@pytest.mark.parametrize("cluster", [0], indirect=True)
+def test_a_scheduler_without_workers_is_told_of_and_waited_for(
+    make_lut: Callable[..., Lut], tmp_path: Path, cluster: LocalCluster
+) -> None:
+    address = cluster.scheduler_address.replace("tcp://", "dask://")
+    told: list[str] = []
+
+    def start_one(sentence: str) -> None:
+        told.append(sentence)
+        cluster.scale(1)
+
+    scenes = random_scenes(2, 24, 16)
+    made = generate_dataset(make_lut(), tmp_path / "out", scenes, [0], engine=address, on_wait=start_one)
+    assert made.description.images == 2
+    assert told == [f"the Dask scheduler has no worker yet; start some with: dask worker {cluster.scheduler_address}"]
 
 
 def test_workers_that_were_started_in_another_folder(
