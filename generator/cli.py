@@ -30,6 +30,9 @@ _LIGHT = "Light"
 _IMAGES = "Images"
 _WORK = "Work"
 
+_STORE_READERS = 16
+"""Threads that read the files of an object store."""
+
 _HELP = f"""Make a dataset of raw linear images with exact ground truth.
 
 Reads the table LUT (made by build-lut) and the source pictures. Writes the dataset OUT, a folder or a URL of a store
@@ -269,7 +272,7 @@ def generate(
 ) -> None:
     """Make a dataset."""
     if verify is not None:
-        _verify(verify)
+        _verify(verify, workers)
         return
     if finish is not None:
         from generator.dataset import finish_dataset
@@ -416,17 +419,24 @@ def _tell(dataset: Dataset, out: str) -> None:
         )
 
 
-def _verify(out: str) -> None:
+def _verify(out: str, workers: int | None) -> None:
     """Print every fault of a dataset; a QualityError if there is one."""
+    from drivers.console import progress
     from drivers.errors import QualityError
     from generator.dataset import open_dataset
     from generator.production.assembly import damage
+    from generator.production.engines import check_workers, default_workers
+    from generator.store import is_remote
 
+    # Whoever reads from a store waits for it most of the time.
+    at_once = max(default_workers(), _STORE_READERS if is_remote(out) else 1) if workers is None else workers
+    check_workers("local", at_once)
     dataset = open_dataset(out)
     faults = 0
-    for fault in damage(out):
-        print(fault)
-        faults += 1
+    with progress("files") as told:
+        for fault in damage(out, told, workers=at_once):
+            print(fault)
+            faults += 1
     if faults:
         raise QualityError(f"{out} is not as it was made, see above ({faults} faults); make it again, or copy it again")
     print(f"{out}: {dataset.description.images} images, every file as it was made")

@@ -9,8 +9,9 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -213,7 +214,7 @@ def _card(description: Description) -> str:
     )
 
 
-def damage(place: str | Path, progress: Callable[[int], None] | None = None) -> Iterator[str]:
+def damage(place: str | Path, progress: Callable[[int, int], None] | None = None, *, workers: int = 1) -> Iterator[str]:
     """Yield what of a dataset is not as it was made, each fault in words; reads every byte of it.
 
     Parameters
@@ -221,7 +222,9 @@ def damage(place: str | Path, progress: Callable[[int], None] | None = None) -> 
     place
         Path or URL of the dataset.
     progress
-        Told after each file how many were looked at.
+        Told after each file how many were looked at, and how many there are.
+    workers
+        Threads that read and hash.
 
     Raises
     ------
@@ -231,25 +234,42 @@ def damage(place: str | Path, progress: Callable[[int], None] | None = None) -> 
     store = open_store(place)
     if not store.has(DESCRIPTION):
         raise FormatError(f"{place} is no dataset: it has no {DESCRIPTION}; make one with generate")
-    known: set[str] = {SUMS}
     with store.open(SUMS) as listed:
+        total = sum(1 for _ in listed)
+    known: set[str] = {SUMS}
+    pending: deque[Future[str | None]] = deque()
+    looked_at = 0
+
+    def finished(most: int) -> Iterator[str]:
+        nonlocal looked_at
+        while len(pending) > most:
+            fault = pending.popleft().result()
+            if fault is not None:
+                yield fault
+            looked_at += 1
+            if progress is not None:
+                progress(looked_at, total)
+
+    with ThreadPoolExecutor(workers) as pool, store.open(SUMS) as listed:
         for number, line in enumerate(listed, start=1):
             digest, _, name = line.decode("utf-8", "replace").rstrip("\n").partition("  ")
-            if not name:
-                yield f"{SUMS}, line {number}: expected a hash, two blanks and a name"
-                continue
-            known.add(name)
-            try:
-                with store.open(name) as stream:
-                    found = hashlib.sha256()
-                    while block := stream.read(_BLOCK):
-                        found.update(block)
-            except FormatError:
-                yield f"{name} is missing or cannot be read"
+            if name:
+                known.add(name)
+                pending.append(pool.submit(_fault_of, store, name, digest))
+                yield from finished(4 * workers)
             else:
-                if found.hexdigest() != digest:
-                    yield f"{name} has changed"
-            if progress is not None:
-                progress(number)
+                yield f"{SUMS}, line {number}: expected a hash, two blanks and a name"
+        yield from finished(0)
     for name in sorted(set(store.names()) - known):
         yield f"{name} is no part of the dataset"
+
+
+def _fault_of(store: Store, name: str, digest: str) -> str | None:
+    try:
+        with store.open(name) as stream:
+            found = hashlib.sha256()
+            while block := stream.read(_BLOCK):
+                found.update(block)
+    except FormatError:
+        return f"{name} is missing or cannot be read"
+    return None if found.hexdigest() == digest else f"{name} has changed"

@@ -196,10 +196,11 @@ def grey(data: bytes) -> npt.NDArray[np.uint16]:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_verifying_names_what_is_not_as_it_was_made(make: Make, layout: Layout) -> None:
     folder = place_of(make(layout, split=(0.5, 0.2, 0.3)))
-    looked_at: list[int] = []
-    assert list(damage(folder, looked_at.append)) == []
+    looked_at: list[tuple[int, int]] = []
+    assert list(damage(folder, lambda done, total: looked_at.append((done, total)), workers=3)) == []
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    assert len(looked_at) == len(names) - 1, "every file but the list of hashes itself"
+    files = len(names) - 1  # every one but the list of hashes itself
+    assert looked_at == [(done + 1, files) for done in range(files)]
     victim = sorted(path for path in folder.rglob("00000*") if path.suffix in (".png", ".tar", ".parquet"))[0]
     data = bytearray(victim.read_bytes())
     data[len(data) // 2] ^= 1
