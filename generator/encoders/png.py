@@ -22,12 +22,13 @@ from drivers.errors import InputError
 from generator.encoders.deflate import WIDEST, Packer
 from generator.encoders.shot import Shot
 
+SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+"""The first bytes of every PNG file (clause 5.2)."""
 BAND: Final = 1 << 18
 """Pixels that a band has at most, unless a row has more."""
 TALLEST: Final = (1 << 31) - 1
 """Largest size in the format (clause 11.2.2)."""
 
-_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _ZLIB: Final = bytes([0x78, 0x01])
 """Deflate, a window of 32 KiB, packed fast (RFC 1950, 2.2)."""
 _ADLER: Final = 65521
@@ -54,9 +55,9 @@ def png_pieces(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> I
             f"an image of {width}x{height} px is too large for PNG: {WIDEST} columns and {TALLEST} rows at most; "
             "make it smaller"
         )
-    yield _SIGNATURE
-    yield from _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0))
-    yield from _chunk(b"tEXt", b"Description\0" + shot.note().encode("ascii"))
+    yield SIGNATURE
+    yield from chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0))
+    yield from chunk(b"tEXt", b"Description\0" + shot.note().encode("ascii"))
     rows = max(1, BAND // width)
     tops = range(0, height, rows)
     total = 1
@@ -64,8 +65,8 @@ def png_pieces(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> I
         total = _joined(total, checksum, size)
         start = b"" if number else _ZLIB
         end = struct.pack(">I", total) if number == len(tops) - 1 else b""
-        yield from _chunk(b"IDAT", start, data, end)
-    yield from _chunk(b"IEND")
+        yield from chunk(b"IDAT", start, data, end)
+    yield from chunk(b"IEND")
 
 
 def _bands(
@@ -102,7 +103,7 @@ def _joined(first: int, second: int, size: int) -> int:
     return high << 16 | low
 
 
-def _chunk(kind: bytes, *parts: bytes | memoryview) -> Iterator[bytes | memoryview]:
+def chunk(kind: bytes, *parts: bytes | memoryview) -> Iterator[bytes | memoryview]:
     """Yield the pieces of a chunk (clause 5.3)."""
     checksum = isal_zlib.crc32(kind)
     for part in parts:

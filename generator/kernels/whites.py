@@ -2,26 +2,69 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
 from generator.kernels.compiled import compiled
+
+_ZERO: Final = np.float32(0)
+
+
+@numba.njit(inline="always")
+def _light_at(weights: Any, whites: Any, y: int, x: int) -> Any:
+    """Return r, g and b of the light of a pixel."""
+    red = green = blue = _ZERO
+    for light in range(weights.shape[2]):
+        weight = weights[y, x, light]
+        red += weight * whites[light, 0]
+        green += weight * whites[light, 1]
+        blue += weight * whites[light, 2]
+    total = red + green + blue
+    return red / total, green / total, blue / total
 
 
 @compiled
 def _chromaticities(weights: Any, whites: Any, out: Any) -> None:
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1]):
-            red = green = blue = np.float32(0)
-            for light in range(weights.shape[2]):
-                weight = weights[y, x, light]
-                red += weight * whites[light, 0]
-                green += weight * whites[light, 1]
-                blue += weight * whites[light, 2]
+            out[y, x, 0], out[y, x, 1], out[y, x, 2] = _light_at(weights, whites, y, x)
+
+
+@compiled
+def _whole_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> None:
+    for y in range(weights.shape[0]):
+        for x in range(weights.shape[1]):
+            r, _, b = _light_at(weights, whites, y, x)
+            first, last = np.int32(np.rint(r * full)), np.int32(np.rint(b * full))
+            out[y, x, 0], out[y, x, 1], out[y, x, 2] = first, np.int32(full) - first - last, last
+
+
+@compiled
+def _whole_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: Any) -> None:
+    """Do the same for weights (H, 2 W) and `out` (H, 3 W), in a loop of which the compiler makes vectors."""
+    for y in range(weights.shape[0]):
+        for x in range(weights.shape[1] // 2):
+            one, other = weights[y, 2 * x], weights[y, 2 * x + 1]
+            # From 0 on, as where lights are many.
+            red = _ZERO + one * whites[0, 0] + other * whites[1, 0]
+            green = _ZERO + one * whites[0, 1] + other * whites[1, 1]
+            blue = _ZERO + one * whites[0, 2] + other * whites[1, 2]
             total = red + green + blue
-            out[y, x, 0], out[y, x, 1], out[y, x, 2] = red / total, green / total, blue / total
+            first, last = np.int32(np.rint(red / total * full)), np.int32(np.rint(blue / total * full))
+            out[y, 3 * x] = first
+            out[y, 3 * x + 1] = np.int32(np.int32(full) - first - last)
+            out[y, 3 * x + 2] = last
+
+
+@compiled
+def _whole_weights(weights: Any, full: Any, out: Any) -> None:
+    for y in range(weights.shape[0]):
+        for light in range(weights.shape[2]):
+            for x in range(weights.shape[1]):
+                out[light, y, x] = np.int32(np.rint(weights[y, x, light] * full))
 
 
 @compiled
@@ -51,6 +94,28 @@ def chromaticities(weights: npt.NDArray[np.float32], whites: npt.NDArray[np.floa
     """
     out = np.empty((*weights.shape[:2], 3), np.float32)
     _chromaticities(weights, whites.astype(np.float32), out)
+    return out
+
+
+def whole_chromaticities(
+    weights: npt.NDArray[np.float32], whites: npt.NDArray[np.float64], full: int
+) -> npt.NDArray[np.uint16]:
+    """Return `chromaticities` as whole parts of `full` ≤ 65535, rounded; green takes what is left: (H, W, 3) uint16."""
+    height, width, lights = weights.shape
+    out = np.empty((height, width, 3), np.uint16)
+    numbers = whites.astype(np.float32), np.float32(full)
+    if lights == 2:
+        _whole_chromaticities_of_two(weights.reshape(height, -1), *numbers, out.reshape(height, -1))
+    else:
+        _whole_chromaticities(weights, *numbers, out)
+    return out
+
+
+def whole_weights(weights: npt.NDArray[np.float32], full: int) -> npt.NDArray[np.uint16]:
+    """Return weights (H, W, K) float32 from 0 to 1 as whole parts of `full` ≤ 65535, rounded: (K, H, W) uint16."""
+    height, width, lights = weights.shape
+    out = np.empty((lights, height, width), np.uint16)
+    _whole_weights(weights, np.float32(full), out)
     return out
 
 

@@ -26,6 +26,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.errors import FormatError
+from generator.encoders.maps import encode_map
+from generator.kernels.whites import whole_chromaticities, whole_weights
 from generator.lights.lighting import FULL, Lighting, MaskMaker
 from generator.masks.making import whole_parts
 
@@ -132,12 +134,10 @@ def encode_maps(lut: Lut, lighting: Lighting, weights: _Array) -> list[tuple[str
     weights
         (H, W, lights) float32 in whole 65535ths, what the image was made with.
     """
-    whole = np.rint(weights * FULL).astype(np.uint16)
-    maps = [("masks", f"_{light}.png", _png(whole[..., light])) for light in range(whole.shape[2])]
-    truth = np.rint(lighting.ground_truth_map(lut, weights) * FULL).astype(np.uint16)
-    # Green takes what rounding leaves, so that the sum is exact.
-    truth[..., 1] = FULL - truth[..., 0] - truth[..., 2]
-    return [*maps, ("ground_truth", ".png", _png(truth))]
+    shares = whole_weights(weights, FULL)
+    maps = [("masks", f"_{light}.png", encode_map(share)) for light, share in enumerate(shares)]
+    truth = whole_chromaticities(weights, lighting.whites(lut), FULL)
+    return [*maps, ("ground_truth", ".png", encode_map(truth))]
 
 
 def read_weights(folder: Path, stem: str, lights: int) -> _Array:
@@ -216,15 +216,3 @@ def _fitted(mask: _Array, height: int, width: int) -> _Array:
     smaller = height <= mask.shape[0] and width <= mask.shape[1]
     way = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(mask, (width, height), interpolation=way), dtype=np.float32)
-
-
-def _png(image: npt.NDArray[np.uint16]) -> bytes:
-    import cv2
-
-    ordered = image if image.ndim == 2 else image[..., ::-1]
-    # Rows as differences from the rows above suit what is smooth, and trying all filters takes three times as long.
-    how = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]
-    done, data = cv2.imencode(".png", np.ascontiguousarray(ordered), how)
-    if not done:
-        raise FormatError(f"a map of {image.shape[1]}×{image.shape[0]} px cannot be written as PNG")
-    return data.tobytes()

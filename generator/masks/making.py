@@ -27,9 +27,10 @@ from generator.lights.options import Range, parse_numbers
 from generator.masks.shapes import Array, Dice, HalfPlanes, Shape, SmoothFields, Spots, Windows
 
 Weights = npt.NDArray[np.float32]
-_ROWS: Final = 64
-"""Rows computed at a time, so that what is between stays in the processor's cache."""
+_PIXELS: Final = 1 << 15
+"""Pixels computed at a time: what is between stays in the processor's cache, and in memory that a program has."""
 _FULL: Final = np.float32(FULL)
+_WHOLE: Final = np.int32(FULL)
 _HALF: Final = np.float32(0.5)
 
 
@@ -55,12 +56,13 @@ class MadeMasks:
     def weights(self, height: int, width: int, lights: int) -> Weights:
         """Return (height, width, lights) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel."""
         longer = max(height, width)
-        shares = self.shape.shares(self.dice, (width / longer / 2, height / longer / 2), lights, 1 / longer)
         u = ((np.arange(width) - (width - 1) / 2) / longer).astype(np.float32)[None, :]
         v = ((np.arange(height) - (height - 1) / 2) / longer).astype(np.float32)[:, None]
+        shares = self.shape.shares(self.dice, (width / longer / 2, height / longer / 2), lights, 1 / longer, u)
         out = np.empty((height, width, lights), np.float32)
-        for top in range(0, height, _ROWS):
-            whole_parts(shares(u, v[top : top + _ROWS]), out[top : top + _ROWS])
+        rows = max(1, _PIXELS // width)
+        for top in range(0, height, rows):
+            whole_parts(shares(v[top : top + rows]), out[top : top + rows])
         return out
 
 
@@ -78,6 +80,19 @@ class MadeMaskPlan:
     def describe(self) -> dict[str, Any]:
         """Return the plan as plain values."""
         return self.shape.describe()
+
+
+@compiled
+def _fill_whole_parts_of_two(first: Any, second: Any, out: Any) -> None:
+    """Do what `_fill_whole_parts` does, for `out` (H, 2 W), in a loop of which the compiler makes vectors."""
+    for y in range(first.shape[0]):
+        for x in range(first.shape[1]):
+            total = first[y, x] + second[y, x]
+            one = np.int32(first[y, x] / total * _FULL + _HALF)
+            other = np.int32(second[y, x] / total * _FULL + _HALF)
+            left, is_less = np.int32(_WHOLE - one - other), np.int32(second[y, x] > first[y, x])
+            out[y, 2 * x] = np.float32(np.int32(one + left * np.int32(1 - is_less))) / _FULL
+            out[y, 2 * x + 1] = np.float32(np.int32(other + left * is_less)) / _FULL
 
 
 @compiled
@@ -108,9 +123,12 @@ def whole_parts(shares: Array, out: Weights) -> None:
     shares
         (K, H, W) float32 ≥ 0, not all 0 in a pixel.
     out
-        (H, W, K) float32, 0 to 1.
+        (H, W, K) float32, 0 to 1, contiguous.
     """
-    _fill_whole_parts(shares, out)
+    if len(shares) == 2:
+        _fill_whole_parts_of_two(shares[0], shares[1], out.reshape(len(out), -1))
+    else:
+        _fill_whole_parts(shares, out)
 
 
 _SHARE: Range = (0.0, 1.0)

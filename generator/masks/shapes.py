@@ -11,20 +11,26 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
 from generator.kernels import philox
+from generator.kernels.compiled import compiled
 
 Array = npt.NDArray[np.floating[Any]]
 """float32: what is computed from float32 arrays and Python's own numbers stays float32."""
+_ZERO: Final = np.float32(0)
+_HALF: Final = np.float32(0.5)
+_ONE: Final = np.float32(1)
+_THREE: Final = np.float32(3)
 _STEP: Final = 64
 """Numbers that one shape may draw."""
 _BAR: Final = 0.06
 """Breadth of the bars between a window's panes, as a share of the window."""
 
-Shares = Callable[[Array, Array], Array]
-"""From u (1, W) and v (h, 1), shares of the longer side from the picture's centre, to the lights' shares (K, h, W)."""
+Shares = Callable[[Array], Array]
+"""From v (h, 1), rows' distances from the picture's centre, shares of its longer side, to lights' shares (K, h, W)."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +49,8 @@ class Dice:
 class Shape(Protocol):
     """A kind of masks: from the dice of an image to where its lights fall."""
 
-    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float) -> Shares:
-        """Return the function that fills a picture.
+    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
+        """Return the function that fills a picture's rows.
 
         Parameters
         ----------
@@ -56,6 +62,8 @@ class Shape(Protocol):
             How many lights fall.
         pixel
             Size of a pixel, a share of the longer side.
+        u
+            (1, W), the columns' distances from the picture's centre, shares of the longer side.
         """
         ...
 
@@ -64,10 +72,11 @@ class Shape(Protocol):
         ...
 
 
-def smoothstep(x: Array) -> Array:
-    """Return 0 below 0, 1 above 1, and 3x² − 2x³ between."""
-    x = np.minimum(np.maximum(x, 0.0), 1.0)
-    return x * x * (3.0 - x - x)
+@numba.njit(inline="always")
+def stepped(x: Any) -> Any:
+    """Return of a float32 0 below 0, 1 above 1, and 3x² − 2x³ between."""
+    x = min(max(x, _ZERO), _ONE)
+    return x * x * (_THREE - x - x)
 
 
 @dataclass(frozen=True)
@@ -85,20 +94,22 @@ class HalfPlanes:
     angle: float | None = None
     width: float | None = 0.0
 
-    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float) -> Shares:
-        """Return the function that fills a picture."""
+    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
+        """Return the function that fills a picture's rows."""
         drawn: list[float] = dice.uniform(0).tolist()
         angle = math.radians(360 * drawn[0] if self.angle is None else self.angle)
-        across = (math.cos(angle), math.sin(angle))
+        across = math.cos(angle), math.sin(angle)
         width = max(0.1 + 0.5 * drawn[1] if self.width is None else self.width, pixel)
         reach = abs(math.cos(angle)) * half[0] + abs(math.sin(angle)) * half[1]
         edges = [reach * (2 * (edge + 0.6 * drawn[1 + edge] - 0.3) / lights - 1) for edge in range(1, lights)]
 
-        def fill(u: Array, v: Array) -> Array:
-            along = u * across[0] + v * across[1]
-            past = [smoothstep((along - edge) / width + 0.5) for edge in edges]
-            ones, zeros = np.ones_like(along), np.zeros_like(along)
-            return np.stack([one - other for one, other in zip([ones, *past], [*past, zeros], strict=True)])
+        right, down = (np.float32(part) for part in across)
+        edge_places, soft = np.array(edges, np.float32), np.float32(width)
+
+        def fill(v: Array) -> Array:
+            strips = np.ones((lights, len(v), u.shape[1]), np.float32)
+            _fill_strips(u[0], v[:, 0], right, down, edge_places, soft, strips)
+            return strips
 
         return fill
 
@@ -125,8 +136,8 @@ class Spots:
     radius: float | None = None
     softness: float = 0.8
 
-    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float) -> Shares:
-        """Return the function that fills a picture."""
+    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
+        """Return the function that fills a picture's rows."""
         discs: list[list[tuple[float, float, float, float]]] = []
         for light in range(1, lights):
             drawn = dice.uniform(light)
@@ -138,15 +149,13 @@ class Spots:
                 edge = max(self.softness * radius, pixel)
                 discs[-1].append((*place, radius, edge))
 
-        def fill(u: Array, v: Array) -> Array:
-            lit: list[Array] = []
-            for light in discs:
-                dark = np.ones(np.broadcast_shapes(u.shape, v.shape), np.float32)
-                for x, y, radius, edge in light:
-                    distance = np.sqrt((u - x) * (u - x) + (v - y) * (v - y))
-                    dark *= smoothstep((distance - radius) / edge + 0.5)
-                lit.append(1 - dark)
-            return _over_the_first(lit)
+        places = [np.array(light, np.float32).reshape(-1, 4) for light in discs]
+
+        def fill(v: Array) -> Array:
+            shares = np.ones((lights, len(v), u.shape[1]), np.float32)
+            for light, its in enumerate(places, start=1):
+                _add_discs(u[0], v[:, 0], its, shares[0], shares[light])
+            return shares
 
         return fill
 
@@ -170,23 +179,19 @@ class SmoothFields:
     scale: float = 0.5
     contrast: float = 2.0
 
-    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float) -> Shares:
-        """Return the function that fills a picture."""
+    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
+        """Return the function that fills a picture's rows."""
         del half, pixel
         knots = math.ceil(2 / self.scale) + 4
         fields: list[Array] = []
         for light in range(lights):
             drawn = dice.uniform(light, knots * knots).reshape(knots, knots)
             # The spline leaves 0.479 of the knots' variance in each direction, on the average.
-            fields.append((self.contrast / 0.479 * math.sqrt(12) * (drawn - 0.5)).astype(np.float32))
+            field = (self.contrast / 0.479 * math.sqrt(12) * (drawn - 0.5)).astype(np.float32)
+            fields.append(self._splined(field.T, u[0]).T)
 
-        def fill(u: Array, v: Array) -> Array:
-            parts: list[Array] = []
-            for field in fields:
-                x = self._splined(field.T, u[0]).T
-                level = self._splined(x, v[:, 0])
-                parts.append(_growth(level))
-            return np.stack(parts)
+        def fill(v: Array) -> Array:
+            return np.stack([_growth(self._splined(field, v[:, 0])) for field in fields])
 
         return fill
 
@@ -208,8 +213,7 @@ class SmoothFields:
             t * t * t / 6,
         )
         total = np.zeros((len(at), knots.shape[1]), np.float32)
-        for step, weight in enumerate(weights):
-            total += weight[:, None] * knots[index + step]
+        _add_splines(np.ascontiguousarray(knots), index, np.stack(weights), total)
         return total
 
 
@@ -229,11 +233,11 @@ class Windows:
     rows: int | None = None
     softness: float | None = None
 
-    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float) -> Shares:
-        """Return the function that fills a picture."""
+    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
+        """Return the function that fills a picture's rows."""
         windows = [self._window(dice.uniform(light), half, pixel) for light in range(1, lights)]
 
-        def fill(u: Array, v: Array) -> Array:
+        def fill(v: Array) -> Array:
             lit: list[Array] = []
             for matrix, columns, rows, soft in windows:
                 x, y, w = (row[0] * u + row[1] * v + row[2] for row in matrix)
@@ -272,11 +276,55 @@ class Windows:
         return matrix.tolist(), columns, rows, max(soft, pixel / float(min(width, height)))
 
 
-def _growth(x: Array) -> Array:
-    """Return (x + √(1 + x²))², which grows from 0 to ∞ as an exponential does, but without one."""
-    root = np.sqrt(1 + x * x)
-    grown = np.where(x >= 0, root + x, 1 / (root + np.abs(x)))
-    return grown * grown
+@compiled
+def _fill_strips(u: Any, v: Any, right: Any, down: Any, edges: Any, width: Any, shares: Any) -> None:
+    """Fill the lights' shares (K, n, m), all 1, with strips between K − 1 soft edges."""
+    for y in range(len(v)):
+        for edge in range(len(edges)):
+            for x in range(len(u)):
+                past = stepped((u[x] * right + v[y] * down - edges[edge]) / width + _HALF)
+                shares[edge, y, x] -= past
+                shares[edge + 1, y, x] = past
+
+
+@compiled
+def _add_discs(u: Any, v: Any, discs: Any, first: Any, light: Any) -> None:
+    """Fill a light's shares (n, m), all 1, with discs, and take from the first light's what falls over it."""
+    for y in range(len(v)):
+        for disc in range(len(discs)):
+            x0, y0, radius, edge = discs[disc, 0], discs[disc, 1], discs[disc, 2], discs[disc, 3]
+            for x in range(len(u)):
+                distance = np.sqrt((u[x] - x0) * (u[x] - x0) + (v[y] - y0) * (v[y] - y0))
+                light[y, x] *= stepped((distance - radius) / edge + _HALF)
+        for x in range(len(u)):
+            light[y, x] = _ONE - light[y, x]
+            first[y, x] *= _ONE - light[y, x]
+
+
+@compiled
+def _add_splines(knots: Any, index: Any, weights: Any, total: Any) -> None:
+    """Add to each row of `total` (n, m) four rows of `knots`, from that of `index` (n,) on, times `weights` (4, n)."""
+    for y in range(total.shape[0]):
+        for step in range(4):
+            weight, row = weights[step, y], index[y] + step
+            for x in range(total.shape[1]):
+                total[y, x] += weight * knots[row, x]
+
+
+@compiled
+def _grow(levels: Any) -> None:
+    for y in range(levels.shape[0]):
+        for x in range(levels.shape[1]):
+            level = levels[y, x]
+            root = np.sqrt(_ONE + level * level)
+            grown = root + level if level >= _ZERO else _ONE / (root - level)
+            levels[y, x] = grown * grown
+
+
+def _growth(levels: Array) -> Array:
+    """Return (x + √(1 + x²))² in the place of float32 x: it grows from 0 to ∞ as an exponential does, without one."""
+    _grow(levels)
+    return levels
 
 
 def _homography(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -288,14 +336,29 @@ def _homography(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.append(np.linalg.solve(np.array(rows), square.reshape(-1)), 1.0).reshape(3, 3)
 
 
+@compiled
+def _add_panes(at: Any, sides: Any, soft: Any, light: Any) -> None:
+    for y in range(at.shape[0]):
+        for pane in range(sides.shape[0]):
+            left, right = sides[pane, 0], sides[pane, 1]
+            for x in range(at.shape[1]):
+                light[y, x] += stepped((at[y, x] - left) / soft + _HALF) - stepped((at[y, x] - right) / soft + _HALF)
+        for x in range(at.shape[1]):
+            light[y, x] = min(max(light[y, x], _ZERO), _ONE)
+
+
 def _panes(at: Array, count: int, soft: float) -> Array:
     """Return the light along one side of a window at places `at`, 0 to 1 from edge to edge."""
-    total = np.zeros_like(at)
-    for pane in range(count):
-        left = pane / count + (_BAR / 2 if pane else 0.0)
-        right = (pane + 1) / count - (_BAR / 2 if pane < count - 1 else 0.0)
-        total += smoothstep((at - left) / soft + 0.5) - smoothstep((at - right) / soft + 0.5)
-    return np.minimum(np.maximum(total, 0.0), 1.0)
+    sides = [
+        (
+            pane / count + (_BAR / 2 if pane else 0.0),
+            (pane + 1) / count - (_BAR / 2 if pane < count - 1 else 0.0),
+        )
+        for pane in range(count)
+    ]
+    light = np.zeros_like(at)
+    _add_panes(at, np.array(sides, np.float32), np.float32(soft), light)
+    return light
 
 
 def _over_the_first(lit: list[Array]) -> Array:

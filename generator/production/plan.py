@@ -289,10 +289,10 @@ def sources_sha256(sources: Sequence[Source]) -> str:
 @lru_cache
 def versions(form: Format, layout: Layout) -> dict[str, str]:
     """Return the versions of what decodes sources, finds lights and encodes images: others may give other bytes."""
-    names = ["numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "scipy", "simplejpeg"]
+    names = {"isal", "numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "scipy", "simplejpeg"}
     if layout == "parquet":
-        names.append("pyarrow")
-    return {name: importlib.metadata.version(name) for name in (*names, *libraries_of(form))}
+        names.add("pyarrow")
+    return {name: importlib.metadata.version(name) for name in sorted(names | {*libraries_of(form)})}
 
 
 def software() -> str:

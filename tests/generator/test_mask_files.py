@@ -7,12 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
+import imagecodecs
 import numpy as np
 import numpy.typing as npt
 import PIL.Image
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from drivers.errors import FormatError
+from generator.encoders.maps import encode_map
 from generator.lights.gamut import angles_between
 from generator.lights.lighting import FULL, Lighting, plain
 from generator.masks.files import encode_maps, find_masks, read_ground_truth_map, read_weights
@@ -119,26 +124,42 @@ def test_a_file_that_is_no_picture_is_named(tmp_path: Path, data: bytes) -> None
         find_masks(tmp_path, 2)
 
 
-def test_maps_are_read_back_as_the_image_was_made(tmp_path: Path, make_lut: Callable[..., Lut]) -> None:
+@pytest.mark.parametrize("lights", [2, 3])
+def test_maps_are_read_back_as_the_image_was_made(tmp_path: Path, make_lut: Callable[..., Lut], lights: int) -> None:
     lut = make_lut()
-    lighting = Lighting((plain(0), plain(2), plain(3)), parse_masks("smooth", 3, 1).maker(0))
+    shining = [0, 2, 3][:lights]
+    lighting = Lighting(tuple(plain(light) for light in shining), parse_masks("smooth", lights, 1).maker(0))
     weights = lighting.weights_of(40, 60)
     names: list[str] = []
     for folder, suffix, data in encode_maps(lut, lighting, weights):
         (tmp_path / folder).mkdir(exist_ok=True)
         (tmp_path / folder / f"000004{suffix}").write_bytes(data)
         names.append(f"{folder}/000004{suffix}")
-    assert names == ["masks/000004_0.png", "masks/000004_1.png", "masks/000004_2.png", "ground_truth/000004.png"]
-    np.testing.assert_array_equal(read_weights(tmp_path, "000004", 3), weights)
+    assert names == [*(f"masks/000004_{light}.png" for light in range(lights)), "ground_truth/000004.png"]
+    np.testing.assert_array_equal(read_weights(tmp_path, "000004", lights), weights)
     truth = read_ground_truth_map(tmp_path, "000004")
-    exact = weights.astype(np.float64) @ lut.white[[0, 2, 3]]
+    exact = weights.astype(np.float64) @ lut.white[shining]
     assert angles_between(truth.astype(np.float64), exact).max() < 0.002
     np.testing.assert_allclose(truth.sum(axis=2), 1, atol=1e-6)
     # The same by an independent reader; and the masks can be given again.
     with PIL.Image.open(tmp_path / "masks/000004_1.png") as mask:
         assert mask.mode == "I;16"
         np.testing.assert_array_equal(np.asarray(mask), np.rint(weights[..., 1] * FULL))
-    np.testing.assert_array_equal(find_masks(tmp_path / "masks", 3).maker(0).weights(40, 60, 3), weights)
+    again = find_masks(tmp_path / "masks", lights).maker(0)
+    np.testing.assert_array_equal(again.weights(40, 60, lights), weights)
+
+
+@given(
+    st.sampled_from([(), (3,)]).flatmap(
+        lambda channels: hnp.arrays(np.uint16, st.tuples(st.integers(1, 9), st.integers(1, 9), *map(st.just, channels)))
+    )
+)
+def test_any_map_is_read_by_others(values: npt.NDArray[np.uint16]) -> None:
+    data = encode_map(values)
+    np.testing.assert_array_equal(imagecodecs.png_decode(data), values)
+    seen = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert seen is not None
+    np.testing.assert_array_equal(seen if values.ndim == 2 else seen[..., ::-1], values)
 
 
 def test_maps_that_are_missing_or_damaged_are_named(tmp_path: Path) -> None:

@@ -11,11 +11,12 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from drivers.errors import InputError
 from generator.lights.lighting import FULL, MaskMaker
 from generator.masks.making import MadeMaskPlan, parse_masks, whole_parts
-from generator.masks.shapes import HalfPlanes, SmoothFields, Spots, Windows, smoothstep
+from generator.masks.shapes import HalfPlanes, SmoothFields, Spots, Windows
 
 KINDS = ("half-plane", "soft-edge", "spots", "smooth", "window")
 Map = npt.NDArray[np.float32]
@@ -108,8 +109,8 @@ def test_a_soft_edge_has_its_width() -> None:
     between = np.flatnonzero((edge > 0) & (edge < 1))
     assert len(between) == pytest.approx(500, abs=6)
     middle = between.mean()
-    x = (np.arange(1000) - middle) / 500 + 0.5
-    np.testing.assert_allclose(edge, smoothstep(x), atol=2e-3)
+    x = ((np.arange(1000) - middle) / 500 + 0.5).clip(0, 1)
+    np.testing.assert_allclose(edge, 3 * x**2 - 2 * x**3, atol=2e-3)
 
 
 def test_spots_have_their_size() -> None:
@@ -164,6 +165,15 @@ def test_whole_parts_give_what_is_left_to_the_largest() -> None:
     out = np.empty((1, 1, 3), np.float32)
     whole_parts(np.array([1, 1, 1.0001], np.float32).reshape(3, 1, 1), out)
     assert np.rint(out * FULL).ravel().tolist() == [21844, 21844, 21847]
+
+
+@given(hnp.arrays(np.float32, (2, 3, 37), elements=st.floats(0, 1, width=32)))
+def test_whole_parts_of_two_are_those_of_three_one_of_which_is_dark(shares: npt.NDArray[np.float32]) -> None:
+    shares[0] += np.float32(2**-20) * (shares.sum(axis=0) == 0)
+    two, three = np.empty((3, 37, 2), np.float32), np.empty((3, 37, 3), np.float32)
+    whole_parts(shares, two)
+    whole_parts(np.concatenate([shares, np.zeros_like(shares[:1])]), three)
+    np.testing.assert_array_equal(three, np.dstack([two, np.zeros((3, 37))]))
 
 
 def test_texts_of_masks() -> None:
