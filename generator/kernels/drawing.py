@@ -31,13 +31,13 @@ def draw_groups(
     end: int,
     limit: int,
     soon: int,
-    lines: int,
+    asked: int,
     base: int,
 ) -> None:
     """Write the samples of groups `begin` … `end` − 1 of a row; its first pixel would go to `base`.
 
     Offsets are chosen `AHEAD` groups before the samples they lead to are fetched, but none from group `limit` on, so
-    that the processor multiplies while it waits. With each group so many `lines` of what is read `soon` are asked for.
+    that the processor multiplies while it waits. With each group so many lines of what is read `soon` are `asked` for.
     Two bytes are written behind the last pixel, if it is not the row's last.
     """
     done, whole = begin, min(limit, width // GROUP)
@@ -45,13 +45,13 @@ def draw_groups(
         while done < min(end, whole - AHEAD):
             source, word = row + 3 * GROUP * (done + AHEAD), uint32(LANES * (done + AHEAD))
             ask_group(row, done + AHEAD)
-            _ask(soon, lines, done - begin)
+            _ask(soon, asked, done - begin)
             choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, done + AHEAD))
             _copy_group(samples, slot(scratch, done), base + SAMPLE_BYTES * GROUP * done)
             done += 1
         # The last groups have none to choose ahead, or fewer pixels.
         if done < end:
-            _ask(soon, lines, done - begin)
+            _ask(soon, asked, done - begin)
             if done + AHEAD < limit:
                 choose_group(row, width, done + AHEAD, keys, count, bits, scratch, slot(scratch, done + AHEAD))
             offsets, at, pixels = slot(scratch, done), base + SAMPLE_BYTES * GROUP * done, width - GROUP * done

@@ -156,15 +156,15 @@ def _draw_stretch(
     bits: Any,
     scratch: int,
     soon: int,
-    lines: int,
+    asked: int,
     base: int,
 ) -> None:
     """Fill the groups `low` … `high` − 1 of a row under one light; the row's first pixel would go to `base`.
 
-    With each group so many `lines` of what is read `soon` are asked for.
+    With each group so many lines of what is read `soon` are `asked` for.
     """
     choose_first(row, width, keys, count, bits, scratch, low, high)
-    draw_groups(row, width, keys, samples, count, bits, scratch, low, high, high, soon, lines, base)
+    draw_groups(row, width, keys, samples, count, bits, scratch, low, high, high, soon, asked, base)
 
 
 @compiled
