@@ -27,6 +27,7 @@ from calibration.primaries import pure_lights
 from calibration.radiometry import saturation
 from drivers.errors import FormatError
 from drivers.rawfile import Mosaic, decode_raw
+from drivers.storage import read_whole
 
 MOST_THREADS = 8
 """Each thread holds a raw file and its counts, 110 MB for a 6D Mark II: more would not stay below 2 GB."""
@@ -130,7 +131,7 @@ def decode(session: Session, record: FrameRecord) -> Decoded:
     """
     path = session.folder / record.file
     try:
-        data = path.read_bytes()
+        data = read_whole(path)
     except FileNotFoundError as error:
         raise FormatError(
             f"{path} is missing, but the session's journal counts it; restore the file from a copy, "

@@ -75,7 +75,7 @@ _PLAIN: dict[Tag, tuple[tuple[int, ...], ...]] = {
 """What a plain file states, or does not state."""
 
 
-def read_plainly(data: bytes, directories: Sequence[Directory]) -> PlainDng | None:
+def read_plainly(data: bytes | memoryview, directories: Sequence[Directory]) -> PlainDng | None:
     """Return what a plain DNG holds; None for any other file.
 
     LibRaw copies such counts one by one, which takes longer than all that is done with a frame afterwards.
@@ -88,7 +88,7 @@ def read_plainly(data: bytes, directories: Sequence[Directory]) -> PlainDng | No
         Its TIFF directories.
     """
     pixels = raw_pixels(directories)
-    if pixels is None or not data.startswith(b"II") or sys.byteorder != "little":
+    if pixels is None or data[:2] != b"II" or sys.byteorder != "little":
         return None
     if any(pixels.integers(tag) not in allowed for tag, allowed in _PLAIN.items()):
         return None

@@ -36,6 +36,7 @@ from drivers.dng_reading import (
     stated_black,
 )
 from drivers.errors import FormatError
+from drivers.storage import read_whole
 from drivers.tiff import Directory, Tag, TiffDamaged, is_tiff, read_directories
 
 if TYPE_CHECKING:
@@ -180,7 +181,7 @@ def read_raw(path: Path) -> Mosaic:
     return decode_raw(_read_bytes(path), path)
 
 
-def decode_raw(data: bytes, path: Path) -> Mosaic:
+def decode_raw(data: bytes | memoryview, path: Path) -> Mosaic:
     """Return the mosaic of a raw file's bytes, for those who have read them already; `path` names it in messages.
 
     Raises
@@ -206,7 +207,7 @@ def decode_raw(data: bytes, path: Path) -> Mosaic:
             raise _unreadable(path, str(error) or type(error).__name__) from error
 
 
-def _plain_mosaic(data: bytes, directories: list[Directory], plain: PlainDng) -> Mosaic:
+def _plain_mosaic(data: bytes | memoryview, directories: list[Directory], plain: PlainDng) -> Mosaic:
     visible, camera = plain.active, _camera_name(data, directories)
     return Mosaic(
         counts=_part(plain.sensor, visible),
@@ -223,7 +224,7 @@ def _plain_mosaic(data: bytes, directories: list[Directory], plain: PlainDng) ->
     )
 
 
-def _mosaic(path: Path, raw: RawPy, data: bytes, directories: list[Directory]) -> Mosaic:
+def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, directories: list[Directory]) -> Mosaic:
     import rawpy
 
     pattern = raw.raw_pattern
@@ -279,9 +280,9 @@ def _part(sensor: NDArray[np.uint16], area: Area) -> NDArray[np.uint16]:
     return sensor[area.top : area.top + area.height, area.left : area.left + area.width]
 
 
-def _read_bytes(path: Path) -> bytes:
+def _read_bytes(path: Path) -> memoryview:
     try:
-        data = path.read_bytes()
+        data = read_whole(path)
     except FileNotFoundError as error:
         raise FormatError(f"there is no raw file {path}; check the name") from error
     except IsADirectoryError as error:
@@ -293,7 +294,7 @@ def _read_bytes(path: Path) -> bytes:
     return data
 
 
-def _check_structure(path: Path, data: bytes) -> list[Directory]:
+def _check_structure(path: Path, data: bytes | memoryview) -> list[Directory]:
     """Return the file's TIFF directories, none for other formats; refuse a file that ends before its pixels do."""
     if not is_tiff(data):
         return []
@@ -309,7 +310,7 @@ def _check_structure(path: Path, data: bytes) -> list[Directory]:
     return directories
 
 
-def _camera_name(data: bytes, directories: list[Directory]) -> str:
+def _camera_name(data: bytes | memoryview, directories: list[Directory]) -> str:
     for directory in directories:
         maker, model = directory.text(Tag.MAKE), directory.text(Tag.MODEL)
         if model:
@@ -327,7 +328,7 @@ def _joined(maker: str, model: str) -> str:
     return f"{maker} {model}"
 
 
-def _ciff_camera(data: bytes) -> tuple[str, str]:
+def _ciff_camera(data: bytes | memoryview) -> tuple[str, str]:
     """Return maker and model from Canon's CRW heap; two empty strings for any other file.
 
     Source: Canon, CIFF 1.0 revision 4: a heap ends with the offset of its table; 0x300A is the heap of the
@@ -347,7 +348,7 @@ def _ciff_camera(data: bytes) -> tuple[str, str]:
                     break
             else:
                 return "", ""
-        maker, model, *_ = data[start:end].split(b"\0")
+        maker, model, *_ = bytes(data[start:end]).split(b"\0")
     except (struct.error, ValueError):
         return "", ""
     return maker.decode("ascii", "replace"), model.decode("ascii", "replace")

@@ -111,12 +111,12 @@ class Directory:
         return [*strips, *tiles]
 
 
-def is_tiff(data: bytes) -> bool:
+def is_tiff(data: bytes | memoryview) -> bool:
     """Return whether `data` begins as TIFF does, or as a maker's near copy of it."""
     return data[:4] in (b"II*\0", b"MM\0*", b"IIRO", b"IIRS", b"MMOR", b"IIU\0")
 
 
-def read_directories(data: bytes) -> list[Directory]:
+def read_directories(data: bytes | memoryview) -> list[Directory]:
     """Return the directories of the main chain and, after each, those it points to by SubIFDs and as Exif.
 
     Raises
@@ -142,7 +142,7 @@ def read_directories(data: bytes) -> list[Directory]:
     return directories
 
 
-def _read_directory(order: str, data: bytes, offset: int) -> tuple[Directory, int]:
+def _read_directory(order: str, data: bytes | memoryview, offset: int) -> tuple[Directory, int]:
     (count,) = _unpack(order, "H", data, offset)
     values: dict[int, Value] = {}
     for number in range(count):
@@ -156,7 +156,7 @@ def _read_directory(order: str, data: bytes, offset: int) -> tuple[Directory, in
     return Directory(values), following
 
 
-def _read_value(order: str, data: bytes, place: int, kind: int, length: int) -> Value:
+def _read_value(order: str, data: bytes | memoryview, place: int, kind: int, length: int) -> Value:
     if length > _MAX_VALUES:
         raise TiffDamaged(f"a tag claims {length} values")
     one = _FORMATS[kind]
@@ -166,14 +166,14 @@ def _read_value(order: str, data: bytes, place: int, kind: int, length: int) -> 
     if kind == _TEXT:
         if place + length > len(data):
             raise TiffDamaged(f"a text reaches to byte {place + length}, and it has only {len(data)}")
-        return data[place : place + length].split(b"\0")[0].decode("utf-8", "replace").strip()
+        return bytes(data[place : place + length]).split(b"\0")[0].decode("utf-8", "replace").strip()
     numbers = _unpack(order, one * length if len(one) == 2 else f"{length}{one}", data, place)
     if len(one) == 2:
         return tuple(top / bottom if bottom else 0.0 for top, bottom in zip(numbers[::2], numbers[1::2], strict=True))
     return tuple(numbers)
 
 
-def _unpack(order: str, layout: str, data: bytes, offset: int) -> tuple[int, ...]:
+def _unpack(order: str, layout: str, data: bytes | memoryview, offset: int) -> tuple[int, ...]:
     try:
         return struct.unpack_from(order + layout, data, offset)
     except struct.error as error:

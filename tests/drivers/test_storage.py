@@ -16,7 +16,7 @@ import pytest
 
 from drivers import storage
 from drivers.errors import InputError, StorageError
-from drivers.storage import is_partial, partial_path, require_free, whole_file, whole_folder, write_whole
+from drivers.storage import is_partial, partial_path, read_whole, require_free, whole_file, whole_folder, write_whole
 
 
 def names(folder: Path) -> list[str]:
@@ -242,3 +242,27 @@ def test_whole_file_yields_a_stream_that_can_be_sized(tmp_path: Path) -> None:
         assert isinstance(stream, BufferedRandom)
         stream.write(b"123")
         assert stream.tell() == 3
+
+
+@pytest.mark.parametrize("size", [0, 1, 70_000, 5 << 20])
+def test_a_file_is_read_whole_and_cannot_be_written_through(tmp_path: Path, size: int) -> None:
+    written = os.urandom(size)
+    (tmp_path / "frame").write_bytes(written)
+    data = read_whole(tmp_path / "frame")
+    assert data == written
+    assert data.readonly
+    assert bool(data) == bool(written)
+
+
+@pytest.mark.parametrize("told", [0, 5, 20])
+def test_a_file_of_another_size_than_the_system_told_is_read_to_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: int
+) -> None:
+    (tmp_path / "frame").write_bytes(b"ten bytes.")
+
+    def fstat(handle: int) -> os.stat_result:
+        del handle
+        return os.stat_result((0,) * 6 + (told, 0, 0, 0))
+
+    monkeypatch.setattr(storage.os, "fstat", fstat)
+    assert read_whole(tmp_path / "frame") == b"ten bytes."
