@@ -128,3 +128,29 @@ def test_a_full_device_under_stdout_is_5(lines: int) -> None:
     assert code == 5
     assert error.startswith("error: cannot ")
     assert "No space left" in error
+
+
+MEANWHILE = """
+from drivers.console import progress
+with progress("files") as told:
+    told(1, 2)
+    print("found")
+"""
+
+
+def test_what_is_printed_beside_a_bar_on_the_terminal_goes_where_standard_output_goes() -> None:
+    pty = pytest.importorskip("pty")
+    terminal, end = pty.openpty()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", MEANWHILE],
+            env={**os.environ, "TERM": "xterm"},
+            stdout=subprocess.PIPE,
+            stderr=end,
+            check=True,
+        )
+        os.close(end)
+        assert b"1/2" in os.read(terminal, 1 << 16)
+    finally:
+        os.close(terminal)
+    assert done.stdout.splitlines() == [b"found"]
