@@ -53,13 +53,12 @@ def usual(lut: Lut, picture: npt.NDArray[np.uint8]) -> None:
 
 def measure(name: str, lut: Lut, picture: npt.NDArray[np.uint8], repeats: int) -> None:
     height, width, _ = picture.shape
-    weights = {kind: mask_weights(kind, height, width) for kind in KINDS}
-    lightings = {kind: Lighting((plain(0), plain(1)), parse_masks(kind, 2, 1).maker(0)) for kind in KINDS}
-    image = mix_samples(lut.samples, picture, weights["soft-edge"], white_level=WHITE)
+    image = mix_samples(lut.samples, picture, mask_weights("soft-edge", height, width), white_level=WHITE)
     calls: dict[str, Callable[[], object]] = {"usual": lambda: usual(lut, picture)}
-    for kind, its in weights.items():
-        lighting = lightings[kind]
-        calls[f"{kind}, masks"] = lambda kind=kind: mask_weights(kind, height, width)
+    for kind in KINDS:
+        lighting = Lighting((plain(0), plain(1)), parse_masks(kind, 2, 1).maker(0))
+        its = lighting.weights_of(height, width)
+        calls[f"{kind}, masks"] = lambda lighting=lighting: lighting.weights_of(height, width)
         calls[f"{kind}, mixing"] = lambda its=its: mix_samples(lut.samples, picture, its, white_level=WHITE)
         calls[f"{kind}, maps"] = lambda its=its, lighting=lighting: encode_maps(lut, lighting, its)
     calls["image"] = lambda: sum(len(piece) for piece in encode_pieces(image, "png", SHOT))

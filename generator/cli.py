@@ -331,7 +331,7 @@ def generate(
                 on_done=told.done,
                 on_image=told.image,
                 on_skip=told.skip,
-                on_wait=told.wait,
+                on_wait=told.warn,
             )
         rest = f"make a dataset of them with generate --finish {out}" if done == shards else "others are to be made yet"
         print(f"{done} of {shards} shards of {out} are done; {rest}")
@@ -345,7 +345,7 @@ def generate(
             on_done=told.done,
             on_image=told.image,
             on_skip=told.skip,
-            on_wait=told.wait,
+            on_wait=told.warn,
         )
     _tell(dataset, out)
     if contact_sheet is not None:
@@ -378,10 +378,10 @@ class _Told:
     def skip(self, name: str, reason: str, images: int) -> None:
         """Show that a picture cannot be read."""
         self.progress.update(self.task, total=(self.progress.tasks[0].total or 0) - images)
-        self.progress.console.print(f"passed over {name}: {reason}", style="yellow", markup=False, highlight=False)
+        self.warn(f"passed over {name}: {reason}")
 
-    def wait(self, sentence: str) -> None:
-        """Show what the work waits for."""
+    def warn(self, sentence: str) -> None:
+        """Show what the user should know meanwhile."""
         self.progress.console.print(sentence, style="yellow", markup=False, highlight=False)
 
 

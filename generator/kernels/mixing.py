@@ -161,7 +161,8 @@ def _draw_stretch(
 ) -> None:
     """Fill the groups `low` … `high` − 1 of a row under one light; the row's first pixel would go to `base`.
 
-    With each group so many lines of what is read `soon` are `asked` for.
+    A function of its own, as `_mix_stretch`: both within the loop of rows are more than the registers hold. With each
+    group so many lines of what is read `soon` are `asked` for.
     """
     choose_first(row, width, keys, count, bits, scratch, low, high)
     draw_groups(row, width, keys, samples, count, bits, scratch, low, high, high, soon, asked, base)

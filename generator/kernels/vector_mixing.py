@@ -84,13 +84,9 @@ def mean4(typing: Any, source: Any, count: Any, target: Any) -> Any:
 
 
 def _each_line(builder: Builder, weights: Value, count: Value, do: Callable[[Value, Value], None]) -> None:
-    """Do something with each eight pixels' weights of a pair of lights and their number; with the last ones twice."""
-    blocks = builder.lshr(builder.add(count, ir.Constant(I64, BLOCK - 1)), ir.Constant(I64, 3))
-    with cgutils.for_range(builder, builder.lshr(count, ir.Constant(I64, 3))) as loop:
-        at = builder.add(weights, builder.shl(loop.index, ir.Constant(I64, 6)))
-        do(load(builder, at, 0, WORDS), loop.index)
-    at = builder.add(weights, builder.shl(builder.sub(count, ir.Constant(I64, BLOCK)), ir.Constant(I64, 3)))
-    do(load(builder, at, 0, WORDS), builder.sub(blocks, ir.Constant(I64, 1)))
+    """Do something with each eight pixels' weights of a pair of lights, and their number."""
+    with _blocks(builder, count) as (block, begin):
+        do(load(builder, builder.add(weights, builder.shl(begin, ir.Constant(I64, 3))), 0, WORDS), block)
 
 
 def _some(builder: Builder, words: Value) -> Value:

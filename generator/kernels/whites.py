@@ -15,31 +15,39 @@ _ZERO: Final = np.float32(0)
 
 @numba.njit(inline="always")
 def _light_at(weights: Any, whites: Any, y: int, x: int) -> Any:
-    """Return r, g and b of the light of a pixel."""
+    """Return linear red, green and blue of the light of a pixel."""
     red = green = blue = _ZERO
     for light in range(weights.shape[2]):
         weight = weights[y, x, light]
         red += weight * whites[light, 0]
         green += weight * whites[light, 1]
         blue += weight * whites[light, 2]
+    return red, green, blue
+
+
+@numba.njit(inline="always")
+def _whole(red: Any, green: Any, blue: Any, full: Any) -> Any:
+    """Return r, g and b as whole parts of `full`; green takes what rounding leaves."""
     total = red + green + blue
-    return red / total, green / total, blue / total
+    first, last = np.int32(np.rint(red / total * full)), np.int32(np.rint(blue / total * full))
+    return first, np.int32(np.int32(full) - first - last), last
 
 
 @compiled
 def _chromaticities(weights: Any, whites: Any, out: Any) -> None:
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1]):
-            out[y, x, 0], out[y, x, 1], out[y, x, 2] = _light_at(weights, whites, y, x)
+            red, green, blue = _light_at(weights, whites, y, x)
+            total = red + green + blue
+            out[y, x, 0], out[y, x, 1], out[y, x, 2] = red / total, green / total, blue / total
 
 
 @compiled
 def _whole_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> None:
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1]):
-            r, _, b = _light_at(weights, whites, y, x)
-            first, last = np.int32(np.rint(r * full)), np.int32(np.rint(b * full))
-            out[y, x, 0], out[y, x, 1], out[y, x, 2] = first, np.int32(full) - first - last, last
+            red, green, blue = _light_at(weights, whites, y, x)
+            out[y, x, 0], out[y, x, 1], out[y, x, 2] = _whole(red, green, blue, full)
 
 
 @compiled
@@ -52,11 +60,7 @@ def _whole_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: Any)
             red = _ZERO + one * whites[0, 0] + other * whites[1, 0]
             green = _ZERO + one * whites[0, 1] + other * whites[1, 1]
             blue = _ZERO + one * whites[0, 2] + other * whites[1, 2]
-            total = red + green + blue
-            first, last = np.int32(np.rint(red / total * full)), np.int32(np.rint(blue / total * full))
-            out[y, 3 * x] = first
-            out[y, 3 * x + 1] = np.int32(np.int32(full) - first - last)
-            out[y, 3 * x + 2] = last
+            out[y, 3 * x], out[y, 3 * x + 1], out[y, 3 * x + 2] = _whole(red, green, blue, full)
 
 
 @compiled

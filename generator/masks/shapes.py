@@ -98,12 +98,11 @@ class HalfPlanes:
         """Return the function that fills a picture's rows."""
         drawn: list[float] = dice.uniform(0).tolist()
         angle = math.radians(360 * drawn[0] if self.angle is None else self.angle)
-        across = math.cos(angle), math.sin(angle)
         width = max(0.1 + 0.5 * drawn[1] if self.width is None else self.width, pixel)
         reach = abs(math.cos(angle)) * half[0] + abs(math.sin(angle)) * half[1]
         edges = [reach * (2 * (edge + 0.6 * drawn[1 + edge] - 0.3) / lights - 1) for edge in range(1, lights)]
 
-        right, down = (np.float32(part) for part in across)
+        right, down = np.float32(math.cos(angle)), np.float32(math.sin(angle))
         edge_places, soft = np.array(edges, np.float32), np.float32(width)
 
         def fill(v: Array) -> Array:
@@ -154,8 +153,8 @@ class Spots:
         def fill(v: Array) -> Array:
             shares = np.ones((lights, len(v), u.shape[1]), np.float32)
             for light, its in enumerate(places, start=1):
-                _add_discs(u[0], v[:, 0], its, shares[0], shares[light])
-            return shares
+                _fill_discs(u[0], v[:, 0], its, shares[light])
+            return _over_the_first(shares)
 
         return fill
 
@@ -188,7 +187,7 @@ class SmoothFields:
             drawn = dice.uniform(light, knots * knots).reshape(knots, knots)
             # The spline leaves 0.479 of the knots' variance in each direction, on the average.
             field = (self.contrast / 0.479 * math.sqrt(12) * (drawn - 0.5)).astype(np.float32)
-            fields.append(self._splined(field.T, u[0]).T)
+            fields.append(np.ascontiguousarray(self._splined(np.ascontiguousarray(field.T), u[0]).T))
 
         def fill(v: Array) -> Array:
             return np.stack([_growth(self._splined(field, v[:, 0])) for field in fields])
@@ -213,7 +212,7 @@ class SmoothFields:
             t * t * t / 6,
         )
         total = np.zeros((len(at), knots.shape[1]), np.float32)
-        _add_splines(np.ascontiguousarray(knots), index, np.stack(weights), total)
+        _add_splines(knots, index, np.stack(weights), total)
         return total
 
 
@@ -238,14 +237,14 @@ class Windows:
         windows = [self._window(dice.uniform(light), half, pixel) for light in range(1, lights)]
 
         def fill(v: Array) -> Array:
-            lit: list[Array] = []
-            for matrix, columns, rows, soft in windows:
+            shares = np.ones((lights, len(v), u.shape[1]), np.float32)
+            for light, (matrix, columns, rows, soft) in enumerate(windows, start=1):
                 x, y, w = (row[0] * u + row[1] * v + row[2] for row in matrix)
                 # Behind the vanishing line there is no window.
                 seen = w > 1e-3
                 w = np.where(seen, w, 1)
-                lit.append(_panes(x / w, columns, soft) * _panes(y / w, rows, soft) * seen)
-            return _over_the_first(lit)
+                shares[light] = _panes(x / w, columns, soft) * _panes(y / w, rows, soft) * seen
+            return _over_the_first(shares)
 
         return fill
 
@@ -288,8 +287,8 @@ def _fill_strips(u: Any, v: Any, right: Any, down: Any, edges: Any, width: Any, 
 
 
 @compiled
-def _add_discs(u: Any, v: Any, discs: Any, first: Any, light: Any) -> None:
-    """Fill a light's shares (n, m), all 1, with discs, and take from the first light's what falls over it."""
+def _fill_discs(u: Any, v: Any, discs: Any, light: Any) -> None:
+    """Fill a light's shares (n, m), all 1, with discs."""
     for y in range(len(v)):
         for disc in range(len(discs)):
             x0, y0, radius, edge = discs[disc, 0], discs[disc, 1], discs[disc, 2], discs[disc, 3]
@@ -298,7 +297,6 @@ def _add_discs(u: Any, v: Any, discs: Any, first: Any, light: Any) -> None:
                 light[y, x] *= stepped((distance - radius) / edge + _HALF)
         for x in range(len(u)):
             light[y, x] = _ONE - light[y, x]
-            first[y, x] *= _ONE - light[y, x]
 
 
 @compiled
@@ -361,9 +359,8 @@ def _panes(at: Array, count: int, soft: float) -> Array:
     return light
 
 
-def _over_the_first(lit: list[Array]) -> Array:
-    """Return the shares (K, h, W) of the first light and of those that fall over it, each 0 to 1 for itself."""
-    dark = np.ones_like(lit[0])
-    for light in lit:
-        dark *= 1 - light
-    return np.stack([dark, *lit])
+def _over_the_first(shares: Array) -> Array:
+    """Return the lights' shares (K, h, W), the first light's, all 1, less what of the others falls over it."""
+    for light in shares[1:]:
+        shares[0] *= 1 - light
+    return shares

@@ -190,10 +190,11 @@ def _by_dask(
             key = f"crop-shard-{shard}-{attempts[shard]}-{plan.seed}-{id(plan)}"
             return client.submit(make_elsewhere, plan.job(shard), place, key=key, pure=False)
 
-        if not client.nthreads():
+        threads = client.nthreads()
+        if not threads:
             on_wait(f"the Dask scheduler has no worker yet; start some with: dask worker {address}")
         # A few tasks a thread are handed out at a time: a plan may have more of them than memory has room for.
-        at_once = max(4, 3 * sum(client.nthreads().values()))
+        at_once = max(4, 3 * sum(threads.values()))
         running = {submit(shard): shard for shard in islice(waiting, at_once)}
         futures = as_completed(list(running), loop=client.loop)
         for future in futures:
