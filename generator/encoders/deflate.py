@@ -57,6 +57,8 @@ _FEW_ROWS: Final = 4
 """Rows that are counted at least."""
 _FEW: Final = 1 << 13
 """Symbols from which the counted rows speak for the others."""
+_ROOMY: Final = 56
+"""Bits that a flush has room for beside the up to seven that wait."""
 _ROOM: Final = 1024
 """Bytes for the head of a block, its end, and what a flush writes beyond; no byte of a row takes two, see `LONGEST`."""
 
@@ -148,9 +150,8 @@ def find_repeats(image: Any, seen: Any, distances: Any) -> None:
     `seen` holds for each hash of a pixel where it was last seen, in bytes, above the bits of the pixel that the
     hash leaves open. As mixing is one to one, what agrees in both is the pixel itself.
     """
-    left = uint64(48) - uint64(15)
+    left, turn = uint64(48) - uint64(15), uint64(64 - 48 + 15)
     open_bits = (uint64(1) << left) - uint64(1)
-    mask = (uint64(1) << uint64(48)) - uint64(1)
     for place in range(_PLACES):
         seen[place] = 0
     samples, backs = image.reshape(-1), distances.reshape(-1)
@@ -166,23 +167,30 @@ def find_repeats(image: Any, seen: Any, distances: Any) -> None:
                 | (uint64(samples[at + uint64(1)]) << uint64(16))
                 | (uint64(samples[at + uint64(2)]) << uint64(32))
             )
-            mixed = (pixel * uint64(_MIX)) & mask
-            last = seen[mixed >> left]
-            seen[mixed >> left] = (position << left) | (mixed & open_bits)
-            back = position - (last >> left)
-            # Whether a pixel repeats cannot be foreseen, so there is no branch on it: 0 where it is equal and in reach.
-            other = ((last ^ mixed) & open_bits) | ((back - uint64(1)) // uint64(_WINDOW))
-            backs[pixels] = uint16(back * uint64(other == uint64(0)))
+            mixed = pixel * uint64(_MIX)
+            place = (mixed >> left) & uint64(_PLACES - 1)
+            here = (position << left) | (mixed & open_bits)
+            gone = here - seen[place]
+            seen[place] = here
+            # The bytes back to the last pixel of this hash, and above them what is not 0 where that is another pixel.
+            # Whether a pixel repeats cannot be foreseen, so there is no branch on it.
+            back = (gone >> left) | (gone << turn)
+            backs[pixels] = uint16(back) if back - uint64(1) < uint64(_WINDOW) else uint16(0)
             at += uint64(3)
             pixels += uint64(1)
             position += uint64(6)
 
 
 @compiled
+def _place_of(less: Any) -> Any:
+    """Return where `_DISTANCE_SYMBOLS` has the symbol of a distance, given one less than the distance."""
+    return less if less < uint64(256) else uint64(256) + (less >> uint64(7))
+
+
+@compiled
 def _symbol_of(distance: Any) -> Any:
     """Return the symbol of a distance; some symbol where there is none."""
-    back = (uint32(distance) - uint32(1)) & uint32(_WINDOW - 1)
-    return _DISTANCE_SYMBOLS[back if back < uint32(256) else uint32(256) + (back >> uint32(7))]
+    return _DISTANCE_SYMBOLS[_place_of((uint64(distance) - uint64(1)) & uint64(_WINDOW - 1))]
 
 
 @compiled
@@ -269,7 +277,10 @@ def _estimate(plain: Any, distances: Any, literals: Any, backs: Any) -> None:
 
 @compiled
 def _join_codes(codes: Any, largest: Any, samples: Any) -> None:
-    """Fill `samples` with the code of both bytes of every sample up to `largest`, its length from bit 24 on."""
+    """Fill `samples` with the code of both bytes of every sample up to `largest`, its length in the lowest eight bits.
+
+    So a word is the number of places to shift what follows it, and sums of words have the sum of lengths.
+    """
     mask, length = uint32(0xFFFF), uint32(16)
     for high in range((largest >> 8) + 1):
         first = codes[high]
@@ -277,7 +288,49 @@ def _join_codes(codes: Any, largest: Any, samples: Any) -> None:
         for low in range(256):
             second = codes[low]
             joined = (first & mask) | ((second & mask) << bits)
-            samples[256 * high + low] = joined | ((bits + (second >> length)) << uint32(24))
+            samples[256 * high + low] = (joined << uint32(8)) | (bits + (second >> length))
+
+
+@compiled
+def _run_codes(codes: Any) -> Any:
+    """Return the code and extra bits, 12 + 5 at most, of each run's length; (`_LONGEST_RUN` + 1,) uint64.
+
+    They stand from bit 8 on, their number in the lowest bits.
+    """
+    runs = np.zeros(_LONGEST_RUN + 1, np.uint64)
+    for run in range(1, _LONGEST_RUN + 1):
+        code, extra = uint64(codes[_RUNS[run, 0]]), uint64(_RUNS[run, 2])
+        bits = code >> uint64(16)
+        runs[run] = (((code & uint64(0xFFFF)) | (extra << bits)) << uint64(8)) | (bits + uint64(_RUNS[run, 1]))
+    return runs
+
+
+@compiled
+def _match_codes(single: Any, codes: Any) -> Any:
+    """Return the codes of a match of a `single` pixel for each entry of `_DISTANCE_SYMBOLS`; (N,) uint64.
+
+    They stand from bit 8 on, 12 each at most, their number in the lowest bits, that of all bits from bit 32 on, and a
+    mask of the distance's extra bits, 13 at most, from bit 48 on.
+    """
+    matches = np.zeros(len(_DISTANCE_SYMBOLS), np.uint64)
+    first = single & uint64(63)
+    for i in range(len(matches)):
+        symbol = _DISTANCE_SYMBOLS[i]
+        code, extra = uint64(codes[symbol]), uint64(_DISTANCE_BITS[symbol])
+        bits = first + (code >> uint64(16))
+        both = (single >> uint64(8)) | ((code & uint64(0xFFFF)) << first)
+        mask = (uint64(1) << extra) - uint64(1)
+        matches[i] = bits | (both << uint64(8)) | ((bits + extra) << uint64(32)) | (mask << uint64(48))
+    return matches
+
+
+@compiled
+def _match(matches: Any, distance: Any) -> Any:
+    """Return the bits of a match of one pixel, and their number; some where there is no distance."""
+    less = (distance - uint64(1)) & uint64(_WINDOW - 1)
+    match = matches[_place_of(less)]
+    extra = (less & (match >> uint64(48))) << (match & uint64(63))
+    return ((match >> uint64(8)) & uint64(0xFFFFFF)) | extra, (match >> uint64(32)) & uint64(63)
 
 
 @compiled
@@ -306,46 +359,49 @@ def _put_bytes(out: Any, writer: Any, rows: Any, codes: Any) -> None:
 def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, back_codes: Any, joined: Any) -> None:
     """Write rows as literals, from the `joined` codes of samples, and matches."""
     at, waiting, number = writer[0], writer[1], writer[2]
-    mask, length, one, two = uint64(0xFFFF), uint64(16), uint64(1), uint64(2)
-    sample_mask, sample_length = uint64(0xFFFFFF), uint64(24)
+    zero, one, two, three, byte, low = uint64(0), uint64(1), uint64(2), uint64(3), uint64(8), uint64(63)
     samples, backs = image.reshape(-1), distances.reshape(-1)
+    runs = _run_codes(codes)
+    single = runs[1] & low
+    matches = _match_codes(runs[1], back_codes)
     width = uint64(image.shape[1])
     row_code = uint64(codes[0])
-    x = uint64(0)
+    x = zero
     for _ in range(image.shape[0]):
-        waiting |= (row_code & mask) << number
-        at, waiting, number = flush(out, at, waiting, number + (row_code >> length))
+        waiting |= (row_code & uint64(0xFFFF)) << number
+        at, waiting, number = flush(out, at, waiting, number + (row_code >> uint64(16)))
         end = x + width
         while x < end:
-            distance = backs[x]
-            if distance == 0:
-                i = uint64(3) * x
-                red, green = uint64(joined[samples[i]]), uint64(joined[samples[i + one]])
-                blue = uint64(joined[samples[i + two]])
-                bits = red >> sample_length
-                waiting |= ((red & sample_mask) | ((green & sample_mask) << bits)) << number
-                at, waiting, number = flush(out, at, waiting, number + bits + (green >> sample_length))
-                waiting |= (blue & sample_mask) << number
-                at, waiting, number = flush(out, at, waiting, number + (blue >> sample_length))
-                x += one
+            distance = uint64(backs[x])
+            following = uint64(backs[x + one]) if x + one < end else zero
+            # Seldom the next pixel goes on with a match. One sign tells it: of two conditions LLVM makes two branches.
+            if (((following ^ distance) - one) & (zero - distance)) >> low:
+                run = two
+                while run < uint64(_LONGEST_RUN) and x + run < end and uint64(backs[x + run]) == distance:
+                    run += one
+                bits, length = _match(matches, distance)
+                bits, length = (bits >> single) << (runs[run] & low), length - single + (runs[run] & low)
+                waiting |= ((runs[run] >> byte) | bits) << number
+                at, waiting, number = flush(out, at, waiting, number + length)
+                x += run
                 continue
-            run = one
-            while run < uint64(_LONGEST_RUN) and x + run < end and backs[x + run] == distance:
-                run += one
-            # Length, its extra bits, distance, its extra bits: 12 + 5 + 12 + 13 at most.
-            code = uint64(codes[_RUNS[run, 0]])
-            match, bits = code & mask, code >> length
-            match |= uint64(_RUNS[run, 2]) << bits
-            bits += uint64(_RUNS[run, 1])
-            symbol = _symbol_of(distance)
-            code = uint64(back_codes[symbol])
-            match |= (code & mask) << bits
-            bits += code >> length
-            extra = uint64(_DISTANCE_BITS[symbol])
-            match |= ((uint64(distance) - one) & ((one << extra) - one)) << bits
-            waiting |= match << number
-            at, waiting, number = flush(out, at, waiting, number + bits + extra)
-            x += run
+            # Whether a pixel is a match cannot be foreseen: both ways are gone, which takes less than a wrong guess.
+            i = three * x
+            red, green = uint64(joined[samples[i]]), uint64(joined[samples[i + one]])
+            blue = uint64(joined[samples[i + two]])
+            both = red + green
+            most = (red >> byte) | ((green >> byte) << (red & low))
+            literal, literal_length = most | ((blue >> byte) << (both & low)), (both + blue) & uint64(255)
+            match, match_length = _match(matches, distance)
+            bits = literal if distance == zero else match
+            length = literal_length if distance == zero else match_length
+            if length > uint64(_ROOMY):
+                waiting |= most << number
+                at, waiting, number = flush(out, at, waiting, number + (both & low))
+                bits, length = blue >> byte, blue & low
+            waiting |= bits << number
+            at, waiting, number = flush(out, at, waiting, number + length)
+            x += one
     writer[0], writer[1], writer[2] = at, waiting, number
 
 

@@ -30,14 +30,15 @@ _ORDER: Final = np.array([16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2,
 
 @compiled
 def _sort(keys: Any, used: int) -> None:
-    """Sort the first `used` keys by insertion: they are few, and numba's own sort takes seconds to compile."""
-    for i in range(1, used):
-        key = keys[i]
-        j = i
-        while j > 0 and keys[j - 1] > key:
-            keys[j] = keys[j - 1]
-            j -= 1
-        keys[j] = key
+    """Sort the first `used` keys by Shell's method: they are few, and numba's own sort takes seconds to compile."""
+    for gap in (57, 23, 10, 4, 1):
+        for i in range(gap, used):
+            key = keys[i]
+            j = i
+            while j >= gap and keys[j - gap] > key:
+                keys[j] = keys[j - gap]
+                j -= gap
+            keys[j] = key
 
 
 @compiled

@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from imagecodecs import deflate_adler32
 from isal import isal_zlib
 
 from drivers.errors import InputError
@@ -76,7 +77,7 @@ def _bands(
 
     def pack(top: int) -> tuple[memoryview, int, int]:
         data, plain = _packer().pack(np.ascontiguousarray(image[top : top + rows]), last=top + rows >= len(image))
-        return data.data, isal_zlib.adler32(plain.data), plain.size
+        return data.data, deflate_adler32(plain.data), plain.size
 
     def keep(top: int) -> tuple[bytes, int, int]:
         data, checksum, size = pack(top)
