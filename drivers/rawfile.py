@@ -19,6 +19,7 @@ import threading
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -418,15 +419,21 @@ def _turn_c_stderr(step: int) -> None:
     with _silence:
         _silenced += step
         try:
-            libc = ctypes.CDLL(None)
-            stream = ctypes.c_void_p.in_dll(libc, "stderr")
+            stream = ctypes.c_void_p.in_dll(ctypes.CDLL(None), "stderr")
         except (OSError, ValueError, TypeError):
             return
-        if step > 0 and _silenced == 1:
-            libc.fopen.restype = ctypes.c_void_p
-            null = libc.fopen(b"/dev/null", b"w")
-            if null:
-                _kept_stream, stream.value = stream.value, null
+        if step > 0 and _silenced == 1 and (null := _null_stream()):
+            _kept_stream, stream.value = stream.value, null
         elif _silenced == 0 and _kept_stream is not None:
-            libc.fclose(ctypes.c_void_p(stream.value))
             stream.value, _kept_stream = _kept_stream, None
+
+
+@cache
+def _null_stream() -> int | None:
+    """Return C's stream that forgets what is written; None if there is none.
+
+    It is never closed: a C++ library that is loaded while ``stderr`` leads there writes to it until the program's end.
+    """
+    libc = ctypes.CDLL(None)
+    libc.fopen.restype = ctypes.c_void_p
+    return libc.fopen(b"/dev/null", b"w")

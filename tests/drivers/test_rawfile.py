@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import subprocess
+import sys
 import threading
 from datetime import UTC, datetime
 from pathlib import Path
@@ -311,6 +313,25 @@ def test_what_is_no_raw_file(tmp_path: Path, content: bytes, capfd: pytest.Captu
     with pytest.raises(FormatError, match=r"frame\.CR2 cannot be read as a raw file: .*; expected .*: copy"):
         read_raw(tmp_path / "frame.CR2")
     assert capfd.readouterr() == ("", "")
+
+
+LATE_WRITER = """
+import ctypes
+from pathlib import Path
+from drivers import rawfile
+
+libc = ctypes.CDLL(None)
+with rawfile._libraw_silenced():
+    kept = ctypes.c_void_p.in_dll(libc, "stderr").value
+print(libc.fputs(b"late", ctypes.c_void_p(kept)) >= 0 and libc.fflush(ctypes.c_void_p(kept)) == 0)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="C's stderr is a variable of that name on Linux only")
+def test_a_library_that_came_while_a_raw_file_was_read_may_write_later() -> None:
+    """The C++ library keeps the stream that it finds as stderr when it is loaded, and flushes it at the end."""
+    done = subprocess.run([sys.executable, "-c", LATE_WRITER], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")
 
 
 def test_a_sensor_that_is_no_bayer_is_named_so(tmp_path: Path) -> None:
