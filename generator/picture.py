@@ -16,6 +16,9 @@ What is done to a file's values, in this order, so that one picture always gives
 from __future__ import annotations
 
 import hashlib
+import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -31,6 +34,11 @@ Picture = npt.NDArray[np.uint8]
 
 LARGEST_SIDE: Final = 65535
 """Longest side of a crop or a random scene, px."""
+LARGEST_PICTURE: Final = 1 << 29
+"""Most pixels of a picture: a small file can hold more than any memory, and one such file is to stop no data set."""
+
+_MULTIPLIED: Final = frozenset({"dpx", "iff", "openexr", "rla", "tiff"})
+"""Formats whose colours are multiplied by alpha unless the file says otherwise; those of others are as they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,19 +173,28 @@ class _Values:
 
 
 def _read(path: Path) -> _Values:
-    import OpenImageIO as oiio  # noqa: N813
-
     if not path.is_file():
         raise FormatError(f"cannot read {path}: there is no such file; name a picture")
+    with _named_in_text(path) as name:
+        return _read_named(path, name)
+
+
+def _read_named(path: Path, name: str) -> _Values:
+    import OpenImageIO as oiio  # noqa: N813
+
     wish = oiio.ImageSpec()
     wish.attribute("oiio:UnassociatedAlpha", 1)
-    stream = oiio.ImageInput.open(str(path), wish)
+    stream = oiio.ImageInput.open(name, wish)
     if stream is None:
         raise FormatError(f"cannot read {path}: {_reason(oiio.geterror())}; use another picture, or convert it to PNG")
     try:
         spec = stream.spec()
         if spec.deep or spec.depth > 1 or spec.nchannels < 1:
             raise FormatError(f"cannot read {path}: it is no flat picture; use another, or convert it to PNG")
+        if spec.width * spec.height > LARGEST_PICTURE:
+            raise FormatError(
+                f"cannot read {path}: {spec.width}x{spec.height} px are more than {LARGEST_PICTURE}; make it smaller"
+            )
         space = str(spec.get_string_attribute("oiio:ColorSpace")).lower()
         kind = spec.format.basetype
         floating = kind in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
@@ -190,17 +207,20 @@ def _read(path: Path) -> _Values:
                 f"cannot read {path}: {_reason(stream.geterror())}; the file is damaged, use another copy"
             )
         alpha_channel = spec.alpha_channel
-        associated = not spec.get_int_attribute("oiio:UnassociatedAlpha", 0)
+        kept_apart = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) or stream.format_name() not in _MULTIPLIED
         orientation = spec.get_int_attribute("Orientation", 1)
         icc = spec.getattribute("ICCProfile")
     finally:
         stream.close()
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+    # Of a GIF file the reader names the channel after the last.
+    alpha_channel = min(alpha_channel, spec.nchannels - 1)
     alpha = None
-    if 0 < alpha_channel < spec.nchannels:
+    if alpha_channel > 0:
         top = 1.0 if floating else float(np.iinfo(pixels.dtype).max)
         alpha = np.clip(pixels[..., alpha_channel].astype(np.float64) / top, 0.0, 1.0)
-        if alpha.min() == 1.0:
+        # The fourth byte of a plain BMP file means nothing, and most programs write 0.
+        if alpha.min() == 1.0 or (not alpha.any() and stream.format_name() == "bmp"):
             alpha = None
     colours = [channel for channel in range(spec.nchannels) if channel != alpha_channel]
     if colours[:3] == [0, 1, 2]:
@@ -211,8 +231,27 @@ def _read(path: Path) -> _Values:
         values = ((values.astype(np.uint32) + 128) // 257).astype(np.uint8)
     elif floating:
         values = values.astype(np.float64) * (1.0 if linear else 255.0)
+    associated = not kept_apart
+    if alpha is not None and not floating:
+        # What is brighter than its alpha was not multiplied by it, whatever the format's custom.
+        associated = associated and not bool(np.any(values > 255.0 * alpha[..., None] + 1.0))
     profile = None if icc is None else np.asarray(icc, dtype=np.uint8).tobytes()
     return _Values(values, alpha, associated, linear, orientation, profile)
+
+
+@contextmanager
+def _named_in_text(path: Path) -> Generator[str]:
+    """Give a name for a file that OpenImageIO takes: it knows no names with bytes that are no UTF-8."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory() as folder:
+            suffix = path.suffix.encode("ascii", "ignore").decode()
+            link = Path(folder) / f"picture{suffix}"
+            link.symlink_to(path.absolute())
+            yield str(link)
+    else:
+        yield str(path)
 
 
 def _jpeg(path: Path) -> npt.NDArray[np.uint8] | None:

@@ -29,7 +29,7 @@ def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArra
     Parameters
     ----------
     codes
-        (H, W, 3) uint8 in the space of the profile; for a grey profile the first channel counts.
+        (H, W, 3) uint8 in the space of the profile; a grey profile is applied where the channels are alike.
     icc
         The embedded profile; None where there is none.
 
@@ -42,6 +42,8 @@ def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArra
     if icc is None:
         return codes, ASSUMED
     transform, mode, word = _transform(icc)
+    if mode == "L" and (codes != codes[..., :1]).any():
+        return codes, f"{word.rpartition(', ')[0]} of grey, not applied to colours, taken as sRGB"
     if transform is None:
         return codes, word
     from PIL import Image, ImageCms

@@ -278,7 +278,7 @@ def _below_folder(folder: str, prefix: str = "") -> Iterator[str]:
                 f"{entry.name}/" if entry.is_dir(follow_symlinks=False) else entry.name
                 for entry in entries
                 if not entry.name.startswith(".")
-                and (entry.is_dir(follow_symlinks=False) or (_is_picture(entry.name) and entry.is_file()))
+                and (entry.is_dir(follow_symlinks=False) or (_is_picture(entry.name) and _is_file(entry)))
             )
     except OSError as error:
         raise InputError(f"cannot look into {folder}: {error.strerror}; name a folder that may be read") from error
@@ -287,6 +287,16 @@ def _below_folder(folder: str, prefix: str = "") -> Iterator[str]:
             yield from _below_folder(f"{folder.rstrip('/')}/{name[:-1]}", prefix + name)
         else:
             yield prefix + name
+
+
+def _is_file(entry: os.DirEntry[str]) -> bool:
+    """Return whether an entry is a file or leads to one; a link that leads round in a circle does not."""
+    try:
+        return entry.is_file()
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            return False
+        raise
 
 
 def _below_url(url: str) -> list[str]:

@@ -5,17 +5,22 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import struct
+import sys
 from pathlib import Path
 from typing import Any
 
 import cv2
+import imagecodecs
 import numpy as np
 import numpy.typing as npt
 import OpenImageIO as oiio  # noqa: N813
 import pytest
 import tifffile
+from PIL import Image
 
 from drivers.errors import FormatError, InputError, StorageError
+from generator import picture
 from generator.picture import Preparation, read_picture
 from generator.scene import RandomScene, find_pictures, random_scenes
 from generator.store import filesystem
@@ -62,20 +67,57 @@ def test_grey_becomes_three_equal_codes(tmp_path: Path, colours: npt.NDArray[np.
     np.testing.assert_array_equal(read_picture(path), colours[..., :1].repeat(3, axis=2))
 
 
-@pytest.mark.parametrize("suffix", ["png", "tif", "tga"])
+STRAIGHT = ["png", "tif", "tga", "bmp", "sgi", "dds", "jp2", "jxl", "dpx", "unsaid.tif"]
+
+
+@pytest.mark.parametrize("suffix", STRAIGHT)
 def test_white_shows_through(tmp_path: Path, suffix: str) -> None:
-    alpha = np.array([[0, 64, 128, 255]], np.float64)
-    rgba = np.stack([alpha * 0 + 200, alpha * 0 + 10, alpha * 0, alpha], axis=-1).astype(np.uint8)
+    rgba = np.random.default_rng(1).integers(0, 256, (32, 64, 4)).astype(np.uint8)
+    rgba[0, :4, 3] = [0, 64, 128, 255]
     path = tmp_path / f"clear.{suffix}"
-    if suffix == "tif":
-        tifffile.imwrite(path, rgba, photometric="rgb", extrasamples=["unassalpha"])
-    elif suffix == "png":
-        path.write_bytes(cv2.imencode(".png", rgba[..., [2, 1, 0, 3]])[1].tobytes())
-    else:
-        write(path, rgba, "uint8", oiio__UnassociatedAlpha=1)
-    share = alpha[..., None] / 255
+    match suffix:
+        case "tif":
+            tifffile.imwrite(path, rgba, photometric="rgb", extrasamples=["unassalpha"])
+        case "jp2":
+            path.write_bytes(imagecodecs.jpeg2k_encode(rgba, level=0, reversible=True))
+        case "jxl":
+            path.write_bytes(imagecodecs.jpegxl_encode(rgba, lossless=True))
+        case "dpx":
+            write(path, rgba, "uint8")
+        case "png" | "unsaid.tif":
+            path.write_bytes(cv2.imencode(path.suffix, rgba[..., [2, 1, 0, 3]])[1].tobytes())
+        case "tga":
+            write(path, rgba, "uint8", oiio__UnassociatedAlpha=1)
+        case _:
+            Image.fromarray(rgba).save(path)
+    share = rgba[..., 3:] / 255
     expected = rgba[..., :3] * share + 255 * (1 - share)
     assert np.abs(read_picture(path) - expected).max() <= 1
+
+
+def test_white_shows_through_a_gif(tmp_path: Path) -> None:
+    picture = Image.new("P", (3, 1))
+    picture.putpalette([200, 10, 0, 0, 90, 7])
+    picture.putdata([0, 1, 0])
+    picture.save(tmp_path / "clear.gif", transparency=0)
+    np.testing.assert_array_equal(read_picture(tmp_path / "clear.gif"), [[[255] * 3, [0, 90, 7], [255] * 3]])
+
+
+def test_colours_multiplied_by_alpha_are_not_multiplied_again(tmp_path: Path) -> None:
+    path = tmp_path / "associated.tif"
+    rgba = np.array([[[100, 5, 0, 128], [0, 0, 0, 0], [9, 8, 7, 255]]], np.uint8)
+    tifffile.imwrite(path, rgba, photometric="rgb", extrasamples=["assocalpha"])
+    np.testing.assert_array_equal(read_picture(path), [[[227, 132, 127], [255] * 3, [9, 8, 7]]])
+
+
+def test_the_fourth_byte_of_a_plain_bmp_means_nothing(tmp_path: Path, colours: npt.NDArray[np.uint8]) -> None:
+    height, width, _ = colours.shape
+    rows = np.zeros((height, width, 4), np.uint8)
+    rows[..., :3] = colours[::-1, :, ::-1]
+    head = b"BM" + struct.pack("<IHHI", 54 + rows.nbytes, 0, 0, 54)
+    head += struct.pack("<IiiHHIIiiII", 40, width, height, 1, 32, 0, rows.nbytes, 0, 0, 0, 0)
+    (tmp_path / "plain.bmp").write_bytes(head + rows.tobytes())
+    np.testing.assert_array_equal(read_picture(tmp_path / "plain.bmp"), colours)
 
 
 def test_grey_with_transparency(tmp_path: Path) -> None:
@@ -174,6 +216,36 @@ def test_links_to_folders_are_not_followed_and_links_to_files_are(tmp_path: Path
     (tmp_path / "in/again").symlink_to(tmp_path / "in")
     (tmp_path / "in/b.png").symlink_to(tmp_path / "in/deep/a.png")
     assert [source.name for source in find_pictures([tmp_path / "in"])] == ["b.png", "deep/a.png"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are bytes, whatever they mean, on Linux only")
+def test_names_that_are_no_text_are_read_and_told_as_escapes(tmp_path: Path, colours: npt.NDArray[np.uint8]) -> None:
+    folder = tmp_path / os.fsdecode(b"folder \xe9")
+    folder.mkdir()
+    data = cv2.imencode(".png", colours[..., ::-1])[1].tobytes()
+    (folder / os.fsdecode(b"picture \xff.png")).write_bytes(data)
+    (folder / os.fsdecode(b"damaged \xff.png")).write_bytes(data[:60])
+    damaged, whole = find_pictures([folder])
+    assert (damaged.name, whole.name) == ("damaged \\xff.png", "picture \\xff.png")
+    np.testing.assert_array_equal(whole.read().picture, colours)
+    with pytest.raises(FormatError, match="damaged"):
+        damaged.read()
+
+
+def test_a_picture_larger_than_any_is_named(
+    tmp_path: Path, colours: npt.NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "huge.png", colours, "uint8")
+    monkeypatch.setattr(picture, "LARGEST_PICTURE", 7 * 5 - 1)
+    with pytest.raises(FormatError, match=r"huge\.png: 7x5 px are more than 34; make it smaller"):
+        read_picture(path)
+
+
+def test_links_that_lead_round_in_a_circle_are_passed_over(tmp_path: Path, colours: npt.NDArray[np.uint8]) -> None:
+    write(tmp_path / "picture.png", colours, "uint8")
+    (tmp_path / "a.png").symlink_to(tmp_path / "b.png")
+    (tmp_path / "b.png").symlink_to(tmp_path / "a.png")
+    assert [found.name for found in find_pictures([tmp_path])] == ["picture.png"]
 
 
 @pytest.mark.parametrize(
