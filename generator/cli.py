@@ -217,7 +217,7 @@ def generate(
         Path | None,
         typer.Option(
             metavar="PATH",
-            help="Write a page of previews to this PNG file.",
+            help="Write a page of previews to this PNG file; with --verify of a dataset that is there.",
             show_default=False,
             rich_help_panel=_IMAGES,
         ),
@@ -271,13 +271,17 @@ def generate(
     ] = None,
 ) -> None:
     """Make a dataset."""
+    if contact_sheet is not None:
+        _check_sheet(contact_sheet, verify or finish or out, shard)
     if verify is not None:
-        _verify(verify, workers)
+        _draw_sheet(_verify(verify, workers), verify, contact_sheet)
         return
     if finish is not None:
         from generator.dataset import finish_dataset
 
-        _tell(finish_dataset(finish), finish)
+        dataset = finish_dataset(finish)
+        _tell(dataset, finish)
+        _draw_sheet(dataset, finish, contact_sheet)
         return
 
     from calibration.lut import open_lut
@@ -294,8 +298,6 @@ def generate(
     at_once = default_workers() if workers is None else workers
     check_workers(engine, at_once)
     require_free_place(out)
-    if contact_sheet is not None:
-        _check_sheet(contact_sheet)
     table = open_lut(lut)
     preparation = Preparation(max_side, None if crop is None else _size(crop, "--crop"), cover, crop_at, profiles, seed)
     pictures = _choose_sources(sources or [], random_scenes, size, seed, preparation)
@@ -348,11 +350,7 @@ def generate(
             on_wait=told.warn,
         )
     _tell(dataset, out)
-    if contact_sheet is not None:
-        from generator.contact import save_contact_sheet
-
-        save_contact_sheet(dataset, contact_sheet)
-        print(f"{contact_sheet}: contact sheet")
+    _draw_sheet(dataset, out, contact_sheet)
 
 
 @dataclass
@@ -405,7 +403,9 @@ def _progress(images: int) -> Generator[_Told]:
 def _tell(dataset: Dataset, out: str) -> None:
     """Print what was made."""
     made = dataset.description
-    print(f"{out}: {made.images} images of {made.sources} pictures under {len(made.lights)} lights")
+    lights = len({light for entry in dataset.entries for light in entry.lights})
+    counts = _counted(made.images, "image"), _counted(made.sources, "picture"), _counted(lights, "light")
+    print("{}: {} of {} under {}".format(out, *counts))
     if made.splits:
         print(", ".join(f"{images} for {part}" for part, images in made.splits.items()))
     if made.skipped:
@@ -419,8 +419,12 @@ def _tell(dataset: Dataset, out: str) -> None:
         )
 
 
-def _verify(out: str, workers: int | None) -> None:
-    """Print every fault of a dataset; a QualityError if there is one."""
+def _counted(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+def _verify(out: str, workers: int | None) -> Dataset:
+    """Print every fault of a dataset and return it; a QualityError if there is one."""
     from drivers.console import progress
     from drivers.errors import QualityError
     from generator.dataset import open_dataset
@@ -439,12 +443,40 @@ def _verify(out: str, workers: int | None) -> None:
             faults += 1
     if faults:
         raise QualityError(f"{out} is not as it was made, see above ({faults} faults); make it again, or copy it again")
-    print(f"{out}: {dataset.description.images} images, every file as it was made")
+    print(f"{out}: {_counted(dataset.description.images, 'image')}, every file as it was made")
+    return dataset
 
 
-def _check_sheet(contact_sheet: Path) -> None:
+def _draw_sheet(dataset: Dataset, out: str, contact_sheet: Path | None) -> None:
+    """Write the contact sheet if one is wanted; a StorageError says how to have it made without the dataset."""
+    if contact_sheet is None:
+        return
+    from drivers.errors import StorageError
+    from generator.contact import save_contact_sheet
+
+    try:
+        save_contact_sheet(dataset, contact_sheet)
+    except StorageError as error:
+        reason = getattr(error.__cause__, "strerror", None) or error
+        raise StorageError(
+            f"{out} is whole, but its contact sheet {contact_sheet} cannot be written: {reason}; have it made alone by "
+            f"generate --verify {out} --contact-sheet, in a place with room that may be written to"
+        ) from error
+    print(f"{contact_sheet}: contact sheet")
+
+
+def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None) -> None:
     from drivers.errors import InputError
+    from generator.store import is_remote, local_path
 
+    if shard is not None:
+        raise InputError(
+            "one share of a dataset has no contact sheet; ask for it with --finish OUT --contact-sheet PATH"
+        )
+    if out and not is_remote(out) and contact_sheet.absolute().is_relative_to(local_path(out).absolute()):
+        raise InputError(
+            f"the contact sheet {contact_sheet} would be no part of the dataset; name a place outside {out}"
+        )
     if contact_sheet.suffix.lower() != ".png":
         raise InputError(f"the contact sheet {contact_sheet} is to be a PNG file; let its name end in .png")
     if contact_sheet.exists():

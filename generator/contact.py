@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,7 +91,13 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     figure: Any = Figure(figsize=(width, height), dpi=150, facecolor=_PAPER)
 
     def put(x: float, y: float, words: str, size: float, colour: str = _INK, **style: str) -> None:
-        figure.text(x / width, 1 - y / height, words, {"fontsize": size, "color": colour, "va": "baseline", **style})
+        figure.text(
+            x / width,
+            1 - y / height,
+            words,
+            # A name may hold dollar signs.
+            {"fontsize": size, "color": colour, "va": "baseline", "parse_math": False, **style},
+        )
 
     def dot(x: float, y: float, light: str) -> None:
         radius = 0.055
@@ -123,7 +130,7 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
                 y = head - 0.2 if under_it else top + heights[row] + 0.15
                 for place, light in enumerate(entry.lights):
                     dot(left + 0.13 * place, y, light)
-                words = _short(" and ".join(_label(light, named) for light in entry.lights), 26)
+                words = _short(" and ".join(map(partial(_label, named), entry.lights, entry.truths)), 28)
                 size, ink = (8, _INK) if under_it else (7, _FAINT)
                 put(left + 0.05 + 0.13 * len(entry.lights), y + 0.04, words, size, ink)
         under = top + heights[row] + (0.0 if shared else caption)
@@ -133,9 +140,9 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     return figure
 
 
-def _label(light: str, named: Mapping[str, str]) -> str:
-    """Return what to call a light: as a person does, or for a mixture how many lights it is of."""
-    return named.get(light) or f"mix of {light.count('+') + 1}"
+def _label(named: Mapping[str, str], light: str, truth: Triple) -> str:
+    """Return what to call a light: as a person does, or for a mixture its chromaticity."""
+    return named.get(light) or "r {} b {}".format(*(f"{part:.2f}".lstrip("0") for part in truth[::2]))
 
 
 def _colour(light: str, lights: Mapping[int, Light]) -> Triple:

@@ -186,7 +186,8 @@ def _read_named(path: Path, name: str) -> _Values:
     wish.attribute("oiio:UnassociatedAlpha", 1)
     stream = oiio.ImageInput.open(name, wish)
     if stream is None:
-        raise FormatError(f"cannot read {path}: {_reason(oiio.geterror())}; use another picture, or convert it to PNG")
+        reason = _reason(oiio.geterror()).replace(name, str(path))
+        raise FormatError(f"cannot read {path}: {reason}; use another picture, or convert it to PNG")
     try:
         spec = stream.spec()
         if spec.deep or spec.depth > 1 or spec.nchannels < 1:

@@ -228,7 +228,9 @@ def random_scenes(count: int, width: int, height: int, seed: int = 0) -> tuple[R
     return tuple(RandomScene(number, width, height, seed) for number in range(count))
 
 
-def find_pictures(places: Sequence[Path | str], preparation: Preparation = AS_THEY_ARE) -> tuple[PictureFile, ...]:
+def find_pictures(
+    places: Sequence[Path | str] | Path | str, preparation: Preparation = AS_THEY_ARE
+) -> tuple[PictureFile, ...]:
     """Return the pictures of folders and files.
 
     A folder is searched with all folders below it, without hidden ones and without following links to folders, for
@@ -238,22 +240,24 @@ def find_pictures(places: Sequence[Path | str], preparation: Preparation = AS_TH
     Parameters
     ----------
     places
-        Paths of this machine, or URLs that fsspec knows, such as ``s3://bucket/folder``.
+        Paths of this machine, or URLs that fsspec knows, such as ``s3://bucket/folder``; or a single one.
     preparation
         What is done to each.
 
     Raises
     ------
     InputError
-        A place is missing, or a folder holds no picture.
+        A place is missing or neither file nor folder, or a folder holds no picture.
     """
     found: list[PictureFile] = []
-    for place in places:
+    for place in (places,) if isinstance(places, Path | str) else places:
         remote = is_remote(str(place))
         # Whole, since a worker may have been started in another folder.
         root = str(place) if remote else os.path.abspath(local_path(place))  # noqa: PTH100  keeps no link's target
         if not remote and not os.path.lexists(root):
             raise InputError(f"there is no {place}; name a picture or a folder of pictures")
+        if not remote and Path(root).exists() and not (Path(root).is_dir() or Path(root).is_file()):
+            raise InputError(f"{place} is a device or a pipe; name a picture or a folder of pictures")
         if not remote and not Path(root).is_dir():
             found.append(PictureFile(root, "", preparation))
             continue

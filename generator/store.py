@@ -290,12 +290,22 @@ def is_remote(place: str) -> bool:
 
 
 def local_path(place: str | Path) -> Path:
-    """Return the path of a place of this machine, of which file:// may be the first part."""
+    """Return the path of a place of this machine, of which file:// may be the first part; it ends in a name.
+
+    Raises
+    ------
+    InputError
+        The place is empty, or the root of all folders.
+    """
     text = str(place)
     for scheme in ("file://", "local://"):
-        if text.startswith(scheme):
-            return Path(text[len(scheme) :])
-    return Path(place)
+        text = text.removeprefix(scheme)
+    path = Path(text)
+    if text and path.name in ("", ".."):
+        path = path.resolve()
+    if not path.name:
+        raise InputError(f"{str(place)!r} names no place; name a folder, such as dataset")
+    return path
 
 
 def filesystem(url: str) -> tuple[AbstractFileSystem, str]:

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from generator import open_lut, read_picture, render
+from drivers.errors import StorageError
+from generator import contact, open_lut, read_picture, render
 from generator.cli import main
 from generator.dataset import open_dataset
 
@@ -104,6 +105,27 @@ def test_layouts_parts_formats_and_several_lights(generate: Generate, capsys: py
     assert cv2.imread("sheet.png") is not None
 
 
+def test_a_sheet_that_could_not_be_written_is_made_alone(
+    generate: Generate, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names are no mathematics, whatever dollar signs are in them."""
+    Path("pictures/two.png").rename("pictures/A$%$ US$_\\frac{$.png")
+    wish = ("--sources", "pictures", "--light", "0:0.5+2:0.5", "--contact-sheet", "sheet.png")
+
+    def full(path: Path, data: bytes) -> None:
+        raise StorageError(f"cannot write {path}") from OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(contact, "write_whole", full)
+        assert generate("lut", "out", *wish) == 5
+    assert (
+        "error: out is whole, but its contact sheet sheet.png cannot be written: No space left on device; have it made "
+        "alone by generate --verify out --contact-sheet"
+    ) in capsys.readouterr().err
+    assert generate("--verify", "out", "--contact-sheet", "sheet.png") == 0
+    assert cv2.imread("sheet.png") is not None
+
+
 def test_shares_are_finished_and_verified(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
     wish = ("--sources", "pictures", "--illuminations", "all", "--shard-images", "3")
     assert generate("lut", "whole", *wish) == 0
@@ -159,6 +181,16 @@ def test_a_share_is_gone_on_with_by_the_whole(generate: Generate, capsys: pytest
         (("--finish", "nowhere"), "no dataset is being made at nowhere"),
         (("lut", "out", "--sources", "pictures", "--contact-sheet", "sheet.jpg"), "end in .png"),
         (("lut", "out", "--sources", "pictures", "--contact-sheet", "pictures/one.png"), "already exists"),
+        (
+            ("lut", "out", "--sources", "pictures", "--contact-sheet", "out/sheet.png"),
+            "would be no part of the dataset",
+        ),
+        (("lut", "out", "--shard", "0/2", "--contact-sheet", "sheet.png"), "ask for it with --finish"),
+        (("lut", "", "--sources", "pictures"), "'' names no place"),
+        (("lut", "/", "--sources", "pictures"), "'/' names no place"),
+        (("lut", ".", "--sources", "pictures"), "already exists"),
+        (("lut", "out", "--sources", ""), "'' names no place"),
+        (("lut", "out", "--sources", "/dev/null"), "/dev/null is a device or a pipe"),
     ],
 )
 def test_what_cannot_be_done_is_one_sentence(
