@@ -150,6 +150,30 @@ class Lut:
             digest.update((self.folder / name).read_bytes())
         return digest.hexdigest()
 
+    def require_unchanged(self, light: int) -> None:
+        """Raise unless a light's samples are those that were measured; costs the reading of a light, once for each.
+
+        Does nothing for tables made before hashes of lights were recorded.
+
+        Raises
+        ------
+        FormatError
+            They are not.
+        """
+        known = self.provenance.lights_sha256
+        if light in self._unchanged or light >= len(known):
+            return
+        if hashlib.sha256(np.ascontiguousarray(self.samples[light]).data).hexdigest() != known[light]:
+            raise FormatError(
+                f"{self.folder / SAMPLES}: the samples of light {light} are not those that were measured; see what "
+                f"else has changed with build-lut --verify {self.folder}, then copy the table again or build it anew"
+            )
+        self._unchanged.add(light)
+
+    @cached_property
+    def _unchanged(self) -> set[int]:
+        return set()
+
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
         """The frames the table was made of, in the order taken; empty in tables made before they were recorded.

@@ -327,21 +327,27 @@ def generate_dataset(
     Raises
     ------
     InputError
-        A light is not in the table, the place is taken or belongs to another plan, or there is no source.
+        A light is not in the table, an option is of another kind, the place is taken or belongs to another plan, or
+        there is no source.
     FormatError
         None of the sources can be read.
     StorageError
         The disk is full, read-only or gone; the shards that are done are kept for the next call.
     """
     choice: LightChoice = lights if isinstance(lights, LightChoice) else ListedLights(tuple(lights))
-    options = Options(
-        form=form,
-        layout=layout,
-        previews=previews,
-        split=split,
-        shard_images=shard_images,
-        sources=dict(reading or {}),
-    )
+    try:
+        options = Options(
+            form=form,
+            layout=layout,
+            previews=previews,
+            split=split,
+            shard_images=shard_images,
+            sources=dict(reading or {}),
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        option = ".".join(map(str, first["loc"]))
+        raise InputError(f"{option} of a dataset is {first['input']!r}: {first['msg']}; see Options") from error
     plan = Plan(lut, sources, choice, seed, options)
     return make_dataset(plan, out, engine=engine, workers=workers, on_image=on_image, on_skip=on_skip, on_wait=on_wait)
 

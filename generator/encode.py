@@ -31,6 +31,7 @@ __all__ = [
     "encode_pieces",
     "encode_preview",
     "libraries_of",
+    "smallest_side",
     "suffix_of",
 ]
 
@@ -54,6 +55,15 @@ def suffix_of(form: Format) -> str:
 def libraries_of(form: Format) -> tuple[str, ...]:
     """Return the distributions whose version may change the bytes of a file of that format; none where we write it."""
     return _LIBRARIES[form]
+
+
+def smallest_side(form: Format) -> int:
+    """Return the least width and height, px, of an image in that format."""
+    if form != "dng":
+        return 1
+    from generator.encoders.dng import SMALLEST_SIDE
+
+    return SMALLEST_SIDE
 
 
 def encode_image(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> bytes:

@@ -108,6 +108,10 @@ class _Part:
         self._flush()
         self._writer.close()
 
+    def give_up(self) -> None:
+        """Keep pyarrow from writing the end of a file that will not be."""
+        self._writer.is_open = False
+
     def _flush(self) -> None:
         import pyarrow as pa
 
@@ -161,6 +165,9 @@ class ParquetWriter:
         return self
 
     def __exit__(self, *error: *Fault) -> None:
+        """Leave no half file behind."""
+        for part in self._parts.values():
+            part.give_up()
         self._stack.__exit__(*error)
 
 

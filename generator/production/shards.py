@@ -215,12 +215,19 @@ def _wanted(job: ShardJob, position: int) -> list[tuple[int, Lighting]]:
 
 
 def _read(job: ShardJob, lut: Lut, place: int) -> _Read:
+    from generator.encode import smallest_side
     from generator.kernels.palette import fit_picture
 
     source: Source = job.sources[place]
     scene = source.read()
     picture, replaced = fit_picture(scene.picture, lut.provenance)
     height, width = picture.shape[:2]
+    least = smallest_side(job.options.form)
+    if min(height, width) < least:
+        raise FormatError(
+            f"{source.name} is {width}x{height} px, too small for {job.options.form}, which takes {least}x{least} and "
+            "more; choose another format, or leave it out"
+        )
     record = SourceRecord(
         position=job.position + place,
         name=source.name,
@@ -263,6 +270,10 @@ def _photograph(
     from generator.kernels.mixing import mix_samples
     from generator.masks.files import encode_maps
 
+    # The hash of the table stands for its samples in the dataset's description.
+    for mixture in lighting.mixtures:
+        for light in mixture.lights:
+            lut.require_unchanged(light)
     tables = [mixture.samples(lut, seed, picture) for mixture in lighting.mixtures]
     if lighting.masks is None:
         image = draw_samples(tables[0], picture, seed=seed, image=number, out=_room(picture.shape))

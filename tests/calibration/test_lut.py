@@ -122,6 +122,16 @@ def test_damage_is_found_and_told_where(tmp_path: Path, change: Callable[[Path],
     assert seen[-1] == (len(LIGHTS), len(LIGHTS))
 
 
+def test_samples_that_have_changed_are_not_used(tmp_path: Path) -> None:
+    lut = write(tmp_path / "lut")
+    flip("samples.npy", 128 + 2 * 1200 + 7)(lut.folder)
+    changed = open_lut(lut.folder)
+    for light in (0, 1, 3):
+        changed.require_unchanged(light)
+    with pytest.raises(FormatError, match=r"samples\.npy: the samples of light 2 are not those .*build-lut --verify"):
+        changed.require_unchanged(2)
+
+
 def test_a_disk_that_forgets_is_noticed(tmp_path: Path) -> None:
     (tmp_path / "lut").mkdir()
     writer = LutWriter(tmp_path / "lut", 1, 8, 25)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import os
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -17,8 +18,9 @@ import pytest
 from drivers.errors import FormatError, InputError
 from generator.contact import contact_sheet
 from generator.dataset import Dataset, Entry, generate_dataset, open_dataset
-from generator.illuminant import RandomLights
+from generator.illuminant import ListedLights, RandomLights
 from generator.kernel import render
+from generator.lights.lighting import mixture_of
 from generator.picture import read_picture
 from generator.scene import find_pictures, random_scenes
 
@@ -147,6 +149,37 @@ def test_replaced_pixels_are_counted(make_lut: Callable[..., Lut], pictures: Pat
     assert not (tmp_path / "out" / "previews").exists()
 
 
+def test_images_come_of_samples_as_they_were_measured(
+    make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path
+) -> None:
+    lut = make_lut()
+    with (lut.folder / "samples.npy").open("r+b") as stream:
+        stream.seek(-1, os.SEEK_END)
+        stream.write(b"\xff")
+    sources = find_pictures([pictures])
+    generate_dataset(lut, tmp_path / "sound", sources, [0, 1])
+    with pytest.raises(FormatError, match="samples of light 3 are not those that were measured"):
+        generate_dataset(lut, tmp_path / "out", sources, [0, 3])
+    with pytest.raises(FormatError, match="samples of light 3 are not those that were measured"):
+        generate_dataset(lut, tmp_path / "mixed", sources, ListedLights((mixture_of({0: 1, 3: 1}),)))
+
+
+def test_pictures_too_small_for_the_format_are_passed_over(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+    sources = (*random_scenes(1, 21, 40), *random_scenes(1, 22, 22, 5))
+    skipped: list[str] = []
+    made = generate_dataset(
+        make_lut(),
+        tmp_path / "out",
+        sources,
+        [0],
+        form="dng",
+        on_skip=lambda name, reason, missed: skipped.append(reason),
+    )
+    assert [entry.image for entry in made.entries] == ["000001.dng"]
+    (reason,) = skipped
+    assert reason.startswith("random-000000 is 21x40 px, too small for dng, which takes 22x22 and more; choose another")
+
+
 def test_nothing_is_left_of_a_dataset_that_cannot_be(
     make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path
 ) -> None:
@@ -157,6 +190,9 @@ def test_nothing_is_left_of_a_dataset_that_cannot_be(
         generate_dataset(lut, tmp_path / "out", sources, [0, 9], workers=2)
     with pytest.raises(FormatError, match="none of the 1 pictures can be read"):
         generate_dataset(lut, tmp_path / "out", find_pictures([pictures / "broken.jpg"]), [0])
+    unlike: Any = (1, 2)
+    with pytest.raises(InputError, match=r"split\.2 of a dataset is .*Field required"):
+        generate_dataset(lut, tmp_path / "out", sources, [0], split=unlike)
     assert contents(tmp_path) == before
     assert not list(tmp_path.glob(".out*"))
     assert threading.active_count() == threads

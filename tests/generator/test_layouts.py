@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import io
 import json
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import tarfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,14 +20,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from drivers.errors import FormatError, InputError
+from drivers.errors import FormatError, InputError, StorageError
 from generator.dataset import Dataset, generate_dataset, open_dataset
 from generator.illuminant import ListedLights, TogetherLights
 from generator.masks.files import read_ground_truth_map, read_weights
 from generator.masks.making import parse_masks
 from generator.production.assembly import damage
 from generator.production.records import Layout
-from generator.scene import random_scenes
+from generator.scene import Scene, random_scenes
 
 if TYPE_CHECKING:
     from calibration.lut import Lut
@@ -140,6 +142,30 @@ def test_hugging_face_reads_the_shards(make: Make, hugging_face: Any, tmp_path: 
             assert row["truth"] == pytest.approx(entry.truth, abs=1e-9)
             assert [light["illumination"] for light in row["lights"]] == list(entry.lights)
     assert not entries
+
+
+@dataclass(frozen=True)
+class Gone:
+    """A source on a disk that is not there any more."""
+
+    name: str = "gone"
+
+    def read(self) -> Scene:
+        raise StorageError("the disk is gone")
+
+    def told(self) -> dict[str, Any]:
+        return {}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_shard_that_cannot_be_ended_is_given_up_quietly(
+    make_lut: Callable[..., Lut], tmp_path: Path, layout: Layout, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A writer that ends its file when it is thrown away finds the file closed; pytest fails for that."""
+    with pytest.raises(StorageError, match="the disk is gone"):
+        generate_dataset(make_lut(), tmp_path / "out", (*SCENES, Gone()), [0], layout=layout)
+    gc.collect()
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("layout", ["webdataset", "parquet"])

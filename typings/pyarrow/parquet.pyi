@@ -5,6 +5,7 @@ from typing import Any, BinaryIO, Self
 from pyarrow import Schema, Table
 
 class ParquetWriter:
+    is_open: bool
     def __init__(
         self,
         where: Any,
