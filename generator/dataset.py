@@ -120,6 +120,35 @@ class Dataset:
         ending = "jpg" if self.layout == "folder" else "preview.jpg"
         return self._bytes(self._name(f"{PurePosixPath(entry.image).stem}.{ending}", entry.split, "previews"))
 
+    def read_weights(self, entry: Entry) -> npt.NDArray[np.float32]:
+        """Return how the lights of an image share its pixels: (H, W, K) float32, in the order of `entry.lights`, sum 1.
+
+        Raises
+        ------
+        InputError
+            One light falls on the image.
+        FormatError
+            A file is missing or damaged.
+        """
+        from generator.masks.files import decode_weights
+
+        masks = [f"_{light}" for light in range(len(entry.lights))]
+        return decode_weights([self._map(entry, "masks", mask) for mask in masks], self._of(entry, "masks"))
+
+    def read_ground_truth_map(self, entry: Entry) -> npt.NDArray[np.float32]:
+        """Return the ground truth of every pixel of an image: (H, W, 3) float32, r + g + b = 1.
+
+        Raises
+        ------
+        InputError
+            One light falls on the image: `entry.truth` is that of every pixel.
+        FormatError
+            The file is missing or damaged.
+        """
+        from generator.masks.files import decode_ground_truth
+
+        return decode_ground_truth(self._map(entry, "ground_truth"), self._of(entry, "ground truth"))
+
     @property
     def layout(self) -> str:
         """How its images lie."""
@@ -153,6 +182,17 @@ class Dataset:
         number = int(file.partition(".")[0])
         shard = shard_key(number // int(self.description.options["shard_images"]))
         return f"{split or 'data'}/{shard}.{'tar' if self.layout == 'webdataset' else 'parquet'}/{file}"
+
+    def _map(self, entry: Entry, kind: str, ending: str = "") -> bytes:
+        """Return the file of a map that lies beside an image of several lights."""
+        if len(entry.lights) == 1:
+            raise InputError(f"one light falls on {entry.image}, so that it has no masks; see its truth")
+        key = PurePosixPath(entry.image).stem
+        file = f"{key}{ending}.png" if self.layout == "folder" else f"{key}.{kind}{ending}.png"
+        return self._bytes(self._name(file, entry.split, kind))
+
+    def _of(self, entry: Entry, what: str) -> str:
+        return f"{self.store.place}, the {what} of {entry.image},"
 
     def _bytes(self, name: str) -> bytes:
         if self.layout == "folder":

@@ -2,7 +2,8 @@
 
 A folder of masks holds one set for each image, in the order of the names, starting over when they end:
 
-    NAME_1.png … NAME_K.png    K grey masks, one a light; the numbers give the order and may begin anywhere
+    NAME_1.png … NAME_K.png    K grey masks, one a light; the numbers, of three digits at most, give the order and may
+                               begin anywhere
     NAME_1.png … NAME_K−1.png  one fewer: masks of the second light and those after it
     NAME.png                   one grey mask for two lights: where the second falls
     NAME.png                   one colour picture for three lights, a channel each
@@ -11,14 +12,17 @@ Full scale is weight 1; 8 or 16 bits, or float from 0 to 1; transparency does no
 fit the image. Weights are divided by their sum. Where K masks leave a pixel dark, the first light falls.
 
 Beside the images of a dataset lie `masks/NNNNNN_k.png`, the weight of light k = 0 … K − 1 in 16-bit grey, 65535 = 1,
-sum 65535, and `ground_truth/NNNNNN.png`, r, g, b in 16 bits with r + g + b = 65535. These masks can be given again.
+sum 65535, and `ground_truth/NNNNNN.png`, r, g, b in 16 bits with r + g + b = 65535. These masks can be given again: in
+a folder of such names alone a set belongs to the image of its number, since a picture that was passed over leaves its
+numbers out. An image whose number has no set takes one in turn.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -75,18 +79,31 @@ class GivenMasks:
 
 @dataclass(frozen=True)
 class GivenMaskPlan:
-    """Sets of mask files for one image after another, starting over when they end; a `MaskPlan`."""
+    """Sets of mask files for one image after another, starting over when they end; a `MaskPlan`.
+
+    Attributes
+    ----------
+    folder
+        Its name.
+    sets
+        In the order of their names.
+    sha256
+        Over the names and bytes of all files in their order.
+    places
+        Which set belongs to the image of a number; empty where all are taken in turn.
+    """
 
     folder: str
     sets: tuple[GivenMasks, ...]
     sha256: str
+    places: Mapping[int, int] = field(default_factory=dict[int, int])
 
     def maker(self, number: int) -> MaskMaker:
         """Return the masks of image `number`."""
-        return self.sets[number % len(self.sets)]
+        return self.sets[self.places.get(number, number % len(self.sets))]
 
     def describe(self) -> dict[str, Any]:
-        """Return the plan as plain values; `sha256` is over the names and bytes of all files in their order."""
+        """Return the plan as plain values."""
         return {"masks": "files", "folder": self.folder, "sets": len(self.sets), "sha256": self.sha256}
 
 
@@ -104,7 +121,8 @@ def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
         raise FormatError(f"cannot list the masks of {folder}: {error.strerror}; name a folder of masks") from error
     groups: dict[str, list[tuple[int, Path]]] = {}
     for path in files:
-        match = re.fullmatch(r"(.+)_(\d{1,4})", path.stem)
+        # Cameras count their files with four digits or more.
+        match = re.fullmatch(r"(.+)_(\d{1,3})", path.stem)
         name, number = (f"{match[1]}_", int(match[2])) if match else (path.stem, 0)
         groups.setdefault(name, []).append((number, path))
     if not groups:
@@ -119,7 +137,9 @@ def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
         given = GivenMasks(members)
         given.weights(2, 2, lights)
         sets.append(given)
-    return GivenMaskPlan(folder.name, tuple(sets), digest.hexdigest())
+    keys = [re.fullmatch(r"(\d{6,})_", name) for name in sorted(groups)]
+    places = {int(key[1]): place for place, key in enumerate(keys) if key}
+    return GivenMaskPlan(folder.name, tuple(sets), digest.hexdigest(), places if len(places) == len(sets) else {})
 
 
 def encode_maps(lut: Lut, lighting: Lighting, weights: _Array) -> list[tuple[str, str, bytes]]:
@@ -140,35 +160,35 @@ def encode_maps(lut: Lut, lighting: Lighting, weights: _Array) -> list[tuple[str
     return [*maps, ("ground_truth", ".png", encode_map(truth))]
 
 
-def read_weights(folder: Path, stem: str, lights: int) -> _Array:
-    """Return the weights (H, W, lights) float32, sum 1, of image `stem` (such as ``000012``) of a dataset.
+def decode_weights(files: Sequence[bytes], what: str) -> _Array:
+    """Return the weights (H, W, K) float32, sum 1, of the K mask files of an image of a dataset.
 
     Raises
     ------
     FormatError
-        A file is missing, damaged, or not of one size with the others.
+        A file is damaged, or not of one size with the others.
     """
-    masks = [_read_16_bits(folder / "masks" / f"{stem}_{light}.png", 2) for light in range(lights)]
+    masks = [_from_16_bits(data, 2, what) for data in files]
     if len({mask.shape for mask in masks}) != 1:
-        raise FormatError(f"the masks of {stem} in {folder} differ in size; make the dataset again")
+        raise FormatError(f"the masks of {what} differ in size; make the dataset again")
     return np.stack(masks, axis=-1)
 
 
-def read_ground_truth_map(folder: Path, stem: str) -> _Array:
-    """Return the ground truth (H, W, 3) float32, r + g + b = 1, of every pixel of image `stem` of a dataset.
+def decode_ground_truth(data: bytes, what: str) -> _Array:
+    """Return the ground truth (H, W, 3) float32, r + g + b = 1, of every pixel of an image of a dataset.
 
     Raises
     ------
     FormatError
-        The file is missing or damaged.
+        The file is damaged.
     """
-    return _read_16_bits(folder / "ground_truth" / f"{stem}.png", 3)
+    return _from_16_bits(data, 3, what)
 
 
-def _read_16_bits(path: Path, dimensions: int) -> _Array:
-    image = _decoded(path)
+def _from_16_bits(data: bytes, dimensions: int, what: str) -> _Array:
+    image = _decoded(data, what)
     if image.dtype != np.uint16 or image.ndim != dimensions:
-        raise FormatError(f"{path} is no map of 16 bits; make the dataset again")
+        raise FormatError(f"{what} is no map of 16 bits; make the dataset again")
     return np.asarray(image / np.float32(FULL), dtype=np.float32)
 
 
@@ -179,14 +199,14 @@ def _bytes_of(path: Path) -> bytes:
         raise FormatError(f"cannot read {path}: {error.strerror}") from error
 
 
-def _decoded(path: Path) -> npt.NDArray[Any]:
+def _decoded(file: bytes, what: Path | str) -> npt.NDArray[Any]:
     """Return a picture (H, W) or (H, W, 3), RGB, of the type that the file has; transparency is left out."""
     import cv2
 
-    data = np.frombuffer(_bytes_of(path), np.uint8)
+    data = np.frombuffer(file, np.uint8)
     image = cast("npt.NDArray[Any] | None", cv2.imdecode(data, cv2.IMREAD_UNCHANGED)) if data.size else None
     if image is None or image.ndim not in (2, 3):
-        raise FormatError(f"{path} is no picture that can be read, or damaged; give masks as PNG or TIFF")
+        raise FormatError(f"{what} is no picture that can be read, or damaged; give masks as PNG or TIFF")
     if image.ndim == 2:
         return image
     return image[..., 0] if image.shape[2] < 3 else image[..., 2::-1]
@@ -194,7 +214,7 @@ def _decoded(path: Path) -> npt.NDArray[Any]:
 
 def _read(path: Path) -> list[_Array]:
     """Return the masks of a file: one if it is grey, also if its three channels are alike, else three."""
-    image = _decoded(path)
+    image = _decoded(_bytes_of(path), path)
     if image.dtype.kind == "u" and image.dtype.itemsize <= 2:
         scaled = np.asarray(image / np.float32(np.iinfo(image.dtype).max), dtype=np.float32)
     elif image.dtype.kind == "f" and np.isfinite(image).all():

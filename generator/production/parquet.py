@@ -171,20 +171,29 @@ class ParquetWriter:
         self._stack.__exit__(*error)
 
 
+def _cell_of(file: str) -> tuple[str, int | None]:
+    """Return the column that has a file, named as in a tar file, and its place where it is one of several."""
+    _, *kind, _ = file.split(".")
+    if not kind:
+        return "image", None
+    name, several, place = kind[0].partition("masks_")
+    return ("masks", int(place)) if several else (name, None)
+
+
 def read_member(store: Store, container: str, file: str) -> bytes:
-    """Return the bytes of the image or preview whose path is `file` in the Parquet file called `container`.
+    """Return the bytes of a file, named as in a tar file, of the Parquet file called `container`.
 
     Raises
     ------
     FormatError
-        The Parquet file is missing or damaged, or there is no such image in it.
+        The Parquet file is missing or damaged, or there is no such file in it.
     """
     require_pyarrow()
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     number = int(file.partition(".")[0])
-    column = "preview" if file.endswith(".preview.jpg") else "image"
+    column, place = _cell_of(file)
     with store.open(container) as stream:
         try:
             table = pq.ParquetFile(stream)
@@ -192,7 +201,8 @@ def read_member(store: Store, container: str, file: str) -> bytes:
                 numbers = table.read_row_group(group, ["number"]).column("number").to_pylist()
                 if number in numbers:
                     cells = table.read_row_group(group, [column]).column(column).to_pylist()
-                    return cells[numbers.index(number)]["bytes"]
-        except (pa.ArrowException, ValueError, OSError) as error:
+                    cell = cells[numbers.index(number)]
+                    return (cell if place is None else cell[place])["bytes"]
+        except (pa.ArrowException, LookupError, ValueError, OSError) as error:
             raise FormatError(f"{store.place}/{container} is damaged: {error}; make the dataset again") from error
     raise FormatError(f"{store.place}/{container} holds no {file}; make the dataset again")

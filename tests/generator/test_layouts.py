@@ -23,7 +23,6 @@ import pytest
 from drivers.errors import FormatError, InputError, StorageError
 from generator.dataset import Dataset, generate_dataset, open_dataset
 from generator.illuminant import ListedLights, TogetherLights
-from generator.masks.files import read_ground_truth_map, read_weights
 from generator.masks.making import parse_masks
 from generator.production.assembly import damage
 from generator.production.records import Layout
@@ -190,12 +189,13 @@ def test_several_lights_in_an_image(make: Make, make_lut: Callable[..., Lut], la
     text = (place_of(made) / "ground_truth.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in text[7:9]] == ["000003.png", "000003.png"]
     if layout == "folder":
-        weights = read_weights(place_of(made), "000003", 2)
-        truths = read_ground_truth_map(place_of(made), "000003")
+        files = [(place_of(made) / "masks" / f"000003_{light}.png").read_bytes() for light in (0, 1)]
+        weights = np.stack([grey(file) for file in files], axis=-1) / 65535
+        truths = decoded((place_of(made) / "ground_truth" / "000003.png").read_bytes()) / 65535
     elif layout == "webdataset":
         with tarfile.open(place_of(made) / "data" / "000000.tar") as tar:
-            files = {member.name: tar.extractfile(member) for member in tar.getmembers()}
-            maps = {name: stream.read() for name, stream in files.items() if stream is not None}
+            members = {member.name: tar.extractfile(member) for member in tar.getmembers()}
+            maps = {name: stream.read() for name, stream in members.items() if stream is not None}
         weights = np.stack([grey(maps[f"000003.masks_{light}.png"]) for light in (0, 1)], axis=-1) / 65535
         truths = decoded(maps["000003.ground_truth.png"]) / 65535
     else:
@@ -204,6 +204,12 @@ def test_several_lights_in_an_image(make: Make, make_lut: Callable[..., Lut], la
         truths = decoded(table[3]["ground_truth"]["bytes"]) / 65535
     assert weights.shape == (24, 28, 2)
     np.testing.assert_allclose(weights.sum(axis=2), 1, atol=1e-6)
+    np.testing.assert_allclose(made.read_weights(entry), weights, atol=1e-7)
+    np.testing.assert_allclose(made.read_ground_truth_map(entry), truths, atol=1e-7)
+    single = make(layout, split=(0.5, 0.5, 0.0))
+    for read in (single.read_weights, single.read_ground_truth_map):
+        with pytest.raises(InputError, match=r"one light falls on 000002\.png"):
+            read(single.entries[2])
     # Where one light is alone, the map is that light; and the mean of the lights is that of their parts.
     alone = weights[..., 0] == 1
     assert 0 < alone.sum() < alone.size

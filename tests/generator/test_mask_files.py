@@ -20,7 +20,7 @@ from drivers.errors import FormatError
 from generator.encoders.maps import encode_map
 from generator.lights.gamut import angles_between
 from generator.lights.lighting import FULL, Lighting, plain
-from generator.masks.files import encode_maps, find_masks, read_ground_truth_map, read_weights
+from generator.masks.files import decode_ground_truth, decode_weights, encode_maps, find_masks
 from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:
@@ -136,8 +136,9 @@ def test_maps_are_read_back_as_the_image_was_made(tmp_path: Path, make_lut: Call
         (tmp_path / folder / f"000004{suffix}").write_bytes(data)
         names.append(f"{folder}/000004{suffix}")
     assert names == [*(f"masks/000004_{light}.png" for light in range(lights)), "ground_truth/000004.png"]
-    np.testing.assert_array_equal(read_weights(tmp_path, "000004", lights), weights)
-    truth = read_ground_truth_map(tmp_path, "000004")
+    *masks, truths = [(tmp_path / name).read_bytes() for name in names]
+    np.testing.assert_array_equal(decode_weights(masks, "it"), weights)
+    truth = decode_ground_truth(truths, "it")
     exact = weights.astype(np.float64) @ lut.white[shining]
     assert angles_between(truth.astype(np.float64), exact).max() < 0.002
     np.testing.assert_allclose(truth.sum(axis=2), 1, atol=1e-6)
@@ -162,15 +163,29 @@ def test_any_map_is_read_by_others(values: npt.NDArray[np.uint16]) -> None:
     np.testing.assert_array_equal(seen if values.ndim == 2 else seen[..., ::-1], values)
 
 
-def test_maps_that_are_missing_or_damaged_are_named(tmp_path: Path) -> None:
-    (tmp_path / "masks").mkdir()
-    (tmp_path / "ground_truth").mkdir()
-    with pytest.raises(FormatError, match=r"cannot read .*000001_0\.png"):
-        read_weights(tmp_path, "000001", 2)
-    save(tmp_path / "masks" / "000001_0.png", np.ones((2, 2)), 16)
-    save(tmp_path / "masks" / "000001_1.png", np.ones((2, 3)), 16)
-    with pytest.raises(FormatError, match="differ in size"):
-        read_weights(tmp_path, "000001", 2)
-    save(tmp_path / "ground_truth" / "000001.png", np.ones((2, 2, 3)))
-    with pytest.raises(FormatError, match="is no map of 16 bits"):
-        read_ground_truth_map(tmp_path, "000001")
+def test_maps_that_are_damaged_are_named() -> None:
+    masks = [encode_map(np.ones(shape, np.uint16)) for shape in ((2, 2), (2, 3))]
+    with pytest.raises(FormatError, match="the masks of it differ in size"):
+        decode_weights(masks, "it")
+    with pytest.raises(FormatError, match="it is no picture that can be read"):
+        decode_weights([masks[0], masks[1][:50]], "it")
+    with pytest.raises(FormatError, match="it is no map of 16 bits"):
+        decode_ground_truth(masks[0], "it")
+
+
+def test_masks_of_a_dataset_go_to_the_images_of_their_numbers(tmp_path: Path) -> None:
+    """Pictures that were passed over leave holes in the numbers."""
+    for image, value in ((1, 0.25), (4, 0.5), (5, 0.75)):
+        save(tmp_path / f"00000{image}_0.png", np.full((2, 2), 1 - value), 16)
+        save(tmp_path / f"00000{image}_1.png", np.full((2, 2), value), 16)
+    plan = find_masks(tmp_path, 2)
+    found = [float(plan.maker(number).weights(2, 2, 2)[0, 0, 1]) for number in (1, 4, 5, 0)]
+    np.testing.assert_allclose(found, [0.25, 0.5, 0.75, 0.25], atol=1e-4)
+
+
+def test_files_of_a_camera_are_a_mask_each(tmp_path: Path) -> None:
+    for number, value in ((1, 0.25), (2, 0.5)):
+        save(tmp_path / f"IMG_000{number}.png", np.full((2, 2), value), 16)
+    plan = find_masks(tmp_path, 2)
+    found = [float(plan.maker(number).weights(2, 2, 2)[0, 0, 1]) for number in range(3)]
+    np.testing.assert_allclose(found, [0.25, 0.5, 0.25], atol=1e-4)
