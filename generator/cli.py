@@ -140,7 +140,8 @@ def generate(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Draw chromaticities from uniform, gaussian:r=.3,b=.25,…, or the file of ground truths of a data set.",
+            help="Draw chromaticities from uniform, gaussian:r=.3,b=.25,sd=.02 (or sd_r, sd_b and corr for sd), or the "
+            "normal distribution fitted to a file of ground truths as of --nearest.",
             show_default=False,
             rich_help_panel=_LIGHT,
         ),
@@ -181,8 +182,9 @@ def generate(
         str | None,
         typer.Option(
             metavar="KIND",
-            help="Where each of several lights falls: half-plane, soft-edge, spots, smooth, window, or a folder of "
-            "masks. [default: smooth]",
+            help="Where each of several lights falls: half-plane:angle=30,width=.1, soft-edge (the same), "
+            "spots:count=3,radius=.1,softness=.5, smooth:scale=.3,contrast=8, window:columns=2,rows=3,softness=.05, "
+            "each with none or some of its numbers, or a folder of masks. [default: smooth]",
             show_default=False,
             rich_help_panel=_LIGHT,
         ),
@@ -489,6 +491,8 @@ def _choose_sources(
     from drivers.errors import InputError
     from generator import scene
 
+    if not places and (preparation.crop or preparation.max_side):
+        raise InputError("--crop and --max-side are for pictures, and --sources names none; random ones have --size")
     found: tuple[Source, ...] = scene.find_pictures(places, preparation)
     if random_scenes:
         found += scene.random_scenes(random_scenes, *_size(size, "--size"), seed)

@@ -62,8 +62,8 @@ from generator.production.records import (
     shard_key,
 )
 from generator.production.shards import OnImage, OnSkip
-from generator.production.workplace import DESCRIPTION, Workplace, finished, stored_identity, workplace
-from generator.store import Store, open_store
+from generator.production.workplace import Workplace, finished, stored_identity, workplace
+from generator.store import DESCRIPTION, Store, open_store
 
 if TYPE_CHECKING:
     from calibration.lut import Lut

@@ -97,10 +97,12 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
     Raises
     ------
     InputError
-        There is none, or one is of another shape or type.
+        There is none, one is of another shape or type, or there are not as many names.
     """
     if not pictures:
         raise InputError("a gallery wants pictures, none were given")
+    if names is not None and len(names) != len(pictures):
+        raise InputError(f"{len(pictures)} pictures of a gallery have {len(names)} names, expected one each")
     for picture in pictures:
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
             raise InputError(f"a picture is {picture.dtype} {picture.shape}, expected uint8 (height, width, 3)")
@@ -163,7 +165,7 @@ def save_gallery(
     return open_gallery(folder)
 
 
-def open_gallery(folder: Path) -> Gallery:
+def open_gallery(folder: Path | str) -> Gallery:
     """Map a gallery that `save_gallery` made.
 
     Raises
@@ -171,6 +173,7 @@ def open_gallery(folder: Path) -> Gallery:
     FormatError
         The folder is none, or its files disagree.
     """
+    folder = Path(folder)
     path = folder / "gallery.json"
     try:
         head = _Head.model_validate_json(path.read_bytes())

@@ -292,8 +292,10 @@ def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT) -> npt.NDArray[n
     Raises
     ------
     InputError
-        The table has no such light.
+        The table has no such light, or it is no whole number.
     """
+    if isinstance(light, bool) or not isinstance(light, int | np.integer):
+        raise InputError(f"light {light!r} is no number of a light; give a whole one from 0")
     if not 0 <= light < len(lut.samples):
         raise InputError(f"there is no light {light}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
     mapped = lut.samples[light]

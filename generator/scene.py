@@ -17,7 +17,7 @@ import numpy as np
 from drivers.errors import FormatError, InputError, StorageError
 from generator.kernels import philox
 from generator.picture import AS_THEY_ARE, LARGEST_SIDE, Picture, Preparation, open_picture
-from generator.store import filesystem, is_remote, local_path
+from generator.store import DESCRIPTION, filesystem, is_remote, local_path
 
 if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
@@ -92,7 +92,9 @@ class PictureFile:
     def name(self) -> str:
         """What the dataset calls it: its path below the folder, a byte that is no text as its hexadecimal escape."""
         name = self.below or PurePosixPath(self.root.replace(os.sep, "/")).name
-        return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+        text = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+        # Many readers of CSV take a carriage return for the end of a line, quoted or not.
+        return text.replace("\r", "\\r")
 
     def told(self) -> dict[str, Any]:
         """Return its name and its preparation."""
@@ -110,6 +112,8 @@ class PictureFile:
         ------
         FormatError
             It is no picture, may not be read, or is gone from among others.
+        InputError
+            There is not enough memory for it.
         StorageError
             Its bytes cannot be had for a reason that is not its own: a disk that is not mounted, a store that does not
             answer. Then no picture may be passed over as if it were damaged.
@@ -125,6 +129,10 @@ class PictureFile:
                 raise FormatError(str(error).replace(str(path), self.location)) from error
             except OSError as error:
                 raise _unread(self.location, error, _is_of_the_file(path, error)) from error
+            except MemoryError as error:
+                raise InputError(
+                    f"there is not enough memory to read {self.location}; use fewer workers, or leave it out"
+                ) from error
         return Scene(reading.picture, digest.hexdigest(), reading.profile)
 
 
@@ -233,7 +241,7 @@ def find_pictures(
 ) -> tuple[PictureFile, ...]:
     """Return the pictures of folders and files.
 
-    A folder is searched with all folders below it, without hidden ones and without following links to folders, for
+    A folder is searched with all folders below it, but for hidden ones, data sets and links to folders, for
     files that end in one of `SUFFIXES`, sorted by their path below it, code point by code point. The order of `places`
     is kept. Nothing is opened: a million files take about 0.2 GB.
 
@@ -247,7 +255,7 @@ def find_pictures(
     Raises
     ------
     InputError
-        A place is missing or neither file nor folder, or a folder holds no picture.
+        A place is missing or neither file nor folder, a folder holds no picture, or two pictures would have one name.
     """
     found: list[PictureFile] = []
     for place in (places,) if isinstance(places, Path | str) else places:
@@ -266,7 +274,24 @@ def find_pictures(
         found += [PictureFile(root, name, preparation) for name in below]
         if len(found) == before:
             raise InputError(f"{root} holds no picture; expected files that end in one of {' '.join(sorted(SUFFIXES))}")
+    if len(found) > len(set(map(_name_of, found))):
+        _refuse_names(found)
     return tuple(found)
+
+
+def _name_of(picture: PictureFile) -> str:
+    return picture.name
+
+
+def _refuse_names(found: Sequence[PictureFile]) -> None:
+    """Raise an InputError that tells two pictures of one name."""
+    seen: dict[str, PictureFile] = {}
+    for picture in found:
+        if (other := seen.setdefault(picture.name, picture)) is not picture:
+            raise InputError(
+                f"two pictures would be called {picture.name}: {other.location} and {picture.location}; name a folder "
+                "that holds both, or rename one"
+            )
 
 
 def _is_picture(name: str) -> bool:
@@ -282,10 +307,19 @@ def _below_folder(folder: str, prefix: str = "") -> Iterator[str]:
                 f"{entry.name}/" if entry.is_dir(follow_symlinks=False) else entry.name
                 for entry in entries
                 if not entry.name.startswith(".")
-                and (entry.is_dir(follow_symlinks=False) or (_is_picture(entry.name) and _is_file(entry)))
+                and (
+                    entry.is_dir(follow_symlinks=False)
+                    or (_is_picture(entry.name) and _is_file(entry))
+                    or entry.name == DESCRIPTION
+                )
             )
     except OSError as error:
         raise InputError(f"cannot look into {folder}: {error.strerror}; name a folder that may be read") from error
+    if DESCRIPTION in listed:
+        # A data set among the pictures, the one made of them perhaps: its images are no sources.
+        if prefix:
+            return
+        listed.remove(DESCRIPTION)
     for name in listed:
         if name.endswith("/"):
             yield from _below_folder(f"{folder.rstrip('/')}/{name[:-1]}", prefix + name)
@@ -314,8 +348,11 @@ def _below_url(url: str) -> list[str]:
     except Exception as error:
         # Every store raises errors of its own.
         raise InputError(f"cannot look into {url}: {error}; check the address and that you may read there") from error
+    datasets = {path.parent for path in listed if path.name == DESCRIPTION and len(path.parts) > 1}
     return sorted(
         path.as_posix()
         for path in listed
-        if _is_picture(path.name) and not any(part.startswith(".") for part in path.parts)
+        if _is_picture(path.name)
+        and not any(part.startswith(".") for part in path.parts)
+        and datasets.isdisjoint(path.parents)
     )

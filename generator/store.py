@@ -29,6 +29,9 @@ from drivers.storage import is_partial, partial_path, storage_error, sync_folder
 Pieces = Iterable[bytes | memoryview]
 """A file's bytes in order; the memory of one piece may be that of the next."""
 
+DESCRIPTION: Final = "dataset.json"
+"""The file that is there where a data set is complete, and nowhere else."""
+
 _WAITING: Final = 16
 
 if TYPE_CHECKING:

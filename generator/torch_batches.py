@@ -10,11 +10,16 @@ import numpy as np
 from drivers.errors import InputError
 from generator.batches import Batch, Crops
 
+
+class TorchMissingError(InputError, ImportError):
+    """PyTorch is not installed: one sentence for who runs a command, an ImportError for who asks by one."""
+
+
 try:
     import torch
     from torch.utils.data import Dataset, IterableDataset, get_worker_info
 except ImportError as error:
-    raise InputError("training batches for PyTorch need it: pip install 'croplab[torch]'") from error
+    raise TorchMissingError("training batches for PyTorch need it: pip install 'croplab[torch]'") from error
 
 Item = dict[str, Any]
 """``image`` (3, height, width) float32 and ``illuminant`` (3,) float32, r + g + b = 1; of a batch with N before."""

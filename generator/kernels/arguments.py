@@ -75,12 +75,14 @@ def check_target(
     Raises
     ------
     InputError
-        `out` is of another shape or type.
+        `out` is of another shape or type, or not to be written to.
     """
     if out is None:
         return np.empty(shape, dtype)
     if out.dtype != dtype or out.shape != shape:
         raise InputError(f"the target is {out.dtype} {out.shape}, expected {np.dtype(dtype)} {shape}")
+    if not out.flags.writeable:
+        raise InputError("the target may not be written to; give an array whose flags.writeable is True")
     return out
 
 

@@ -162,7 +162,7 @@ def parse_distribution(text: str) -> Distribution:
     """Return the distribution that a text names.
 
     ``uniform``; ``gaussian:r=.3,b=.25,sd=.02`` or ``gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8``; ``fit:GT.csv``
-    with a file as `ground_truths.load_ground_truths` reads it.
+    with a file as `ground_truths.load_ground_truths` reads it, or the file alone.
 
     Raises
     ------
@@ -176,8 +176,8 @@ def parse_distribution(text: str) -> Distribution:
     kind, _, rest = text.strip().partition(":")
     if kind == "uniform" and not rest:
         return Uniform()
-    if kind == "fit" and rest:
-        path = Path(rest)
+    if (kind == "fit" and rest) or Path(text).is_file():
+        path = Path(rest if kind == "fit" else text)
         return Fitted.of(load_ground_truths(path), path.name)
     if kind == "gaussian":
         numbers = parse_numbers(rest, _GAUSSIAN, "the distribution gaussian")

@@ -30,8 +30,8 @@ from generator.production.records import (
     Table,
     image_key,
 )
-from generator.production.workplace import DESCRIPTION, Workplace
-from generator.store import Store, open_store
+from generator.production.workplace import Workplace
+from generator.store import DESCRIPTION, Store, open_store
 
 GROUND_TRUTH = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS = ("image", "source", "illumination", "r", "g", "b")

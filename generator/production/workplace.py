@@ -33,9 +33,8 @@ from pydantic import ValidationError
 from drivers.errors import FormatError, InputError
 from drivers.storage import partial_path, require_free, storage_error, sync_folder
 from generator.production.records import ShardRecord, shard_key
-from generator.store import LocalStore, RemoteStore, Store, is_remote, local_path, open_store
+from generator.store import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
 
-DESCRIPTION: Final = "dataset.json"
 PLAN: Final = "plan.json"
 RECORDS: Final = "shards"
 _NOTES: Final = ".plan"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -179,8 +181,27 @@ def test_a_gallery_on_disk_is_the_pictures(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.codes, gallery.codes)
     with pytest.raises(InputError, match="gallery"):
         save_gallery(sources, tmp_path / "gallery")
+    np.testing.assert_array_equal(open_gallery(str(tmp_path / "gallery")).codes, gallery.codes)
+    with pytest.raises(InputError, match="1 pictures of a gallery have 2 names"):
+        gallery_of([sources[0].read().picture], ["one", "two"])
     (tmp_path / "gallery" / "codes.u8").write_bytes(b"short")
     with pytest.raises(FormatError, match="5 bytes, expected 567"):
         open_gallery(tmp_path / "gallery")
     with pytest.raises(FormatError, match="no gallery"):
         open_gallery(tmp_path)
+
+
+WITHOUT_TORCH = """
+import sys
+sys.modules["torch"] = None
+from generator.batches import Crops
+try:
+    from generator.batches import CropDataset
+except ImportError as error:
+    print(error)
+"""
+
+
+def test_pytorch_that_is_missing_is_an_import_error_and_named() -> None:
+    done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("training batches for PyTorch need it: pip install 'croplab[torch]'\n", "")

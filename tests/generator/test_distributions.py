@@ -116,6 +116,7 @@ def test_texts_of_distributions(tmp_path: Path) -> None:
     fitted = parse_distribution(f"fit:{file}")
     assert fitted.describe()["ground_truths"] == 4
     assert fitted.describe()["file"] == "gt.csv"
+    assert parse_distribution(str(file)).describe() == fitted.describe()
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -228,6 +228,11 @@ def test_a_light_that_is_not_there_is_named(make_lut: Callable[..., Lut], pictur
     for light in (-1, 4):
         with pytest.raises(InputError, match=rf"there is no light {light}; the table .* has lights 0 to 3"):
             render(lut, picture, light)
+    wrong: list[Any] = [True, "3", 1.5]
+    for light in wrong:
+        with pytest.raises(InputError, match=rf"light {light!r} is no number of a light"):
+            render(lut, picture, light)
+    np.testing.assert_array_equal(render(lut, picture, np.arange(4)[2]), render(lut, picture, 2))
 
 
 def test_wrong_shapes_and_numbers_are_named(picture: npt.NDArray[np.uint8]) -> None:
@@ -240,6 +245,10 @@ def test_wrong_shapes_and_numbers_are_named(picture: npt.NDArray[np.uint8]) -> N
         draw_samples(samples[..., :2], picture)
     with pytest.raises(InputError, match="the target is"):
         draw_samples(samples, picture, out=np.zeros((1, 1, 3), np.uint16))
+    locked = np.zeros(picture.shape, np.uint16)
+    locked.flags.writeable = False
+    with pytest.raises(InputError, match="the target may not be written to"):
+        draw_samples(samples, picture, out=locked)
     with pytest.raises(InputError, match="the image number is"):
         draw_samples(samples, picture, image=1 << 32)
     with pytest.raises(InputError, match="the seed is -1"):

@@ -20,7 +20,7 @@ import tifffile
 from PIL import Image
 
 from drivers.errors import FormatError, InputError, StorageError
-from generator import picture
+from generator import picture, scene
 from generator.picture import Preparation, read_picture
 from generator.scene import RandomScene, find_pictures, random_scenes
 from generator.store import filesystem
@@ -239,6 +239,51 @@ def test_a_picture_larger_than_any_is_named(
     monkeypatch.setattr(picture, "LARGEST_PICTURE", 7 * 5 - 1)
     with pytest.raises(FormatError, match=r"huge\.png: 7x5 px are more than 34; make it smaller"):
         read_picture(path)
+
+
+@pytest.mark.parametrize("url", [False, True])
+def test_datasets_among_the_pictures_are_no_sources(tmp_path: Path, colours: npt.NDArray[np.uint8], url: bool) -> None:
+    for name in ("a.png", "made/images/000000.png", "made/previews/000000.jpg", "more/b.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        write(tmp_path / name, colours, "uint8")
+    (tmp_path / "made" / "dataset.json").write_text("{}")
+    place = str(tmp_path)
+    if url:
+        place = f"memory://{tmp_path.name}"
+        store, top = filesystem(place)
+        for path in tmp_path.rglob("*.*"):
+            store.pipe_file(f"{top}/{path.relative_to(tmp_path).as_posix()}", path.read_bytes())
+    assert [found.name for found in find_pictures([place])] == ["a.png", "more/b.png"]
+    # Who names it wants it.
+    named = find_pictures(f"{place}/made")
+    assert [found.name for found in named] == ["images/000000.png", "previews/000000.jpg"]
+
+
+def test_two_pictures_of_one_name_are_told(tmp_path: Path, colours: npt.NDArray[np.uint8]) -> None:
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder / "a.png", colours, "uint8")
+    with pytest.raises(InputError, match=r"two pictures would be called a\.png: .*one/a\.png and .*two/a\.png; name"):
+        find_pictures([tmp_path / "one", tmp_path / "two"])
+    assert [found.name for found in find_pictures(tmp_path)] == ["one/a.png", "two/a.png"]
+
+
+def test_a_name_is_one_line_of_a_list(tmp_path: Path, colours: npt.NDArray[np.uint8]) -> None:
+    write(tmp_path / "a.png", colours, "uint8").rename(tmp_path / "a\rb.png")
+    assert find_pictures([tmp_path])[0].name == "a\\rb.png"
+
+
+def test_a_picture_that_memory_does_not_hold_is_named(
+    tmp_path: Path, colours: npt.NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "large.png", colours, "uint8")
+
+    def full(*arguments: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(scene, "open_picture", full)
+    with pytest.raises(InputError, match=r"not enough memory to read .*large\.png; use fewer workers"):
+        find_pictures(path)[0].read()
 
 
 def test_links_that_lead_round_in_a_circle_are_passed_over(tmp_path: Path, colours: npt.NDArray[np.uint8]) -> None:
