@@ -182,9 +182,9 @@ def generate(
         str | None,
         typer.Option(
             metavar="KIND",
-            help="Where each of several lights falls: half-plane:angle=30,width=.1, soft-edge (the same), "
-            "spots:count=3,radius=.1,softness=.5, smooth:scale=.3,contrast=8, window:columns=2,rows=3,softness=.05, "
-            "each with none or some of its numbers, or a folder of masks. [default: smooth]",
+            help="Where each of several lights falls: half-plane or soft-edge (angle, width), spots (count, radius, "
+            "softness), smooth (scale, contrast), window (columns, rows, softness), with numbers where wanted, as in "
+            "spots:count=3,radius=.1; or a folder of masks. [default: smooth]",
             show_default=False,
             rich_help_panel=_LIGHT,
         ),

@@ -13,6 +13,7 @@ does not survive a fork. Rows are split by plain threads instead.
 
 from __future__ import annotations
 
+import operator
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -294,11 +295,13 @@ def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT) -> npt.NDArray[n
     InputError
         The table has no such light, or it is no whole number.
     """
-    if isinstance(light, bool) or not isinstance(light, int | np.integer):
-        raise InputError(f"light {light!r} is no number of a light; give a whole one from 0")
-    if not 0 <= light < len(lut.samples):
-        raise InputError(f"there is no light {light}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
-    mapped = lut.samples[light]
+    try:
+        number = operator.index(light)
+    except TypeError as error:
+        raise InputError(f"light {light!r} is no number of a light; give a whole one from 0") from error
+    if not 0 <= number < len(lut.samples):
+        raise InputError(f"there is no light {number}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
+    mapped = lut.samples[number]
     return np.array(mapped) if pixels >= WHOLE_LIGHT else mapped
 
 

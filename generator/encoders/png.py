@@ -12,7 +12,7 @@ import struct
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -77,7 +77,7 @@ def _bands(
 
     def pack(top: int) -> tuple[memoryview, int, int]:
         data, plain = _packer().pack(np.ascontiguousarray(image[top : top + rows]), last=top + rows >= len(image))
-        return data.data, deflate_adler32(plain.data), plain.size
+        return data.data, deflate_adler32(_bytes(plain)), plain.size
 
     def keep(top: int) -> tuple[bytes, int, int]:
         data, checksum, size = pack(top)
@@ -88,6 +88,11 @@ def _bands(
             yield from pool.map(keep, tops)
     else:
         yield from map(pack, tops)
+
+
+def _bytes(data: npt.NDArray[np.uint8]) -> Any:
+    """Return the memory of an array; imagecodecs takes it, though its type hints do not say so."""
+    return data.data
 
 
 def _packer() -> Packer:

@@ -228,7 +228,7 @@ def test_a_light_that_is_not_there_is_named(make_lut: Callable[..., Lut], pictur
     for light in (-1, 4):
         with pytest.raises(InputError, match=rf"there is no light {light}; the table .* has lights 0 to 3"):
             render(lut, picture, light)
-    wrong: list[Any] = [True, "3", 1.5]
+    wrong: list[Any] = ["3", 1.5, None]
     for light in wrong:
         with pytest.raises(InputError, match=rf"light {light!r} is no number of a light"):
             render(lut, picture, light)
