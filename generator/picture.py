@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from drivers.errors import FormatError, InputError
 from generator.kernels import philox
-from generator.profile import ASSUMED, to_srgb
+from generator.profile import ADOBE_RGB, ASSUMED, from_adobe_rgb, to_srgb
 
 Picture = npt.NDArray[np.uint8]
 
@@ -37,6 +37,8 @@ LARGEST_SIDE: Final = 65535
 LARGEST_PICTURE: Final = 1 << 29
 """Most pixels of a picture: a small file can hold more than any memory, and one such file is to stop no data set."""
 
+_UNCALIBRATED: Final = 0xFFFF
+"""EXIF 2.3, tag 40961 ColorSpace: not sRGB."""
 _MULTIPLIED: Final = frozenset({"dpx", "iff", "openexr", "rla", "tiff"})
 """Formats whose colours are multiplied by alpha unless the file says otherwise; those of others are as they are."""
 
@@ -156,6 +158,11 @@ def open_picture(path: Path, preparation: Preparation = AS_THEY_ARE, name: str |
             codes, word = to_srgb(codes, values.icc)
         else:
             word = "ignored, taken as sRGB"
+    elif values.adobe_rgb:
+        if preparation.profiles == "honour":
+            codes, word = from_adobe_rgb(codes), ADOBE_RGB
+        else:
+            word = "ignored, taken as sRGB"
     codes = _turn(codes, values.orientation)
     return Reading(_fit(codes, preparation, path, path.name if name is None else name), word)
 
@@ -170,6 +177,7 @@ class _Values:
     linear: bool
     orientation: int
     icc: bytes | None
+    adobe_rgb: bool
 
 
 def _read(path: Path) -> _Values:
@@ -211,6 +219,7 @@ def _read_named(path: Path, name: str) -> _Values:
         kept_apart = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) or stream.format_name() not in _MULTIPLIED
         orientation = spec.get_int_attribute("Orientation", 1)
         icc = spec.getattribute("ICCProfile")
+        uncalibrated = spec.get_int_attribute("Exif:ColorSpace", 0) == _UNCALIBRATED
     finally:
         stream.close()
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
@@ -237,7 +246,8 @@ def _read_named(path: Path, name: str) -> _Values:
         # What is brighter than its alpha was not multiplied by it, whatever the format's custom.
         associated = associated and not bool(np.any(values > 255.0 * alpha[..., None] + 1.0))
     profile = None if icc is None else np.asarray(icc, dtype=np.uint8).tobytes()
-    return _Values(values, alpha, associated, linear, orientation, profile)
+    adobe_rgb = uncalibrated and profile is None and _interoperability(path) == "R03"
+    return _Values(values, alpha, associated, linear, orientation, profile, adobe_rgb)
 
 
 @contextmanager
@@ -253,6 +263,20 @@ def _named_in_text(path: Path) -> Generator[str]:
             yield str(link)
     else:
         yield str(path)
+
+
+def _interoperability(path: Path) -> str:
+    """Return the interoperability index of a file's EXIF data; empty if there is none."""
+    from PIL import Image
+    from PIL.ExifTags import IFD
+
+    try:
+        with Image.open(path) as picture:
+            index = picture.getexif().get_ifd(IFD.Interop).get(1, "")
+    except (OSError, ValueError, SyntaxError):
+        # Damaged data say nothing; OpenImageIO has read the picture.
+        return ""
+    return str(index).strip("\0 ")
 
 
 def _jpeg(path: Path) -> npt.NDArray[np.uint8] | None:

@@ -3,6 +3,8 @@
 A chart is printed from sRGB codes, so a picture in another space, such as Adobe RGB (1998) or Display P3, has to be
 converted or its colours come out dull. LittleCMS converts, by relative colorimetry (ICC.1:2022, clause 6.3.2), in 8
 bits; a profile that moves no code by more than one is sRGB under another name and is left alone.
+
+A camera set to Adobe RGB embeds no profile, but says so in its EXIF data (DCF 2.0, interoperability index R03).
 """
 
 from __future__ import annotations
@@ -20,7 +22,18 @@ if TYPE_CHECKING:
 ASSUMED: Final = "none, taken as sRGB"
 """What is said of a picture without a profile."""
 
+ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"
+"""What is said of a picture that a camera made in that space."""
+
 _PROBE_STEPS: Final = 9
+_ADOBE_GAMMA: Final = 563 / 256
+"""Adobe RGB (1998) Color Image Encoding, clause 4.3.1.2."""
+_ADOBE_TO_SRGB: Final = np.array(
+    [[1.39835574, -0.39835574, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04292899, 1.04292899]], np.float32
+)
+"""Of linear light: the matrices of Adobe RGB (1998), clause 4.3.5.3, and IEC 61966-2-1; both have the white D65."""
+_STEPS: Final = 65535
+_ROWS: Final = 256
 
 
 def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArray[np.uint8], str]:
@@ -51,6 +64,19 @@ def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArra
     picture = Image.fromarray(codes if mode == "RGB" else np.ascontiguousarray(codes[..., 0]))
     converted = ImageCms.applyTransform(picture, transform)
     return np.array(converted, dtype=np.uint8), word
+
+
+def from_adobe_rgb(codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return the sRGB codes (H, W, 3) uint8 of codes of Adobe RGB (1998), clipped where sRGB ends."""
+    linear = (np.arange(256, dtype=np.float32) / 255) ** _ADOBE_GAMMA
+    light = np.arange(_STEPS + 1) / _STEPS
+    curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
+    encoded = np.rint(255 * curve).astype(np.uint8)
+    out = np.empty_like(codes)
+    for top in range(0, len(codes), _ROWS):
+        wanted = linear[codes[top : top + _ROWS]] @ _ADOBE_TO_SRGB.T
+        out[top : top + _ROWS] = encoded[np.rint(np.clip(wanted, 0, 1) * _STEPS).astype(np.uint16)]
+    return out
 
 
 @lru_cache(maxsize=16)

@@ -85,6 +85,26 @@ def test_a_damaged_profile_costs_no_picture(dull: Codes, icc: bytes) -> None:
     assert word.endswith("taken as sRGB")
 
 
+@pytest.mark.parametrize("index", ["R03", "R98"])
+def test_a_camera_s_adobe_rgb_is_converted(tmp_path: Path, dull: Codes, index: str) -> None:
+    """The space is named by EXIF's "uncalibrated" and DCF's interoperability index R03; R98 is sRGB."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA001] = 0xFFFF
+    exif.get_ifd(0x8769)[0xA005] = {1: index}
+    path = tmp_path / "_MG_0001.jpg"
+    Image.fromarray(dull).save(path, exif=exif, quality=100)
+    reading, ignored = open_picture(path), open_picture(path, Preparation(profiles="ignore"))
+    if index == "R98":
+        np.testing.assert_array_equal(reading.picture, ignored.picture)
+        assert reading.profile == "none, taken as sRGB"
+        return
+    wanted, _ = to_srgb(ignored.picture, ADOBE_RGB)
+    assert np.abs(reading.picture.astype(int) - wanted).max() <= 1
+    assert np.abs(reading.picture.astype(int) - ignored.picture).max() > 10
+    assert reading.profile == "Adobe RGB (1998) by EXIF, converted to sRGB"
+    assert ignored.profile == "ignored, taken as sRGB"
+
+
 def test_a_grey_profile_is_applied(tmp_path: Path) -> None:
     grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
     icc = gamma_profile("Grey 1.8", 1.8, None)
