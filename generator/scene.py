@@ -258,7 +258,8 @@ def find_pictures(
         A place is missing or neither file nor folder, a folder holds no picture, or two pictures would have one name.
     """
     found: list[PictureFile] = []
-    for place in (places,) if isinstance(places, Path | str) else places:
+    named = (places,) if isinstance(places, Path | str) else places
+    for place in named:
         remote = is_remote(str(place))
         # Whole, since a worker may have been started in another folder.
         root = str(place) if remote else os.path.abspath(local_path(place))  # noqa: PTH100  keeps no link's target
@@ -274,13 +275,9 @@ def find_pictures(
         found += [PictureFile(root, name, preparation) for name in below]
         if len(found) == before:
             raise InputError(f"{root} holds no picture; expected files that end in one of {' '.join(sorted(SUFFIXES))}")
-    if len(found) > len(set(map(_name_of, found))):
+    if len(named) > 1:
         _refuse_names(found)
     return tuple(found)
-
-
-def _name_of(picture: PictureFile) -> str:
-    return picture.name
 
 
 def _refuse_names(found: Sequence[PictureFile]) -> None:

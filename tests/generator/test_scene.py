@@ -265,6 +265,8 @@ def test_two_pictures_of_one_name_are_told(tmp_path: Path, colours: npt.NDArray[
         write(tmp_path / folder / "a.png", colours, "uint8")
     with pytest.raises(InputError, match=r"two pictures would be called a\.png: .*one/a\.png and .*two/a\.png; name"):
         find_pictures([tmp_path / "one", tmp_path / "two"])
+    with pytest.raises(InputError, match=r"two pictures would be called a\.png"):
+        find_pictures([tmp_path / "one", tmp_path / "one"])
     assert [found.name for found in find_pictures(tmp_path)] == ["one/a.png", "two/a.png"]
 
 
