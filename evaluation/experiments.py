@@ -62,12 +62,13 @@ def evaluate(
     Raises
     ------
     InputError
-        There is no scene or no method.
+        There is no scene or no method, or a scene's light is none.
     FormatError
         An image cannot be read.
     """
     if not scenes or not methods:
         raise InputError(f"{len(methods)} methods on {len(scenes)} images: name at least one of each")
+    truths = np.stack([_light(scene) for scene in scenes])
 
     def estimate(scene: Scene) -> npt.NDArray[np.float64]:
         image, mask = scene.read()
@@ -80,7 +81,6 @@ def evaluate(
             if on_scene:
                 on_scene()
     lights = np.stack(estimates, axis=1)
-    truths = np.stack([scene.truth for scene in scenes])
     return tuple(
         Result(
             method.name,
@@ -89,6 +89,16 @@ def evaluate(
         )
         for method, given in zip(methods, lights, strict=True)
     )
+
+
+def _light(scene: Scene) -> npt.NDArray[np.float64]:
+    truth = scene.truth
+    if not (np.isfinite(truth).all() and truth.min() >= 0 and truth.any()):
+        raise InputError(
+            f"the ground truth of {scene.name} is {' '.join(f'{part:g}' for part in truth)}, expected red, green and "
+            "blue of a light: none below 0, not all 0; correct it"
+        )
+    return truth
 
 
 def table_csv(results: Sequence[Result], kind: ErrorKind) -> str:

@@ -437,7 +437,6 @@ def _verify(out: str, workers: int | None) -> Dataset:
     # Whoever reads from a store waits for it most of the time.
     at_once = max(default_workers(), _STORE_READERS if is_remote(out) else 1) if workers is None else workers
     check_workers("local", at_once)
-    dataset = open_dataset(out)
     faults = 0
     with progress("files") as told:
         for fault in damage(out, told, workers=at_once):
@@ -445,6 +444,7 @@ def _verify(out: str, workers: int | None) -> Dataset:
             faults += 1
     if faults:
         raise QualityError(f"{out} is not as it was made, see above ({faults} faults); make it again, or copy it again")
+    dataset = open_dataset(out)
     print(f"{out}: {_counted(dataset.description.images, 'image')}, every file as it was made")
     return dataset
 

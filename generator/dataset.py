@@ -83,6 +83,10 @@ __all__ = [
 
 OnDone = Callable[[int], None]
 
+_LIGHT = "with r + g + b = 1 and none below 0"
+_ROUNDING = 2e-6
+"""More than six digits are off by, and less than a thousandth of a degree."""
+
 
 @dataclass(frozen=True)
 class Dataset:
@@ -218,13 +222,7 @@ def open_dataset(place: Path | str) -> Dataset:
     if not store.has(DESCRIPTION):
         raise FormatError(f"{place} is no dataset: it has no {DESCRIPTION}; make one with generate")
     description = _load_description(store)
-    entries = tuple(_entries(store, description))
-    if len(entries) != description.images:
-        raise FormatError(
-            f"{place}/{GROUND_TRUTH} has rows of {len(entries)} images, expected the {description.images} of "
-            f"{DESCRIPTION}; make the dataset again"
-        )
-    return Dataset(store, description, entries)
+    return Dataset(store, description, tuple(_entries(store, description)))
 
 
 def _load_description(store: Store) -> Description:
@@ -256,7 +254,7 @@ def _upgraded(told: dict[str, Any]) -> dict[str, Any]:
 
 
 def _entries(store: Store, description: Description) -> Iterator[Entry]:
-    """Yield the images of `ground_truth.csv`, whose rows of one image follow each other."""
+    """Yield the images of `ground_truth.csv`, whose rows of one image follow each other, as `gt.txt` has them too."""
     name = f"{store.place}/{GROUND_TRUTH}"
     part_of: dict[int, Split] = {}
     for part in SPLITS:
@@ -264,30 +262,88 @@ def _entries(store: Store, description: Description) -> Iterator[Entry]:
             with _text(store, f"splits/{part}.txt") as images:
                 part_of.update((_number(image), part) for image in images)
     with _text(store, TRUTHS) as truths, _text(store, GROUND_TRUTH) as table:
-        rows = csv.DictReader(table)
-        last = -1
-        for image, group in groupby(enumerate(rows, start=2), key=lambda numbered: numbered[1].get("image")):
-            lights: list[tuple[str, Triple]] = []
-            source = ""
-            for line, row in group:
-                try:
-                    lights.append(_light(row["illumination"], row["r"], row["g"], row["b"]))
-                    source = sys.intern(row["source"])
-                except (KeyError, TypeError, ValueError, InputError) as error:
-                    raise FormatError(f"{name}, line {line}: expected {','.join(GROUND_TRUTH_COLUMNS)}") from error
-            labels, whites = _unzipped(tuple(lights))
-            try:
-                truth = _triple(*next(truths, "").split())
-            except (TypeError, ValueError) as error:
-                raise FormatError(
-                    f"{store.place}/{TRUTHS}: expected three numbers for each of the {description.images} images of "
-                    f"{DESCRIPTION}; make the dataset again"
-                ) from error
+        last, count = -1, 0
+        for image, group in groupby(_numbered_rows(name, table), key=lambda numbered: numbered[1].get("image")):
+            count += 1
+            source, labels, whites = _read_rows(name, group)
             number = _number(image or "")
             if image is None or number <= last:
                 raise FormatError(f"{name}: {image!r} is not in the order of the images; make the dataset again")
             last = number
+            truth = _truth(store, next(truths, ""), count, image, whites)
             yield Entry(image, source, labels, whites, truth, part_of.get(number))
+        if count != description.images:
+            raise FormatError(
+                f"{name} has rows of {count} images, expected the {description.images} of {DESCRIPTION}; make the "
+                "dataset again"
+            )
+        more = sum(1 for line in truths if line.strip())
+        if more:
+            raise FormatError(
+                f"{store.place}/{TRUTHS} has {count + more} lines, expected one for each of the {count} images of "
+                f"{GROUND_TRUTH}; make the dataset again"
+            )
+
+
+def _numbered_rows(name: str, table: Iterable[str]) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield the rows of a CSV file with the line where each ends."""
+    rows = csv.DictReader(table)
+    try:
+        for row in rows:
+            yield rows.line_num, row
+    except csv.Error as error:
+        raise FormatError(f"{name}, line {rows.line_num + 1} is no CSV: {error}; make the dataset again") from error
+
+
+def _read_rows(
+    name: str, rows: Iterable[tuple[int, dict[str, str]]]
+) -> tuple[str, tuple[str, ...], tuple[Triple, ...]]:
+    """Return source, names of the lights, and ground truth of each, of an image's rows with their line numbers."""
+    lights: list[tuple[str, Triple]] = []
+    source = ""
+    for line, row in rows:
+        try:
+            lights.append(_light(row["illumination"], row["r"], row["g"], row["b"]))
+            source = sys.intern(row["source"])
+        except (KeyError, TypeError, ValueError, InputError) as error:
+            raise FormatError(
+                f"{name}, line {line}: expected {','.join(GROUND_TRUTH_COLUMNS)} {_LIGHT}, found "
+                f"{_shown(','.join(map(str, row.values())))}; make the dataset again"
+            ) from error
+    return source, *_unzipped(tuple(lights))
+
+
+def _truth(store: Store, text: str, line: int, image: str, lights: tuple[Triple, ...]) -> Triple:
+    """Return the mean of an image's lights by its line of `gt.txt`; a FormatError if it cannot be their mean."""
+    name = f"{store.place}/{TRUTHS}, line {line}"
+    try:
+        truth = _triple(*text.split())
+    except (TypeError, ValueError) as error:
+        raise FormatError(
+            f"{name}: expected the light of {image}, r g b {_LIGHT}, found {_shown(text.strip())}; make the dataset "
+            "again"
+        ) from error
+    if not _is_among(truth, lights):
+        told = " and ".join("{:g} {:g} {:g}".format(*light) for light in lights)
+        raise FormatError(
+            f"{name}: {text.strip()} is not the light of {image}, which is {told} in {GROUND_TRUTH}; see with generate "
+            f"--verify {store.place} which of the two files has changed, and restore it"
+        )
+    return truth
+
+
+# As for `_triple`.
+@lru_cache(maxsize=4096)
+def _is_among(mean: Triple, lights: tuple[Triple, ...]) -> bool:
+    """Return whether lights may have this mean; one light is its own."""
+    return all(
+        min(parts) - _ROUNDING <= part <= max(parts) + _ROUNDING for part, *parts in zip(mean, *lights, strict=True)
+    )
+
+
+def _shown(text: str) -> str:
+    """Return what stands in a line, cut where it is long."""
+    return repr(text if len(text) <= 80 else f"{text[:80]}…") if text else "nothing"
 
 
 @contextmanager
@@ -316,7 +372,10 @@ def _unzipped(lights: tuple[tuple[str, Triple], ...]) -> tuple[tuple[str, ...], 
 
 @lru_cache(maxsize=4096)
 def _triple(red: str, green: str, blue: str) -> Triple:
-    return float(red), float(green), float(blue)
+    triple = float(red), float(green), float(blue)
+    if not (min(triple) >= 0 and abs(sum(triple) - 1) <= _ROUNDING):
+        raise ValueError(f"{triple} is no chromaticity")
+    return triple
 
 
 def generate_dataset(

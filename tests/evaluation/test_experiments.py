@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from acquisition.illuminations import Illumination
@@ -68,6 +70,31 @@ def test_the_tables_as_text(dataset: Path) -> None:
 def test_nothing_to_evaluate_is_said(dataset: Path) -> None:
     with pytest.raises(InputError, match="0 methods on 16 images"):
         evaluate(open_scenes(dataset), [])
+
+
+@dataclass(frozen=True)
+class Flat:
+    """A scene of one colour that says when it is read."""
+
+    name: str
+    truth: npt.NDArray[np.float64]
+    log: list[str]
+    saturation: float | None = None
+
+    def read(self) -> tuple[npt.NDArray[np.float32], None]:
+        self.log.append(self.name)
+        return np.ones((8, 8, 3), np.float32), None
+
+
+@pytest.mark.parametrize("light", [(0, 0, 0), (np.nan, 1, 1), (np.inf, 1, 1), (1, 1, -1)])
+def test_a_scene_without_a_light_is_named_before_the_work(light: tuple[float, ...]) -> None:
+    read: list[str] = []
+    good, dark = Flat("good.png", np.ones(3), read), Flat("dark.png", np.array(light), read)
+    methods = [GrayEdge("Gray-world", 0, 1, 0)]
+    evaluate([good], methods)
+    with pytest.raises(InputError, match=r"the ground truth of dark\.png is .*, expected red, green and blue"):
+        evaluate([good, dark], methods)
+    assert read == ["good.png"]
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:

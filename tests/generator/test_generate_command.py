@@ -146,6 +146,10 @@ def test_shares_are_finished_and_verified(generate: Generate, capsys: pytest.Cap
     printed = capsys.readouterr()
     assert printed.out == "images/000005.png has changed\n"
     assert "out is not as it was made, see above (1 faults)" in printed.err
+    truths = Path("out/gt.txt").read_text().splitlines()
+    Path("out/gt.txt").write_text("\n".join(reversed(truths)))
+    assert generate("--verify", "out") == 4
+    assert "gt.txt has changed\n" in capsys.readouterr().out
 
 
 def test_a_share_is_gone_on_with_by_the_whole(generate: Generate, capsys: pytest.CaptureFixture[str]) -> None:
