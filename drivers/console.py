@@ -11,7 +11,8 @@ import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 
-from drivers.errors import EXIT_INTERRUPTED, CropError, StorageError
+from drivers.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
+from drivers.storage import remedy_of
 
 EXIT_CODES = (
     "Exit codes: 0 done; 2 something given cannot be used; 3 a device failed; 4 the data are not good enough; "
@@ -54,7 +55,14 @@ def _outcome(command: Callable[[], object]) -> int:
         if error.errno in (errno.ENOSPC, errno.EROFS, errno.EDQUOT):
             say_error(f"cannot write {error.filename or 'to the disk'}: {error.strerror}; free space and run again")
             return StorageError.exit_code
-        raise
+        remedy = remedy_of(error)
+        if remedy is None or not isinstance(error.filename, str | bytes):
+            raise
+        say_error(f"cannot use {os.fsdecode(error.filename)}: {error.strerror}; {remedy}")
+        return InputError.exit_code
+    except MemoryError as error:
+        say_error(f"not enough memory ({str(error) or 'none is left'}); use fewer --workers, or smaller pictures")
+        return InputError.exit_code
     except SystemExit as error:
         if error.code == EXIT_INTERRUPTED:
             return _interrupted()

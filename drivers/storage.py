@@ -20,6 +20,15 @@ from typing import TypeGuard
 from drivers.errors import InputError, StorageError
 
 _PARTIAL = ".partial"
+_PART_IS_A_FILE = "a part of that path is a file, not a folder; name another"
+_REMEDIES = {
+    errno.EACCES: "ask its owner for permission, or name another place",
+    errno.EPERM: "ask its owner for permission, or name another place",
+    errno.EISDIR: "a folder is called so; name a file",
+    errno.ENOTDIR: _PART_IS_A_FILE,
+    errno.ENAMETOOLONG: "name it shorter",
+    errno.ELOOP: "links there lead in a circle; name the place that is meant",
+}
 _DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EACCES, errno.EPERM}
 
 
@@ -31,6 +40,11 @@ def partial_path(path: Path) -> Path:
 def is_partial(path: Path) -> bool:
     """Return whether `path` is a leftover of a write that never finished."""
     return path.name.startswith(".") and path.name.endswith(_PARTIAL)
+
+
+def remedy_of(error: OSError) -> str | None:
+    """Return what helps against a fault of the path that was named; None if the fault is another."""
+    return _REMEDIES.get(error.errno or 0)
 
 
 def storage_error(path: Path, error: OSError) -> StorageError:
@@ -56,7 +70,7 @@ def _make_folder(folder: Path, path: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise InputError(f"cannot write {path}: a part of that path is a file, not a folder; name another") from error
+        raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
     except OSError as error:
         raise storage_error(path, error) from error
 

@@ -66,7 +66,52 @@ def test_a_disk_fault_that_nobody_translated_is_5(number: int, capsys: pytest.Ca
     )
 
 
-@pytest.mark.parametrize("error", [OSError(errno.EINVAL, "odd"), ValueError("our mistake"), AssertionError()])
+@pytest.mark.parametrize("name", ["/theirs/dataset.json", b"/theirs/dataset.json"])
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.EACCES, "ask its owner for permission, or name another place"),
+        (errno.EPERM, "ask its owner for permission, or name another place"),
+        (errno.EISDIR, "a folder is called so; name a file"),
+        (errno.ENOTDIR, "a part of that path is a file, not a folder; name another"),
+        (errno.ENAMETOOLONG, "name it shorter"),
+        (errno.ELOOP, "links there lead in a circle; name the place that is meant"),
+    ],
+)
+def test_a_path_that_cannot_be_used_is_2(
+    number: int, remedy: str, name: str | bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        raise OSError(number, os.strerror(number), name)
+
+    assert run(fail) == 2
+    assert capsys.readouterr().err == f"error: cannot use /theirs/dataset.json: {os.strerror(number)}; {remedy}\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [(MemoryError(), "none is left"), (MemoryError("Unable to allocate 9 TiB"), "Unable to allocate 9 TiB")],
+)
+def test_no_memory_is_2(error: MemoryError, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail() -> None:
+        raise error
+
+    assert run(fail) == 2
+    assert capsys.readouterr().err == (
+        f"error: not enough memory ({reason}); use fewer --workers, or smaller pictures\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.EINVAL, "odd"),
+        OSError(errno.EBADF, "odd", "file"),
+        PermissionError(errno.EACCES, "of what?"),
+        ValueError("our mistake"),
+        AssertionError(),
+    ],
+)
 def test_our_own_mistakes_are_not_hidden(error: Exception) -> None:
     def fail() -> None:
         raise error
