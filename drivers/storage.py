@@ -47,11 +47,13 @@ def remedy_of(error: OSError) -> str | None:
     return _REMEDIES.get(error.errno or 0)
 
 
-def storage_error(path: Path, error: OSError) -> StorageError:
-    """Return what went wrong at `path` as one sentence with its remedy."""
-    reason = error.strerror or str(error)
-    return StorageError(
-        f"cannot write {path}: {reason}; free space or choose another disk, then run the same command again"
+def storage_error(path: Path, error: OSError) -> InputError | StorageError:
+    """Return what went wrong at `path` as one sentence with its remedy; an InputError if the name is to blame."""
+    remedy = remedy_of(error)
+    by_name = remedy is not None and not isinstance(error, PermissionError)
+    return (InputError if by_name else StorageError)(
+        f"cannot write {path}: {error.strerror or error}; "
+        f"{remedy or 'free space or choose another disk, then run the same command again'}"
     )
 
 
@@ -105,6 +107,8 @@ def whole_file(path: Path, final: Callable[[], Path] | None = None) -> Generator
 
     Raises
     ------
+    InputError
+        `path` is a folder, too long, or below a file.
     StorageError
         The disk is full, read-only or gone. Nothing is left behind.
     """
@@ -159,8 +163,18 @@ def require_free(path: Path, what: str) -> None:
     InputError
         Something is there already; the message says how to go on.
     """
-    if path.is_dir() and not any(path.iterdir()):
-        return
+    if not path.is_dir() or any(path.iterdir()):
+        require_free_file(path, what)
+
+
+def require_free_file(path: Path, what: str) -> None:
+    """Refuse when `path` exists, be it an empty folder.
+
+    Raises
+    ------
+    InputError
+        Something is there already; the message says how to go on.
+    """
     if path.exists() or path.is_symlink():
         raise InputError(f"{path} already exists; name another place for {what}, or remove what is there")
 

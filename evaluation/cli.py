@@ -38,11 +38,13 @@ def evaluate(
         Literal["reproduction", "recovery"], typer.Option(help="Angular error to sum up.")
     ] = "reproduction",
     csv: Annotated[
-        Path | None, typer.Option(metavar="OUT.csv", help="Write the table to this file too.", show_default=False)
+        Path | None, typer.Option(metavar="OUT.csv", help="Write the table to this new file too.", show_default=False)
     ] = None,
     images: Annotated[
         Path | None,
-        typer.Option(metavar="OUT.csv", help="Write each image's estimates and errors.", show_default=False),
+        typer.Option(
+            metavar="OUT.csv", help="Write each image's estimates and errors to this new file.", show_default=False
+        ),
     ] = None,
     workers: Annotated[
         int | None,
@@ -60,6 +62,7 @@ def evaluate(
     from generator.dataset import default_workers
 
     chosen = _choose(methods)
+    _require_free(csv, images)
     scenes = open_scenes(dataset)
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("images", total=len(scenes))
@@ -75,6 +78,17 @@ def evaluate(
         write_whole(csv, experiments.table_csv(results, error))
     if images is not None:
         write_whole(images, experiments.images_csv(scenes, results))
+
+
+def _require_free(csv: Path | None, images: Path | None) -> None:
+    from drivers.errors import InputError
+    from drivers.storage import require_free_file
+
+    for path, what in ((csv, "the table"), (images, "the images' errors")):
+        if path is not None:
+            require_free_file(path, what)
+    if csv is not None and images is not None and csv.resolve() == images.resolve():
+        raise InputError(f"--csv and --images are both {images}; give each a file of its own")
 
 
 def _choose(text: str) -> list[Method]:

@@ -16,7 +16,16 @@ import pytest
 
 from drivers import storage
 from drivers.errors import InputError, StorageError
-from drivers.storage import is_partial, partial_path, read_whole, require_free, whole_file, whole_folder, write_whole
+from drivers.storage import (
+    is_partial,
+    partial_path,
+    read_whole,
+    require_free,
+    require_free_file,
+    whole_file,
+    whole_folder,
+    write_whole,
+)
 
 
 def names(folder: Path) -> list[str]:
@@ -114,12 +123,24 @@ class TestWholeFile:
                 write_whole(path, "x")
         assert (tmp_path / "file").read_text() == "x"
 
-    def test_a_name_that_is_a_folder_or_too_long_is_told(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize(
+        ("name", "message"),
+        [
+            ("taken", r"cannot write .*taken: Is a directory; a folder is called so; name a file$"),
+            ("x" * 300, r"cannot write .*xxx: File name too long; name it shorter$"),
+        ],
+    )
+    def test_a_name_that_cannot_be_a_file_is_told(self, tmp_path: Path, name: str, message: str) -> None:
         (tmp_path / "taken").mkdir()
-        for name in ("taken", "x" * 300):
-            with pytest.raises(StorageError, match="cannot write"):
-                write_whole(tmp_path / name, "x")
+        with pytest.raises(InputError, match=message):
+            write_whole(tmp_path / name, "x")
         assert names(tmp_path) == ["taken"]
+
+    @pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])
+    def test_a_place_where_nobody_may_write_keeps_its_code(self, tmp_path: Path, number: int) -> None:
+        error = storage.storage_error(tmp_path, OSError(number, os.strerror(number)))
+        assert isinstance(error, StorageError)
+        assert str(error).endswith("; ask its owner for permission, or name another place")
 
     @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
     def test_a_folder_without_permission(self, tmp_path: Path) -> None:
@@ -235,6 +256,14 @@ def test_require_free(tmp_path: Path) -> None:
     write_whole(tmp_path / "x", "")
     with pytest.raises(InputError, match="already exists"):
         require_free(tmp_path, "the session")
+
+
+def test_an_empty_folder_is_no_free_file(tmp_path: Path) -> None:
+    require_free_file(tmp_path / "new", "the lights")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for path in (tmp_path, tmp_path / "link"):
+        with pytest.raises(InputError, match="already exists; name another place for the lights"):
+            require_free_file(path, "the lights")
 
 
 def test_whole_file_yields_a_stream_that_can_be_sized(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from acquisition.illuminations import Illumination
 from calibration.lut import LutWriter, Provenance, open_lut
 from drivers.errors import InputError
 from drivers.presenter import Colour
+from evaluation import experiments
 from evaluation.cli import main
 from evaluation.datasets import open_scenes
 from evaluation.experiments import evaluate, images_csv, table_csv
@@ -120,6 +121,10 @@ def test_the_command(dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     [
         (("made", "--methods", "magic"), "'magic' is no method; the methods are white-patch"),
         (("lut",), "is no dataset"),
+        (("made", "--csv", "made"), "made already exists; name another place for the table"),
+        (("made", "--csv", "made/gt.txt"), "made/gt.txt already exists; name another place for the table"),
+        (("made", "--images", "empty"), "empty already exists; name another place for the images' errors"),
+        (("made", "--csv", "new.csv", "--images", "lut/../new.csv"), "are both lut/../new.csv; give each a file"),
     ],
 )
 def test_what_cannot_be_done_is_one_sentence(
@@ -129,5 +134,13 @@ def test_what_cannot_be_done_is_one_sentence(
     arguments: tuple[str, ...],
     message: str,
 ) -> None:
-    assert call(monkeypatch, str(dataset.parent / arguments[0]), *arguments[1:]) == 2
+    def never(*given: object) -> None:
+        pytest.fail("the work must not begin")
+
+    monkeypatch.chdir(dataset.parent)
+    monkeypatch.setattr(experiments, "evaluate", never)
+    Path("empty").mkdir()
+    before = {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")}
+    assert call(monkeypatch, *arguments) == 2
     assert message in capsys.readouterr().err
+    assert {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")} == before
