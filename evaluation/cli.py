@@ -10,9 +10,16 @@ import typer
 from drivers.console import EXIT_CODES, run
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from evaluation.experiments import Result
     from evaluation.methods import Method
+    from evaluation.metrics import ErrorKind
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+_WIDE = 10_000
+"""More columns than a table of methods has."""
 
 _HELP = f"""Estimate the light of every image of a dataset and sum up the errors.
 
@@ -54,7 +61,6 @@ def evaluate(
     """Evaluate methods."""
     from rich.console import Console
     from rich.progress import Progress
-    from rich.table import Table
 
     from drivers.storage import write_whole
     from evaluation import experiments
@@ -67,13 +73,8 @@ def evaluate(
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("images", total=len(scenes))
         results = experiments.evaluate(scenes, chosen, workers or default_workers(), lambda: progress.advance(task))
-    table = Table(title=f"{dataset.name}: {error} angular error of {len(scenes)} images, degrees")
-    table.add_column("Algorithm")
-    for column in ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg."):
-        table.add_column(column, justify="right")
-    for result in results:
-        table.add_row(result.method, *(f"{number:.2f}" for number in result.summary(error).as_tuple()))
-    Console().print(table)
+    print(f"{dataset.name}: {error} angular error of {len(scenes)} images, degrees")
+    _print_table(results, error)
     if csv is not None:
         write_whole(csv, experiments.table_csv(results, error))
     if images is not None:
@@ -89,6 +90,25 @@ def _require_free(csv: Path | None, images: Path | None) -> None:
             require_free_file(path, what)
     if csv is not None and images is not None and csv.resolve() == images.resolve():
         raise InputError(f"--csv and --images are both {images}; give each a file of its own")
+
+
+def _print_table(results: Sequence[Result], error: ErrorKind) -> None:
+    """Print the summaries; where the terminal is narrow names are folded, numbers never cut."""
+    from rich.console import Console
+    from rich.table import Table
+
+    longest_word = max(len(word) for result in results for word in result.method.split())
+    table = Table()
+    table.add_column("Algorithm", min_width=longest_word)
+    for column in ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg."):
+        table.add_column(column, justify="right", no_wrap=True, min_width=len(column))
+    for result in results:
+        table.add_row(result.method, *(f"{number:.2f}" for number in result.summary(error).as_tuple()))
+    console = Console()
+    needed = Console(width=_WIDE).measure(table)
+    # What is not a terminal has no width, but rich would ask the terminal that stdin or stderr is.
+    console.width = max(console.width, needed.minimum) if console.is_terminal else needed.maximum
+    console.print(table)
 
 
 def _choose(text: str) -> list[Method]:

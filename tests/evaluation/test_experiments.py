@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from evaluation import experiments
 from evaluation.cli import main
 from evaluation.datasets import open_scenes
 from evaluation.experiments import evaluate, images_csv, table_csv
-from evaluation.methods import GrayEdge
+from evaluation.methods import GrayEdge, standard_methods
 from generator.dataset import generate_dataset
 from generator.scene import random_scenes
 
@@ -114,6 +115,35 @@ def test_the_command(dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert printed.index("White-Patch") < printed.index("Gray-world")
     assert [row.split(",")[0] for row in table.read_text().splitlines()] == ["method", "White-Patch", "Gray-world"]
     assert len(images.read_text().splitlines()) == 33
+
+
+def test_a_file_gets_the_whole_table_however_narrow_the_terminal(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
+    assert call(monkeypatch, str(dataset)) == 0
+    first, *table = capsys.readouterr().out.splitlines()
+    assert first == "made: reproduction angular error of 16 images, degrees"
+    assert {len(line) for line in table} == {len(table[0])}
+    for method in standard_methods().values():
+        assert [line for line in table if method.name in line and len(re.findall(r"\d\.\d\d ", line)) == 6]
+
+
+def test_a_narrow_terminal_cuts_no_number(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # By which rich takes any output for a terminal.
+    printed: dict[int, str] = {}
+    for columns in (30, 75, 120):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        assert call(monkeypatch, str(dataset)) == 0
+        printed[columns] = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out)
+    numbers = {columns: re.findall(r"\d\.\d\d ", text) for columns, text in printed.items()}
+    assert len(numbers[120]) == 6 * len(standard_methods())
+    assert numbers[30] == numbers[75] == numbers[120]
+    assert max(map(len, printed[75].splitlines())) <= 75
+    for word in ("Gray-world", "2nd-order", "Worst 25%"):
+        assert all(word in text for text in printed.values())
 
 
 @pytest.mark.parametrize(
