@@ -55,7 +55,7 @@ def evaluate(
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Threads. [default: one a processor]", min=1, show_default=False),
+        typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False),
     ] = None,
 ) -> None:
     """Evaluate methods."""
@@ -73,7 +73,7 @@ def evaluate(
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("images", total=len(scenes))
         results = experiments.evaluate(scenes, chosen, workers or default_workers(), lambda: progress.advance(task))
-    print(f"{dataset.name}: {error} angular error of {len(scenes)} images, degrees")
+    print(f"{dataset.resolve().name}: {error} angular error of {len(scenes)} images, degrees")
     _print_table(results, error)
     if csv is not None:
         write_whole(csv, experiments.table_csv(results, error))

@@ -131,7 +131,7 @@ def generate(
         typer.Option(
             metavar="K",
             help="K images of each picture, under distinct random lights of the table, or under lights drawn from "
-            "--distribution. [default: 1]",
+            "--distribution. \\[default: 1]",
             show_default=False,
             rich_help_panel=_LIGHT,
         ),
@@ -173,7 +173,7 @@ def generate(
         int | None,
         typer.Option(
             metavar="K",
-            help="Let K lights fall on each image. [default: 1; 2 with --masks]",
+            help="Let K lights fall on each image. \\[default: 1; 2 with --masks]",
             show_default=False,
             rich_help_panel=_LIGHT,
         ),
@@ -184,7 +184,7 @@ def generate(
             metavar="KIND",
             help="Where each of several lights falls: half-plane or soft-edge (angle, width), spots (count, radius, "
             "softness), smooth (scale, contrast), window (columns, rows, softness), with numbers where wanted, as in "
-            "spots:count=3,radius=.1; or a folder of masks. [default: smooth]",
+            "spots:count=3,radius=.1; or a folder of masks. \\[default: smooth]",
             show_default=False,
             rich_help_panel=_LIGHT,
         ),
@@ -228,7 +228,7 @@ def generate(
         int | None,
         typer.Option(
             metavar="N",
-            help="Threads, or processes of the engine dask. [default: one a processor]",
+            help="Threads, or processes of the engine dask. \\[default: one a processor]",
             show_default=False,
             rich_help_panel=_WORK,
         ),

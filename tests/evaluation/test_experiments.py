@@ -117,6 +117,17 @@ def test_the_command(dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert len(images.read_text().splitlines()) == 33
 
 
+@pytest.mark.parametrize("place", [".", "../set[a-1]", "splits/.."])
+def test_the_table_names_the_dataset(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: str
+) -> None:
+    folder = dataset.rename(dataset.with_name("set[a-1]"))
+    (folder / "splits").mkdir()
+    monkeypatch.chdir(folder)
+    assert call(monkeypatch, place, "--methods", "gray-world") == 0
+    assert capsys.readouterr().out.startswith("set[a-1]: reproduction angular error of 16 images, degrees\n")
+
+
 def test_a_file_gets_the_whole_table_however_narrow_the_terminal(
     dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

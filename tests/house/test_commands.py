@@ -5,8 +5,12 @@ from __future__ import annotations
 import importlib.metadata
 import subprocess
 import sys
+from collections.abc import Iterator
+from importlib import import_module
+from typing import Any
 
 import pytest
+from typer.main import get_command
 
 COMMANDS = {
     "acquire": "acquisition.cli",
@@ -30,6 +34,14 @@ def call(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
+def commands_of(command: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield a command, and what is below it, with the words that lead there."""
+    yield (), command
+    for name, below in getattr(command, "commands", {}).items():
+        for path, found in commands_of(below):
+            yield (name, *path), found
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_command_is_installed(command: str) -> None:
     entries = importlib.metadata.entry_points(group="console_scripts", name=command)
@@ -42,6 +54,22 @@ def test_help_tells_the_exit_codes_and_loads_nothing_heavy(module: str) -> None:
     assert done.returncode == 0, done.stderr
     assert "Exit codes" in done.stdout
     assert done.stderr.splitlines()[-1] == "LOADED"
+
+
+@pytest.mark.parametrize("module", COMMANDS.values())
+def test_help_shows_all_that_is_written_of_every_option(
+    module: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "1000")
+    room = import_module(module)
+    for path, command in commands_of(get_command(room.app)):
+        monkeypatch.setattr(sys, "argv", ["command", *path, "--help"])
+        assert room.main() == 0
+        shown = capsys.readouterr().out
+        for option in command.params:
+            # Rich takes what stands in brackets for its own unless a backslash is before it.
+            written = (getattr(option, "help", None) or "").replace("\\[", "[")
+            assert " ".join(written.split()) in " ".join(shown.split()), f"{' '.join(path)} {option.name}"
 
 
 @pytest.mark.parametrize("module", COMMANDS.values())
