@@ -16,6 +16,7 @@ from drivers.errors import InputError, QualityError
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
+    pretty_exceptions_enable=False,
     help="Plan, print and take a session: a chart photographed raw under many known lights.\n\n" + EXIT_CODES,
 )
 

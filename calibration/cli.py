@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from calibration.choices import Choices
     from calibration.result import BuildResult, Growth
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
 def main() -> int:

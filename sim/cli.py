@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
+    pretty_exceptions_enable=False,
     help="Simulated devices on loopback connections, until interrupted.\n\n" + EXIT_CODES,
 )
 

@@ -79,6 +79,18 @@ def test_an_unknown_option_is_the_users_fault(module: str) -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize("module", COMMANDS.values())
+def test_a_mistake_of_ours_shows_a_plain_traceback(module: str) -> None:
+    code = (
+        f"from {module} import app\n@app.command()\ndef fail():\n    raise ValueError('our mistake')\n"
+        "from drivers.console import run\nrun(lambda: app(['fail']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("Traceback (most recent call last):")
+    assert done.stderr.endswith("\nValueError: our mistake\n")
+
+
 @pytest.mark.parametrize("room", ROOMS)
 def test_every_name_of_ours_has_one_owner(room: str) -> None:
     assert set(importlib.metadata.packages_distributions()[room]) == {"croplab"}
