@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from evaluation.metrics import ErrorKind
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+_CAUSES = "too small for it, clipped, black or even"
 
 _WIDE = 10_000
 """More columns than a table of methods has."""
@@ -75,6 +78,10 @@ def evaluate(
         results = experiments.evaluate(scenes, chosen, workers or default_workers(), lambda: progress.advance(task))
     print(f"{dataset.resolve().name}: {error} angular error of {len(scenes)} images, degrees")
     _print_table(results, error)
+    for result in results:
+        if result.guessed.any():
+            counted = f"{result.guessed.sum()} of {len(scenes)} images"
+            print(f"{result.method}: no usable pixel in {counted} ({_CAUSES}); their light was taken to be grey")
     if csv is not None:
         write_whole(csv, experiments.table_csv(results, error))
     if images is not None:
@@ -88,7 +95,7 @@ def _require_free(csv: Path | None, images: Path | None) -> None:
     for path, what in ((csv, "the table"), (images, "the images' errors")):
         if path is not None:
             require_free_file(path, what)
-    if csv is not None and images is not None and csv.resolve() == images.resolve():
+    if csv is not None and images is not None and os.path.realpath(csv) == os.path.realpath(images):
         raise InputError(f"--csv and --images are both {images}; give each a file of its own")
 
 

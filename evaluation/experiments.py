@@ -14,6 +14,7 @@ import numpy.typing as npt
 from drivers.errors import InputError
 from evaluation.datasets import Scene
 from evaluation.methods import Method
+from evaluation.methods.pixels import GREY
 from evaluation.metrics import ErrorKind, Summary, recovery_error, reproduction_error, summarise
 
 COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg")
@@ -31,11 +32,14 @@ class Result:
         (N, 3) float64 of unit length, in the order of the scenes.
     errors
         Kind of error to (N,) float64, degrees.
+    guessed
+        (N,) bool, True where the method found no pixel to go by, and its estimate is grey for want of a better.
     """
 
     method: str
     estimates: npt.NDArray[np.float64]
     errors: Mapping[ErrorKind, npt.NDArray[np.float64]]
+    guessed: npt.NDArray[np.bool_]
 
     def summary(self, kind: ErrorKind) -> Summary:
         """Return the six numbers for one kind of error."""
@@ -70,24 +74,26 @@ def evaluate(
         raise InputError(f"{len(methods)} methods on {len(scenes)} images: name at least one of each")
     truths = np.stack([_light(scene) for scene in scenes])
 
-    def estimate(scene: Scene) -> npt.NDArray[np.float64]:
+    def estimate(scene: Scene) -> list[npt.NDArray[np.float64]]:
         image, mask = scene.read()
-        return np.stack([method.estimate(image, scene.saturation, mask) for method in methods])
+        return [method.estimate(image, scene.saturation, mask) for method in methods]
 
-    estimates: list[npt.NDArray[np.float64]] = []
+    estimates: list[list[npt.NDArray[np.float64]]] = []
     with ThreadPoolExecutor(max(1, workers)) as pool:
         for answer in pool.map(estimate, scenes):
             estimates.append(answer)
             if on_scene:
                 on_scene()
-    lights = np.stack(estimates, axis=1)
+    lights = np.stack([np.stack(given) for given in estimates], axis=1)
+    guessed = np.array([[light is GREY for light in given] for given in estimates]).T
     return tuple(
         Result(
             method.name,
             given,
             {"recovery": recovery_error(given, truths), "reproduction": reproduction_error(given, truths)},
+            blind,
         )
-        for method, given in zip(methods, lights, strict=True)
+        for method, given, blind in zip(methods, lights, guessed, strict=True)
     )
 
 

@@ -29,7 +29,7 @@ class Method(Protocol):
     def estimate(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float64]:
-        """Return the estimated light (3,) float64 of unit length.
+        """Return the estimated light (3,) float64 of unit length; `pixels.GREY` itself where no pixel may be used.
 
         Parameters
         ----------

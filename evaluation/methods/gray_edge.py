@@ -51,7 +51,7 @@ class GrayEdge:
         saturation: float | None = None,
         mask: npt.NDArray[np.bool_] | None = None,
     ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64 of unit length; grey where no pixel may be used. See `Method.estimate`."""
+        """Return the light (3,) float64 of unit length; `GREY` where no pixel may be used. See `Method.estimate`."""
         border = math.floor(self.sigma) + 1 if self.border is None else self.border
         used = usable(image, saturation, mask, border)
         response = differentiate(image.astype(np.float32), self.order, self.sigma)

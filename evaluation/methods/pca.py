@@ -38,7 +38,7 @@ class BrightDark:
         saturation: float | None = None,
         mask: npt.NDArray[np.bool_] | None = None,
     ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64 of unit length; grey where no pixel may be used. See `Method.estimate`."""
+        """Return the light (3,) float64 of unit length; `GREY` where no pixel may be used. See `Method.estimate`."""
         values = image[usable(image, saturation, mask, 0)].astype(np.float64)
         if not values.any():
             return unit(np.zeros(3))

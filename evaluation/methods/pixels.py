@@ -8,7 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 GREY = np.full(3, 3**-0.5)
-"""The estimate where no pixel may be used, or none differs from black: no cast."""
+"""The estimate where no pixel may be used, or none differs from black: no cast.
+
+Methods return this very array then, by which it is told from grey that was found.
+"""
+GREY.setflags(write=False)
 
 
 def usable(
@@ -42,7 +46,7 @@ def usable(
 
 
 def unit(estimate: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return `estimate` (3,) scaled to length 1, or grey where it is zero or not finite."""
+    """Return `estimate` (3,) scaled to length 1, or `GREY` where it is zero or not finite."""
     vector = np.asarray(estimate, dtype=np.float64)
     length = float(np.linalg.norm(vector))
-    return vector / length if np.isfinite(length) and length > 0 else GREY.copy()
+    return vector / length if np.isfinite(length) and length > 0 else GREY

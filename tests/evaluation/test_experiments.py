@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,8 +29,14 @@ LIGHTS = np.array([[2000.0, 3000, 1000], [1500, 3000, 2500]])
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Path:
-    """Return a dataset of 8 random scenes whose colours all reflect as their code, under two lights without noise."""
+def dataset(make_dataset: Callable[[int, int], Path]) -> Path:
+    """Return a dataset of images of 96 x 64 px."""
+    return make_dataset(96, 64)
+
+
+@pytest.fixture
+def make_dataset(tmp_path: Path) -> Callable[[int, int], Path]:
+    """Return a maker of datasets of 8 random scenes whose colours reflect as their code, under two lights, no noise."""
     folder = tmp_path / "lut"
     folder.mkdir()
     index = np.arange(512)
@@ -40,8 +47,13 @@ def dataset(tmp_path: Path) -> Path:
     known = Provenance(camera="Test", bits=3, white_level=9000, session_sha256="0", chart_sha256="0", software="test")
     plan = [Illumination(number, "uniform", None, Colour(1, 2, 3)) for number in range(2)]
     writer.finish(plan, LIGHTS, known)
-    generate_dataset(open_lut(folder), tmp_path / "made", random_scenes(8, 96, 64), [0, 1], previews=False)
-    return tmp_path / "made"
+
+    def make(width: int, height: int) -> Path:
+        scenes = random_scenes(8, width, height)
+        generate_dataset(open_lut(folder), tmp_path / "made", scenes, [0, 1], previews=False)
+        return tmp_path / "made"
+
+    return make
 
 
 def test_grey_on_average_is_what_gray_world_finds(dataset: Path) -> None:
@@ -99,6 +111,15 @@ def test_a_scene_without_a_light_is_named_before_the_work(light: tuple[float, ..
     assert read == ["good.png"]
 
 
+def test_images_without_a_usable_pixel_are_told_from_grey_ones() -> None:
+    truth = np.array([1.0, 2.0, 1.0])
+    scenes = [Flat("grey.png", truth, []), Flat("clipped.png", truth, [], 1.0), Flat("grey.png", truth, [])]
+    (flat, edges) = evaluate(scenes, [GrayEdge("Gray-world", 0, 1, 0), GrayEdge("Gray-Edge", 1, 1, 1)])
+    assert flat.guessed.tolist() == [False, True, False]
+    assert edges.guessed.all()
+    np.testing.assert_allclose(np.stack([*flat.estimates, *edges.estimates]), 3**-0.5)
+
+
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr(sys, "argv", ["evaluate", *arguments])
     return main()
@@ -115,6 +136,20 @@ def test_the_command(dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert printed.index("White-Patch") < printed.index("Gray-world")
     assert [row.split(",")[0] for row in table.read_text().splitlines()] == ["method", "White-Patch", "Gray-world"]
     assert len(images.read_text().splitlines()) == 33
+
+
+def test_the_command_counts_images_without_a_usable_pixel(
+    make_dataset: Callable[[int, int], Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call(monkeypatch, str(make_dataset(12, 12))) == 0
+    after = capsys.readouterr().out.rpartition("┘")[2]
+    told = "no usable pixel in 16 of 16 images (too small for it, clipped, black or even); their light was taken to be"
+    assert after.split("\n") == [
+        "",
+        f"General Gray-world: {told} grey",
+        f"1st-order Gray-Edge: {told} grey",
+        "",
+    ]
 
 
 @pytest.mark.parametrize("place", [".", "../set[a-1]", "splits/.."])
