@@ -33,7 +33,7 @@ def main() -> int:
     return console.run(app)
 
 
-@app.command()
+@app.command(epilog=EXIT_CODES)
 def chart(
     out: Annotated[
         Path, typer.Argument(help="New folder for chart.json, chart.tif, chart.pdf and what goes with them.")
@@ -56,9 +56,9 @@ def chart(
 ) -> None:
     """Make the print: every colour once, AprilTags and achromatic references, at true size.
 
-    Writes OUT/chart.json (what calibration reads), chart.pdf (vector), chart.tif (600 dpi), preview.png, proof.pdf (an
-    A4 page to try the printer with) and PRINTING.txt. Print the PDF or the TIFF with the printer's colour management
-    off, at 100 %, on matte paper. A line on stderr tells when cells are too small for the paper's cameras.
+    Reads no file. Writes OUT/chart.json (what calibration reads), chart.pdf (vector), chart.tif (600 dpi), preview.png,
+    proof.pdf (an A4 page to try the printer with) and PRINTING.txt. Print the PDF or the TIFF with the printer's colour
+    management off, at 100 %, on matte paper. A line on stderr tells when cells are too small for the paper's cameras.
     """
     from acquisition.layout import design_chart, paper_chart
     from acquisition.printing import save_pdf, save_preview, save_tiff
@@ -100,7 +100,7 @@ def _page(text: str | None) -> str | tuple[float, float] | None:
     return width, height
 
 
-@app.command()
+@app.command(epilog=EXIT_CODES)
 def illuminations(
     out: Annotated[Path, typer.Argument(help="New CSV file; a plot of the lights is written beside it as .png.")],
     grid: Annotated[int, typer.Option(min=0, max=200, help="Steps along an edge of the chromaticity triangle.")] = 35,
@@ -110,7 +110,7 @@ def illuminations(
 ) -> None:
     """Make the lights: uniformly spread chromaticities and black bodies; 707 unless said otherwise.
 
-    Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb-chromaticities beside it.
+    Reads no file. Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb-chromaticities beside it.
     """
     from acquisition.illuminations import parse_ccts, plan_illuminations, save_illuminations
     from acquisition.plots import plot_illuminations
@@ -127,14 +127,17 @@ def illuminations(
     print(f"{out}: {len(lights)} lights; plot in {plot}")
 
 
-@app.command()
+@app.command(epilog=EXIT_CODES)
 def devices(
     search: Annotated[
         float, typer.Option(min=0, help="Seconds to wait for PJLink projectors to answer; 0 does not ask.")
     ] = 10.0,
     identify: Annotated[bool, typer.Option(help="Show on every display its number for ten seconds.")] = False,
 ) -> None:
-    """List what is attached and reachable: cameras, serial ports, displays, projectors on the network."""
+    """List what is attached and reachable: cameras, serial ports, displays, projectors on the network.
+
+    Reads and writes no file.
+    """
     from acquisition.rig import attached_devices, identify_displays
 
     for attached in attached_devices(search):
@@ -147,7 +150,7 @@ def devices(
         identify_displays(10.0)
 
 
-@app.command()
+@app.command(epilog=EXIT_CODES)
 def check(
     lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
     picture: Annotated[Path | None, typer.Option(help="Save the frame with what was found on it as PNG.")] = None,
@@ -163,7 +166,8 @@ def check(
 ) -> None:
     """Talk to every device, find the chart, judge focus, framing and exposure; records nothing.
 
-    Reads LAB.toml and the chart it names. Ends with 4 when the frame would not do.
+    Reads LAB.toml and the chart it names. Writes nothing unless asked with --picture. Ends with 4 when the frame would
+    not do.
     """
     from acquisition.checking import check_lab
     from acquisition.config import load_lab
@@ -185,7 +189,7 @@ def check(
         raise QualityError("; ".join(report.faults))
 
 
-@app.command()
+@app.command(epilog=EXIT_CODES)
 def run(
     lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
     session: Annotated[Path, typer.Argument(help="Session folder: new, or one that was interrupted.")],
@@ -210,9 +214,12 @@ def run(
     print(f"{session}: complete, {outcome.total} frames; next: build-lut {session} LUT/")
 
 
-@app.command()
+@app.command(epilog=EXIT_CODES)
 def status(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
-    """Tell how far a session is, how long it will take, and what was refused."""
+    """Tell how far a session is, how long it will take, and what was refused.
+
+    Reads SESSION, also while it is being taken; writes nothing.
+    """
     from acquisition.progress import duration_text, session_progress
     from acquisition.session import Session
 
@@ -226,12 +233,15 @@ def status(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> 
         print(f"  {reason}")
 
 
-@app.command()
+@app.command(epilog=EXIT_CODES)
 def monitor(
     session: Annotated[Path, typer.Argument(help="Session folder.")],
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0 takes a free one.")] = 8707,
 ) -> None:
-    """Show a session's state as a live web page on this machine, until interrupted."""
+    """Show a session's state as a live web page on this machine, until interrupted.
+
+    Reads SESSION anew for each request, also while it is being taken; writes nothing.
+    """
     from acquisition.monitor import open_monitor
 
     with open_monitor(session, port) as server:
@@ -239,7 +249,7 @@ def monitor(
         server.serve_forever()
 
 
-@app.command("import")
+@app.command("import", epilog=EXIT_CODES)
 def import_(
     frames: Annotated[
         Path, typer.Argument(help="CSV of raw files, columns as frames.csv; with illuminations.csv beside.")
@@ -247,7 +257,10 @@ def import_(
     chart: Annotated[Path, typer.Argument(help="chart.json of the print.")],
     session: Annotated[Path, typer.Argument(help="New session folder.")],
 ) -> None:
-    """Make a session from raw files taken by other means; every file is copied and judged."""
+    """Make a session from raw files taken by other means; every file is copied and judged.
+
+    Reads FRAMES, illuminations.csv beside it, CHART and the raw files. Writes SESSION, as acquire run does.
+    """
     from acquisition.importing import import_session
     from drivers.console import progress
 

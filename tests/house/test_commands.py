@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -42,6 +43,10 @@ def commands_of(command: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
             yield (name, *path), found
 
 
+def paths_of(module: str) -> list[tuple[str, ...]]:
+    return [path for path, _ in commands_of(get_command(import_module(module).app))]
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_command_is_installed(command: str) -> None:
     entries = importlib.metadata.entry_points(group="console_scripts", name=command)
@@ -56,20 +61,33 @@ def test_help_tells_the_exit_codes_and_loads_nothing_heavy(module: str) -> None:
     assert done.stderr.splitlines()[-1] == "LOADED"
 
 
-@pytest.mark.parametrize("module", COMMANDS.values())
-def test_help_shows_all_that_is_written_of_every_option(
-    module: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("COLUMNS", "1000")
+@pytest.fixture(params=[(module, path) for module in COMMANDS.values() for path in paths_of(module)], ids=str)
+def shown(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> tuple[Any, str]:
+    """Return a command or subcommand and its help as it is shown, every run of blanks as one."""
+    module, path = request.param
     room = import_module(module)
-    for path, command in commands_of(get_command(room.app)):
-        monkeypatch.setattr(sys, "argv", ["command", *path, "--help"])
-        assert room.main() == 0
-        shown = capsys.readouterr().out
-        for option in command.params:
-            # Rich takes what stands in brackets for its own unless a backslash is before it.
-            written = (getattr(option, "help", None) or "").replace("\\[", "[")
-            assert " ".join(written.split()) in " ".join(shown.split()), f"{' '.join(path)} {option.name}"
+    monkeypatch.setenv("COLUMNS", "1000")
+    monkeypatch.setattr(sys, "argv", ["command", *path, "--help"])
+    assert room.main() == 0
+    return dict(commands_of(get_command(room.app)))[path], " ".join(capsys.readouterr().out.split())
+
+
+def test_help_shows_all_that_is_written_of_every_option(shown: tuple[Any, str]) -> None:
+    command, text = shown
+    for option in command.params:
+        # Rich takes what stands in brackets for its own unless a backslash is before it.
+        written = (getattr(option, "help", None) or "").replace("\\[", "[")
+        assert " ".join(written.split()) in text, option.name
+
+
+def test_help_says_what_is_read_and_written_and_how_it_ends(shown: tuple[Any, str]) -> None:
+    command, text = shown
+    assert re.search(r"Exit codes?: |Exit code 2 when ", text)
+    if not hasattr(command, "commands"):
+        assert "Reads " in text
+        assert re.search(r"\bwrites ", text, re.IGNORECASE)
 
 
 @pytest.mark.parametrize("module", COMMANDS.values())
