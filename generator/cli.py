@@ -273,6 +273,7 @@ def generate(
     ] = None,
 ) -> None:
     """Make a dataset."""
+    _require_alone({"--verify": verify, "--finish": finish}, lut)
     if contact_sheet is not None:
         _check_sheet(contact_sheet, verify or finish or out, shard)
     if verify is not None:
@@ -353,6 +354,17 @@ def generate(
         )
     _tell(dataset, out)
     _draw_sheet(dataset, out, contact_sheet)
+
+
+def _require_alone(commands: dict[str, str | None], more: Path | None) -> None:
+    """Refuse a second command beside one that needs its place only, and a table or place that it would not look at."""
+    from drivers.errors import InputError
+
+    given = [name for name, place in commands.items() if place is not None]
+    if len(given) > 1:
+        raise InputError(f"{' and '.join(given)} are two commands; give one of them")
+    if given and more is not None:
+        raise InputError(f"{given[0]} does not expect {more}; leave it out")
 
 
 @dataclass

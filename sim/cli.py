@@ -113,7 +113,7 @@ def camera(
     """Serve a simulated Canon EOS on a network or a USB cable: it photographs grey squares under white light.
 
     Reads and writes no file. Prints the address it listens on, then serves until interrupted (Ctrl-C), which is its
-    proper end: exit code 0. Exit code 2 when there is no such model or no port, 3 when the port is taken.
+    proper end: exit code 0. Exit code 2 when there is no such model or not exactly one cable, 3 when the port is taken.
 
     With --port, any software that speaks PTP/IP can use it, for instance (both connections go to one port):
 
@@ -139,10 +139,8 @@ def camera(
     from sim.usbip import serve_usbip
     from sim.world import REFERENCE_EXPOSURE, Room, World
 
-    if port is None and usbip is None:
-        raise ConfigurationError("name a cable: --port N for PTP/IP, --usbip N for USB/IP, or both")
-    if port is not None and usbip is not None:
-        raise ConfigurationError("one camera hangs on one cable: either --port or --usbip")
+    if (port is None) == (usbip is None):
+        raise ConfigurationError("one camera hangs on one cable: either --port N for PTP/IP or --usbip N for USB/IP")
     if model not in EOS_BODIES:
         raise ConfigurationError(f"--model {model!r}: known are {', '.join(sorted(EOS_BODIES))}")
     # A lamp that ages would be dark by now: its drift counts from the day when the simulated lab opened.

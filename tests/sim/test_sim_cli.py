@@ -122,6 +122,15 @@ def test_a_password_longer_than_the_standards_is_refused(
     assert "at most 32" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("cables", [(), ("--port", "0", "--usbip", "0")])
+def test_a_camera_hangs_on_one_cable(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], cables: tuple[str, ...]
+) -> None:
+    assert run(monkeypatch, "camera", *cables) == 2
+    told = "one camera hangs on one cable: either --port N for PTP/IP or --usbip N for USB/IP"
+    assert capsys.readouterr().err == f"error: {told}\n"
+
+
 def test_an_unknown_model_is_told_the_known_ones(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
