@@ -22,8 +22,6 @@ from drivers.pjlink import wire
 from drivers.projector import Fault, Power
 
 SEARCH = b"%2SRCH\r"
-ANSWER_WITHIN_S = 10.0
-"""A projector waits a random time up to this long, so that not all answer at once."""
 COLLECT_S = 30.0
 """So long a controller collects answers."""
 

@@ -307,11 +307,6 @@ class PropertyChanged:
         """The value as text."""
         return text_of(self.value)
 
-    @property
-    def image_format(self) -> ImageFormat:
-        """The value as an image format; ProtocolError where it is none."""
-        return ImageFormat.decode(self.value)
-
 
 @dataclass(frozen=True)
 class AvailableValues:
@@ -521,38 +516,3 @@ def _encode_transfer_request(record: TransferRequest) -> bytes:
             text_value(record.name) + bytes(record.padding),
         )
     )
-
-
-# The group record of newer bodies.
-
-_OLC_SIZES: tuple[tuple[int, tuple[int, ...]], ...] = (
-    (0x14, (2, 9, 9, 7, 4, 6, 8, 5, 7, 5, 5, 9, 8)),
-    (0x13, (2, 7, 9, 7, 4, 6, 8, 5, 7, 5, 5, 9, 8)),
-    (0x12, (2, 7, 9, 6, 4, 6, 8, 5, 7, 5, 5, 9, 8)),
-    (0x11, (2, 7, 6, 6, 4, 6, 8, 4, 6, 5, 5, 9, 8)),
-    (0x0F, (2, 7, 6, 4, 4, 6, 8, 4, 6, 5, 5, 9, 1)),
-    (0x0B, (2, 6, 5, 4, 4, 6, 8, 4, 6, 5, 5, 9, 1)),
-    (0x08, (2, 6, 5, 4, 4, 6, 7, 4, 6, 7, 7, 8, 1)),
-    (0x07, (2, 6, 5, 4, 4, 6, 7, 4, 6, 5, 5, 8, 1)),
-)
-"""Bytes of the fields 0x0001, 0x0002, … 0x1000, from the version on (property 0xd199)."""
-OLC_SHUTTER, OLC_APERTURE, OLC_ISO, OLC_FOCUS = 0x0002, 0x0004, 0x0008, 0x0100
-
-
-def decode_olc_info(body: bytes, version: int) -> dict[int, bytes]:
-    """Return the fields in the body of a record of type 0xc1a5, by their bit in its mask.
-
-    `version` is the body's property 0xd199. Some versions' sizes are inferred from their neighbours: where they do not
-    add up to the record's, there are no fields, for none could be trusted. No body sends this record before
-    SetRequestOLCInfoGroup asks for it.
-    """
-    cursor = Cursor(body, describe(EosEvent, EosEvent.OLC_INFO_CHANGED))
-    length, mask = cursor.u32("length"), cursor.u16("mask")
-    if length not in (len(body), len(body) + 4):
-        raise cursor.fault("length", f"{len(body)} or {len(body) + 4}", length, at=0)
-    cursor.take(2, "reserved")
-    known = next((sizes for first, sizes in _OLC_SIZES if version >= first), ())
-    sizes = {1 << bit: size for bit, size in enumerate(known) if mask >> bit & 1}
-    if sum(sizes.values()) != cursor.left:
-        return {}
-    return {bit: cursor.take(size, f"field 0x{bit:04x}") for bit, size in sizes.items()}

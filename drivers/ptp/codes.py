@@ -404,8 +404,6 @@ class ReleaseButton(IntEnum):
 
 VENDOR_CANON_USB = 0x04A9
 """Canon's USB vendor id."""
-EOS_MODEL_IDS = {0x80000270: "Canon EOS 550D", 0x80000287: "Canon EOS 60D", 0x80000406: "Canon EOS 6D Mark II"}
-"""Property 0xd116 of the bodies that we know."""
 
 
 def describe(kind: type[IntEnum], code: int) -> str:

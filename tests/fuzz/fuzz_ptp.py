@@ -94,10 +94,6 @@ def _feed_ip() -> Callable[[bytes], list[object]]:
     return lambda piece: [*cutter.feed(piece)]
 
 
-def _olc(data: bytes) -> None:
-    canon.decode_olc_info(data[1:], data[0] if data else 0)
-
-
 CHECKS: tuple[tuple[Callable[[bytes], None], tuple[bytes, ...]], ...] = (
     (_both(DeviceInfo.decode, DeviceInfo.encode), (examples.DEVICE_INFO,)),
     (_both(ObjectInfo.decode, ObjectInfo.encode), (examples.OBJECT_INFO,)),
@@ -120,7 +116,6 @@ CHECKS: tuple[tuple[Callable[[bytes], None], tuple[bytes, ...]], ...] = (
     (_both(ptpip.decode, ptpip.encode), examples.IP_PACKETS),
     (_stream(_feed_usb), (examples.USB_STREAM, examples.EOS_400D_SHOT)),
     (_stream(_feed_ip), (b"".join(examples.IP_PACKETS),)),
-    (_olc, (b"\x08" + examples.OLC_SHUTTER, b"\x08" + examples.OLC_APERTURE)),
 )
 
 

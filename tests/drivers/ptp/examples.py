@@ -51,9 +51,6 @@ STATE = bytes.fromhex(
     "02000000 10000000 06000000 00000000 04000000 10000000 01000000 00000000 03000000"
     "0c000000 8bc10000 01000000  0a000000 fec10000 abcd  08000000 00000000"
 )
-# EOS M6, first answer to 0x9116: three group records.
-OLC_APERTURE = bytes.fromhex("0d000000 0400 0000 0000000000")
-OLC_SHUTTER = bytes.fromhex("0e000000 0200 0000 000000000000")
 # libgphoto2's ptp.h: GetObjectInfoEx on a body of 2006, a folder; and its ptp-pack.c: a picture.
 FOLDER_ENTRY = bytes.fromhex(
     "38000000 00000030 01000000 01300000 01000000 10000000 00000000 00000020 00000030"
@@ -121,7 +118,6 @@ READERS: tuple[tuple[str, Callable[[bytes], object], bytes], ...] = (
     ("GetEvent, shot", canon.decode_events, EOS_400D_SHOT[12:]),
     ("GetEvent, transfer", canon.decode_events, TRANSFER_REQUEST),
     ("GetEvent, state", canon.decode_events, STATE),
-    ("OLC", lambda data: canon.decode_olc_info(data, 8), OLC_SHUTTER),
     ("GetObjectInfoEx", canon.decode_object_entries, OBJECT_ENTRIES),
     ("DeviceInfoEx", canon.DeviceInfoEx.decode, DEVICE_INFO_EX),
     ("setting", canon.PropertySetting.decode, SETTING),

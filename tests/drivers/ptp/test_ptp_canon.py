@@ -295,34 +295,3 @@ def test_a_device_and_what_it_reports() -> None:
     info = DeviceInfoEx((0xC181, 0xC189), (0xD101,), (4,))
     assert info.encode() == examples.DEVICE_INFO_EX
     assert DeviceInfoEx.decode(examples.DEVICE_INFO_EX) == info
-
-
-@pytest.mark.parametrize(
-    ("version", "bit", "octets"),
-    [
-        (0x07, canon.OLC_SHUTTER, "010198100060"),  # 6D and others
-        (0x07, canon.OLC_APERTURE, "01015b3030"),
-        (0x07, canon.OLC_ISO, "01010078"),
-        (0x0B, canon.OLC_FOCUS, "000000000101"),  # 5Ds
-        (0x0F, canon.OLC_SHUTTER, "01039810007000"),  # 200D
-        (0x10, canon.OLC_APERTURE, "010150202000"),
-        (0x11, canon.OLC_SHUTTER, "0101a00c000c00"),  # R
-        (0x12, canon.OLC_APERTURE, "01030058002d003000"),  # M6 Mark II
-        (0x12, canon.OLC_ISO, "0101006b6828"),
-    ],
-)
-def test_fields_have_the_sizes_that_bodies_sent(version: int, bit: int, octets: str) -> None:
-    # Fields quoted in libgphoto2's ptp-pack.c, each alone in a record.
-    value = bytes.fromhex(octets)
-    body = (8 + len(value)).to_bytes(4, "little") + bit.to_bytes(4, "little") + value
-    assert canon.decode_olc_info(body, version) == {bit: value}
-
-
-def test_groups_of_newer_bodies() -> None:
-    # EOS M6, version 8; the shutter's and the aperture's fields arrive alone.
-    assert canon.decode_olc_info(examples.OLC_SHUTTER, 8) == {canon.OLC_SHUTTER: bytes(6)}
-    assert canon.decode_olc_info(examples.OLC_APERTURE, 8) == {canon.OLC_APERTURE: bytes(5)}
-    # Sizes of another version do not fit, those of no version are not known.
-    assert canon.decode_olc_info(examples.OLC_SHUTTER, 0x0F) == canon.decode_olc_info(examples.OLC_SHUTTER, 0) == {}
-    with pytest.raises(ProtocolError, match="length"):
-        canon.decode_olc_info(examples.OLC_SHUTTER[:-1] + b"\0\0", 8)

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from drivers.ptp import canon, container
 from drivers.ptp.apex import APERTURE, ISO
-from drivers.ptp.canon import AvailableValues, DeviceInfoEx, Notice, PropertyChanged, PropertySetting
-from drivers.ptp.codes import EOS_MODEL_IDS, Operation, Property
+from drivers.ptp.canon import AvailableValues, DeviceInfoEx, ImageFormat, Notice, PropertyChanged, PropertySetting
+from drivers.ptp.codes import Operation, Property
 from drivers.ptp.container import ContainerReader, DataPiece, DataStart
 from drivers.ptp.datasets import (
     DeviceInfo,
@@ -102,10 +102,10 @@ def test_the_state_dump(recording: list[Recorded]) -> None:
     }
     assert isinstance(records[77], Notice)
     state = {record.code: record for record in records if isinstance(record, PropertyChanged)}
-    assert EOS_MODEL_IDS[state[Property.EOS_MODEL_ID].number] == "Canon EOS 60D"
+    assert state[Property.EOS_MODEL_ID].number == 0x80000287  # An EOS 60D.
     assert ISO.value(state[Property.EOS_ISO_SPEED].number) == 1600
     assert APERTURE.value(state[Property.EOS_APERTURE].number) == 4
-    assert str(state[Property.EOS_IMAGE_FORMAT].image_format) == "JPEG L fine"
+    assert str(ImageFormat.decode(state[Property.EOS_IMAGE_FORMAT].value)) == "JPEG L fine"
     lists = {record.code: record.values for record in records if isinstance(record, AvailableValues)}
     assert lists[Property.EOS_CAPTURE_DESTINATION] == (2, 4, 6)
     assert APERTURE.labels(lists[Property.EOS_APERTURE]).startswith("3.5, 4, 4.5, 5, 5.6, 6.3")
