@@ -99,7 +99,8 @@ def import_session(
     Raises
     ------
     FormatError
-        The list, the chart, the lights or a hash is wrong; no session is left behind.
+        The list, the chart, the lights or a hash is wrong, or two lights have the same raw file; no session is left
+        behind.
     InputError
         `folder` holds something already.
     """
@@ -115,10 +116,13 @@ def import_session(
     settings = LabSettings(rig="imported", chart=chart, illuminations=frame_list.parent / "illuminations.csv")
     steps = [_step(number, frame, lights) for number, frame in enumerate(frames)]
     refused: list[str] = []
+    taken: dict[str, ListedFrame] = {}
     with Session.create(folder, settings.to_toml(), loaded, lights, steps) as session:
         try:
             for step, frame in zip(steps, frames, strict=True):
-                reason = _take_over(session, step, frame, settings)
+                reason, sha256 = _take_over(session, step, frame, settings)
+                if frame.kind == "light":
+                    _require_another_light(taken.setdefault(sha256, frame), frame, frame_list)
                 if reason:
                     refused.append(f"{frame.path.name}: {reason}")
                 observe(step.number + 1, len(frames))
@@ -137,7 +141,9 @@ def _step(number: int, frame: ListedFrame, lights: tuple[Illumination, ...]) -> 
     return Step(number, frame.kind, frame.illumination, colour)
 
 
-def _take_over(session: Session, step: Step, frame: ListedFrame, settings: LabSettings) -> str | None:
+def _take_over(session: Session, step: Step, frame: ListedFrame, settings: LabSettings) -> tuple[str | None, str]:
+    """Copy and judge a frame; return why it is refused, None if it is not, and the SHA-256 of its file."""
+
     def copy(into: BinaryIO) -> CapturedFrame:
         with frame.path.open("rb") as stream:
             shutil.copyfileobj(stream, into, 1 << 20)
@@ -160,7 +166,16 @@ def _take_over(session: Session, step: Step, frame: ListedFrame, settings: LabSe
         verdict=ACCEPTED if reason is None else REFUSED,
         reason=reason or "",
     )
-    return reason
+    return reason, received.sha256
+
+
+def _require_another_light(first: ListedFrame, frame: ListedFrame, frame_list: Path) -> None:
+    """Refuse a raw file that is listed for two lights."""
+    if first.illumination != frame.illumination:
+        raise FormatError(
+            f"{frame_list}: lights {first.illumination} and {frame.illumination} have the same raw file, "
+            f"{first.path.name} and {frame.path.name}; list each light's own"
+        )
 
 
 def _modified(path: Path) -> datetime:

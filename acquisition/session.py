@@ -172,6 +172,21 @@ class Session:
         self.illuminations: tuple[Illumination, ...] = load_illuminations(folder / "illuminations.csv")
         rows = journal.execute("SELECT step, kind, illumination, red, green, blue FROM plan ORDER BY step")
         self.steps: tuple[Step, ...] = tuple(Step(row[0], row[1], row[2], Colour(*row[3:])) for row in rows)
+        self._require_planned_lights()
+
+    def _require_planned_lights(self) -> None:
+        """Refuse lights that are not those of the plan: what was shown would bear other codes."""
+        for step in self.steps:
+            if step.illumination is None:
+                continue
+            known = self.illuminations[step.illumination : step.illumination + 1]
+            if not known or known[0].colour != step.colour:
+                says = "has no such light" if not known else f"says {_codes(known[0].colour)}"
+                raise FormatError(
+                    f"{self.folder / 'illuminations.csv'} is not what the session was taken with: light "
+                    f"{step.illumination} was planned as {_codes(step.colour)}, the file {says}; "
+                    "restore it from a copy"
+                )
 
     @property
     def frames_folder(self) -> Path:
@@ -228,7 +243,7 @@ class Session:
         Raises
         ------
         FormatError
-            The folder is no session, or one of a version not known here.
+            The folder is no session, one of a version not known here, or its lights are not those of its plan.
         """
         path = folder / "journal.sqlite"
         if not path.is_file():
@@ -494,6 +509,10 @@ def _connect(path: Path) -> sqlite3.Connection:
         journal.close()
         raise
     return journal
+
+
+def _codes(colour: Colour) -> str:
+    return f"{colour.red} {colour.green} {colour.blue}"
 
 
 def _text(at: datetime) -> str:

@@ -28,7 +28,6 @@ from calibration.choices import Choices
 from calibration.darkness import DarkFigures, additivity, drift_gains
 from calibration.frames import (
     Progress,
-    accepted_lights,
     ahead,
     best_frame,
     chosen_frames,
@@ -38,6 +37,7 @@ from calibration.frames import (
     session_sha256,
 )
 from calibration.growing import Checkpoint, Growing, growing
+from calibration.labels import angles_off_codes_deg
 from calibration.linearity import read_linearity
 from calibration.lut import SAMPLES as SAMPLES_FILE
 from calibration.lut import LutWriter, Provenance
@@ -48,7 +48,7 @@ from calibration.references import references_csv
 from calibration.result import BuildResult, Growth
 from calibration.subtraction import DarkLight
 from calibration.tally import Tally
-from calibration.verdict import refusal
+from calibration.verdict import refusal, truth_errors_deg
 from drivers.errors import FormatError, QualityError, RegistrationError
 from drivers.storage import write_whole
 
@@ -86,13 +86,14 @@ def check(
     Raises
     ------
     FormatError
-        No frame can be used, or the file is not what the journal says.
+        No frame can be used, two lights have the same file, or the file is not what the journal says.
     RegistrationError
         The chart is not found, or not the one expected.
     QualityError
         The white references cannot be used.
     """
     _require_darks(session, choices)
+    _, missing = chosen_frames(session)
     best = best_frame(session)
     decoded = decode(session, best)
     try:
@@ -118,7 +119,7 @@ def check(
         camera=decoded.mosaic.camera,
         registration=work.first.registration,
         registered_file=best.file,
-        lights=len({record.illumination for record in accepted_lights(session)}),
+        lights=len(session.illuminations) - len(missing),
         white=figures.paper.white[None],
         white_error=figures.paper.error[None],
         white_level=round(decoded.saturation - float(decoded.black.mean())),
@@ -437,6 +438,7 @@ class _Work:
             at_zero=at_zero,
             linearity=self._linearity,
             primaries=work.primaries,
+            off_codes_deg=angles_off_codes_deg(lights, white / gains, truth_errors_deg(white, error)),
         )
         records = [figures.record for figures in self._figures]
         self._writer.finish(

@@ -311,6 +311,7 @@ def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
 
 def _tell(result: BuildResult) -> None:
     from calibration.report import summary
+    from calibration.verdict import where
 
     names = {
         "Tags found",
@@ -326,7 +327,8 @@ def _tell(result: BuildResult) -> None:
             print(f"{name + ':':17}{value}" + (f"  ({note})" if note else ""))
     verdict = result.verdict
     for row in verdict.remarks:
-        print(f"remark: {row.text()}; {row.threshold.remedy}")
+        found = where(row, result)
+        print(f"remark: {row.text()}{f', {found}' if found else ''}; {row.threshold.remedy}")
     print(f"{'Verdict:':17}{verdict.outcome}")
     if verdict.refused:
         return

@@ -73,11 +73,24 @@ def chosen_frames(session: Session) -> tuple[list[FrameRecord], list[int]]:
     """Return the frames a table is made of, and the lights that have none.
 
     The frames are every light's last accepted, and the white and dark ones, in the order taken.
+
+    Raises
+    ------
+    FormatError
+        Two lights have the same raw file.
     """
     last: dict[int, FrameRecord] = {}
     for record in accepted_lights(session):
         if record.illumination is not None:
             last[record.illumination] = record
+    lights_of: dict[str, int] = {}
+    for light, record in last.items():
+        other = lights_of.setdefault(record.sha256, light)
+        if other != light:
+            raise FormatError(
+                f"{session.folder}: lights {other} and {light} have the same raw file, {record.file}, SHA-256 "
+                f"{record.sha256[:16]}…; each light has its own, so correct the list of frames and import it again"
+            )
     missing = [light.index for light in session.illuminations if light.index not in last]
     others = [record for record in session.frames() if record.kind in ("white", "dark") and record.accepted]
     return sorted([*last.values(), *others], key=lambda record: (record.taken_at, record.file)), missing

@@ -258,6 +258,16 @@ def _light_figures(result: BuildResult) -> list[tuple[str, str, str]]:
                 + ("not subtracted" if result.subtracted is None else "subtracted from samples and ground truth"),
             )
         )
+    if result.off_codes_deg is not None:
+        worst = int(np.argmax(result.off_codes_deg))
+        told.append(
+            (
+                "Lights and their codes",
+                f"{result.off_codes_deg[worst]:.2f}° at most, light {worst}",
+                "angle of a white from what its codes give by a smooth model through all lights, beyond four standard "
+                "errors",
+            )
+        )
     if result.added is not None:
         told.append(("Red + green + blue − white", _percents(result.added), "of white; 0 where light adds"))
     tints = zip(result.grey_names, grey_tints_deg(result).tolist(), strict=True)

@@ -80,6 +80,8 @@ class BuildResult:
     primaries
         The primaries each alone, by which the field of coloured cells was told from that of paper; None where the plan
         has no light of each alone, or it is too dim.
+    off_codes_deg
+        (L,) how far each white is off what its codes give, degrees (`calibration.labels`); None where not told.
     """
 
     session: Path
@@ -109,6 +111,7 @@ class BuildResult:
     at_zero: _Array = field(default_factory=lambda: np.zeros(0))
     linearity: Linearity | None = None
     primaries: Primaries | None = None
+    off_codes_deg: _Array | None = None
 
     @property
     def verdict(self) -> Verdict:

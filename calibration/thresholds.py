@@ -182,6 +182,14 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
     ),
     Threshold(
+        "off_codes_deg", "White of a light against what its codes give", "°", "at most", 2.0, 8.0,
+        "a frame bears another light's name, or was taken before the picture changed: codes in the table are not those "
+        "of its whites",
+        SIMULATED + ": .2 and less, with wheels of six segments, any gamma and 10 % of drift to .5; a list of frames "
+        "shifted by a row gives 28 and more, an exchange of two lights the angle between them",
+        "correct the list of frames that was imported, or let the picture settle for longer (sequence.settle_s)",
+    ),
+    Threshold(
         "grey_tint_deg", "Tint of the print's greys against paper", "°", "at most", 6.0, None,
         "greys are not neutral; the ground truth is paper's, so methods that trust in grey are judged by another grey",
         JUDGEMENT + "; the simulated print, without colour management, has 4.5",

@@ -163,6 +163,8 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         figures["linearity"] = result.linearity.worst
     if result.added is not None:
         figures["additivity"] = float(np.abs(result.added).max())
+    if result.off_codes_deg is not None:
+        figures["off_codes_deg"] = float(result.off_codes_deg.max())
     if (tint := grey_tints_deg(result)).size and np.isfinite(tint).any():
         figures["grey_tint_deg"] = float(np.nanmax(tint))
     if result.transfer is not None:
@@ -229,9 +231,8 @@ def refusal(verdict: Verdict, result: BuildResult) -> str:
     worst = verdict.refused[0]
     remedy = worst.threshold.remedy
     more = f" (and {len(verdict.refused) - 1} more)" if len(verdict.refused) > 1 else ""
-    detail = ""
-    if worst.threshold.name in ("softer_bleed", "unlike_scatter", "unlike_block"):
-        detail = f", {_most_unlike(result, worst.threshold.name)}"
+    found = where(worst, result)
+    detail = f", {found}" if found else ""
     if worst.threshold.name == "unfit_share":
         causes: dict[str, int] = {}
         for cell in result.unfit:
@@ -242,16 +243,29 @@ def refusal(verdict: Verdict, result: BuildResult) -> str:
     return f"{worst.text()}{detail}{more}; {remedy}, and take the session anew"
 
 
-def _most_unlike(result: BuildResult, name: str) -> str:
-    """Return in which frame the worst of a figure is, and where on the print."""
-    if name == "softer_bleed":
-        softest = max(result.frames, key=lambda frame: frame.blur_px)
-        return f"in {softest.record.file}, blurred by {softest.blur_px:.2f} px"
-    if name == "unlike_scatter":
-        return f"in {max(result.frames, key=lambda frame: frame.likeness.scatter).record.file}"
-    frame = max(result.frames, key=lambda frame: frame.likeness.block)
-    x_mm, y_mm = frame.likeness.at_mm
-    return f"in {frame.record.file} about {x_mm:.0f}, {y_mm:.0f} mm"
+def where(row: Judged, result: BuildResult) -> str:
+    """Return in which frame or lights the worst of a figure is, and where on the print; "" where it has no place."""
+    match row.threshold.name:
+        case "softer_bleed":
+            softest = max(result.frames, key=lambda frame: frame.blur_px)
+            return f"in {softest.record.file}, blurred by {softest.blur_px:.2f} px"
+        case "unlike_scatter":
+            return f"in {max(result.frames, key=lambda frame: frame.likeness.scatter).record.file}"
+        case "unlike_block":
+            frame = max(result.frames, key=lambda frame: frame.likeness.block)
+            x_mm, y_mm = frame.likeness.at_mm
+            return f"in {frame.record.file} about {x_mm:.0f}, {y_mm:.0f} mm"
+        case "off_codes_deg":
+            lights = lights_off_codes(result, row.threshold.accept)
+            return f"{len(lights)} lights: {', '.join(map(str, lights[:10]))}{' …' if len(lights) > 10 else ''}"
+        case _:
+            return ""
+
+
+def lights_off_codes(result: BuildResult, accept_deg: float) -> list[int]:
+    """Return the lights whose white is further than that off what their codes give, the furthest first."""
+    off = np.zeros(0) if result.off_codes_deg is None else result.off_codes_deg
+    return [int(light) for light in np.argsort(-off) if off[light] > accept_deg]
 
 
 def _channels(result: BuildResult) -> dict[str, Any]:
@@ -293,6 +307,9 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "camera": result.camera,
         "lights": result.lights,
         "channels": _channels(result),
+        "off_codes_deg": None
+        if result.off_codes_deg is None
+        else [float(f"{angle:.3g}") for angle in result.off_codes_deg.tolist()],
         "primaries_differ": None if result.primaries is None else float(f"{result.primaries.difference:.3g}"),
         "figures": {name: float(f"{value:.6g}") for name, value in figures.items()},
         "limits": [asdict(row.threshold) | {"outcome": row.outcome} for row in verdict.rows],

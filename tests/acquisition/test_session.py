@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sqlite3
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
-from acquisition.illuminations import Illumination
+from acquisition.illuminations import Illumination, save_illuminations
 from acquisition.layout import design_chart
 from acquisition.session import Session, plan_steps
 from drivers.camera import CapturedFrame
@@ -103,6 +104,20 @@ def test_a_session_is_never_made_over_something(tmp_path: Path, session: Session
 def test_no_session(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"holds no journal\.sqlite"):
         Session.open(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("lights", "said"),
+    [
+        ((LIGHTS[0], replace(LIGHTS[1], colour=LIGHTS[2].colour), *LIGHTS[2:]), "planned as 255 1 0, the file says"),
+        (LIGHTS[:4], "light 4 was planned as 255 4 0, the file has no such light"),
+    ],
+)
+def test_lights_edited_since_are_refused(session: Session, lights: tuple[Illumination, ...], said: str) -> None:
+    session.close()
+    save_illuminations(lights, session.folder / "illuminations.csv")
+    with pytest.raises(FormatError, match=rf"illuminations\.csv is not what .*{said}.*; restore it from a copy"):
+        Session.open(session.folder)
 
 
 def test_a_damaged_journal(session: Session) -> None:

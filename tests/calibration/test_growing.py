@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Generator
 from contextlib import closing
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -187,19 +188,21 @@ def test_a_table_follows_its_session(growing_session: Session, undisturbed: dict
     assert files(out) == undisturbed
 
 
-def test_a_light_taken_again_is_taken_in_again(growing_session: Session, tmp_path: Path) -> None:
+def test_a_light_taken_again_is_taken_in_again(
+    growing_session: Session, undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
     """What had been taken in of it before must not stay."""
     session = growing_session
-    victim = next(record for record in session.frames() if record.illumination == 2)
-    other = next(record for record in session.frames() if record.illumination == 3)
+    one, other = (next(r for r in session.frames() if r.illumination == light) for light in (2, 3))
     show(session, 6)
     append(session, tmp_path / "lut")
-    change = "UPDATE attempts SET sha256=?, file=? WHERE file=?"
-    alter(session, change, [(other.sha256, other.file, victim.file)])
+    change = "UPDATE attempts SET sha256=?, file=? WHERE illumination=?"
+    alter(session, change, [(other.sha256, other.file, "2"), (one.sha256, one.file, "3")])
     show(session, 100)
     append(session, tmp_path / "lut")
-    lut = open_lut(tmp_path / "lut")
-    assert np.array_equal(lut.samples[2], lut.samples[3])
+    lut, before = open_lut(tmp_path / "lut"), np.load(BytesIO(undisturbed["samples.npy"]))
+    assert np.array_equal(lut.samples[2], before[3])
+    assert np.array_equal(lut.samples[3], before[2])
 
 
 def test_two_programs_do_not_make_one_table(session: Session, tmp_path: Path) -> None:
