@@ -78,6 +78,9 @@ Four even stops show whether a frame is linear, and the darkest is still some hu
 exposed. None is a colour of the chart: its low bits are not zero.
 """
 
+LEAST_WHITES = 18
+"""White references from which on calibration sees the light fall towards the corners; fewer tell a slope alone."""
+
 _PX_MM = 25.4 / DESIGN_DPI
 _Slots = npt.NDArray[np.bool_]
 
@@ -134,7 +137,7 @@ def _tag_starts(slots: int) -> list[int]:
 
 
 def _least_references(bits: int) -> int:
-    """Return the fewest references: one of each grey and four whites a quarter, and one for 40 colours."""
+    """Return the fewest references: three of each grey and 20 whites, and one for 40 colours."""
     return max(32, 8**bits // 40)
 
 
@@ -358,12 +361,17 @@ def _tag(grid: _Grid, number: int, column: int, row: int) -> Tag:
 
 
 def _references(grid: _Grid, referenced: _Slots, rng: np.random.Generator) -> list[Reference]:
-    """Give each level of grey an eighth of the references, evenly over the field, and leave the rest white."""
+    """Give each level of grey an eighth of the references, evenly over the field, and leave the rest white.
+
+    Where they are few the greys get less, so that there are `LEAST_WHITES`.
+    """
     codes = np.zeros(referenced.shape, dtype=np.int64)
     codes[referenced] = PAPER_WHITE[0]
     left = referenced.copy()
+    count = int(referenced.sum())
+    each = min(count // (2 * len(GREY_CODES)), (count - LEAST_WHITES) // len(GREY_CODES))
     for code in GREY_CODES:
-        chosen = spread(left, int(referenced.sum()) // (2 * len(GREY_CODES)), rng)
+        chosen = spread(left, each, rng)
         codes[chosen] = code
         left &= ~chosen
     return [

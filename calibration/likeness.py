@@ -8,6 +8,8 @@ polynomial's own error, strewn over the sheet as the codes are, and what ought n
 
 - `scatter`, over all cells: blur mixes neighbours, another order of cells fits nothing;
 - `block`, the mean over neighbouring cells: a hand, a shadow, a reflection lies in one place.
+
+Charts of 8 and 64 cells have no more cells than the polynomial has terms, or twice as many: they tell nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.colours import code_polynomial
+from calibration.colours import code_polynomial, code_powers
 from calibration.fitting import least_squares, product
 
 DEGREE = 4
@@ -30,6 +32,9 @@ CELLS = 8192
 FIT_CELLS = 1500
 BLOCK_CELLS = 32
 LEAST_CELLS = 12
+CELLS_A_TERM = 2
+"""With fewer cells for each term, what is wrong would be fitted, or what is right not."""
+
 _ROUNDS = 3
 _CERTAIN = 4.0
 """Standard errors that are taken off a block's mean before it counts."""
@@ -78,6 +83,11 @@ class _Channel:
         return _Channel(terms, level, there, some, terms[some] * level[some, None])
 
 
+def can_tell(cells: int) -> bool:
+    """Return whether a chart of so many cells can be held against its codes at all."""
+    return cells >= CELLS_A_TERM * len(code_powers(DEGREE))
+
+
 class Expectation:
     """What cells should look like under any light, from one frame of the print.
 
@@ -100,7 +110,7 @@ class Expectation:
 
     def __init__(self, rgb: npt.ArrayLike, cells_mm: _Array, level: _Array, usable: _Mask) -> None:
         self.cells = slice(None, None, max(1, len(cells_mm) // CELLS))
-        terms = code_polynomial(np.asarray(rgb)[self.cells], DEGREE if len(cells_mm) >= 200 else 1)
+        terms = code_polynomial(np.asarray(rgb)[self.cells], DEGREE)
         self._usable = usable[self.cells]
         self._channels = [_Channel.of(terms, level[self.cells, channel], self._usable) for channel in range(3)]
         self._block, self._middles = _blocks(cells_mm[self.cells])
@@ -124,7 +134,7 @@ class Expectation:
         return worst
 
     def _of_channel(self, known: _Channel, mean: _Array, variance: _Array) -> Likeness:
-        if len(known.there) < 2 * known.terms.shape[1]:
+        if len(known.there) < CELLS_A_TERM * known.terms.shape[1]:
             return Likeness()
         design, level, seen = known.design, known.level[known.some], mean[known.some]
         # Each cell counts by what it should tell, not by what it does: what is covered would count most.

@@ -45,6 +45,9 @@ MAX_BLUR_PX = 1.0
 """σ of the tags' edges up to which cells of any size are found to a few hundredths of a pixel, as `acquire check` has
 it. What such a blur mixes into the samples depends on the cells' size, and the verdict judges it as bleed."""
 
+ROOM_PX = 1.75
+"""From there to the edge of a cell of 10 px, for which the limits of places were found."""
+
 MAX_TAG_RESIDUAL_PX = 8.0
 """RMS of the tags against homography and distortion; 2.3 is a sheet that waves by 6 mm and curls by 10."""
 
@@ -69,6 +72,9 @@ _FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
 _FEW_SLIPPED = 2
 _SLIPPED_SHARE = 0.015
 """Parts of a field from which on it is refused; none looks slipped in any simulated room that is registered well."""
+
+_LEAST_COLOURS = 64
+"""A model fitted on fewer colours is no judge of one of them."""
 
 _STRANGE_SIGMA = 10.0
 _NEIGHBOURS = 13
@@ -142,6 +148,14 @@ class Registration:
     def block_rms_px(self) -> float:
         """RMS of what the good blocks would still ask for: the registration's own estimate of its error."""
         return rms(self.blocks.residual_px[self.blocks.good])
+
+    @property
+    def room(self) -> float:
+        """How much further samples are from their cells' edges than in cells of 10 px, ≥ 1: places matter less by it.
+
+        Cells of a hundred pixels are found to a pixel, which is nothing to them.
+        """
+        return max(1.0, (self.cell_px / 2 - SAMPLE_REACH_PX) / ROOM_PX)
 
 
 def register(
@@ -287,9 +301,11 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
     residual = marks.places_px - matcher.to_pixels(marks.points_mm)
     if framing.field is not None:
         residual = (residual * framing.field.normals).sum(axis=1, keepdims=True) * framing.field.normals
-    strangers = _with_neighbours(
-        _strangers(seen, wanted, paper)[: chart.colour_count], chart.centres_mm / np.array(chart.cell_mm)
-    )
+    strangers = np.zeros(chart.colour_count, dtype=np.bool_)
+    if chart.colour_count >= _LEAST_COLOURS:
+        strangers = _with_neighbours(
+            _strangers(seen, wanted, paper)[: chart.colour_count], chart.centres_mm / np.array(chart.cell_mm)
+        )
     blocks = matcher.blocks()
     if not chart.tags:
         there[: chart.colour_count] &= ~strangers
@@ -354,8 +370,9 @@ def _judge(registration: Registration, least_agreement: float, what: str) -> Non
             what,
             f"{share:.0%} of the blocks of cells look as the chart has them, at least {MIN_GOOD_BLOCKS:.0%} needed",
         )
-    if registration.block_rms_px > MAX_BLOCK_RESIDUAL_PX:
+    allowed = MAX_BLOCK_RESIDUAL_PX * registration.room
+    if registration.block_rms_px > allowed:
         raise RegistrationError(
             f"{what}: blocks of cells still ask for movements of {registration.block_rms_px:.2f} px RMS, "
-            f"{MAX_BLOCK_RESIDUAL_PX:g} allowed; hang the print flatter"
+            f"{allowed:.2g} allowed; hang the print flatter"
         )

@@ -10,6 +10,7 @@ Laws that hold inside:
   ink or paper, and next to nothing in common with the cell's own place.
 - A cell is judged by its neighbourhood: one deviating cell is the prediction's error or noise. Beside a stain it is
   judged alone as well, for a neighbourhood sees a stain's rim but half.
+- Of charts of less than `LEAST_BITS` nothing is told: between four levels of a code curvature does not change slowly.
 - A deviation must be significant and large enough to matter. What is found is listed, never corrected.
 """
 
@@ -38,6 +39,8 @@ RIM_SIGMA = 4.0
 
 LEAST_COUNTS = 30.0
 """Darker cells tell nothing: a count of stray light is 3 % of them."""
+
+LEAST_BITS = 3
 
 _ROUNDS = 3
 _Array = npt.NDArray[np.float64]
@@ -101,6 +104,9 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     usable
         (8**bits,) bool, cells whose level means anything: not covered, cut off or clipped.
     """
+    if bits < LEAST_BITS:
+        unknown = np.full(level.shape, np.nan)
+        return Stains(unknown, unknown, unknown, np.zeros(len(level), dtype=np.bool_))
     usable = np.ones(len(level), dtype=np.bool_) if usable is None else usable
     near = np.asarray(cKDTree(centres_mm).query(centres_mm, k=min(NEIGHBOURS, len(level)))[1])
     near = near.reshape(len(level), -1)

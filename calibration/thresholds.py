@@ -95,12 +95,14 @@ THRESHOLDS: tuple[Threshold, ...] = (
     ),
     Threshold(
         "tag_final_px", "Tags against the final map", "px RMS", "at most", 0.4, 2.0,
-        "cells and tags disagree about where the print is", SIMULATED + ": 0.05 to 0.2, the detector's own error 0.09",
+        "cells and tags disagree about where the print is; of cells of 10 px, larger ones leave more room",
+        SIMULATED + ": 0.05 to 0.2, the detector's own error 0.09",
         "check that chart.json is that of the print, and that the print is one flat sheet",
     ),
     Threshold(
         "block_residual_px", "Movement that blocks still ask for", "px RMS", "at most", 0.1, MAX_BLOCK_RESIDUAL_PX,
-        "cells are sampled beside their centres", SIMULATED + ": 0.01 to 0.06", _HANG,
+        "cells are sampled beside their centres; of cells of 10 px, larger ones leave more room",
+        SIMULATED + ": 0.01 to 0.06", _HANG,
     ),
     Threshold(
         "blocks_good", "Blocks that look like the chart", "share", "at least", 0.98, MIN_GOOD_BLOCKS,

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.choices import WINDOWS
+from calibration.likeness import can_tell
 from calibration.linearity import curve
 from calibration.references import tint_deg
 from calibration.sampling import WINDOW
@@ -133,17 +134,14 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "cell_px": registration.cell_px,
         "bleed": bleed(registration.cell_px, registration.blur_px, result.window),
         "tag_residual_px": registration.lens_residual_px,
-        "tag_final_px": registration.marks_rms_px,
-        "block_residual_px": registration.block_rms_px,
+        "tag_final_px": registration.marks_rms_px / registration.room,
+        "block_residual_px": registration.block_rms_px / registration.room,
         "blocks_good": float(registration.blocks.good.mean()),
         "agreement": registration.agreement,
         "unfit_share": len(result.unfit) / max(len(registration.strangers), 1),
-        "doubtful_share": float(result.stains.doubtful.mean()),
         "softer_bleed": max(
             (_bleed_beyond(registration, frame.blur_px, result.window) for frame in result.frames), default=0.0
         ),
-        "unlike_scatter": max((frame.likeness.scatter for frame in result.frames), default=0.0),
-        "unlike_block": max((frame.likeness.block for frame in result.frames), default=0.0),
         "moved_anew": float(sum(frame.registered for frame in result.frames)),
         "black_drift_counts": result.black_drift,
         "references_used": used / max(result.white_references, 1),
@@ -152,6 +150,11 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "brightest_share": float(paper.max()) / result.white_level,
         "darkest_counts": float(paper.min()),
     }
+    if np.isfinite(result.stains.deviation).any():
+        figures["doubtful_share"] = float(result.stains.doubtful.mean())
+    if can_tell(len(registration.strangers)):
+        figures["unlike_scatter"] = max((frame.likeness.scatter for frame in result.frames), default=0.0)
+        figures["unlike_block"] = max((frame.likeness.block for frame in result.frames), default=0.0)
     if registration.framing.field is None:
         figures["tags_found"] = tags / max(tags + len(registration.framing.missing), 1)
     full = white.mean(axis=0) if len(white) else result.white[int(np.argmax(result.white.sum(axis=1)))]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.likeness import Expectation, Likeness
+from calibration.likeness import Expectation, Likeness, can_tell
 from calibration.thresholds import THRESHOLDS
 
 LIMITS = {limit.name: limit for limit in THRESHOLDS}
@@ -77,6 +77,16 @@ def test_cells_that_were_covered_from_the_start_do_not_count(sheet: Sheet) -> No
     under = np.abs(sheet.places - [260.0, 90.0]).max(axis=1) < 45
     like = sheet.compared(sheet.other * np.where(under, 0.2, 1.0)[:, None], usable=~under)
     assert like.block < 0.5 * LIMITS["unlike_block"].accept
+
+
+def test_too_few_cells_say_nothing() -> None:
+    """64 cells of two inks that a plane through their codes cannot describe."""
+    sheet = Sheet()
+    few = np.flatnonzero((sheet.rgb % 80 == 0).all(axis=1))
+    expected = Expectation(sheet.rgb[few], sheet.places[few], sheet.white[few], np.ones(len(few), dtype=np.bool_))
+    assert len(few) == 64
+    assert not can_tell(64)
+    assert expected.held_against(*sheet.seen(sheet.other[few])) == Likeness()
 
 
 def test_a_dark_frame_says_nothing(sheet: Sheet) -> None:
