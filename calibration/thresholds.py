@@ -189,7 +189,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "of its whites",
         SIMULATED + ": .2 and less, with wheels of six segments, any gamma and 10 % of drift to .5; a list of frames "
         "shifted by a row gives 28 and more, an exchange of two lights the angle between them",
-        "correct the list of frames that was imported, or let the picture settle for longer (sequence.settle_s)",
+        "correct the list of frames that was imported, let the picture settle for longer (sequence.settle_s), or "
+        "expose whole turns of the colour wheel",
     ),
     Threshold(
         "grey_tint_deg", "Tint of the print's greys against paper", "°", "at most", 6.0, None,
