@@ -418,7 +418,8 @@ class Measurement:
         self, decoded: Decoded, stretch: Stretch, shift: Shift, even: bool, dark: DarkLight | None = None
     ) -> Measured:
         """Return what the frame says that has begun a stretch, `shift` after the one before; else as `measure`."""
-        return self._measured(decoded, stretch, stretch.cells, stretch.references, shift, even, dark, registered=True)
+        anew = stretch is not self.first
+        return self._measured(decoded, stretch, stretch.cells, stretch.references, shift, even, dark, anew)
 
     def measure_dark(self, decoded: Decoded, stretch: Stretch) -> MeasuredDark:
         """Return what a dark frame says; no tag is seen in it, so the chart is taken to lie where it did."""

@@ -192,7 +192,6 @@ def summary(result: BuildResult) -> list[tuple[str, str, str]]:
     share = result.white_error / np.maximum(result.white, 1e-9)
     brightest = result.white.max(axis=1) if len(result.white) else np.zeros(1)
     black = np.mean([figures.black for figures in result.frames], axis=0)
-    moved = sum(figures.registered for figures in result.frames)
     return [
         ("Lights", str(result.lights), "every one with an accepted frame"),
         ("Frame registered", result.registered_file, ""),
@@ -212,9 +211,8 @@ def summary(result: BuildResult) -> list[tuple[str, str, str]]:
         ),
         ("Blocks of cells", f"{registration.block_rms_px:.3f} px RMS", "movement they still ask for"),
         ("Colours agree", f"{registration.agreement:.4f}", "correlation of cells and chart; another chart has about 0"),
-        ("Chart moved", f"{result.largest_shift_px:.3f} px at most", f"{moved} frames registered anew"),
+        *_course_told(result),
         ("Black level", f"{black.mean():.2f} counts", f"drift {result.black_drift:.2f}, {MAX_BLACK_DRIFT:g} is usual"),
-        ("White drift", f"{result.white_drift:.2%}", "between white frames; at most 1 % is usual"),
         ("Saturation", f"{result.white_level} in the table", f"bare paper reaches {brightest.max():.0f}"),
         ("Darkest light", f"{brightest.min():.0f}", "its strongest channel on bare paper"),
         ("Ground truth", f"± {np.median(share):.2%} a channel, median", "standard error of the mean of the references"),
@@ -227,6 +225,17 @@ def summary(result: BuildResult) -> list[tuple[str, str, str]]:
         *_light_figures(result),
         ("Cells unfit", str(len(result.unfit)), "listed in lut.json, never filled"),
     ]
+
+
+def _course_told(result: BuildResult) -> list[tuple[str, str, str]]:
+    """Return how chart and lamp changed from frame to frame; a frame alone, as a check reads, tells neither."""
+    told: list[tuple[str, str, str]] = []
+    if len(result.frames) > 1:
+        anew = sum(figures.registered for figures in result.frames)
+        told.append(("Chart moved", f"{result.largest_shift_px:.3f} px at most", f"{anew} frames registered anew"))
+    if sum(figures.record.kind == "white" for figures in result.frames) > 1:
+        told.append(("White drift", f"{result.white_drift:.2%}", "between white frames; at most 1 % is usual"))
+    return told
 
 
 def _percents(values: npt.NDArray[np.floating]) -> str:

@@ -142,7 +142,6 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "softer_bleed": max(
             (_bleed_beyond(registration, frame.blur_px, result.window) for frame in result.frames), default=0.0
         ),
-        "moved_anew": float(sum(frame.registered for frame in result.frames)),
         "black_drift_counts": result.black_drift,
         "references_used": used / max(result.white_references, 1),
         "truth_median_deg": float(np.median(errors)),
@@ -152,6 +151,8 @@ def figures_of(result: BuildResult) -> dict[str, float]:
     }
     if np.isfinite(result.stains.deviation).any():
         figures["doubtful_share"] = float(result.stains.doubtful.mean())
+    if len(result.frames) > 1:
+        figures["moved_anew"] = float(sum(frame.registered for frame in result.frames))
     if can_tell(len(registration.strangers)):
         figures["unlike_scatter"] = max((frame.likeness.scatter for frame in result.frames), default=0.0)
         figures["unlike_block"] = max((frame.likeness.block for frame in result.frames), default=0.0)

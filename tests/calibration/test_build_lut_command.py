@@ -53,6 +53,15 @@ def test_info_tells_of_a_table_of_version_1(command: Command) -> None:
     assert "not listed" in out
 
 
+def test_a_check_tells_nothing_that_one_frame_cannot(session: Session, command: Command) -> None:
+    code, out, _ = command("--check", session.folder)
+    assert code == 0
+    assert "remark: Frames" not in out
+    assert "Chart moved" not in out
+    assert "White drift" not in out
+    assert "Tags found" in out
+
+
 def test_verify_accepts_what_is_whole(lut: Path, session: Session, command: Command) -> None:
     assert command("--verify", lut)[0] == 0
     code, out, _ = command("--verify", lut, session.folder)
