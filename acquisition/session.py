@@ -60,6 +60,8 @@ CREATE TABLE plan (
 CREATE TABLE events (id INTEGER PRIMARY KEY, at TEXT NOT NULL, what TEXT NOT NULL, detail TEXT NOT NULL);
 """
 
+_TABLES = {"attempts", "plan", "events"}
+
 
 @dataclass(frozen=True)
 class Step:
@@ -251,13 +253,25 @@ class Session:
                 f"{folder} is no session: it holds no journal.sqlite; name a folder made by acquire run or import"
             )
         try:
+            # SQLite calls a file that it may not read, too, one that it cannot open.
+            path.open("rb").close()
             journal = _connect(path)
             version = journal.execute("PRAGMA user_version").fetchone()[0]
+            tables = {name for (name,) in journal.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        except OSError as error:
+            raise FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk") from error
+        except sqlite3.OperationalError as error:
+            raise FormatError(f"cannot read {path}: {error}; see that no other program holds it") from error
         except sqlite3.DatabaseError as error:
             raise FormatError(f"{path} is damaged: {error}; restore it from a copy") from error
         if version != JOURNAL_VERSION:
             journal.close()
             raise FormatError(f"{path} is of version {version}, this software reads {JOURNAL_VERSION}")
+        if lacking := _TABLES - tables:
+            journal.close()
+            raise FormatError(
+                f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; restore it from a copy"
+            )
         try:
             return cls(folder, journal)
         except BaseException:
@@ -293,8 +307,21 @@ class Session:
             yield
 
     def settings(self) -> str:
-        """Return the text of `session.toml`."""
-        return (self.folder / "session.toml").read_text(encoding="utf-8")
+        """Return the text of `session.toml`.
+
+        Raises
+        ------
+        FormatError
+            It is missing or cannot be read.
+        """
+        path = self.folder / "session.toml"
+        try:
+            return path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise FormatError(
+                f"cannot read {path}, the settings of the session: {reason}; restore it from a copy"
+            ) from error
 
     def begin(self, step: Step, file: str, at: datetime) -> int:
         """Note that an attempt at `step` begins, to be saved as `file`; return the attempt's id."""
@@ -452,7 +479,17 @@ class Session:
         -------
         list of Path
             The new names of the files set aside; their content is untouched.
+
+        Raises
+        ------
+        FormatError
+            The folder of the frames is missing.
         """
+        if not self.frames_folder.is_dir():
+            raise FormatError(
+                f"{self.frames_folder} is missing, where the session's raw files are; restore it from a copy, or begin "
+                "a new session"
+            )
         counted = {frame.file for frame in self.frames()}
         moved: list[Path] = []
         for path in sorted(self.frames_folder.iterdir()):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -125,6 +126,48 @@ def test_a_damaged_journal(session: Session) -> None:
     (session.folder / "journal.sqlite").write_bytes(b"not a database at all" * 100)
     with pytest.raises(FormatError, match="damaged"):
         Session.open(session.folder)
+
+
+def test_a_journal_without_its_plan(session: Session) -> None:
+    session.close()
+    with closing(sqlite3.connect(session.folder / "journal.sqlite")) as journal, journal:
+        journal.execute("DROP TABLE plan")
+    with pytest.raises(FormatError, match=r"journal\.sqlite is damaged: it lacks its table plan; restore"):
+        Session.open(session.folder)
+
+
+def test_a_journal_that_may_not_be_read_is_not_damaged(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    session.close()
+
+    def refuse(path: Path, mode: str) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(FormatError, match=r"cannot read .*journal\.sqlite: Permission denied; check its permissions"):
+        Session.open(session.folder)
+
+
+def test_a_journal_that_another_holds_is_not_damaged(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    session.close()
+
+    def locked(path: Path, timeout: float) -> None:
+        raise sqlite3.OperationalError("database is locked")
+
+    monkeypatch.setattr(sqlite3, "connect", locked)
+    with pytest.raises(FormatError, match="database is locked; see that no other program holds it"):
+        Session.open(session.folder)
+
+
+def test_a_session_without_its_settings(session: Session) -> None:
+    (session.folder / "session.toml").unlink()
+    with pytest.raises(FormatError, match=r"session\.toml, the settings of the session: No such file .*; restore it"):
+        session.settings()
+
+
+def test_a_session_without_its_frames(session: Session) -> None:
+    session.frames_folder.rmdir()
+    with pytest.raises(FormatError, match=r"frames is missing, .*; restore it from a copy"):
+        session.set_aside_strays()
 
 
 def test_a_journal_of_the_future(session: Session) -> None:
