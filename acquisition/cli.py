@@ -259,13 +259,20 @@ def import_(
 ) -> None:
     """Make a session from raw files taken by other means; every file is copied and judged.
 
-    Reads FRAMES, illuminations.csv beside it, CHART and the raw files. Writes SESSION, as acquire run does.
+    Reads FRAMES, illuminations.csv beside it, CHART and the raw files. Writes SESSION, as acquire run does. Ends with 4
+    when a light, or every white or dark frame, is without an accepted frame; the session is there all the same.
     """
     from acquisition.importing import import_session
     from drivers.console import progress
 
     with progress("files") as advance:
-        refused = import_session(frames, chart, session, advance)
-    print(f"{session}: imported; {len(refused)} frames refused")
-    for line in refused:
+        imported = import_session(frames, chart, session, advance)
+    print(f"{session}: imported; {len(imported.refused)} frames refused")
+    for line in imported.refused:
         print(f"  {line}")
+    if imported.left:
+        named = ", ".join(imported.left[:10]) + (" …" if len(imported.left) > 10 else "")
+        raise QualityError(
+            f"{session}: without an accepted frame are {len(imported.left)}: {named}; list other files and import them "
+            "into a new folder"
+        )

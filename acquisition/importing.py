@@ -7,6 +7,7 @@ verdict. The result is a session like any other.
 from __future__ import annotations
 
 import csv
+import math
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -38,23 +39,43 @@ class ListedFrame:
     verdict: str
 
 
-def read_frame_list(path: Path, lights: int) -> list[ListedFrame]:
-    """Read a list of frames: columns as `frames.csv`, files relative to the list.
+@dataclass(frozen=True)
+class Imported:
+    """How an import ended.
+
+    Attributes
+    ----------
+    refused
+        What was refused, one line a frame.
+    left
+        Lights and kinds of frames of which none was accepted, in words.
+    """
+
+    refused: tuple[str, ...]
+    left: tuple[str, ...]
+
+
+def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, ...]]:
+    """Read a list of frames, columns as `frames.csv`, files relative to the list; and the lights beside it.
 
     Only `kind`, `illumination` and `file` must be filled.
 
     Raises
     ------
     FormatError
-        The list is missing, lacks a column, or holds an unusable row; the message names it.
+        The list is missing, lacks a column, or holds an unusable row, the message names it; or the lights are unusable.
     """
     try:
         rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(f"cannot read the list of frames {path}: {error}") from error
+    except OSError as error:
+        raise FormatError(f"cannot read the list of frames {path}: {error.strerror}; name a CSV file") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FormatError(f"cannot read the list of frames {path}: {error}; save it as CSV in UTF-8") from error
     if not rows or any(column not in rows[0] for column in FRAME_COLUMNS[:3]):
         raise FormatError(f"{path}: expected frames under the columns {','.join(FRAME_COLUMNS)}")
-    return [_listed(row, f"{path}, line {number}", path.parent, lights) for number, row in enumerate(rows, 2)]
+    lights = load_illuminations(path.parent / "illuminations.csv")
+    frames = [_listed(row, f"{path}, line {number}", path.parent, len(lights)) for number, row in enumerate(rows, 2)]
+    return frames, lights
 
 
 def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int) -> ListedFrame:
@@ -75,15 +96,20 @@ def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int
         raise FormatError(f"{where}: {error}") from error
     if illumination is not None and not 0 <= illumination < lights:
         raise FormatError(f"{where}: illumination is {illumination}, illuminations.csv has 0 … {lights - 1}")
+    if not 0 <= exposure_s < math.inf:
+        raise FormatError(f"{where}: exposure_s is {exposure_s:g}, expected seconds, or nothing if it is not known")
+    verdict = cell("verdict")
+    if verdict not in ("", ACCEPTED, REFUSED) and not verdict.startswith(f"{REFUSED}: "):
+        raise FormatError(f"{where}: verdict is {verdict!r}, expected {ACCEPTED}, {REFUSED}: REASON, or nothing")
     if not taken_at.tzinfo:
         taken_at = taken_at.replace(tzinfo=UTC)
-    return ListedFrame(kind, illumination, file, cell("sha256").lower(), taken_at, exposure_s, cell("verdict"))
+    return ListedFrame(kind, illumination, file, cell("sha256").lower(), taken_at, exposure_s, verdict)
 
 
 def import_session(
     frame_list: Path, chart: Path, folder: Path, observe: Callable[[int, int], None] = lambda done, total: None
-) -> list[str]:
-    """Make a session of listed raw files; return what was refused, one line a frame.
+) -> Imported:
+    """Make a session of listed raw files.
 
     Parameters
     ----------
@@ -105,8 +131,7 @@ def import_session(
         `folder` holds something already.
     """
     require_free(folder, "the session")
-    lights = load_illuminations(frame_list.parent / "illuminations.csv")
-    frames = read_frame_list(frame_list, len(lights))
+    frames, lights = read_frame_list(frame_list)
     loaded = load_chart(chart)
     for frame in frames:
         if frame.sha256 and file_sha256(frame.path) != frame.sha256:
@@ -131,7 +156,18 @@ def import_session(
             session.close()
             shutil.rmtree(folder)
             raise
-    return refused
+        return Imported(tuple(refused), tuple(_left(session)))
+
+
+def _left(session: Session) -> list[str]:
+    """Return what was listed of which no frame is accepted."""
+    accepted = {(frame.kind, frame.illumination) for frame in session.frames() if frame.accepted}
+    listed = dict.fromkeys((step.kind, step.illumination) for step in session.steps)
+    return [
+        f"every {kind} frame" if light is None else f"light {light}"
+        for kind, light in listed
+        if (kind, light) not in accepted
+    ]
 
 
 def _step(number: int, frame: ListedFrame, lights: tuple[Illumination, ...]) -> Step:
@@ -152,7 +188,8 @@ def _take_over(session: Session, step: Step, frame: ListedFrame, settings: LabSe
     attempt = session.begin(step, f"frames/{step.stem}", frame.taken_at)
     received = session.receive(step.stem, copy)
     if frame.verdict:
-        reason = None if frame.verdict == ACCEPTED else frame.verdict.removeprefix(f"{REFUSED}: ")
+        listed = frame.verdict.removeprefix(REFUSED).removeprefix(":").strip() or "for no reason that is listed"
+        reason = None if frame.verdict == ACCEPTED else listed
     else:
         reason = judge_file(received.path, frame.kind, settings)
     session.commit(
