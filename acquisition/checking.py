@@ -17,6 +17,7 @@ from acquisition.corners import Corners
 from acquisition.exposure import measure_exposure, refusal
 from acquisition.framing import MIN_MODULE_PX, Framing, find_chart
 from acquisition.health import make_ready
+from acquisition.illuminations import load_illuminations
 from acquisition.rig import open_rig
 from acquisition.sequencer import Devices
 from acquisition.session import FrameKind
@@ -67,7 +68,8 @@ def check_lab(
         The settings or a device make a look impossible.
     """
     chart = load_chart(settings.chart)
-    lines: list[str] = []
+    lights = load_illuminations(settings.illuminations)
+    lines = [f"lights      {len(lights)} in {settings.illuminations.name}"]
     faults: list[str] = []
     with open_rig(settings, chart) as devices, tempfile.TemporaryDirectory() as scratch:
         body = devices.camera.identity()

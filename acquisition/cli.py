@@ -117,6 +117,8 @@ def illuminations(
     from drivers.storage import require_free
 
     plot = out.with_suffix(".png")
+    if plot == out:
+        raise InputError(f"{out} is where the plot of the lights goes; name the lights {out.with_suffix('.csv')}")
     require_free(out, "the lights")
     require_free(plot, "the plot of the lights")
     lights = plan_illuminations(grid, parse_ccts(blackbodies))
@@ -166,8 +168,8 @@ def check(
 ) -> None:
     """Talk to every device, find the chart, judge focus, framing and exposure; records nothing.
 
-    Reads LAB.toml and the chart it names. Writes nothing unless asked with --picture. Ends with 4 when the frame would
-    not do.
+    Reads LAB.toml, the chart and the lights it names. Writes nothing unless asked with --picture. Ends with 4 when the
+    frame would not do.
     """
     from acquisition.checking import check_lab
     from acquisition.config import load_lab

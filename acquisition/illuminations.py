@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ Kind = Literal["uniform", "blackbody"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")
 GRID = 35
 CCTS_K = tuple(range(2000, 10001, 200))
+MOST_CCTS = 10_000
 
 
 @dataclass(frozen=True)
@@ -173,18 +175,31 @@ def parse_ccts(text: str) -> tuple[float, ...]:
     Raises
     ------
     InputError
-        The text is neither, or a temperature is not within 1000 … 100 000 K.
+        The text is neither, its steps lead away from LAST or are too many, or a temperature is not within
+        1000 … 100 000 K.
     """
+    said = f"black bodies {text!r}"
     try:
-        if ":" in text:
-            first, last, step = (float(part) for part in text.split(":"))
-            count = int(np.floor((last - first) / step + 1e-9)) + 1
-            ccts = tuple(first + step * number for number in range(count))
-        else:
-            ccts = tuple(float(part) for part in text.split(",") if part.strip())
-    except (ValueError, ZeroDivisionError, OverflowError) as error:
-        raise InputError(f"black bodies {text!r}: expected FIRST:LAST:STEP or K,K,… in kelvin") from error
+        named = [float(part) for part in text.split(":" if ":" in text else ",") if part.strip()]
+    except ValueError as error:
+        raise InputError(f"{said}: expected FIRST:LAST:STEP or K,K,… in kelvin") from error
+    if ":" in text:
+        if len(named) != 3:
+            raise InputError(f"{said}: expected FIRST:LAST:STEP or K,K,… in kelvin")
+        first, last, step = named
+        _require_kelvin((first, last), said)
+        steps = (last - first) / step if step else math.nan
+        if not 0 <= steps < MOST_CCTS:
+            raise InputError(
+                f"{said}: steps of {step:g} K do not lead from {first:g} to {last:g} K in at most {MOST_CCTS} "
+                "temperatures; a fall has a step below 0"
+            )
+        return tuple(first + step * number for number in range(int(steps + 1e-9) + 1))
+    _require_kelvin(named, said)
+    return tuple(named)
+
+
+def _require_kelvin(ccts: Sequence[float], said: str) -> None:
     for cct_k in ccts:
         if not 1000 <= cct_k <= 100_000:
-            raise InputError(f"black bodies {text!r}: {cct_k:g} K is not within 1000 … 100 000 K")
-    return ccts
+            raise InputError(f"{said}: {cct_k:g} K is not within 1000 … 100 000 K")

@@ -81,6 +81,8 @@ exposed. None is a colour of the chart: its low bits are not zero.
 LEAST_WHITES = 18
 """White references from which on calibration sees the light fall towards the corners; fewer tell a slope alone."""
 
+LARGEST_PAGE_MM = 10_000.0
+
 _PX_MM = 25.4 / DESIGN_DPI
 _Slots = npt.NDArray[np.bool_]
 
@@ -350,6 +352,11 @@ def _page_mm(page: str | tuple[float, float]) -> tuple[float, float]:
     width, height = page
     if not (math.isfinite(width) and math.isfinite(height) and width > 0 and height > 0):
         raise InputError(f"a page of {width:g} × {height:g} mm cannot be printed; give width and height above 0")
+    if max(width, height) > LARGEST_PAGE_MM:
+        raise InputError(
+            f"a page of {width:g} × {height:g} mm is larger than any print, {LARGEST_PAGE_MM:g} mm a side; give width "
+            "and height in mm"
+        )
     return float(width), float(height)
 
 

@@ -89,6 +89,7 @@ def test_the_paper_s_arrangement(chart: Run, capsys: pytest.CaptureFixture[str])
         (("--arrangement", "paper", "--cell-mm", "3"), "leave --cell-mm out"),
         (("--arrangement", "paper", "--page", "A6"), "256 × 128 cells"),
         (("--page", "letter"), "is not known"),
+        (("--page", "1e9x1e9"), "larger than any print, 10000 mm a side"),
     ],
 )
 def test_what_cannot_be_printed_is_refused_in_one_line(

@@ -10,12 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from acquisition.cli import main
 from acquisition.illuminations import (
     Illumination,
     decode_srgb,
     encode_srgb,
     illuminations_to_csv,
     load_illuminations,
+    parse_ccts,
     plan_illuminations,
     save_illuminations,
     shown_colour,
@@ -78,6 +80,43 @@ def test_black_bodies_have_the_published_chromaticities(
 def test_black_bodies_grow_bluer(plan: tuple[Illumination, ...]) -> None:
     light = decode_srgb(np.array(codes(plan[666:])) / 255)
     assert (np.diff(light[:, 2] / light[:, 0]) > 0).all()
+
+
+def test_temperatures_are_read() -> None:
+    assert parse_ccts("2000:3000:250") == (2000, 2250, 2500, 2750, 3000)
+    assert parse_ccts("2000:2999:500") == (2000, 2500)
+    assert parse_ccts("3000:2000:-500") == (3000, 2500, 2000)
+    assert parse_ccts("6500:6500:1") == (6500,)
+    assert parse_ccts("2856, 6504") == (2856, 6504)
+    assert parse_ccts("") == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("10000:2000:200", "steps of 200 K do not lead from 10000 to 2000 K"),
+        ("2000:10000:0", "steps of 0 K do not lead"),
+        ("2000:10000:nan", "steps of nan K do not lead"),
+        ("2000:10000:1e-6", "in at most 10000 temperatures"),
+        ("1:1e12:1", "1 K is not within 1000"),
+        ("2000:inf:200", "inf K is not within"),
+        ("2000:3000", "expected FIRST:LAST:STEP"),
+        ("warm", "expected FIRST:LAST:STEP"),
+        ("500", "500 K is not within"),
+    ],
+)
+def test_temperatures_that_are_none_are_refused(text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        parse_ccts(text)
+
+
+def test_lights_do_not_overwrite_their_plot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["acquire", "illuminations", str(tmp_path / "a.png"), "--grid", "1"])
+    assert main() == 2
+    assert "a.png is where the plot of the lights goes; name the lights" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_smaller_plan() -> None:

@@ -127,6 +127,20 @@ def test_a_replayed_session_has_the_same_bytes(
     assert frame_hashes(replayed) == frame_hashes(recorded)
 
 
+@pytest.mark.parametrize(("text", "said"), [(None, "No such file"), ("garbage", "expected lights under the columns")])
+def test_a_look_reads_the_lights_too(
+    lab: Path, text: str | None, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lights = lab.parent / "illuminations.csv"
+    lights.unlink()
+    if text is not None:
+        lights.write_text(text)
+    assert run(monkeypatch, "check", lab) == 2
+    told = capsys.readouterr().err
+    assert str(lights) in told
+    assert said in told
+
+
 def test_an_imported_session_has_the_same_frames(
     lab: Path, frame_hashes: Hashes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
