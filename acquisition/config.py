@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 from drivers.camera import ExposureSettings
 from drivers.errors import ConfigurationError
@@ -169,6 +169,18 @@ class LabSettings(_Settings):
     simulated: SimulatedSettings = SimulatedSettings()
     replay: ReplaySettings | None = None
     lab: LabRig = LabRig()
+    _file: str = PrivateAttr(default="LAB.toml")
+
+    @property
+    def file(self) -> str:
+        """The file that the settings were read from, for messages."""
+        return self._file
+
+    def read_from(self, file: str) -> LabSettings:
+        """Return the same settings as read from a file."""
+        named = self.model_copy()
+        named._file = file
+        return named
 
     def to_toml(self) -> str:
         """Return the settings, defaults included, as the text of `session.toml`."""
@@ -230,7 +242,7 @@ def parse_lab(text: str, where: str) -> LabSettings:
         if first["type"] == "missing":
             raise ConfigurationError(f"{where}: {key} is missing; add it") from error
         raise ConfigurationError(f"{where}: {key} = {first['input']!r}: {first['msg']}") from error
-    return settings
+    return settings.read_from(where)
 
 
 def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> None:

@@ -115,22 +115,22 @@ def open_rig(
 def _open_lab(settings: LabSettings, opened: ExitStack) -> Devices:
     clock = SystemClock()
     require_whole_turns(settings.camera, settings.lab.projector)
-    projector = _lab_projector(settings.lab.projector, clock)
+    projector = _lab_projector(settings.lab.projector, clock, settings.file)
     if projector is not None:
         opened.callback(projector.close)
-    presenter = _lab_presenter(settings.lab.light, clock)
+    presenter = _lab_presenter(settings.lab.light, clock, settings.file)
     opened.callback(presenter.close)
-    camera = _lab_camera(settings.lab.camera, clock)
+    camera = _lab_camera(settings.lab.camera, clock, settings.file)
     opened.callback(camera.close)
     return Devices(camera, presenter, projector, clock)
 
 
-def _lab_camera(cable: CameraCable, clock: Clock) -> Camera:
+def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:
     match cable.connection:
         case "usb":
             return CanonEos(lambda: UsbTransport(_usb_pipes(cable), clock), clock)
         case "ptpip":
-            host = _required(cable.host, "lab.camera.host", "the camera's address")
+            host = _required(cable.host, "lab.camera.host", "the camera's address", file)
             # A body remembers the computers it was paired with by this number.
             guid = uuid.uuid5(uuid.NAMESPACE_DNS, f"croplab.{uuid.getnode()}").bytes
             return CanonEos(
@@ -147,11 +147,11 @@ def _usb_pipes(cable: CameraCable) -> UsbPipes:
     return open_usb(vendor=VENDOR_CANON_USB, serial=cable.serial, port=cable.usb_port)
 
 
-def _lab_projector(cable: ProjectorCable, clock: Clock) -> Projector | None:
+def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector | None:
     if cable.control == "none":
         return None
     if cable.control == "pjlink":
-        host = _required(cable.host, "lab.projector.host", "the projector's address")
+        host = _required(cable.host, "lab.projector.host", "the projector's address", file)
         port = cable.port or PJLINK_PORT
         label = f"the projector at {host}:{port}"
         return PjLinkProjector(lambda: TcpLink.connect(host, port, CONNECT_S), cable.password, label=label, clock=clock)
@@ -162,10 +162,10 @@ def _lab_projector(cable: ProjectorCable, clock: Clock) -> Projector | None:
         return spoken.network(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
     if cable.device is None and cable.host is not None:
         raise ConfigurationError(
-            f"LAB.toml: lab.projector.host: {spoken.maker} projectors are reached over a serial port only; "
+            f"{file}: lab.projector.host: {spoken.maker} projectors are reached over a serial port only; "
             "name lab.projector.device, acquire devices lists what is there"
         )
-    device = _required(cable.device, "lab.projector.device", "the serial port")
+    device = _required(cable.device, "lab.projector.device", "the serial port", file)
     return spoken.projector(
         lambda: SerialLink.open(device, cable.baud or spoken.baud, spoken.parity),
         label=f"the projector at {device}",
@@ -173,22 +173,22 @@ def _lab_projector(cable: ProjectorCable, clock: Clock) -> Projector | None:
     )
 
 
-def _lab_presenter(light: LightSource, clock: Clock) -> Presenter:
+def _lab_presenter(light: LightSource, clock: Clock, file: str) -> Presenter:
     match light.shown_by:
         case "display":
             return FullScreen(light.display, clock)
         case "lightcrafter":
             return LightCrafter(find_lightcrafter, clock)
         case "jvc":
-            host = _required(light.host, "lab.light.host", "the projector's address")
+            host = _required(light.host, "lab.light.host", "the projector's address", file)
             port = light.port or JVC_PORT
             label = f"the JVC projector at {host}:{port}"
             return JvcFlatField(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
 
 
-def _required(value: str | None, key: str, what: str) -> str:
+def _required(value: str | None, key: str, what: str, file: str) -> str:
     if value is None:
-        raise ConfigurationError(f"LAB.toml: {key} is missing; name {what}, acquire devices lists what is there")
+        raise ConfigurationError(f"{file}: {key} is missing; name {what}, acquire devices lists what is there")
     return value
 
 
@@ -234,7 +234,7 @@ def simulated_body(settings: LabSettings) -> Body:
     """
     name = settings.simulated.body
     if name not in BODIES:
-        raise ConfigurationError(f"simulated.body = {name!r}: known are {', '.join(sorted(BODIES))}")
+        raise ConfigurationError(f"{settings.file}: simulated.body = {name!r}: known are {', '.join(sorted(BODIES))}")
     return BODIES[name]
 
 
@@ -249,13 +249,13 @@ def simulated_room(settings: LabSettings) -> Room:
     known = [field.name for field in fields(Room) if field.name != "seed"]
     for key in settings.simulated.room:
         if key not in known:
-            raise unknown_key(f"simulated.room.{key}", known, "LAB.toml")
+            raise unknown_key(f"simulated.room.{key}", known, settings.file)
     try:
         return TypeAdapter(Room).validate_python({"seed": settings.simulated.seed, **settings.simulated.room})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(["simulated.room", *(str(part) for part in first["loc"][:1])])
-        raise ConfigurationError(f"LAB.toml: {key}: {first['msg']}, got {first['input']!r}") from error
+        raise ConfigurationError(f"{settings.file}: {key}: {first['msg']}, got {first['input']!r}") from error
 
 
 def _exposed(session: Session | None) -> Counter[Colour]:

@@ -84,7 +84,7 @@ def _require_same(session: Session, settings: LabSettings) -> None:
         old, new = _value(before, key), _value(settings, key)
         if old != new:
             raise ConfigurationError(
-                f"{session.folder} was begun with {key} = {old!r}, LAB.toml says {new!r}; "
+                f"{session.folder} was begun with {key} = {old!r}, {settings.file} says {new!r}; "
                 "put the old value back, or name a new session folder"
             )
     if load_chart(settings.chart).sha256 != session.chart.sha256:

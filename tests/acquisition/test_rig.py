@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.config import LabSettings, parse_lab
+from acquisition.config import LabSettings, load_lab, parse_lab
 from acquisition.layout import design_chart
 from acquisition.rig import attached_devices, open_rig, simulated_body, simulated_room
 from drivers.errors import ConfigurationError
@@ -40,6 +40,13 @@ def test_a_wrong_parameter_is_named(text: str, expected: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         simulated_room(settings(f"[simulated.room]\n{text}\n"))
     assert expected in str(caught.value)
+
+
+def test_the_file_that_is_wrong_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "e.toml"
+    path.write_text(HEAD + "[simulated.room]\nwavines_mm = 3\n")
+    with pytest.raises(ConfigurationError, match=rf"^{path}: unknown key 'simulated\.room\.wavines_mm'; did you mean"):
+        simulated_room(load_lab(path))
 
 
 def test_an_unknown_body_is_named_with_the_known_ones() -> None:
