@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,7 @@ from typing import Annotated
 import typer
 
 from drivers import console
-from drivers.console import EXIT_CODES
+from drivers.console import EXIT_CODES, orderly_end
 from drivers.errors import InputError, QualityError
 
 app = typer.Typer(
@@ -184,7 +185,8 @@ def check(
         from acquisition.rig import identify_displays
 
         identify_displays(10.0)
-    report = check_lab(settings, picture, lambda sentence: print(sentence, file=sys.stderr), told)
+    with orderly_end():
+        report = check_lab(settings, picture, lambda sentence: print(sentence, file=sys.stderr), told)
     for line in report.lines:
         print(line)
     if report.faults:
@@ -207,7 +209,7 @@ def run(
     from drivers.console import progress
 
     settings = load_lab(lab)
-    with progress("frames") as advance:
+    with orderly_end(), progress("frames") as advance:
         outcome = run_session(settings, session, advance, lambda sentence: print(sentence, file=sys.stderr))
     if not outcome.complete:
         raise QualityError(
@@ -246,7 +248,7 @@ def monitor(
     """
     from acquisition.monitor import open_monitor
 
-    with open_monitor(session, port) as server:
+    with open_monitor(session, port) as server, suppress(KeyboardInterrupt):
         print(f"http://127.0.0.1:{server.server_address[1]}/ shows {session}; Ctrl-C ends it", flush=True)
         server.serve_forever()
 

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from drivers.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
 from drivers.storage import remedy_of
@@ -21,8 +23,9 @@ EXIT_CODES = (
 
 
 def say_error(message: str) -> None:
-    """Print one error line to stderr."""
-    print(f"error: {message}", file=sys.stderr)
+    """Print one error line to stderr; where nobody reads it any more, the exit code says enough."""
+    with suppress(OSError):
+        print(f"error: {message}", file=sys.stderr)
 
 
 def run(command: Callable[[], object]) -> int:
@@ -78,6 +81,39 @@ def _abandon_stdout() -> None:
 def _interrupted() -> int:
     say_error("interrupted; run the same command again to go on")
     return EXIT_INTERRUPTED
+
+
+@contextmanager
+def orderly_end() -> Generator[None]:
+    """End as by Ctrl-C, devices closed, where the block is told to end: by `kill`, or by a terminal that went away.
+
+    A hang-up that is ignored already, as under `nohup`, stays ignored.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    told = False
+
+    def end(number: int, frame: object) -> None:
+        nonlocal told
+        told = True
+        raise KeyboardInterrupt
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    taken = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
+    for number in taken:
+        signal.signal(number, end)
+    try:
+        yield
+    except OSError as error:
+        if not told:
+            raise
+        # A terminal that went away does not take the last state of a bar either.
+        raise KeyboardInterrupt from error
+    finally:
+        for number, handler in taken.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -8,10 +8,12 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 
+from acquisition.cli import main
 from acquisition.illuminations import Illumination
 from acquisition.layout import design_chart
 from acquisition.monitor import open_monitor
@@ -97,6 +99,20 @@ def test_a_taken_port_is_said(folder: Path, address: str) -> None:
     port = int(address.rsplit(":", 1)[1])
     with pytest.raises(InputError, match=f"port {port}"):
         open_monitor(folder, port)
+
+
+def test_ctrl_c_is_its_proper_end(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(server: ThreadingHTTPServer) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupted)
+    monkeypatch.setattr("sys.argv", ["acquire", "monitor", str(folder), "--port", "0"])
+    assert main() == 0
+    told = capsys.readouterr()
+    assert "Ctrl-C ends it" in told.out
+    assert told.err == ""
 
 
 def test_no_session_no_page(tmp_path: Path) -> None:

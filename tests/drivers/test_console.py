@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
+import signal
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from drivers import errors
-from drivers.console import EXIT_CODES, run
+from drivers.console import EXIT_CODES, orderly_end, run
 
 
 def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
@@ -199,3 +202,42 @@ def test_what_is_printed_beside_a_bar_on_the_terminal_goes_where_standard_output
     finally:
         os.close(terminal)
     assert done.stdout.splitlines() == [b"found"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_hang_up_that_is_ignored_stays_ignored(number: int) -> None:
+    """As under nohup, which starts a program that way."""
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        with orderly_end():
+            os.kill(os.getpid(), number)
+        assert signal.getsignal(number) == signal.SIG_IGN
+    finally:
+        signal.signal(number, before)
+
+
+def test_a_terminal_that_went_away_takes_no_last_line() -> None:
+    def draw() -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    def hang_up() -> None:
+        with orderly_end(), ExitStack() as stack:
+            stack.callback(draw)
+            os.kill(os.getpid(), signal.SIGHUP)
+
+    with pytest.raises(KeyboardInterrupt):
+        hang_up()
+    with pytest.raises(OSError, match="Input/output error"), orderly_end():
+        draw()
+
+
+def test_nobody_reads_the_error_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Gone(io.StringIO):
+        def write(self, text: str, /) -> int:
+            raise OSError(errno.EIO, "Input/output error")
+
+    def refuse() -> None:
+        raise errors.InputError("no such lab")
+
+    monkeypatch.setattr(sys, "stderr", Gone())
+    assert run(refuse) == 2

@@ -17,6 +17,8 @@ from acquisition.cli import main
 from acquisition.config import load_lab
 from acquisition.session import Session
 from acquisition.taking import run_session
+from drivers.pjlink.projector import PjLinkProjector
+from drivers.ptp.canon_eos import CanonEos
 
 Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 
@@ -139,6 +141,41 @@ def test_a_look_reads_the_lights_too(
     told = capsys.readouterr().err
     assert str(lights) in told
     assert said in told
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_run_that_is_told_to_end_closes_its_devices(
+    lab: Path, number: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    closed: list[str] = []
+
+    def spy(owner: type, name: str) -> None:
+        close = owner.close  # pyright: ignore[reportAttributeAccessIssue, reportUnknownMemberType, reportUnknownVariableType]
+
+        def closing(self: object) -> None:
+            closed.append(name)
+            close(self)
+
+        monkeypatch.setattr(owner, "close", closing)
+
+    spy(CanonEos, "camera")
+    spy(PjLinkProjector, "projector")
+    spy(Session, "journal")
+    commit = Session.commit
+
+    def told_to_end(self: Session, attempt: int, **frame: Any) -> None:
+        commit(self, attempt, **frame)
+        os.kill(os.getpid(), number)
+
+    session = lab.parent / "session"
+    before = signal.getsignal(number)
+    with monkeypatch.context() as patched:
+        patched.setattr(Session, "commit", told_to_end)
+        assert run(monkeypatch, "run", lab, session) == 130
+    assert "interrupted; run the same command again to go on" in capsys.readouterr().err
+    assert set(closed) == {"camera", "projector", "journal"}
+    assert signal.getsignal(number) == before
+    assert run(monkeypatch, "run", lab, session) == 0
 
 
 def test_an_imported_session_has_the_same_frames(
