@@ -60,6 +60,8 @@ CHECKPOINT_EVERY = 16
 METHOD = 5
 """Raised when samples or ground truth come out otherwise than before, so that no table is made by two methods."""
 
+_SAME_EXPOSURE = 1.01
+
 PLAIN = Choices()
 """The paper's way: 25 samples, nothing subtracted but black."""
 
@@ -438,7 +440,9 @@ class _Work:
             at_zero=at_zero,
             linearity=self._linearity,
             primaries=work.primaries,
-            off_codes_deg=angles_off_codes_deg(lights, white / gains, truth_errors_deg(white, error)),
+            off_codes_deg=angles_off_codes_deg(lights, white / gains, truth_errors_deg(white, error))
+            if _exposed_alike(frames)
+            else None,
         )
         records = [figures.record for figures in self._figures]
         self._writer.finish(
@@ -508,6 +512,12 @@ def _drift(frames: Sequence[FrameFigures], lights: int) -> tuple[_Array, _Array 
             at[figures.record.illumination] = (figures.record.taken_at - start).total_seconds()
     white_at = np.array([(figures.record.taken_at - start).total_seconds() for figures in whites])
     return drift_gains(at, white_at, np.array([figures.paper.white for figures in whites])), whites[0].paper.white
+
+
+def _exposed_alike(frames: Sequence[FrameFigures]) -> bool:
+    """Return whether all lights are known to have been exposed alike: what they are to one another is their codes'."""
+    exposures = [figures.exposure for figures in frames if figures.record.kind == "light"]
+    return min(exposures) > 0 and max(exposures) < _SAME_EXPOSURE * min(exposures)
 
 
 def _require_good(result: BuildResult, out: Path, folder: Path) -> None:

@@ -27,7 +27,10 @@ LIGHTS_A_TERM = 3
 """With fewer lights for each coefficient, what is wrong would be fitted."""
 
 _ROUNDS = 15
-_LEAST_OTHERS = 0.02
+_LEAST_OTHERS = 0.1
+_FLICKER = 1.25
+"""Factor by which the lamp may make a light brighter or darker than another of its codes."""
+
 _CERTAIN = 4.0
 """Standard errors of a ground truth that are taken off its angle."""
 
@@ -42,7 +45,7 @@ def angles_off_codes_deg(lights: Sequence[Illumination], white: _Array, errors_d
     lights
         L lights.
     white
-        (L, 3) > 0, their ground truths, the lamp's drift taken out.
+        (L, 3) > 0, their ground truths, the lamp's drift taken out, all exposed alike.
     errors_deg
         (L,) standard error of each white's direction.
 
@@ -58,17 +61,20 @@ def angles_off_codes_deg(lights: Sequence[Illumination], white: _Array, errors_d
     # Each light counts alike, however bright.
     design, seen = terms / length[:, None], white / length[:, None]
     weights = np.ones(len(lights))
-    given: _Array = seen
+    given, aims = seen, seen
     for _ in range(_ROUNDS):
         root = np.sqrt(weights)[:, None]
         rooted = design * root
         inverse: _Array = np.asarray(np.linalg.pinv(rooted), dtype=np.float64)
-        given = product(design, inverse @ (seen * root))
+        given = product(design, inverse @ (aims * root))
         # As seen from the other lights: a primary alone in its corner draws the fit to itself, whatever it shows.
         own = np.einsum("lt,tl->l", rooted, inverse)
-        residual = np.linalg.norm(seen - given, axis=1) / np.maximum(1 - own, _LEAST_OTHERS)
+        residual = np.linalg.norm(aims - given, axis=1) / np.maximum(1 - own, _LEAST_OTHERS)
         usual = max(1.4826 * float(np.median(residual)), 1e-9)
         weights = np.minimum(1, 2 * usual / np.maximum(residual, 1e-12)) ** 2
+        # A light's brightness is its own: a lamp that flickers by a hundredth would else look like wrong names.
+        brightness = (given * seen).sum(axis=1, keepdims=True)
+        aims = seen * np.clip(brightness, 1 / _FLICKER, _FLICKER)
     crossed = np.linalg.norm(np.cross(given, seen), axis=1)
     angles = np.degrees(np.arctan2(crossed, (given * seen).sum(axis=1)))
     return np.maximum(angles - _CERTAIN * errors_deg, 0)

@@ -70,6 +70,8 @@ class FrameFigures:
         Share of the table's samples that are 0.
     blur_px
         How soft the frame is: that of the frame registered last, and what tags or outline are softer than in it.
+    exposure
+        Shutter time × ISO speed / f-number² by the raw file, s; 0 where it does not state them.
     """
 
     record: FrameRecord
@@ -84,6 +86,7 @@ class FrameFigures:
     dark: _Array = field(default_factory=lambda: np.zeros(3))
     at_zero: float = 0.0
     blur_px: float = 0.0
+    exposure: float = 0.0
 
     def told(self) -> dict[str, Any]:
         """Return the figures as JSON holds them; `recall` makes them again to the last bit."""
@@ -103,6 +106,7 @@ class FrameFigures:
             "dark": self.dark.tolist(),
             "at_zero": self.at_zero,
             "blur": self.blur_px,
+            "exposure": self.exposure,
         }
 
     @staticmethod
@@ -125,6 +129,8 @@ class FrameFigures:
             np.array(told["dark"]),
             told["at_zero"],
             told["blur"],
+            # Checkpoints of earlier versions do not know it.
+            told.get("exposure", 0.0),
         )
 
 
@@ -486,8 +492,17 @@ class Measurement:
             np.zeros(3) if dark is None else dark.paper,
             1 - int(np.count_nonzero(values)) / values.size,
             float(np.sqrt(max(stretch.registration.blur_px**2 + softer, 0.0))),
+            _exposure(decoded.mosaic),
         )
         return Measured(figures, stretch, dark, decoded.saturation, values, highest, cells.inside, kept, noise)
+
+
+def _exposure(mosaic: Mosaic) -> float:
+    """Return how much light a frame gathered, as its file states it; 0 where it does not."""
+    if mosaic.shutter_s is None or mosaic.iso is None:
+        return 0.0
+    # A lens without contacts has no f-number, and keeps the one that it has.
+    return mosaic.shutter_s * mosaic.iso / (mosaic.aperture or 1.0) ** 2
 
 
 def _means(samples: npt.NDArray[np.float32], highest: npt.NDArray[np.uint16], sites: Sites, saturation: int) -> _Array:

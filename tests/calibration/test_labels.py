@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from acquisition.illuminations import Illumination, decode_srgb, plan_illuminati
 from acquisition.session import Session, Step
 from calibration.build import build
 from calibration.labels import DEGREE, LIGHTS_A_TERM, angles_off_codes_deg
+from calibration.measuring import FrameFigures
 from calibration.report import write_report
 from calibration.thresholds import THRESHOLDS
 from calibration.verdict import judge
@@ -60,6 +62,13 @@ def test_a_lamp_whose_drift_is_not_known_is_no_wrong_name() -> None:
     assert off(whites(Room()) * fading[:, None]).max() < LIMIT.accept / 3
 
 
+def test_a_flickering_lamp_is_no_wrong_name() -> None:
+    white, random = whites(Room()), np.random.default_rng(8)
+    for _ in range(5):
+        flicker = 1 + 0.04 * random.standard_normal(len(PLAN))
+        assert off(white * flicker[:, None]).max() < LIMIT.accept / 4
+
+
 def test_light_added_where_primaries_overlap_is_no_wrong_name() -> None:
     """A wheel of six segments, or a white boost: yellow is brighter than red and green."""
     white = whites(Room())
@@ -86,16 +95,25 @@ def shifted_but_for_primaries(count: int) -> npt.NDArray[np.int64]:
 def test_a_shifted_list_is_refused(room: Room, shift: Callable[[int], npt.NDArray[np.int64]]) -> None:
     angles = off(whites(room)[shift(len(PLAN))])
     assert outcome(angles) == "refuse"
-    assert (angles > LIMIT.accept).sum() >= 10
+    assert (angles > LIMIT.accept).sum() >= 6
 
 
-@pytest.mark.parametrize(("one", "other"), [(35, 53), (40, 41), (0, 104)])
+@pytest.mark.parametrize(("one", "other"), [(35, 53), (40, 41), (0, 50)])
 def test_two_exchanged_lights_are_named(one: int, other: int) -> None:
     white = whites(Room())
     white[[one, other]] = white[[other, one]]
     angles = off(white)
     assert set(np.flatnonzero(angles > LIMIT.accept)) == {one, other}
     assert outcome(angles) != "accept"
+
+
+def test_exchanged_primaries_are_refused() -> None:
+    """With corners of the plan amiss it is not sure which of them is."""
+    white = whites(Room())
+    white[[0, 104]] = white[[104, 0]]
+    angles = off(white)
+    assert {0, 104} & set(np.flatnonzero(angles > LIMIT.accept))
+    assert outcome(angles) == "refuse"
 
 
 def test_a_white_that_is_not_known_is_not_judged() -> None:
@@ -128,6 +146,28 @@ def test_lights_off_their_codes_make_no_table_and_are_named(
     assert "12.00° at most, light 7" in (tmp_path / "lut.refused" / "report.html").read_text()
     assert (held[0] > 0).all()
     assert (held[1] < 0.5).all()
+
+
+def test_lights_exposed_otherwise_are_not_held_against_their_codes(
+    lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def told(*_: object) -> _Array:
+        return np.zeros(3)
+
+    def longer(step: Step) -> bytes:
+        exposed = replace(SETTINGS, shutter_s=0.6) if step.illumination == 1 else SETTINGS
+        return lab.dng(step.colour, step.number, exposed)
+
+    monkeypatch.setattr("calibration.build.angles_off_codes_deg", told)
+    with take(lab, tmp_path / "alike", LIGHTS[:3]) as session:
+        result = build(session, tmp_path / "lut")
+        assert result.off_codes_deg is not None
+        assert result.frames[0].exposure == pytest.approx(0.5 * 100 / 8**2)
+        # A checkpoint of before it was noted.
+        earlier = {name: value for name, value in result.frames[0].told().items() if name != "exposure"}
+        assert FrameFigures.recall(result.frames[0].record, lab.chart.page_mm, earlier).exposure == 0
+    with take(lab, tmp_path / "longer", LIGHTS[:3], frame=longer) as session:
+        assert build(session, tmp_path / "other").off_codes_deg is None
 
 
 def test_two_lights_of_one_file_make_no_table(lab: Lab, tmp_path: Path) -> None:
