@@ -280,3 +280,7 @@ def import_(
             f"{session}: without an accepted frame are {len(imported.left)}: {named}; list other files and import them "
             "into a new folder"
         )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -336,3 +336,7 @@ def _tell(result: BuildResult) -> None:
         print(f"{result.session}: the chart is found and is the one expected; a table can be built")
     else:
         print(f"{result.lut}: {result.lights} lights, {result.camera}; see {result.lut / 'report.html'}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -190,3 +190,7 @@ def _until_interrupted(announcement: str) -> None:
         threading.Event().wait()
     except KeyboardInterrupt:
         print("stopped")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -54,6 +54,13 @@ def test_the_command_is_installed(command: str) -> None:
 
 
 @pytest.mark.parametrize("module", COMMANDS.values())
+def test_the_module_is_the_command(module: str) -> None:
+    done = subprocess.run([sys.executable, "-m", module, "--unknown"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "--unknown" in done.stderr
+
+
+@pytest.mark.parametrize("module", COMMANDS.values())
 def test_help_tells_the_exit_codes_and_loads_nothing_heavy(module: str) -> None:
     done = call(module, "--help")
     assert done.returncode == 0, done.stderr
