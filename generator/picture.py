@@ -273,8 +273,8 @@ def _interoperability(path: Path) -> str:
     try:
         with Image.open(path) as picture:
             index = picture.getexif().get_ifd(IFD.Interop).get(1, "")
-    except (OSError, ValueError, SyntaxError):
-        # Damaged data say nothing; OpenImageIO has read the picture.
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        # Damaged data say nothing, nor do pictures too large for Pillow; OpenImageIO has read the picture.
         return ""
     return str(index).strip("\0 ")
 
