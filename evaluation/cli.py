@@ -26,8 +26,8 @@ _WIDE = 10_000
 
 _HELP = f"""Estimate the light of every image of a dataset and sum up the errors.
 
-Reads the folder DATASET (made by generate). Prints a table in the paper's order: mean, median, trimean, best 25 %,
-worst 25 % and Avg., their geometric mean, all in degrees. Writes nothing unless asked with --csv or --images.
+Reads DATASET, a folder or a URL (made by generate). Prints a table in the paper's order: mean, median, trimean, best
+25 %, worst 25 % and Avg., their geometric mean, all in degrees. Writes nothing unless asked with --csv or --images.
 
 {EXIT_CODES}
 """
@@ -35,7 +35,9 @@ worst 25 % and Avg., their geometric mean, all in degrees. Writes nothing unless
 
 @app.command(help=_HELP)
 def evaluate(
-    dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder of the dataset.", show_default=False)],
+    dataset: Annotated[
+        str, typer.Argument(metavar="DATASET", help="Folder of the dataset, or its URL.", show_default=False)
+    ],
     methods: Annotated[
         str,
         typer.Option(
@@ -76,7 +78,7 @@ def evaluate(
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("images", total=len(scenes))
         results = experiments.evaluate(scenes, chosen, workers or default_workers(), lambda: progress.advance(task))
-    print(f"{dataset.resolve().name}: {error} angular error of {len(scenes)} images, degrees")
+    print(f"{_name_of(dataset)}: {error} angular error of {len(scenes)} images, degrees")
     _print_table(results, error)
     for result in results:
         if result.guessed.any():
@@ -86,6 +88,11 @@ def evaluate(
         write_whole(csv, experiments.table_csv(results, error))
     if images is not None:
         write_whole(images, experiments.images_csv(scenes, results))
+
+
+def _name_of(dataset: str) -> str:
+    """Return what to call a dataset: the last part of its URL, or of its folder's whole path."""
+    return dataset.rstrip("/").rpartition("/")[2] if "://" in dataset else Path(dataset).resolve().name
 
 
 def _require_free(csv: Path | None, images: Path | None) -> None:

@@ -64,13 +64,13 @@ class GeneratedScene:
         return self.dataset.read_image(self.entry), None
 
 
-def open_scenes(folder: Path) -> Sequence[GeneratedScene]:
-    """Return the scenes of a dataset folder.
+def open_scenes(place: Path | str) -> Sequence[GeneratedScene]:
+    """Return the scenes of a dataset, from its folder or its URL on a store that fsspec knows.
 
     Raises
     ------
     FormatError
-        The folder is no dataset.
+        There is no dataset.
     """
-    dataset = open_dataset(folder)
+    dataset = open_dataset(place)
     return tuple(GeneratedScene(dataset, entry) for entry in dataset.entries)

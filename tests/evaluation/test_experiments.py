@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from fsspec.core import url_to_fs
 
 from acquisition.illuminations import Illumination
 from calibration.lut import LutWriter, Provenance, open_lut
@@ -123,6 +124,23 @@ def test_images_without_a_usable_pixel_are_told_from_grey_ones() -> None:
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr(sys, "argv", ["evaluate", *arguments])
     return main()
+
+
+def test_a_dataset_on_a_store(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call(monkeypatch, str(dataset), "--methods", "white-patch") == 0
+    table = capsys.readouterr().out.splitlines()[1:]
+    store, top = url_to_fs("memory://evaluated/set")
+    for path in dataset.rglob("*"):
+        if path.is_file():
+            store.pipe_file(f"{top}/{path.relative_to(dataset).as_posix()}", path.read_bytes())
+    assert call(monkeypatch, "memory://evaluated/set/", "--methods", "white-patch") == 0
+    title, *same = capsys.readouterr().out.splitlines()
+    assert title == "set: reproduction angular error of 16 images, degrees"
+    assert same == table
+    assert call(monkeypatch, "memory://evaluated/nothing") == 2
+    assert "memory://evaluated/nothing is no dataset" in capsys.readouterr().err
 
 
 def test_the_command(dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
