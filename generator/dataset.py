@@ -47,7 +47,7 @@ from generator.production.assembly import (
     assemble,
 )
 from generator.production.engines import OnWait, check_workers, default_workers, make_shards
-from generator.production.layouts import read_member
+from generator.production.layouts import member_name, read_member
 from generator.production.plan import SHARD_IMAGES, Options, Plan
 from generator.production.records import (
     FORMAT,
@@ -121,8 +121,7 @@ class Dataset:
         """Return the JPEG file of an image's preview, or None if the dataset has none."""
         if not self.description.options["previews"]:
             return None
-        ending = "jpg" if self.layout == "folder" else "preview.jpg"
-        return self._bytes(self._name(f"{PurePosixPath(entry.image).stem}.{ending}", entry.split, "previews"))
+        return self._beside(entry, "previews", ".jpg")
 
     def read_weights(self, entry: Entry) -> npt.NDArray[np.float32]:
         """Return how the lights of an image share its pixels: (H, W, K) float32, in the order of `entry.lights`, sum 1.
@@ -136,8 +135,8 @@ class Dataset:
         """
         from generator.masks.files import decode_weights
 
-        masks = [f"_{light}" for light in range(len(entry.lights))]
-        return decode_weights([self._map(entry, "masks", mask) for mask in masks], self._of(entry, "masks"))
+        masks = [self._map(entry, "masks", f"_{light}.png") for light in range(len(entry.lights))]
+        return decode_weights(masks, self._of(entry, "masks"))
 
     def read_ground_truth_map(self, entry: Entry) -> npt.NDArray[np.float32]:
         """Return the ground truth of every pixel of an image: (H, W, 3) float32, r + g + b = 1.
@@ -151,7 +150,7 @@ class Dataset:
         """
         from generator.masks.files import decode_ground_truth
 
-        return decode_ground_truth(self._map(entry, "ground_truth"), self._of(entry, "ground truth"))
+        return decode_ground_truth(self._map(entry, "ground_truth", ".png"), self._of(entry, "ground truth"))
 
     @property
     def layout(self) -> str:
@@ -187,12 +186,16 @@ class Dataset:
         shard = shard_key(number // int(self.description.options["shard_images"]))
         return f"{split or 'data'}/{shard}.{'tar' if self.layout == 'webdataset' else 'parquet'}/{file}"
 
-    def _map(self, entry: Entry, kind: str, ending: str = "") -> bytes:
+    def _map(self, entry: Entry, kind: str, ending: str) -> bytes:
         """Return the file of a map that lies beside an image of several lights."""
         if len(entry.lights) == 1:
             raise InputError(f"one light falls on {entry.image}, so that it has no masks; see its truth")
+        return self._beside(entry, kind, ending)
+
+    def _beside(self, entry: Entry, kind: str, ending: str) -> bytes:
+        """Return a file that lies beside an image."""
         key = PurePosixPath(entry.image).stem
-        file = f"{key}{ending}.png" if self.layout == "folder" else f"{key}.{kind}{ending}.png"
+        file = f"{key}{ending}" if self.layout == "folder" else member_name(kind, key, ending)
         return self._bytes(self._name(file, entry.split, kind))
 
     def _of(self, entry: Entry, what: str) -> str:

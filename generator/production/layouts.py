@@ -18,6 +18,14 @@ _SETTLED_PIXELS: Final = 1 << 23
 """Images, and pixels of them, from which files are brought to the disk while others are made."""
 
 
+_KINDS: Final = {"images": "", "previews": ".preview", "masks": ".masks", "ground_truth": ".ground_truth"}
+
+
+def member_name(kind: str, key: str, ending: str) -> str:
+    """Return what a file of an image is called where those of a shard lie together: ``000123.masks_0.png``."""
+    return f"{key}{_KINDS[kind]}{ending}"
+
+
 @dataclass(frozen=True)
 class Sample:
     """An image with all that goes with it, ready to be written.

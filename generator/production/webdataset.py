@@ -16,15 +16,13 @@ import io
 import json
 import tarfile
 from contextlib import ExitStack
-from typing import Any, BinaryIO, Final, Self, cast
+from typing import Any, BinaryIO, Self, cast
 
 from drivers.errors import FormatError
-from generator.production.layouts import Fault, Sample, hold
+from generator.production.layouts import Fault, Sample, hold, member_name
 from generator.production.plan import ShardJob
 from generator.production.records import FileSum, shard_key
 from generator.store import Store
-
-_ENDINGS: Final = {"images": "", "previews": ".preview", "masks": ".masks", "ground_truth": ".ground_truth"}
 
 
 class Hashed(io.RawIOBase):
@@ -94,7 +92,7 @@ class TarWriter:
         text = json.dumps(about(sample), ensure_ascii=False) + "\n"
         for kind, ending, pieces in (*sample.files, ("images", ".json", (text.encode(),))):
             data = b"".join(pieces)
-            header = tarfile.TarInfo(f"{sample.key}{_ENDINGS[kind]}{ending}")
+            header = tarfile.TarInfo(member_name(kind, sample.key, ending))
             header.size = len(data)
             header.mode = 0o644
             tar.addfile(header, io.BytesIO(data))
