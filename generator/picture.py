@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from drivers.errors import FormatError, InputError
 from generator.kernels import philox
-from generator.profile import ADOBE_RGB, ASSUMED, from_adobe_rgb, to_srgb
+from generator.profile import ADOBE_RGB, ASSUMED, encode_srgb, from_adobe_rgb, to_srgb
 
 Picture = npt.NDArray[np.uint8]
 
@@ -148,21 +148,20 @@ def open_picture(path: Path, preparation: Preparation = AS_THEY_ARE, name: str |
         white = (1.0 - opaque) * (1.0 if values.linear else 255.0)
         light = (light if values.associated else light * opaque) + white
     if values.linear:
-        codes = _encode(light)
+        codes = encode_srgb(light)
     else:
         # Rounding takes seconds on a large picture, and codes of 8 bits have nothing to round.
         codes = (light if light.dtype == np.uint8 else np.rint(np.clip(light, 0, 255))).astype(np.uint8, copy=False)
-    word = "linear light, encoded as sRGB" if values.linear else ASSUMED
-    if values.icc is not None and not values.linear:
-        if preparation.profiles == "honour":
-            codes, word = to_srgb(codes, values.icc)
-        else:
-            word = "ignored, taken as sRGB"
-    elif values.adobe_rgb:
-        if preparation.profiles == "honour":
-            codes, word = from_adobe_rgb(codes), ADOBE_RGB
-        else:
-            word = "ignored, taken as sRGB"
+    if values.linear:
+        word = "linear light, encoded as sRGB"
+    elif values.icc is None and not values.adobe_rgb:
+        word = ASSUMED
+    elif preparation.profiles == "ignore":
+        word = "ignored, taken as sRGB"
+    elif values.icc is not None:
+        codes, word = to_srgb(codes, values.icc)
+    else:
+        codes, word = from_adobe_rgb(codes), ADOBE_RGB
     codes = _turn(codes, values.orientation)
     return Reading(_fit(codes, preparation, path, path.name if name is None else name), word)
 
@@ -296,13 +295,6 @@ def _jpeg(path: Path) -> npt.NDArray[np.uint8] | None:
 def _reason(message: str) -> str:
     """Return a library's message as part of our sentence."""
     return " ".join(message.split()).rstrip(".") or "no known picture format"
-
-
-def _encode(linear: npt.NDArray[np.float64]) -> Picture:
-    """Return the sRGB codes 0 … 255 of linear light, clipped at 1 (IEC 61966-2-1)."""
-    light = np.clip(linear, 0.0, 1.0)
-    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
-    return np.rint(255 * code).astype(np.uint8)
 
 
 def _turn(picture: Picture, orientation: int) -> Picture:

@@ -66,12 +66,17 @@ def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArra
     return np.array(converted, dtype=np.uint8), word
 
 
+def encode_srgb(linear: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
+    """Return the sRGB codes 0 … 255 of linear light, clipped at 1 (IEC 61966-2-1)."""
+    light = np.clip(linear, 0.0, 1.0)
+    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
+    return np.rint(255 * code).astype(np.uint8)
+
+
 def from_adobe_rgb(codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """Return the sRGB codes (H, W, 3) uint8 of codes of Adobe RGB (1998), clipped where sRGB ends."""
     linear = (np.arange(256, dtype=np.float32) / 255) ** _ADOBE_GAMMA
-    light = np.arange(_STEPS + 1) / _STEPS
-    curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
-    encoded = np.rint(255 * curve).astype(np.uint8)
+    encoded = encode_srgb(np.arange(_STEPS + 1) / _STEPS)
     out = np.empty_like(codes)
     for top in range(0, len(codes), _ROWS):
         wanted = linear[codes[top : top + _ROWS]] @ _ADOBE_TO_SRGB.T

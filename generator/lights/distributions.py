@@ -176,8 +176,8 @@ def parse_distribution(text: str) -> Distribution:
     kind, _, rest = text.strip().partition(":")
     if kind == "uniform" and not rest:
         return Uniform()
-    if (kind == "fit" and rest) or Path(text).is_file():
-        path = Path(rest if kind == "fit" else text)
+    path = Path(rest if kind == "fit" else text)
+    if (kind == "fit" and rest) or path.is_file():
         return Fitted.of(load_ground_truths(path), path.name)
     if kind == "gaussian":
         numbers = parse_numbers(rest, _GAUSSIAN, "the distribution gaussian")
