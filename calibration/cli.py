@@ -311,7 +311,7 @@ def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
 
 def _tell(result: BuildResult) -> None:
     from calibration.report import summary
-    from calibration.verdict import where
+    from calibration.verdict import with_place
 
     names = {
         "Tags found",
@@ -327,8 +327,7 @@ def _tell(result: BuildResult) -> None:
             print(f"{name + ':':17}{value}" + (f"  ({note})" if note else ""))
     verdict = result.verdict
     for row in verdict.remarks:
-        found = where(row, result)
-        print(f"remark: {row.text()}{f', {found}' if found else ''}; {row.threshold.remedy}")
+        print(f"remark: {with_place(row, result)}; {row.threshold.remedy}")
     print(f"{'Verdict:':17}{verdict.outcome}")
     if verdict.refused:
         return

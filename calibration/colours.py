@@ -15,6 +15,12 @@ from calibration.fitting import least_squares
 _Array = npt.NDArray[np.float64]
 
 
+def angles_deg(one: _Array, other: _Array) -> _Array:
+    """Return the angles (...) between colours (..., 3) and others of that shape, degrees; exact for small ones."""
+    crossed = np.linalg.norm(np.cross(one, other), axis=-1)
+    return np.degrees(np.arctan2(crossed, (one * other).sum(axis=-1)))
+
+
 @dataclass(frozen=True, eq=False)
 class ColourModel:
     """What camera RGB a printed code gives in one frame: a polynomial, times a smooth light over the page.

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.illuminations import Illumination
+from calibration.colours import angles_deg
 from calibration.fitting import product
 
 DEGREE = 4
@@ -75,9 +76,7 @@ def angles_off_codes_deg(lights: Sequence[Illumination], white: _Array, errors_d
         # A light's brightness is its own: a lamp that flickers by a hundredth would else look like wrong names.
         brightness = (given * seen).sum(axis=1, keepdims=True)
         aims = seen * np.clip(brightness, 1 / _FLICKER, _FLICKER)
-    crossed = np.linalg.norm(np.cross(given, seen), axis=1)
-    angles = np.degrees(np.arctan2(crossed, (given * seen).sum(axis=1)))
-    return np.maximum(angles - _CERTAIN * errors_deg, 0)
+    return np.maximum(angles_deg(given, seen) - _CERTAIN * errors_deg, 0)
 
 
 def _terms(codes: npt.NDArray[np.integer]) -> _Array:

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart import Reference
+from calibration.colours import angles_deg
 
 NAME = "references.csv"
 COLUMNS = ("light", "name", "r", "g", "b", "r_error", "g_error", "b_error")
@@ -104,6 +105,4 @@ def references_csv(names: Sequence[str], white: _Array, white_error: _Array, gre
 
 def tint_deg(white: _Array, greys: _Array) -> _Array:
     """Return the angle (..., G) between camera RGB of greys (..., G, 3) and of white (..., 3), degrees."""
-    one = np.broadcast_to(white[..., None, :], greys.shape)
-    crossed = np.linalg.norm(np.cross(one, greys), axis=-1)
-    return np.degrees(np.arctan2(crossed, (one * greys).sum(axis=-1)))
+    return angles_deg(np.broadcast_to(white[..., None, :], greys.shape), greys)

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.choices import WINDOWS
+from calibration.colours import angles_deg
 from calibration.likeness import can_tell
 from calibration.linearity import curve
 from calibration.references import tint_deg
@@ -176,7 +177,7 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         figures["noisy_share"] = float(result.transfer.noisy.mean())
     if len(white) > 1:
         figures["white_drift"] = result.white_drift
-        figures["white_drift_deg"] = float(_angles_deg(white, np.broadcast_to(white[0], white.shape)).max())
+        figures["white_drift_deg"] = float(angles_deg(white, np.broadcast_to(white[0], white.shape)).max())
     if spread:
         figures["reference_spread"] = max(spread)
     return figures
@@ -225,18 +226,12 @@ def truth_errors_deg(white: _Array, error: _Array) -> _Array:
     return np.degrees(across / np.maximum(length[:, 0], 1e-9))
 
 
-def _angles_deg(one: _Array, other: _Array) -> _Array:
-    crossed = np.linalg.norm(np.cross(one, other), axis=1)
-    return np.degrees(np.arctan2(crossed, (one * other).sum(axis=1)))
-
-
 def refusal(verdict: Verdict, result: BuildResult) -> str:
     """Return why there is no table and what helps, in a line."""
     worst = verdict.refused[0]
     remedy = worst.threshold.remedy
     more = f" (and {len(verdict.refused) - 1} more)" if len(verdict.refused) > 1 else ""
-    found = where(worst, result)
-    detail = f", {found}" if found else ""
+    detail = ""
     if worst.threshold.name == "unfit_share":
         causes: dict[str, int] = {}
         for cell in result.unfit:
@@ -244,10 +239,16 @@ def refusal(verdict: Verdict, result: BuildResult) -> str:
             causes[name] = causes.get(name, 0) + 1
         cause = max(causes, key=lambda name: causes[name])
         detail, remedy = f", {causes[cause]} of them {cause}", _REMEDIES.get(cause, "look at the report")
-    return f"{worst.text()}{detail}{more}; {remedy}, and take the session anew"
+    return f"{with_place(worst, result)}{detail}{more}; {remedy}, and take the session anew"
 
 
-def where(row: Judged, result: BuildResult) -> str:
+def with_place(row: Judged, result: BuildResult) -> str:
+    """Return a figure against its limit, and where the worst of it is."""
+    place = _where(row, result)
+    return f"{row.text()}, {place}" if place else row.text()
+
+
+def _where(row: Judged, result: BuildResult) -> str:
     """Return in which frame or lights the worst of a figure is, and where on the print; "" where it has no place."""
     match row.threshold.name:
         case "softer_bleed":
