@@ -12,7 +12,7 @@ import typer
 
 from drivers import console
 from drivers.console import EXIT_CODES, orderly_end
-from drivers.errors import InputError, QualityError
+from drivers.errors import InputError, QualityError, first_of
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -275,10 +275,9 @@ def import_(
     for line in imported.refused:
         print(f"  {line}")
     if imported.left:
-        named = ", ".join(imported.left[:10]) + (" …" if len(imported.left) > 10 else "")
         raise QualityError(
-            f"{session}: without an accepted frame are {len(imported.left)}: {named}; list other files and import them "
-            "into a new folder"
+            f"{session}: without an accepted frame are {len(imported.left)}: {first_of(imported.left)}; list other "
+            "files and import them into a new folder"
         )
 
 

@@ -49,7 +49,7 @@ from calibration.result import BuildResult, Growth
 from calibration.subtraction import DarkLight
 from calibration.tally import Tally
 from calibration.verdict import refusal, truth_errors_deg
-from drivers.errors import FormatError, QualityError, RegistrationError
+from drivers.errors import FormatError, QualityError, RegistrationError, first_of
 from drivers.storage import write_whole
 
 REPORT_FILES = ("report.html", "report.json")
@@ -183,10 +183,10 @@ def build(
     """
     chosen, missing = chosen_frames(session)
     if missing:
-        named = ", ".join(str(index) for index in missing[:10]) + (" …" if len(missing) > 10 else "")
         raise FormatError(
-            f"{session.folder}: {len(missing)} of {len(session.illuminations)} lights have no accepted frame: {named}; "
-            "finish the session with acquire run, then build the table; or let it grow with build-lut --append"
+            f"{session.folder}: {len(missing)} of {len(session.illuminations)} lights have no accepted frame: "
+            f"{first_of(missing)}; finish the session with acquire run, then build the table; or let it grow with "
+            "build-lut --append"
         )
     _require_darks(session, choices)
     with growing(out) as making:

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from acquisition.illuminations import COLUMNS, Illumination, load_illuminations
-from drivers.errors import FormatError, InputError, StorageError
+from drivers.errors import FormatError, InputError, StorageError, first_of
 from drivers.storage import partial_path, storage_error, write_whole
 
 FORMAT = "crop.lut"
@@ -291,7 +291,7 @@ def damage(lut: Lut, progress: Callable[[int, int], None] | None = None) -> list
     whole, lights = _samples_sha256(lut.folder / SAMPLES, lut.samples, progress)
     changed = [light for light, (now, then) in enumerate(zip(lights, known.lights_sha256, strict=True)) if now != then]
     if changed:
-        named = ", ".join(map(str, changed[:20])) + (" …" if len(changed) > 20 else "")
+        named = first_of(changed, 20)
         faults.append(f"{SAMPLES}: the samples of {len(changed)} of {len(lights)} lights have changed: {named}")
     elif whole != known.samples_sha256:
         faults.append(f"{SAMPLES}: its first bytes, before the samples, have changed")
@@ -371,8 +371,7 @@ def require_match(one: Lut, other: Lut) -> None:
         pairs = zip(one.illuminations, other.illuminations, strict=True)
         differing = [light.index for light, counterpart in pairs if light != counterpart]
         if differing:
-            named = ", ".join(map(str, differing[:10])) + (" …" if len(differing) > 10 else "")
-            found.append(f"other codes under {len(differing)} lights: {named}")
+            found.append(f"other codes under {len(differing)} lights: {first_of(differing)}")
     if found:
         raise FormatError(
             f"{one.folder} and {other.folder} do not correspond: {'; '.join(found)}; "

@@ -24,6 +24,7 @@ from calibration.linearity import curve
 from calibration.references import tint_deg
 from calibration.sampling import WINDOW
 from calibration.thresholds import THRESHOLDS, Threshold
+from drivers.errors import first_of
 
 if TYPE_CHECKING:
     from calibration.registration import Registration
@@ -262,7 +263,7 @@ def _where(row: Judged, result: BuildResult) -> str:
             return f"in {frame.record.file} about {x_mm:.0f}, {y_mm:.0f} mm"
         case "off_codes_deg":
             lights = lights_off_codes(result, row.threshold.accept)
-            return f"{len(lights)} lights: {', '.join(map(str, lights[:10]))}{' …' if len(lights) > 10 else ''}"
+            return f"{len(lights)} lights: {first_of(lights)}"
         case _:
             return ""
 

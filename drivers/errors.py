@@ -24,6 +24,8 @@ these at the place where the library is called, with ``from error``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 EXIT_INTERRUPTED = 130
 """Exit code of a command that Ctrl-C ended; 128 + SIGINT, as shells have it."""
 
@@ -92,3 +94,8 @@ class StorageError(CropError):
     """The disk is full, read-only or gone; what was complete before is untouched."""
 
     exit_code = 5
+
+
+def first_of(things: Sequence[object], most: int = 10) -> str:
+    """Return things between commas as a message names them: the first ones, and an ellipsis where there are more."""
+    return ", ".join(map(str, things[:most])) + (" …" if len(things) > most else "")

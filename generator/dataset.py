@@ -34,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from drivers.errors import FormatError, InputError
+from drivers.errors import FormatError, InputError, first_of
 from generator.encode import Format, decode_image
 from generator.illuminant import ListedLights
 from generator.lights.lighting import LightChoice, parse_mixture
@@ -528,10 +528,9 @@ def finish_dataset(out: Path | str) -> Dataset:
         with workplace(out, identity) as place:
             missing = sorted(set(range(identity["shards"])) - place.done())
             if missing:
-                named = ", ".join(map(str, missing[:10])) + (" …" if len(missing) > 10 else "")
                 raise InputError(
-                    f"{len(missing)} of {identity['shards']} shards of {out} are not made yet: {named}; run their "
-                    "shares, or the command without a share, which makes all that is missing"
+                    f"{len(missing)} of {identity['shards']} shards of {out} are not made yet: {first_of(missing)}; "
+                    "run their shares, or the command without a share, which makes all that is missing"
                 )
             assemble(place, identity)
     return open_dataset(out)

@@ -23,6 +23,12 @@ def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr() == ("", "")
 
 
+def test_messages_name_the_first_of_many() -> None:
+    assert errors.first_of(range(3)) == "0, 1, 2"
+    assert errors.first_of(["a", "b", "c"], 2) == "a, b …"
+    assert errors.first_of(range(10)) == "0, 1, 2, 3, 4, 5, 6, 7, 8, 9"
+
+
 # The tree in the docstring of drivers.errors.
 @pytest.mark.parametrize(
     ("error", "code"),
