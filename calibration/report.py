@@ -24,6 +24,7 @@ import numpy.typing as npt
 from acquisition.chart import Chart
 from acquisition.illuminations import decode_srgb
 from acquisition.session import Session
+from calibration.likeness import can_tell
 from calibration.mosaic import half_size
 from calibration.radiometry import MAX_BLACK_DRIFT
 from calibration.registration import Registration
@@ -81,13 +82,7 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
             f"samples and ground truth. Each contour is 2 %. {_primaries_told(result)}",
             _drawn(_field, chart, result),
         ),
-        (
-            "The print",
-            "How far cells and their surroundings are off what their codes give elsewhere on the sheet, in the channel "
-            "that is off most. Noise is a fine grain of some tenths of a per cent; stains, folds and shadows have a "
-            "shape. Crosses are cells listed for it.",
-            _drawn(_print, chart, result.stains),
-        ),
+        *_print_drawn(chart, result.stains),
         (
             "The lights",
             "rb-chromaticities of the lights as projected, as the camera sees them on bare paper (the ground truth), "
@@ -521,6 +516,18 @@ def _field(figure: Any, chart: Chart, result: BuildResult) -> None:
     figure.colorbar(image, ax=list(grid), label="light, mean 1", shrink=0.85)
 
 
+def _print_drawn(chart: Chart, stains: Stains) -> list[tuple[str, str, bytes]]:
+    """Return the picture of the print, or none where nothing can be told of it: a clean sheet would be a claim."""
+    if not stains.tells:
+        return []
+    caption = (
+        "How far cells and their surroundings are off what their codes give elsewhere on the sheet, in the channel "
+        "that is off most. Noise is a fine grain of some tenths of a per cent; stains, folds and shadows have a "
+        "shape. Crosses are cells listed for it."
+    )
+    return [("The print", caption, _drawn(_print, chart, stains))]
+
+
 def _print(figure: Any, chart: Chart, stains: Stains) -> None:
     page_w, page_h = chart.page_mm
     figure.set_size_inches(10, 8.6 * page_h / page_w)
@@ -597,7 +604,15 @@ def _course(figure: Any, result: BuildResult) -> None:
         white.legend(frameon=False, fontsize=8)
     white.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     white.set(title="bare paper under white", ylabel="% of the first", xlabel="frame")
-    like.plot(
+    _draw_likeness(like, count, result)
+
+
+def _draw_likeness(axes: Any, count: npt.NDArray[np.integer], result: BuildResult) -> None:
+    axes.set(title="cells off what their codes give", ylabel="%", xlabel="frame")
+    if not can_tell(len(result.registration.strangers)):
+        axes.text(0.5, 0.5, "too few colours to tell", ha="center", va="center", transform=axes.transAxes)
+        return
+    axes.plot(
         count,
         [100 * figures.likeness.scatter for figures in result.frames],
         ".",
@@ -605,7 +620,7 @@ def _course(figure: Any, result: BuildResult) -> None:
         markersize=3,
         label="all cells",
     )
-    like.plot(
+    axes.plot(
         count,
         [100 * figures.likeness.block for figures in result.frames],
         "x",
@@ -613,9 +628,8 @@ def _course(figure: Any, result: BuildResult) -> None:
         markersize=3,
         label="worst part",
     )
-    like.legend(frameon=False, fontsize=8)
-    like.set(title="cells off what their codes give", ylabel="%", xlabel="frame")
-    like.set_ylim(bottom=0, top=max(1.5, like.get_ylim()[1]))
+    axes.legend(frameon=False, fontsize=8)
+    axes.set_ylim(bottom=0, top=max(1.5, axes.get_ylim()[1]))
 
 
 def _worst(figure: Any, picture: _Image, chart: Chart, registration: Registration, window: int) -> None:

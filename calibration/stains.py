@@ -73,6 +73,11 @@ class Stains:
         """(C,) cells in neighbourhoods that are off by a per cent or more: a fold's flanks, a faint stain, a shadow."""
         return _beyond(self.deviation, self.error, DOUBTFUL)
 
+    @property
+    def tells(self) -> bool:
+        """Whether anything can be told of the print."""
+        return bool(np.isfinite(self.deviation).any())
+
     def largest(self) -> _Array:
         """Return (C,) the deviation, with its sign, of the channel that deviates most; 0 where it cannot be told."""
         return _largest(self.deviation)

@@ -151,7 +151,7 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "brightest_share": float(paper.max()) / result.white_level,
         "darkest_counts": float(paper.min()),
     }
-    if np.isfinite(result.stains.deviation).any():
+    if result.stains.tells:
         figures["doubtful_share"] = float(result.stains.doubtful.mean())
     if len(result.frames) > 1:
         figures["moved_anew"] = float(sum(frame.registered for frame in result.frames))
