@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.annotated import annotated_png
-from acquisition.chart import Chart
-from acquisition.field import field_mm
-from acquisition.framing import find_chart
-from acquisition.layout import design_chart, paper_chart
-from drivers.rawfile import read_raw
-from sim.world import Room
+from acquisition.chart.layout import design_chart, paper_chart
+from acquisition.chart.model import Chart
+from acquisition.framing.annotated import annotated_png
+from acquisition.framing.tagless_field import field_mm
+from acquisition.framing.tags import find_chart
+from drivers.raw.rawfile import read_raw
+from sim.world.world import Room
 from tests.calibration.lab import hang_chart
 
 RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw" / "canon_eos_550d_colorchart.dng"

@@ -13,20 +13,20 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart import Chart
-from acquisition.framing import find_chart, find_tags
-from acquisition.layout import A_SERIES_MM, design_chart
-from acquisition.movement import shift_between
-from acquisition.planes import CHANNELS, Plane, channel_offset_px, phases, plane_of, strongest_plane
-from acquisition.printing import drawing
-from acquisition.sharpness import blur_px
+from acquisition.chart.layout import A_SERIES_MM, design_chart
+from acquisition.chart.model import Chart
+from acquisition.chart.printing import drawing
+from acquisition.framing.planes import CHANNELS, Plane, channel_offset_px, phases, plane_of, strongest_plane
+from acquisition.framing.sharpness import blur_px
+from acquisition.framing.tags import find_chart, find_tags
+from calibration.registration.movement import shift_between
 from drivers.camera import ExposureSettings
-from drivers.errors import RegistrationError
 from drivers.presenter import BLACK, WHITE, Colour
-from drivers.rawfile import Mosaic, read_raw
-from sim.bodies import BODIES
-from sim.dng import write_dng
-from sim.world import Print, Room, World
+from drivers.raw.rawfile import Mosaic, read_raw
+from foundation.errors import RegistrationError
+from sim.camera.dng import write_dng
+from sim.camera.sensors import BODIES
+from sim.world.world import Print, Room, World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw"

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acquisition.layout import A_SERIES_MM, design_chart
+from acquisition.chart.layout import A_SERIES_MM, design_chart
 from benchmarks import rooms
-from calibration.displacement import Displacement
-from calibration.lens import fit_lens
-from calibration.registration import register
-from drivers.errors import RegistrationError
+from calibration.registration.displacement import Displacement
+from calibration.registration.lens import fit_lens
+from calibration.registration.register import register
 from drivers.presenter import WHITE, Colour
-from drivers.rawfile import Mosaic, read_raw
-from sim.world import Room
+from drivers.raw.rawfile import Mosaic, read_raw
+from foundation.errors import RegistrationError
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang
 
 RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw"

@@ -14,10 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.camera import CameraIdentity, ExposureSettings
-from drivers.errors import DeviceError, DeviceRefused, LinkClosed, StorageError
-from drivers.links.usb import open_usb
-from drivers.pipes import Pipe, UsbPipes
-from drivers.ptp.canon import (
+from drivers.canon.camera import CanonEos
+from drivers.canon.records import (
     ImageFile,
     ImageFormat,
     Notice,
@@ -28,22 +26,24 @@ from drivers.ptp.canon import (
     decode_events,
     encode_events,
 )
-from drivers.ptp.canon_eos import CanonEos
+from drivers.canon.state import EosState, custom_functions, problems
+from drivers.links.pipes import Pipe, UsbPipes
+from drivers.links.usb import open_usb
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode
-from drivers.ptp.eos_state import EosState, custom_functions, problems
 from drivers.ptp.ip_transport import IpTransport
 from drivers.ptp.messages import Event, Request, Response
 from drivers.ptp.transport import Transaction, Transport
 from drivers.ptp.usb_transport import UsbTransport
+from foundation.errors import DeviceError, DeviceRefused, LinkClosed, StorageError
 from sim import faults
+from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.responder import Answer, Responder
+from sim.buses.usb import SimulatedBus
+from sim.buses.usb_device import PtpUsbDevice
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D, EosBody
 from sim.clock import SimulatedClock
-from sim.eos import SimulatedEos
-from sim.eos_bodies import EOS_6D_MARK_II, EOS_550D, EosBody
 from sim.faults import Occasion
-from sim.ptpip_server import serve_ptpip
-from sim.responder import Answer, Responder
-from sim.usb import SimulatedBus
-from sim.usb_device import PtpUsbDevice
 from tests.contracts.camera import SETTINGS, Bench, CameraContract
 from tests.drivers.eos_lab import Lab
 

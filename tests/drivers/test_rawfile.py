@@ -16,12 +16,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from drivers import dng_reading, rawfile, tiff
 from drivers.camera import ExposureSettings
-from drivers.errors import FormatError
-from drivers.rawfile import Area, Mosaic, read_raw
-from sim.bodies import BODIES, Rectangle
-from sim.dng import write_dng as write_simulated_dng
+from drivers.raw import plain_dng as dng_reading
+from drivers.raw import rawfile
+from drivers.raw.rawfile import Area, Mosaic, read_raw
+from drivers.tiff import reading as tiff
+from foundation.errors import FormatError
+from sim.camera.dng import write_dng as write_simulated_dng
+from sim.camera.sensors import BODIES, Rectangle
 from tests.drivers.raw_files import Tags, longs, ratios, shorts, text, write_cr2, write_dng
 
 REAL = ("canon_eos_550d_colorchart.dng", "canon_powershot_g2.crw", "blackmagic.dng")

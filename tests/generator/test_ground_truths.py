@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.errors import FormatError
+from foundation.errors import FormatError
 from generator.lights.ground_truths import load_ground_truths
 
 GT = Path(__file__).parents[2].parent / "shared" / "data" / "gt"

@@ -16,9 +16,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.camera import ExposureSettings
-from drivers.errors import DeviceRefused, LinkClosed
-from drivers.ptp import apex
-from drivers.ptp.canon import (
+from drivers.canon import apex
+from drivers.canon.camera import CanonEos
+from drivers.canon.records import (
     RAW_ONLY,
     AvailableFormats,
     AvailableValues,
@@ -37,7 +37,6 @@ from drivers.ptp.canon import (
     number_value,
     text_value,
 )
-from drivers.ptp.canon_eos import CanonEos
 from drivers.ptp.codes import (
     AeMode,
     CaptureDestination,
@@ -59,9 +58,11 @@ from drivers.ptp.datasets import (
     encode_string,
 )
 from drivers.ptp.messages import Request
-from sim.clock import OPENING, SimulatedClock
-from sim.eos import SimulatedEos
-from sim.eos_bodies import (
+from foundation.errors import DeviceRefused, LinkClosed
+from sim.buses.ptp_memory import MemoryTransport
+from sim.buses.responder import Answer
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import (
     EOS_6D_MARK_II,
     EOS_550D,
     EOS_550D_AS_LISTED,
@@ -70,9 +71,8 @@ from sim.eos_bodies import (
     TEST_BODY,
     EosBody,
 )
-from sim.eos_state import CARD, DCIM, EMPTY_SLOT, FOLDER
-from sim.ptp_memory import MemoryTransport
-from sim.responder import Answer
+from sim.camera.eos_state import CARD, DCIM, EMPTY_SLOT, FOLDER
+from sim.clock import OPENING, SimulatedClock
 
 RECORDING = Path(__file__).parents[2].parent / "shared" / "data" / "ptp" / "eos60d_transactions.json"
 

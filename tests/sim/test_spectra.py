@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim.spectra import (
+from sim.world.spectra import (
     SURFACE_REFLECTANCE,
     WAVELENGTHS_NM,
     Lamp,

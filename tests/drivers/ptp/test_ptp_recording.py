@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
-from drivers.ptp import canon, container
-from drivers.ptp.apex import APERTURE, ISO
-from drivers.ptp.canon import AvailableValues, DeviceInfoEx, ImageFormat, Notice, PropertyChanged, PropertySetting
+from drivers.canon import records as canon
+from drivers.canon.apex import APERTURE, ISO
+from drivers.canon.records import AvailableValues, DeviceInfoEx, ImageFormat, Notice, PropertyChanged, PropertySetting
+from drivers.ptp import container
 from drivers.ptp.codes import Operation, Property
 from drivers.ptp.container import ContainerReader, DataPiece, DataStart
 from drivers.ptp.datasets import (
