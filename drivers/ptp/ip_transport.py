@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 from drivers.links.link import Link
 from drivers.links.tcp import TcpLink
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.ptpip import (
     PORT,
     Cancel,
@@ -100,7 +100,7 @@ class IpTransport:
         self._clock = clock
         self._place = label
         self._label = label
-        self._events: deque[Event] = deque(maxlen=MAX_EVENTS)
+        self._events: deque[PtpEvent] = deque(maxlen=MAX_EVENTS)
         self._connect()
 
     @classmethod
@@ -125,7 +125,7 @@ class IpTransport:
 
     def transact(
         self,
-        request: Request,
+        request: PtpRequest,
         *,
         send: bytes | None = None,
         receive: Callable[[bytes], object] | None = None,
@@ -139,7 +139,7 @@ class IpTransport:
 
         return self._turns.take(Reception(request, receive, self._label), exchange, self._call_off)
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come since the last call, and answer pings; never waits.
 
         Raises
@@ -230,7 +230,7 @@ class IpTransport:
             except ProtocolError as error:
                 raise ProtocolError(f"what answers in place of {self._place} speaks no PTP/IP: {error}") from error
             if packets:
-                self._events.extend(packet for packet in packets[1:] if isinstance(packet, Event))
+                self._events.extend(packet for packet in packets[1:] if isinstance(packet, PtpEvent))
                 return packets[0]
 
     def _refusal(self, answer: Packet) -> DeviceRefused | ProtocolError:
@@ -248,7 +248,7 @@ class IpTransport:
                 why = f"gives reason {answer.reason}: switch it off and on"
         return DeviceRefused(f"{self._place} refuses the connection; it {why}")
 
-    def _send(self, request: Request, send: bytes | None, timeout: float) -> None:
+    def _send(self, request: PtpRequest, send: bytes | None, timeout: float) -> None:
         self._command.write(encode(OperationRequest(request, send is not None)), timeout)
         if send is None:
             return
@@ -267,9 +267,9 @@ class IpTransport:
                     reception.start(transaction, total)
                 case Data(_, data) | EndData(_, data):
                     reception.take(data)
-                case Response() as response:
+                case PtpResponse() as response:
                     return reception.end(response)
-                case Event() as event:
+                case PtpEvent() as event:
                     self._events.append(event)
                 case Ping():
                     self._command.write(encode(Pong()), timeout)
@@ -307,7 +307,7 @@ class IpTransport:
                 return
             for packet in self._event_cutter.feed(piece):
                 match packet:
-                    case Event():
+                    case PtpEvent():
                         self._events.append(packet)
                     case Ping():
                         self._event.write(encode(Pong()), _PING_EVERY_S)
@@ -321,6 +321,6 @@ class IpTransport:
             self._event.write(encode(Cancel(transaction)), _CALL_OFF_S)
             while self._clock.monotonic() < deadline:
                 packet = self._next(_CALL_OFF_S)
-                if isinstance(packet, Response) and packet.transaction == transaction:
+                if isinstance(packet, PtpResponse) and packet.transaction == transaction:
                     return True
         return False

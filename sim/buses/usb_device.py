@@ -35,7 +35,7 @@ from drivers.ptp.container import (
     encode_data_header,
     ends_with_empty_packet,
 )
-from drivers.ptp.messages import Request
+from drivers.ptp.messages import PtpRequest
 from foundation.errors import ProtocolError
 from sim.buses.responder import NoAnswer, Responder
 
@@ -169,19 +169,19 @@ class PtpUsbDevice:
 
     def _start_over(self) -> None:
         self._reader = ContainerReader(PACKET)
-        self._request: Request | None = None
+        self._request: PtpRequest | None = None
         self._payload = bytearray()
-        self._complete: tuple[Request, bytes | None] | None = None
+        self._complete: tuple[PtpRequest, bytes | None] | None = None
         self._transfer_open = False
         self._outgoing: deque[memoryview] = deque()
         self._events: deque[memoryview] = deque()
 
     def _take(self, message: Message) -> None:
         match message:
-            case Request() if self._responder.takes_data(message):
+            case PtpRequest() if self._responder.takes_data(message):
                 self._request = message
                 self._payload.clear()
-            case Request():
+            case PtpRequest():
                 self._complete = (message, None)
             case DataStart() if self._request is not None:
                 pass
@@ -193,7 +193,7 @@ class PtpUsbDevice:
             case _:
                 raise ProtocolError(f"{type(message).__name__} was not due")
 
-    def _answer(self, request: Request, payload: bytes | None) -> None:
+    def _answer(self, request: PtpRequest, payload: bytes | None) -> None:
         try:
             answer = self._responder.answer(request, payload)
         except NoAnswer:

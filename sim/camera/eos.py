@@ -26,7 +26,7 @@ from dataclasses import replace
 
 from drivers.canon.records import ImageFormat, Notice, number_of, number_value
 from drivers.ptp.codes import AeMode, EosEvent, FocusMode, Operation, Property, ReleaseButton, ResponseCode
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import Clock
 from foundation.errors import LinkClosed
 from sim.buses.responder import Answer
@@ -104,7 +104,7 @@ class SimulatedEos(EosSettings, EosRelease):
 
     # The cable.
 
-    def takes_data(self, request: Request) -> bool:
+    def takes_data(self, request: PtpRequest) -> bool:
         """Return whether the initiator sends a data phase with this operation."""
         return request.code in (
             Operation.SET_DEVICE_PROP_VALUE,
@@ -113,7 +113,7 @@ class SimulatedEos(EosSettings, EosRelease):
             Operation.SEND_OBJECT,
         )
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Carry out a request.
 
         Raises
@@ -128,10 +128,10 @@ class SimulatedEos(EosSettings, EosRelease):
             try:
                 reply = self._carry_out(request, data)
             except Declined as no:
-                return Answer(Response(no.code, request.transaction, no.parameters))
-            return Answer(Response(ResponseCode.OK, request.transaction, reply.parameters), reply.data)
+                return Answer(PtpResponse(no.code, request.transaction, no.parameters))
+            return Answer(PtpResponse(ResponseCode.OK, request.transaction, reply.parameters), reply.data)
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Return hints that GetEvent has something to tell, one for a queue that was empty."""
         with self._guard:
             self._move()
@@ -243,7 +243,7 @@ class SimulatedEos(EosSettings, EosRelease):
 
     # Operations.
 
-    def _carry_out(self, request: Request, data: bytes | None) -> Reply:
+    def _carry_out(self, request: PtpRequest, data: bytes | None) -> Reply:
         operation = self._operations.get(request.code)
         if operation is None:
             raise Declined(ResponseCode.OPERATION_NOT_SUPPORTED)

@@ -31,7 +31,7 @@ from drivers.canon.records import (
     text_value,
 )
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, EventCode, ObjectFormat, Property, ResponseCode
-from drivers.ptp.messages import Event
+from drivers.ptp.messages import PtpEvent
 from foundation.clock import Clock
 from sim.camera.eos_bodies import MIRROR_LOCKUP, EosBody, custom_functions
 from sim.camera.film import Film
@@ -164,7 +164,7 @@ class EosState:
         self._queue: list[Record] = []
         self._memory: dict[int, StoredObject] = {}
         self._host_bytes = 0
-        self._hints: list[Event] = []
+        self._hints: list[PtpEvent] = []
         self._idle_since = clock.monotonic()
         self._warned = False
         # What is under way: (when, order, what happens then), the earliest first.
@@ -221,7 +221,7 @@ class EosState:
         if not self._event_mode:
             return
         if not self._queue:
-            self._hints.append(Event(EventCode.EOS_REQUEST_GET_EVENT))
+            self._hints.append(PtpEvent(EventCode.EOS_REQUEST_GET_EVENT))
         self._queue.append(record)
 
     def _tell_list(self, code: int) -> None:

@@ -57,7 +57,7 @@ from drivers.ptp.datasets import (
     decode_value,
     encode_string,
 )
-from drivers.ptp.messages import Request
+from drivers.ptp.messages import PtpRequest
 from foundation.errors import DeviceRefused, LinkClosed
 from sim.buses.ptp_memory import MemoryTransport
 from sim.buses.responder import Answer
@@ -111,7 +111,7 @@ class Host:
         self.transaction = 0
 
     def ask(self, code: int, *parameters: int, data: bytes | None = None) -> Answer:
-        request = Request(code, 0 if code == Operation.OPEN_SESSION else self.next(), parameters)
+        request = PtpRequest(code, 0 if code == Operation.OPEN_SESSION else self.next(), parameters)
         if code == Operation.OPEN_SESSION:
             self.transaction = 0
         answer = self.eos.answer(request, data)
@@ -231,7 +231,7 @@ def test_holds_the_conversation_of_a_real_60d() -> None:
     sessions = 0
     for number, recorded in enumerate(json.loads(RECORDING.read_text())):
         code = int(recorded["code"], 16)
-        request = Request(code, recorded["tid"], tuple(recorded["params"]))
+        request = PtpRequest(code, recorded["tid"], tuple(recorded["params"]))
         if code == Operation.OPEN_SESSION:
             sessions += 1
             if sessions == 2:
@@ -315,7 +315,7 @@ def test_bodies_have_their_usb_ids(name: str, product: int) -> None:
 
 def test_tells_what_it_is_without_a_session() -> None:
     host = host_of()
-    assert host.eos.answer(Request(Operation.GET_DEVICE_INFO), None).response.ok
+    assert host.eos.answer(PtpRequest(Operation.GET_DEVICE_INFO), None).response.ok
     assert host.code(Operation.GET_STORAGE_IDS) == ResponseCode.SESSION_NOT_OPEN
     assert host.code(Operation.OPEN_SESSION, 0) == ResponseCode.INVALID_PARAMETER
 
@@ -335,7 +335,7 @@ def test_a_transaction_number_is_used_once() -> None:
     host.ok(Operation.OPEN_SESSION, 1)
 
     def code(transaction: int) -> int:
-        return host.eos.answer(Request(Operation.GET_STORAGE_IDS, transaction), None).response.code
+        return host.eos.answer(PtpRequest(Operation.GET_STORAGE_IDS, transaction), None).response.code
 
     assert [code(n) for n in (1, 1, 3, 2, 0, 0xFFFFFFFF, 4)] == [
         ResponseCode.OK,
@@ -385,7 +385,7 @@ def test_answers_whatever_is_asked(code: int, parameters: list[int], data: bytes
     answer = host.ask(code, *parameters, data=data)
     assert answer.response.ok or answer.data is None
     host.clock.sleep(60)
-    assert host.eos.answer(Request(Operation.OPEN_SESSION, 0, (1,)), None)
+    assert host.eos.answer(PtpRequest(Operation.OPEN_SESSION, 0, (1,)), None)
     host.transaction = 1000
     host.events()
 
