@@ -27,9 +27,9 @@ from drivers.pjlink.wire import (
     Input,
     LineCutter,
     NoResolution,
+    PjLinkReply,
+    PjLinkRequest,
     Refused,
-    Reply,
-    Request,
     Resolution,
 )
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
@@ -335,7 +335,7 @@ class PjLinkPeer:
         assert self._password is not None
         return len(nonce) == 16 and digest == wire.sha256_digest(self._challenge, nonce, self._password)
 
-    def _reply(self, request: Request) -> Reply | Refused:
+    def _reply(self, request: PjLinkRequest) -> PjLinkReply | Refused:
         if self._expected_digest:
             if not self._proves_password(request.digest):
                 return Refused.WRONG_PASSWORD
@@ -348,9 +348,9 @@ class PjLinkPeer:
             value = ErrorCode.FAILURE.value
         except ValueError:
             value = ErrorCode.OUT_OF_PARAMETER.value
-        return Reply(request.command, value, request.level)
+        return PjLinkReply(request.command, value, request.level)
 
-    def _value(self, request: Request) -> str:
+    def _value(self, request: PjLinkRequest) -> str:
         projector = self._projector
         match request.command, request.parameter:
             case "POWR", wire.QUERY:
@@ -393,7 +393,7 @@ class PjLinkPeer:
                 return ErrorCode.UNDEFINED.value
         return wire.OK
 
-    def _class_2_value(self, request: Request) -> str:
+    def _class_2_value(self, request: PjLinkRequest) -> str:
         projector = self._projector
         traits = projector.traits
         match request.command, request.parameter:
