@@ -224,13 +224,13 @@ class OptomaPeer(_Listener):
         self._told_power, self._told_faults = power, broken
         return b"".join(optoma.encode_message(info) for info in news if info is not None)
 
-    def _answer(self, command: optoma.Command) -> optoma.Message:
+    def _answer(self, command: optoma.OptomaCommand) -> optoma.Message:
         try:
             return self._done(command)
         except (DeviceRefused, DeviceFault, ValueError):
-            return optoma.Done(False)
+            return optoma.PassFail(False)
 
-    def _done(self, command: optoma.Command) -> optoma.Message:
+    def _done(self, command: optoma.OptomaCommand) -> optoma.Message:
         projector = self._projector
         match command.number, command.value:
             case optoma.POWER, "1":
@@ -249,7 +249,7 @@ class OptomaPeer(_Listener):
                 return optoma.Value("1" if projector.muted() else "0")
             case _:
                 raise ValueError(command)
-        return optoma.Done(True)
+        return optoma.PassFail(True)
 
 
 class NecPeer(_Listener):
@@ -268,17 +268,17 @@ class NecPeer(_Listener):
             self._heard = b""
         return said
 
-    def _answer(self, command: nec.Command) -> nec.Reply:
+    def _answer(self, command: nec.NecCommand) -> nec.NecReply:
         try:
-            return nec.Reply(command.kind, command.code, self._done(command))
+            return nec.NecReply(command.kind, command.code, self._done(command))
         except DeviceRefused:
-            return nec.Reply(command.kind, command.code, failed=nec.POWER_IS_OFF)
+            return nec.NecReply(command.kind, command.code, failed=nec.POWER_IS_OFF)
         except DeviceFault:
-            return nec.Reply(command.kind, command.code, failed=nec.EXECUTION_FAILED)
+            return nec.NecReply(command.kind, command.code, failed=nec.EXECUTION_FAILED)
         except ValueError:
-            return nec.Reply(command.kind, command.code, failed=nec.UNKNOWN_COMMAND)
+            return nec.NecReply(command.kind, command.code, failed=nec.UNKNOWN_COMMAND)
 
-    def _done(self, command: nec.Command) -> bytes:
+    def _done(self, command: nec.NecCommand) -> bytes:
         projector = self._projector
         match command:
             case nec.POWER_ON:

@@ -629,10 +629,10 @@ def test_whatever_is_said_to_a_simulated_one_it_goes_on_answering(name: str, noi
 
 @given(kind=st.integers(0, 3), code=st.integers(0, 255), data=st.binary(max_size=255))
 def test_nec_frames_survive_both_ends(kind: int, code: int, data: bytes) -> None:
-    command = nec.Command(kind, code, data)
+    command = nec.NecCommand(kind, code, data)
     frame = nec.encode_command(command)
     assert nec.take_command(frame + b"more") == (command, len(frame))
-    reply = nec.Reply(kind, code, data)
+    reply = nec.NecReply(kind, code, data)
     frame = nec.encode_reply(reply)
     assert nec.take_reply(frame + b"more") == (reply, len(frame))
 
