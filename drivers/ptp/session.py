@@ -2,8 +2,8 @@
 
 Laws that hold inside:
 
-- A response other than OK is a `Declined`, which tells its code by number and by name; what a device declines for the
-  moment only (`PASSING`) is asked again, for a limited time.
+- A response other than OK raises `OperationDeclined`, which has its code by number and by name; what a device declines
+  for the moment only (`PASSING`) is asked again, for a limited time.
 - A fault of cable or protocol goes straight to the caller: whether an operation may be repeated is not known here.
   After one, the session is spent; a new one begins with `Transport.reset` or a new transport.
 
@@ -38,7 +38,7 @@ _LONGEST_PAUSE_S = 1.0
 _LAST_SESSION = 8
 
 
-class Declined(DeviceRefused):
+class OperationDeclined(DeviceRefused):
     """A device answered an operation with another response than OK: `code`."""
 
     def __init__(self, message: str, code: int) -> None:
@@ -74,7 +74,7 @@ class PtpSession:
         ------
         LinkTimeout, LinkClosed, ProtocolError
             No answer, after `OPEN_TRIES` tries.
-        Declined
+        OperationDeclined
             The device answers, and refuses.
         """
         faults = 0
@@ -135,7 +135,7 @@ class PtpSession:
 
         Raises
         ------
-        Declined
+        OperationDeclined
             The device answered something else than OK.
         LinkError, ProtocolError
             From the transport; the session is spent.
@@ -164,6 +164,6 @@ class PtpSession:
             pause = min(2 * pause, _LONGEST_PAUSE_S)
             yield True
 
-    def _declined(self, request: PtpRequest, code: int) -> Declined:
+    def _declined(self, request: PtpRequest, code: int) -> OperationDeclined:
         remedy = "; wait until it is idle, then try again" if code in PASSING else ""
-        return Declined(f"{self.label} answers {describe(ResponseCode, code)} to {request}{remedy}", code)
+        return OperationDeclined(f"{self.label} answers {describe(ResponseCode, code)} to {request}{remedy}", code)

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.ptp.codes import Operation, ResponseCode
 from drivers.ptp.messages import LAST_TRANSACTION, PtpEvent, PtpRequest, PtpResponse
-from drivers.ptp.session import OPEN_TRIES, PASSING_LIMIT_S, Declined, PtpSession
+from drivers.ptp.session import OPEN_TRIES, PASSING_LIMIT_S, OperationDeclined, PtpSession
 from drivers.ptp.transport import Transaction
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
@@ -100,7 +100,7 @@ def test_what_is_declined_for_the_moment_is_asked_again_under_a_new_number(code:
 
 def test_patience_ends_by_the_clock() -> None:
     session, _, clock = opened(ResponseCode.OK, *[0x2019] * 1000)
-    with pytest.raises(Declined, match="wait until it is idle") as caught:
+    with pytest.raises(OperationDeclined, match="wait until it is idle") as caught:
         session.call(Operation.EOS_KEEP_DEVICE_ON)
     assert caught.value.code == 0x2019
     assert clock.monotonic() == pytest.approx(PASSING_LIMIT_S)
@@ -108,7 +108,7 @@ def test_patience_ends_by_the_clock() -> None:
 
 def test_no_patience_asks_once() -> None:
     session, cable, clock = opened(ResponseCode.OK, 0x2019)
-    with pytest.raises(Declined):
+    with pytest.raises(OperationDeclined):
         session.call(Operation.EOS_REMOTE_RELEASE_ON, 3, 1, patience=0.0)
     assert (len(cable.asked), clock.monotonic()) == (2, 0.0)
 
