@@ -53,7 +53,7 @@ _MOST_SHOTS = 0x7FFFFFFF
 _TEXTS = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT)
 
 
-class Declined(Exception):
+class OperationRefusal(Exception):
     """Ends an operation with another response than OK."""
 
     def __init__(self, code: int, *parameters: int) -> None:
@@ -62,7 +62,7 @@ class Declined(Exception):
         self.parameters = parameters
 
 
-class Reply(NamedTuple):
+class OperationResult(NamedTuple):
     """What an operation that was carried out answers."""
 
     data: bytes | None = None
@@ -210,12 +210,12 @@ class EosState:
 
     # Events.
 
-    def _get_event(self, _: Arguments) -> Reply:
+    def _get_event(self, _: Arguments) -> OperationResult:
         if self._bulb_since is not None and self._event_mode:
             open_s = int(self._clock.monotonic() - self._bulb_since[0])
             self._record(Notice(EosEvent.BULB_EXPOSURE_TIME, open_s))
         records, self._queue = self._queue, []
-        return Reply(encode_events(records))
+        return OperationResult(encode_events(records))
 
     def _record(self, record: Record) -> None:
         if not self._event_mode:
@@ -306,7 +306,7 @@ class EosState:
     def _require_remote(self) -> None:
         # Assumed: nothing shows what a body says to whoever has not taken control of it.
         if not self._remote_mode:
-            raise Declined(ResponseCode.EOS_OPERATION_REFUSED)
+            raise OperationRefusal(ResponseCode.EOS_OPERATION_REFUSED)
 
     def _blank_card(self, capacity: int) -> Card:
         now = self._clock.now()
