@@ -8,13 +8,21 @@ from __future__ import annotations
 from drivers.canon.records import Notice, TransferRequest, encode_object_entries
 from drivers.ptp.codes import EosEvent, FilesystemType, ObjectFormat, Property, ResponseCode, StorageType
 from drivers.ptp.datasets import ObjectInfo, StorageInfo, encode_u32_array
-from sim.camera.eos_state import CARD, EMPTY_SLOT, Arguments, EosState, OperationRefusal, OperationResult, StoredObject
+from sim.camera.eos_state import (
+    CARD,
+    EMPTY_SLOT,
+    Arguments,
+    OperationRefusal,
+    OperationResult,
+    SimulatedEosState,
+    StoredObject,
+)
 
 _ROOT = 0xFFFFFFFF
 _ANY_STORE = _ANY_FORMAT = 0xFFFFFFFF
 
 
-class EosFiles(EosState):
+class EosFiles(SimulatedEosState):
     """What an initiator can ask of a body's files, and do with them."""
 
     def _get_storage_ids(self, _: Arguments) -> OperationResult:

@@ -12,12 +12,12 @@ from drivers.ptp.codes import DataType, Property, ResponseCode
 from drivers.ptp.datasets import DevicePropDesc, EnumerationForm, Value, decode_value, encode_value
 from foundation.errors import ProtocolError
 from sim.camera.eos_bodies import FREE, LIST
-from sim.camera.eos_state import Arguments, EosState, OperationRefusal, OperationResult, PropertyState
+from sim.camera.eos_state import Arguments, OperationRefusal, OperationResult, PropertyState, SimulatedEosState
 
 _FREELY_SET = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT, Property.EOS_CAMERA_TIME)
 
 
-class EosSettings(EosState):
+class EosSettings(SimulatedEosState):
     """What an initiator can ask of a body's settings, and set."""
 
     def _set_device_prop_value_ex(self, arguments: Arguments) -> OperationResult:

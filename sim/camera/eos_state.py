@@ -123,7 +123,7 @@ class Card:
         return self.capacity - sum(len(item.data) for item in self.objects.values())
 
 
-class EosState:
+class SimulatedEosState:
     """The state of a body; see `sim.camera.eos.SimulatedEos` for the parameters."""
 
     def __init__(
