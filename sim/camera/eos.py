@@ -30,7 +30,7 @@ from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import Clock
 from foundation.errors import LinkClosed
 from sim.buses.responder import Answer
-from sim.camera.eos_bodies import EosBody
+from sim.camera.eos_bodies import EosModel
 from sim.camera.eos_release import EosRelease
 from sim.camera.eos_settings import EosSettings
 from sim.camera.eos_state import CARD, Arguments, OperationRefusal, OperationResult
@@ -74,7 +74,7 @@ class SimulatedEos(EosSettings, EosRelease):
 
     def __init__(
         self,
-        body: EosBody,
+        body: EosModel,
         film: Film,
         clock: Clock,
         *,

@@ -33,7 +33,7 @@ from drivers.canon.records import (
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, EventCode, ObjectFormat, Property, ResponseCode
 from drivers.ptp.messages import PtpEvent
 from foundation.clock import Clock
-from sim.camera.eos_bodies import MIRROR_LOCKUP, EosBody, custom_functions
+from sim.camera.eos_bodies import MIRROR_LOCKUP, EosModel, custom_functions
 from sim.camera.film import Film
 
 CARD = 0x00020001
@@ -128,7 +128,7 @@ class SimulatedEosState:
 
     def __init__(
         self,
-        body: EosBody,
+        body: EosModel,
         film: Film,
         clock: Clock,
         *,

@@ -41,7 +41,7 @@ from sim.buses.responder import Answer, Responder
 from sim.buses.usb import SimulatedBus
 from sim.buses.usb_device import PtpUsbDevice
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D, EosBody
+from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D, EosModel
 from sim.clock import SimulatedClock
 from sim.faults import Occasion
 from tests.contracts.camera import SETTINGS, Bench, CameraContract
@@ -199,7 +199,7 @@ SPOILS: list[tuple[Callable[[SimulatedEos], None], str]] = [
 @pytest.mark.parametrize(("spoil", "reason"), SPOILS)
 @pytest.mark.parametrize("body", [EOS_550D, EOS_6D_MARK_II], ids=["550D", "6D Mark II"])
 def test_what_would_spoil_a_series_is_refused_with_its_remedy(
-    spoil: Callable[[SimulatedEos], None], reason: str, body: EosBody
+    spoil: Callable[[SimulatedEos], None], reason: str, body: EosModel
 ) -> None:
     lab = Lab(body)
     spoil(lab.eos)

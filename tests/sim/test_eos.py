@@ -69,7 +69,7 @@ from sim.camera.eos_bodies import (
     EOS_BODIES,
     OPERATIONS,
     TEST_BODY,
-    EosBody,
+    EosModel,
 )
 from sim.camera.eos_state import CARD, DCIM, EMPTY_SLOT, FOLDER
 from sim.clock import OPENING, SimulatedClock
@@ -184,7 +184,7 @@ def statuses(records: tuple[Record, ...]) -> list[int]:
     return [r.number for r in records if isinstance(r, Notice) and r.type == EosEvent.CAMERA_STATUS_CHANGED]
 
 
-def host_of(body: EosBody = TEST_BODY, *, card_bytes: int | None = 8 << 30, battery: float = 1.0) -> Host:
+def host_of(body: EosModel = TEST_BODY, *, card_bytes: int | None = 8 << 30, battery: float = 1.0) -> Host:
     clock, film = SimulatedClock(), NumberedFilm()
     return Host(
         SimulatedEos(body, film, clock, card_bytes=card_bytes, battery=battery, auto_power_off_s=0), clock, film
@@ -349,7 +349,7 @@ def test_a_transaction_number_is_used_once() -> None:
 
 
 @pytest.mark.parametrize("body", EOS_BODIES.values(), ids=lambda body: body.model)
-def test_carries_out_all_that_it_lists_and_nothing_else(body: EosBody) -> None:
+def test_carries_out_all_that_it_lists_and_nothing_else(body: EosModel) -> None:
     host = host_of(body)
     listed = DeviceInfo.decode(host.ok(Operation.GET_DEVICE_INFO)).operations
     assert listed == tuple(OPERATIONS)
@@ -741,7 +741,7 @@ def test_a_half_press_alone_focuses_and_takes_nothing(host: Host) -> None:
 
 
 @pytest.mark.parametrize("body", [EOS_550D, EOS_6D_MARK_II], ids=lambda body: body.model)
-def test_mirror_lockup_blocks_the_release(body: EosBody) -> None:
+def test_mirror_lockup_blocks_the_release(body: EosModel) -> None:
     host = host_of(body).take_control()
     host.eos.switch_mirror_lockup(True)
     assert changes(host.events()), "the host can know"
@@ -884,7 +884,7 @@ def test_a_frame_under_way_outlives_its_session(host: Host) -> None:
     "body", [EOS_550D, EOS_6D_MARK_II, replace(EOS_6D_MARK_II, wide_objects=True)], ids=["550D", "6D2", "wide"]
 )
 @pytest.mark.parametrize("without", [(), (Operation.EOS_REMOTE_RELEASE_ON,)], ids=["press", "release"])
-def test_our_driver_takes_a_series(body: EosBody, without: tuple[int, ...]) -> None:
+def test_our_driver_takes_a_series(body: EosModel, without: tuple[int, ...]) -> None:
     clock, film = SimulatedClock(), NumberedFilm()
     eos = SimulatedEos(body, film, clock, auto_power_off_s=0, without=without)
     camera = CanonEos(lambda: MemoryTransport(eos), clock)
