@@ -26,8 +26,6 @@ from drivers.ptp.datasets import encode_integer
 from drivers.ptp.messages import MAX_PARAMETERS, PtpEvent, PtpRequest, PtpResponse
 from foundation.errors import ProtocolError
 
-INTERFACE_CLASS = (6, 1, 1)
-"""USB class, subclass and protocol of a still image device."""
 HEADER_LENGTH = 12
 UNKNOWN_LENGTH = 0xFFFFFFFF
 """A container's length where the payload goes on until a short packet: more than 4 GiB, or not known."""
