@@ -13,7 +13,7 @@ from foundation import console
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
-    from sim.projectors.pjlink import SimulatedProjector
+    from sim.projectors.projector import SimulatedProjector
     from sim.world.world import Print
 
 app = typer.Typer(
@@ -58,7 +58,7 @@ def projector(
     from drivers.pjlink.wire import MAX_PASSWORD
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError, InputError
-    from sim.projectors.pjlink import SimulatedProjector
+    from sim.projectors.projector import SimulatedProjector
 
     if (pjlink is None) == (serial is None):
         raise ConfigurationError("one projector hangs on one cable: either --pjlink PORT or --serial LANGUAGE")
@@ -78,7 +78,8 @@ def projector(
 def _serve_network(
     device: SimulatedProjector, pjlink: int, password: str | None, udp: int | None, controller: tuple[str, int] | None
 ) -> None:
-    from sim.projectors.pjlink import ProjectorDatagrams, serve_pjlink
+    from sim.projectors.pjlink import serve_pjlink
+    from sim.projectors.pjlink_notices import ProjectorDatagrams
 
     with ExitStack() as served:
         host, port = served.enter_context(serve_pjlink(device, pjlink, password)).address

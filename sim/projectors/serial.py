@@ -2,7 +2,7 @@
 
 Rules that hold inside:
 
-- A peer knows bytes and no physics; what they do happens in `sim.projectors.pjlink.SimulatedProjector`.
+- A peer knows bytes and no physics; what they do happens in `sim.projectors.projector.SimulatedProjector`.
 - A serial cable has no connections: a peer goes on where it was when its cable is opened again, and forgets only a
   half-heard command.
 - `receive` with no bytes asks what a peer has to say by now: a late answer, or news. Whoever joins a peer to a cable
@@ -21,7 +21,7 @@ from drivers.links.tcp import TcpLink, TcpServer
 from drivers.projector import Power, Severity
 from drivers.serial_projectors import benq, epson, nec, optoma
 from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
-from sim.projectors.pjlink import SimulatedProjector
+from sim.projectors.projector import SimulatedProjector
 
 SERIAL_NUMBER = "CROP0000001"
 POLLING_S = 0.02

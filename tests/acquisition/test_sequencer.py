@@ -29,7 +29,8 @@ from foundation.errors import DeviceError, DeviceFault, DeviceRefused, LinkClose
 from sim.camera.dng import write_dng
 from sim.camera.sensors import BODIES
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer, SimulatedProjector, memory_link
+from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.projector import SimulatedProjector
 from sim.projectors.serial import OptomaPeer, SerialPeerLink
 
 BODY = BODIES["Test"]

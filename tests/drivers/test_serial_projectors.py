@@ -32,7 +32,7 @@ from foundation.errors import (
     ProtocolError,
 )
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import SimulatedProjector
+from sim.projectors.projector import SimulatedProjector
 from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer, SerialPeerLink
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling

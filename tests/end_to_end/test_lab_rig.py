@@ -36,7 +36,8 @@ from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_BODIES
 from sim.camera.film import WorldFilm
 from sim.clock import OPENING
-from sim.projectors.pjlink import SimulatedProjector, serve_pjlink
+from sim.projectors.pjlink import serve_pjlink
+from sim.projectors.projector import SimulatedProjector
 from sim.projectors.pty import PseudoTerminal
 from sim.projectors.screen import Screen, SimulatedPresenter
 from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer, serve_network

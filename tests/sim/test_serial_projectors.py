@@ -25,7 +25,7 @@ from drivers.serial_projectors.benq import BenqProjector
 from drivers.serial_projectors.epson import EpsonProjector
 from sim.cli import main
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import ProjectorTraits, SimulatedProjector
+from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from sim.projectors.pty import PseudoTerminal
 from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer, serve_network
 
