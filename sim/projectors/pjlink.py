@@ -7,6 +7,7 @@ Rules that hold inside: a peer is bytes and knows no physics; what they do happe
 from __future__ import annotations
 
 import secrets
+from dataclasses import dataclass
 
 from drivers.links.link import Link
 from drivers.links.memory import PeerLink
@@ -15,6 +16,31 @@ from drivers.pjlink import wire
 from drivers.pjlink.wire import ErrorCode, Greeting, LineCutter, PjLinkReply, PjLinkRequest, Refused
 from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
 from sim.projectors.projector import SimulatedProjector
+
+
+@dataclass
+class _Connection:
+    """One connection.
+
+    Attributes
+    ----------
+    cutter
+        Cuts what comes into lines.
+    last_heard
+        When the last command came, by the projector's clock, seconds.
+    expected_digest
+        What proves the password by MD5; empty where none is wanted, or it has been proved.
+    challenge
+        What a proof by SHA-256 begins with; empty until the controller asks for one.
+    closed
+        Whether the projector has hung up.
+    """
+
+    cutter: LineCutter
+    last_heard: float
+    expected_digest: str = ""
+    challenge: bytes = b""
+    closed: bool = False
 
 
 class PjLinkPeer:
@@ -32,71 +58,74 @@ class PjLinkPeer:
         self._projector = projector
         self._password = password
         self._fixed_seed = seed
-        self.connect()
+        self._connection, _ = self._begun()
 
     def connect(self) -> bytes:
         """Begin a new connection, forgetting the last, and return the greeting."""
-        self._cutter = LineCutter(wire.MAX_LINE + wire.MAX_DIGEST)
-        self._closed = False
-        self._last_heard = self._projector.clock.monotonic()
-        self._expected_digest = ""
-        self._challenge = b""
-        if self._password is None:
-            return wire.encode_greeting(Greeting())
-        seed = self._fixed_seed or secrets.token_hex(4)
-        self._expected_digest = wire.authentication_digest(seed, self._password)
-        return wire.encode_greeting(Greeting(seed))
+        self._connection, greeting = self._begun()
+        return greeting
 
     @property
     def closed(self) -> bool:
         """Whether it has hung up: after 30 s without a command, a wrong password, or something that is no line."""
-        if self._projector.clock.monotonic() - self._last_heard >= wire.IDLE_LIMIT_S:
-            self._closed = True
-        return self._closed
+        connection = self._connection
+        if self._projector.clock.monotonic() - connection.last_heard >= wire.IDLE_LIMIT_S:
+            connection.closed = True
+        return connection.closed
 
     def receive(self, data: bytes) -> bytes:
         """Take the next bytes and return the answers to the commands that they complete."""
         if self.closed:
             return b""
-        answer = b""
+        connection, answer = self._connection, b""
         try:
-            for line in self._cutter.feed(data):
-                if wire.is_security_question(line) and self._expected_digest:
+            for line in connection.cutter.feed(data):
+                if wire.is_security_question(line) and connection.expected_digest:
                     answer += self._security_answer()
                 else:
                     reply = self._reply(wire.parse_request(line))
                     answer += wire.encode_reply(reply)
-                    self._closed = isinstance(reply, Refused)
-                if self._closed:
+                    connection.closed = isinstance(reply, Refused)
+                if connection.closed:
                     break
         except ProtocolError:
-            self._closed = True
-        self._last_heard = self._projector.clock.monotonic()
+            connection.closed = True
+        connection.last_heard = self._projector.clock.monotonic()
         return answer
+
+    def _begun(self) -> tuple[_Connection, bytes]:
+        """Return a new connection and its greeting."""
+        cutter, now = LineCutter(wire.MAX_LINE + wire.MAX_DIGEST), self._projector.clock.monotonic()
+        if self._password is None:
+            return _Connection(cutter, now), wire.encode_greeting(Greeting())
+        seed = self._fixed_seed or secrets.token_hex(4)
+        digest = wire.authentication_digest(seed, self._password)
+        return _Connection(cutter, now, digest), wire.encode_greeting(Greeting(seed))
 
     def _security_answer(self) -> bytes:
         if not self._projector.traits.sha256:
             # Whoever knows MD5 only takes this for a digest, and a wrong one.
-            self._closed = True
+            self._connection.closed = True
             return wire.encode_reply(Refused.WRONG_PASSWORD)
-        self._challenge = secrets.token_bytes(16)
-        return wire.encode_challenge(self._challenge)
+        self._connection.challenge = secrets.token_bytes(16)
+        return wire.encode_challenge(self._connection.challenge)
 
     def _proves_password(self, digest: str) -> bool:
-        if not self._challenge:
-            return digest == self._expected_digest
+        connection = self._connection
+        if not connection.challenge:
+            return digest == connection.expected_digest
         try:
             nonce = bytes.fromhex(digest[:32])
         except ValueError:
             return False
         assert self._password is not None
-        return len(nonce) == 16 and digest == wire.sha256_digest(self._challenge, nonce, self._password)
+        return len(nonce) == 16 and digest == wire.sha256_digest(connection.challenge, nonce, self._password)
 
     def _reply(self, request: PjLinkRequest) -> PjLinkReply | Refused:
-        if self._expected_digest:
+        if self._connection.expected_digest:
             if not self._proves_password(request.digest):
                 return Refused.WRONG_PASSWORD
-            self._expected_digest = ""
+            self._connection.expected_digest = ""
         try:
             value = self._value(request) if request.level == 1 else self._class_2_value(request)
         except DeviceRefused:
