@@ -173,7 +173,7 @@ def test_pings_are_answered_between_transactions() -> None:
 
 
 def test_a_long_wait_for_a_response_answers_pings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.ptp.ip_transport._PING_EVERY_S", 0.01)
+    monkeypatch.setattr("drivers.ptp.ip_connection._PING_EVERY_S", 0.01)
     far = FarEnd()
     transport = far.connect()
     far.heard(far.event)
