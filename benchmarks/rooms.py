@@ -34,7 +34,7 @@ from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import CropError
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
+from sim.world.sensors import BODIES
 from sim.world.world import Print, Room, World
 
 SILENT_PX = 1.0

@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.presenter import WHITE
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
+from sim.world.sensors import BODIES
 from sim.world.world import REFERENCE_EXPOSURE, Print, Room, World
 
 PAGE_MM = (1189.0, 841.0)

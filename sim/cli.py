@@ -137,7 +137,7 @@ def camera(
     from sim.camera.eos import SimulatedEos
     from sim.camera.eos_bodies import EOS_BODIES
     from sim.camera.film import WorldFilm
-    from sim.camera.sensors import BODIES
+    from sim.world.sensors import BODIES
     from sim.world.world import REFERENCE_EXPOSURE, Room, World
 
     if (port is None) == (usbip is None):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from drivers.camera import ExposureSettings
 from drivers.tiff.tags import CFA, D65, TiffTag
 from drivers.tiff.writing import Kind, Tags, head, rationals, text
-from sim.camera.sensors import Body
+from sim.world.sensors import Body
 
 SOFTWARE = "CroP simulated camera"
 

@@ -505,4 +505,4 @@ TEST_BODY = replace(
 EOS_BODIES: Mapping[str, EosModel] = MappingProxyType(
     {"EOS 550D": EOS_550D, "EOS 6D Mark II": EOS_6D_MARK_II, "Test": TEST_BODY}
 )
-"""Every body by the name that settings and commands use, the same as in `sim.camera.sensors.BODIES`."""
+"""Every body by the name that settings and commands use, the same as in `sim.world.sensors.BODIES`."""

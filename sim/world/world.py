@@ -29,8 +29,8 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from foundation.processors import processor_count
-from sim.camera.sensors import Body
 from sim.world.geometry import Folded, View, Waviness
+from sim.world.sensors import Body
 from sim.world.spectra import Lamp, print_reflectance, projector_primaries, sensitivities
 from sim.world.wear import Fold, Stain
 

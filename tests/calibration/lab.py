@@ -22,7 +22,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
+from sim.world.sensors import BODIES
 from sim.world.world import Print, Room, World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.camera.sensors import BODIES
+from sim.world.sensors import BODIES
 from sim.world.world import Print, Room, World
 
 PAGE_MM = (180.0, 125.0)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
-from sim.camera.sensors import BODIES, Body, Rectangle
+from sim.world.sensors import BODIES, Body, Rectangle
 from sim.world.world import REFERENCE_EXPOSURE, Print, Room, World
 
 SIX_SIGMA = 5.0
