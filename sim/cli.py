@@ -96,7 +96,7 @@ def _serve_serial(device: SimulatedProjector, name: str) -> None:
 
     spoken = language(name)
     try:
-        from sim.projectors.pty import PseudoTerminal
+        from sim.buses.pty import PseudoTerminal
     except ImportError as error:
         raise ConfigurationError("this system has no pseudo-terminals; --serial needs Linux or macOS") from error
     from sim.projectors.serial import PEERS

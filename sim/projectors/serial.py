@@ -6,26 +6,23 @@ Rules that hold inside:
 - A serial cable has no connections: a peer goes on where it was when its cable is opened again, and forgets only a
   half-heard command.
 - `receive` with no bytes asks what a peer has to say by now: a late answer, or news. Whoever joins a peer to a cable
-  asks often.
+  asks often (`sim.buses.serial_cable`, `sim.buses.pty`).
 - Where the manuals leave open what a projector does, a peer does what is harder on the driver: it falls silent, or
   refuses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Protocol
 
-from drivers.links.memory import Peer, PeerLink
-from drivers.links.tcp import TcpLink, TcpServer
+from drivers.links.memory import Peer
 from drivers.projector import Power, Severity
 from drivers.serial_projectors import benq, epson, nec, optoma
-from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
+from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 from sim.projectors.projector import SimulatedProjector
 
 SERIAL_NUMBER = "CROP0000001"
-POLLING_S = 0.02
-"""How often a peer on a real cable is asked what it has to say by now."""
 
 _ON_THE_WAY = (Power.WARMING, Power.COOLING)
 
@@ -310,36 +307,3 @@ class _PeerOf(Protocol):
 
 PEERS: Mapping[str, _PeerOf] = {"benq": BenqPeer, "epson": EpsonPeer, "nec": NecPeer, "optoma": OptomaPeer}
 """The far side for each of `drivers.serial_projectors.LANGUAGES`."""
-
-
-class SerialPeerLink(PeerLink):
-    """A cable to a peer in the same thread, which hears before each read what the peer has to say by now."""
-
-    def read(self, limit: int, timeout: float) -> bytes:
-        """Return up to `limit` bytes of what the peer has said."""
-        if self._open:
-            self._incoming += self._peer.receive(b"")
-        return super().read(limit, timeout)
-
-
-def serve_network(peer: Callable[[], Peer], port: int = 0) -> TcpServer:
-    """Return a running server that gives each connection a peer of its own; close it, or use it in a `with` block.
-
-    Raises
-    ------
-    LinkClosed
-        The port is taken.
-    """
-
-    def handle(link: TcpLink) -> None:
-        there = peer()
-        said = there.connect()
-        while True:
-            if said:
-                link.write(said, 5.0)
-            try:
-                said = there.receive(link.read(4096, POLLING_S))
-            except LinkTimeout:
-                said = there.receive(b"")
-
-    return TcpServer(handle, port)

@@ -35,7 +35,8 @@ from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.transport import Transaction, Transport
 from drivers.ptp.usb_transport import UsbTransport
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, StorageError
-from sim import faults
+from sim.buses import faults
+from sim.buses.faults import Occasion
 from sim.buses.ptpip_server import serve_ptpip
 from sim.buses.responder import Answer, Responder
 from sim.buses.usb import SimulatedBus
@@ -43,7 +44,6 @@ from sim.buses.usb_device import PtpUsbDevice
 from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D, EosModel
 from sim.clock import SimulatedClock
-from sim.faults import Occasion
 from tests.contracts.camera import SETTINGS, Bench, CameraContract
 from tests.drivers.eos_lab import Lab
 

@@ -31,9 +31,10 @@ from foundation.errors import (
     LinkTimeout,
     ProtocolError,
 )
+from sim.buses.serial_cable import SerialPeerLink
 from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector
-from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer, SerialPeerLink
+from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling
 
@@ -125,7 +126,7 @@ class TestOverAPseudoTerminal(ProjectorContract):
     @pytest.fixture(params=NAMES)
     def bench(self, request: pytest.FixtureRequest) -> Iterator[Bench]:
         from drivers.links.serial import SerialLink
-        from sim.projectors.pty import PseudoTerminal
+        from sim.buses.pty import PseudoTerminal
 
         spoken = LANGUAGES[request.param]
         device = SimulatedProjector(SimulatedClock())
@@ -711,7 +712,7 @@ def test_a_late_answer_never_meets_a_later_question(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cable_pulled_out_is_told(name: str) -> None:
     from drivers.links.serial import SerialLink
-    from sim.projectors.pty import PseudoTerminal
+    from sim.buses.pty import PseudoTerminal
 
     spoken = language(name)
     with PseudoTerminal(PEERS[name](SimulatedProjector(SimulatedClock(), Power.ON))) as terminal:

@@ -10,10 +10,10 @@ from drivers.links.pipes import Pipe, PipeStalled, UsbPipes
 from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.usb_transport import UsbTransport
 from foundation.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
+from sim.buses.faults import CutOff, Deaf, Garbling, HeaderAlone, Joining, ShortReads, Stalling, WithoutEmptyPackets
 from sim.buses.ptp_memory import MemoryPipes
 from sim.buses.usb_device import PtpUsbDevice
 from sim.clock import SimulatedClock
-from sim.faults import CutOff, Deaf, Garbling, HeaderAlone, Joining, ShortReads, Stalling, WithoutEmptyPackets
 from tests.contracts.transport import (
     ECHO,
     GIVE,

@@ -12,12 +12,7 @@ from drivers.ptp.messages import PtpEvent, PtpRequest
 from drivers.ptp.transport import Transport
 from drivers.ptp.usb_transport import UsbTransport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.ptp_memory import MemoryTransport
-from sim.buses.responder import Responder
-from sim.buses.usb import SimulatedBus
-from sim.buses.usb_device import PtpUsbDevice
-from sim.clock import SimulatedClock
-from sim.faults import (
+from sim.buses.faults import (
     Declining,
     DelayingEvents,
     Falsifying,
@@ -30,6 +25,11 @@ from sim.faults import (
     RepeatingEvents,
     StrangeEvents,
 )
+from sim.buses.ptp_memory import MemoryTransport
+from sim.buses.responder import Responder
+from sim.buses.usb import SimulatedBus
+from sim.buses.usb_device import PtpUsbDevice
+from sim.clock import SimulatedClock
 from tests.contracts.transport import ECHO, GIVE, PATIENCE_S, RAISE, TAKE, Echo, payload
 
 
