@@ -14,7 +14,7 @@ from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
     from sim.projectors.projector import SimulatedProjector
-    from sim.world.world import Print
+    from sim.world.drawing import Print
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -137,8 +137,9 @@ def camera(
     from sim.camera.eos import SimulatedEos
     from sim.camera.eos_bodies import EOS_BODIES
     from sim.camera.film import WorldFilm
+    from sim.world.room import REFERENCE_EXPOSURE, Room
     from sim.world.sensors import BODIES
-    from sim.world.world import REFERENCE_EXPOSURE, Room, World
+    from sim.world.world import World
 
     if (port is None) == (usbip is None):
         raise ConfigurationError("one camera hangs on one cable: either --port N for PTP/IP or --usbip N for USB/IP")
@@ -163,7 +164,7 @@ def _grey_squares() -> Print:
     """Return an A4 sheet with five by three squares from black to paper white."""
     import numpy as np
 
-    from sim.world.world import Print
+    from sim.world.drawing import Print
 
     column, row = (grid.ravel() for grid in np.meshgrid(np.arange(5), np.arange(3)))
     left, top = 18 + 54.0 * column, 21 + 60.0 * row

@@ -61,8 +61,10 @@ from sim.clock import OPENING, SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer, memory_link
 from sim.projectors.projector import SimulatedProjector
 from sim.projectors.screen import Screen, SimulatedPresenter
+from sim.world.drawing import Print
+from sim.world.room import Room
 from sim.world.sensors import BODIES, Body
-from sim.world.world import Print, Room, World
+from sim.world.world import World
 
 __all__ = [
     "Attached",
