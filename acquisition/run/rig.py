@@ -32,7 +32,8 @@ from acquisition.run.sequencer import Devices
 from acquisition.session.folder import Session
 from drivers.camera import Camera
 from drivers.canon.camera import CanonEos
-from drivers.display.fullscreen import FullScreen, identify_displays, list_displays
+from drivers.display.displays import list_displays
+from drivers.display.fullscreen import FullScreen, identify_displays
 from drivers.display.jvc import PORT as JVC_PORT
 from drivers.display.jvc import JvcFlatField
 from drivers.display.lightcrafter import LightCrafter, find_lightcrafter
