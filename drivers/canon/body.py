@@ -20,8 +20,9 @@ from collections.abc import Callable
 from typing import BinaryIO
 
 from drivers.camera import CameraIdentity
-from drivers.canon.records import PropertySetting, decode_events, number_value
+from drivers.canon.records import decode_events
 from drivers.canon.state import EosState, WaitingObject, host_destination
+from drivers.canon.values import PropertySetting, number_value
 from drivers.ptp.codes import CaptureDestination, Operation, Property, ReleaseButton, ResponseCode
 from drivers.ptp.datasets import DeviceInfo
 from drivers.ptp.session import PASSING_LIMIT_S, START_TIMEOUT_S, OperationDeclined, PtpSession

@@ -24,7 +24,8 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import replace
 
-from drivers.canon.records import ImageFormat, Notice, number_of, number_value
+from drivers.canon.records import Notice
+from drivers.canon.values import ImageFormat, number_of, number_value
 from drivers.ptp.codes import AeMode, EosEvent, FocusMode, Operation, Property, ReleaseButton, ResponseCode
 from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import Clock

@@ -21,7 +21,8 @@ from itertools import product
 from types import MappingProxyType
 
 from drivers.canon import apex
-from drivers.canon.records import RAW_ONLY, DeviceInfoEx, ImageFile, ImageFormat, number_value, text_value
+from drivers.canon.datasets import DeviceInfoEx
+from drivers.canon.values import RAW_ONLY, ImageFile, ImageFormat, number_value, text_value
 from drivers.ptp.codes import (
     VENDOR_CANON_USB,
     AeMode,

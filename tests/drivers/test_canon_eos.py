@@ -16,8 +16,6 @@ from hypothesis import strategies as st
 from drivers.camera import CameraIdentity, ExposureSettings
 from drivers.canon.camera import CanonEos
 from drivers.canon.records import (
-    ImageFile,
-    ImageFormat,
     Notice,
     OtherRecord,
     PropertyChanged,
@@ -27,6 +25,7 @@ from drivers.canon.records import (
     encode_events,
 )
 from drivers.canon.state import EosState, custom_functions, problems
+from drivers.canon.values import ImageFile, ImageFormat
 from drivers.links.pipes import Pipe, UsbPipes
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode

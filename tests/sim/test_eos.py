@@ -18,25 +18,18 @@ from hypothesis import strategies as st
 from drivers.camera import ExposureSettings
 from drivers.canon import apex
 from drivers.canon.camera import CanonEos
+from drivers.canon.datasets import DeviceInfoEx, decode_object_entries
 from drivers.canon.records import (
-    RAW_ONLY,
     AvailableFormats,
     AvailableValues,
-    DeviceInfoEx,
-    ImageFile,
-    ImageFormat,
     Notice,
     ObjectEvent,
     PropertyChanged,
-    PropertySetting,
     Record,
     TransferRequest,
     decode_events,
-    decode_object_entries,
-    number_of,
-    number_value,
-    text_value,
 )
+from drivers.canon.values import RAW_ONLY, ImageFile, ImageFormat, PropertySetting, number_of, number_value, text_value
 from drivers.ptp.codes import (
     AeMode,
     CaptureDestination,

@@ -6,8 +6,11 @@ from collections import Counter
 from collections.abc import Callable
 
 from drivers.canon import records as canon
+from drivers.canon import values
 from drivers.canon.apex import APERTURE, ISO
-from drivers.canon.records import AvailableValues, DeviceInfoEx, ImageFormat, Notice, PropertyChanged, PropertySetting
+from drivers.canon.datasets import DeviceInfoEx
+from drivers.canon.records import AvailableValues, Notice, PropertyChanged
+from drivers.canon.values import ImageFormat, PropertySetting
 from drivers.ptp import container
 from drivers.ptp.codes import Operation, Property
 from drivers.ptp.container import ContainerReader, DataPiece, DataStart
@@ -79,7 +82,7 @@ def test_commands_are_the_bytes_that_the_host_sent(recording: list[Recorded]) ->
     settings = [payload(entry) for entry in recording if entry["dir"] == "out"]
     destination, aperture = Property.EOS_CAPTURE_DESTINATION, Property.EOS_APERTURE
     sent = [(destination, 4), (aperture, 0x24), (destination, 2), (destination, 4), (aperture, 0x24), (destination, 1)]
-    assert [PropertySetting(code, canon.number_value(value)).encode() for code, value in sent] == settings
+    assert [PropertySetting(code, values.number_value(value)).encode() for code, value in sent] == settings
 
 
 def test_what_the_body_is(recording: list[Recorded]) -> None:
