@@ -31,7 +31,7 @@ from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import Clock
 from foundation.errors import LinkClosed
 from sim.buses.responder import Answer
-from sim.camera.eos_bodies import EosModel
+from sim.camera.eos_model import EosModel
 from sim.camera.eos_release import EosRelease
 from sim.camera.eos_settings import EosSettings
 from sim.camera.eos_state import CARD, Arguments, OperationRefusal, OperationResult

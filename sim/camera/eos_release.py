@@ -28,8 +28,8 @@ from drivers.ptp.codes import (
     ResponseCode,
 )
 from foundation.errors import CropError, DeviceError, DeviceRefused
-from sim.camera.eos_bodies import FOCUS_CENTRE, focus_points
 from sim.camera.eos_files import EosFiles
+from sim.camera.eos_model import FOCUS_CENTRE, focus_points
 from sim.camera.eos_state import BULB, CARD, FOLDER, Arguments, OperationRefusal, OperationResult, StoredObject
 
 _TIMERS_S: dict[int, float] = {

@@ -11,7 +11,7 @@ from drivers.canon.values import IMAGE_FORMAT_PROPERTIES, ImageFormat, PropertyS
 from drivers.ptp.codes import DataType, Property, ResponseCode
 from drivers.ptp.datasets import DevicePropDesc, EnumerationForm, Value, decode_value, encode_value
 from foundation.errors import ProtocolError
-from sim.camera.eos_bodies import FREE, LIST
+from sim.camera.eos_model import FREE, LIST
 from sim.camera.eos_state import Arguments, OperationRefusal, OperationResult, PropertyState, SimulatedEosState
 
 _FREELY_SET = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT, Property.EOS_CAMERA_TIME)

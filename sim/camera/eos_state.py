@@ -22,7 +22,7 @@ from drivers.canon.values import IMAGE_FORMAT_PROPERTIES, ImageFormat, number_of
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, EventCode, ObjectFormat, Property, ResponseCode
 from drivers.ptp.messages import PtpEvent
 from foundation.clock import Clock
-from sim.camera.eos_bodies import MIRROR_LOCKUP, EosModel, custom_functions
+from sim.camera.eos_model import MIRROR_LOCKUP, EosModel, custom_functions
 from sim.camera.film import Film
 
 CARD = 0x00020001

@@ -16,7 +16,8 @@ from sim.buses.ptp_memory import MemoryPipes
 from sim.buses.responder import Responder
 from sim.buses.usb_device import PtpUsbDevice
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_550D, EosModel
+from sim.camera.eos_bodies import EOS_550D
+from sim.camera.eos_model import EosModel
 from sim.clock import SimulatedClock
 from tests.contracts.camera import SeededFilm
 

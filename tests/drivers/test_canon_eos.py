@@ -41,7 +41,8 @@ from sim.buses.responder import Answer, Responder
 from sim.buses.usb import SimulatedBus
 from sim.buses.usb_device import PtpUsbDevice
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D, EosModel
+from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D
+from sim.camera.eos_model import EosModel
 from sim.clock import SimulatedClock
 from tests.contracts.camera import SETTINGS, Bench, CameraContract
 from tests.drivers.eos_lab import Lab
