@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,9 +25,9 @@ app = typer.Typer(
 )
 
 
-def main() -> int:
-    """Run `sim` and return its exit code."""
-    return console.run(app)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
+    return console.run(lambda: app(args=argv, prog_name="sim"))
 
 
 @app.callback()
@@ -61,7 +62,7 @@ def projector(
     from sim.projectors.projector import SimulatedProjector
 
     if (pjlink is None) == (serial is None):
-        raise ConfigurationError("one projector hangs on one cable: either --pjlink PORT or --serial LANGUAGE")
+        raise ConfigurationError("one projector has one cable: either --pjlink PORT or --serial LANGUAGE")
     if pjlink is None and (password, udp, notify) != (None, None, None):
         raise ConfigurationError("--password, --udp and --notify are PJLink's; a serial cable has none of them")
     if password is not None and not 1 <= len(password) <= MAX_PASSWORD:
@@ -142,7 +143,7 @@ def camera(
     from sim.world.world import World
 
     if (port is None) == (usbip is None):
-        raise ConfigurationError("one camera hangs on one cable: either --port N for PTP/IP or --usbip N for USB/IP")
+        raise ConfigurationError("one camera has one cable: either --port N for PTP/IP or --usbip N for USB/IP")
     if model not in EOS_BODIES:
         raise ConfigurationError(f"--model {model!r}: known are {', '.join(sorted(EOS_BODIES))}")
     # A lamp that ages would be dark by now: its drift counts from the day when the simulated lab opened.

@@ -202,8 +202,7 @@ def test_serves_a_serial_projector_until_interrupted(name: str) -> None:
     ],
 )
 def test_not_exactly_one_cable_or_no_language_ends_with_2(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+    capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["sim", "projector", *arguments])
-    assert main() == 2
+    assert main(["projector", *arguments]) == 2
     assert said in capsys.readouterr().err
