@@ -32,7 +32,8 @@ from acquisition.run.sequencer import Devices
 from acquisition.session.folder import Session
 from drivers.camera import Camera
 from drivers.canon.camera import CanonEos
-from drivers.display.fullscreen import FullScreen, identify_displays, list_displays
+from drivers.display.displays import list_displays
+from drivers.display.fullscreen import FullScreen, identify_displays
 from drivers.display.jvc import PORT as JVC_PORT
 from drivers.display.jvc import JvcFlatField
 from drivers.display.lightcrafter import LightCrafter, find_lightcrafter
@@ -57,11 +58,14 @@ from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_BODIES
 from sim.camera.film import Film, WorldFilm
 from sim.camera.replay import RecordedFrame, ReplayFilm
-from sim.camera.sensors import BODIES, Body
 from sim.clock import OPENING, SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer, SimulatedProjector, memory_link
+from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.projector import SimulatedProjector
 from sim.projectors.screen import Screen, SimulatedPresenter
-from sim.world.world import Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES, Body
+from sim.world.world import World
 
 __all__ = [
     "Attached",

@@ -19,19 +19,15 @@ from dataclasses import dataclass, field
 from drivers.camera import ExposureSettings
 from drivers.canon.apex import APERTURE, ISO, SHUTTER, Scale
 from drivers.canon.records import (
-    RAW_ONLY,
     AvailableFormats,
     AvailableValues,
-    ImageFormat,
     Notice,
     ObjectEvent,
     PropertyChanged,
     Record,
     TransferRequest,
-    number_of,
-    number_value,
-    text_of,
 )
+from drivers.canon.values import RAW_ONLY, ImageFormat, number_of, number_value, text_of
 from drivers.ptp.codes import (
     AeMode,
     CameraStatus,

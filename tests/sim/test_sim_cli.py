@@ -70,28 +70,21 @@ def test_is_found_and_announces_itself() -> None:
     assert (process.returncode, out, err) == (0, "stopped\n", "")
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["sim", *arguments])
-    return main()
-
-
 @pytest.mark.parametrize(
     "arguments",
     [["projector", "--pjlink"], ["camera", "--model", "Test", "--port"], ["camera", "--model", "Test", "--usbip"]],
 )
-def test_a_taken_port_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str]
-) -> None:
+def test_a_taken_port_is_one_line(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:
     with TcpServer(lambda link: None) as server:
-        assert run(monkeypatch, *arguments, str(server.address[1])) == 3
+        assert main([*arguments, str(server.address[1])]) == 3
     error = capsys.readouterr().err
     assert error.startswith("error: cannot listen at 127.0.0.1:")
     assert error.count("\n") == 1
 
 
-def test_a_taken_udp_port_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_taken_udp_port_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with UdpSocket(host="127.0.0.1") as taken:
-        assert run(monkeypatch, "projector", "--pjlink", "0", "--udp", str(taken.address[1])) == 3
+        assert main(["projector", "--pjlink", "0", "--udp", str(taken.address[1])]) == 3
     error = capsys.readouterr().err
     assert error.startswith("error: cannot receive datagrams at 127.0.0.1:")
     assert error.count("\n") == 1
@@ -111,35 +104,29 @@ def test_a_taken_udp_port_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: p
         ["camera", "--port", "0", "--usbip", "0"],
     ],
 )
-def test_wrong_arguments_end_with_2(monkeypatch: pytest.MonkeyPatch, arguments: list[str]) -> None:
-    assert run(monkeypatch, *arguments) == 2
+def test_wrong_arguments_end_with_2(arguments: list[str]) -> None:
+    assert main([*arguments]) == 2
 
 
-def test_a_password_longer_than_the_standards_is_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(monkeypatch, "projector", "--pjlink", "0", "--password", "x" * 33) == 2
+def test_a_password_longer_than_the_standards_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["projector", "--pjlink", "0", "--password", "x" * 33]) == 2
     assert "at most 32" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("cables", [(), ("--port", "0", "--usbip", "0")])
-def test_a_camera_hangs_on_one_cable(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], cables: tuple[str, ...]
-) -> None:
-    assert run(monkeypatch, "camera", *cables) == 2
-    told = "one camera hangs on one cable: either --port N for PTP/IP or --usbip N for USB/IP"
-    assert capsys.readouterr().err == f"error: {told}\n"
+def test_a_camera_has_one_cable(capsys: pytest.CaptureFixture[str], cables: tuple[str, ...]) -> None:
+    assert main(["camera", *cables]) == 2
+    expected = "one camera has one cable: either --port N for PTP/IP or --usbip N for USB/IP"
+    assert capsys.readouterr().err == f"error: {expected}\n"
 
 
-def test_an_unknown_model_is_told_the_known_ones(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(monkeypatch, "camera", "--port", "0", "--model", "EOS R5") == 2
+def test_an_unknown_model_is_answered_by_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["camera", "--port", "0", "--model", "EOS R5"]) == 2
     assert "EOS 550D, EOS 6D Mark II, Test" in capsys.readouterr().err
 
 
-def test_help_names_the_exit_codes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, "--help") == 0
+def test_help_names_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
     assert "130" in capsys.readouterr().out
 
 
