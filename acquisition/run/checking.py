@@ -23,7 +23,7 @@ from acquisition.run.rig import open_rig
 from acquisition.run.sequencer import Devices
 from acquisition.session.folder import FrameKind
 from drivers.camera import keep_awake
-from drivers.presenter import BLACK, WHITE, Colour, SelfDoubting
+from drivers.presenter import BLACK, WHITE, Colour, ReportsWarnings
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import RegistrationError
 from foundation.files import write_whole
@@ -75,7 +75,7 @@ def check_lab(
         body = devices.camera.identity()
         name = body.model if body.model.startswith(body.maker.split()[0]) else f"{body.maker} {body.model}"
         lines.append(f"camera      {name}, serial {body.serial}")
-        if isinstance(devices.presenter, SelfDoubting):
+        if isinstance(devices.presenter, ReportsWarnings):
             lines.extend(f"picture     {warning}" for warning in devices.presenter.warnings())
         devices.camera.configure(settings.camera.exposure)
         if devices.projector is not None:
