@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from acquisition.config import SequenceSettings
-from drivers.projector import PictureWitness, Power, Projector, Severity
+from drivers.projector import Power, Projector, ReportsPictureFault, Severity
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused, LinkError
 
@@ -90,7 +90,7 @@ def require_healthy(projector: Projector) -> None:
         raise DeviceFault(f"the projector went to {power.value} during the session; switch it on")
     if projector.muted():
         raise DeviceFault("the projector's picture is muted; release mute on its remote control")
-    if isinstance(projector, PictureWitness) and (fault := projector.picture_fault()):
+    if isinstance(projector, ReportsPictureFault) and (fault := projector.picture_fault()):
         raise DeviceFault(fault)
 
 
