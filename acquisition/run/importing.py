@@ -19,7 +19,7 @@ from acquisition.chart.model import load_chart
 from acquisition.config import LabSettings
 from acquisition.lights.illuminations import Illumination, load_illuminations
 from acquisition.run.sequencer import judge_file
-from acquisition.session.folder import ACCEPTED, FRAME_COLUMNS, REFUSED, FrameKind, Session, Step
+from acquisition.session.folder import ACCEPTED, FRAME_COLUMNS, REFUSED, FrameKind, Session, SessionStep
 from drivers.camera import CapturedFrame
 from drivers.presenter import BLACK, WHITE
 from foundation.errors import FormatError
@@ -171,14 +171,14 @@ def _left(session: Session) -> list[str]:
     ]
 
 
-def _step(number: int, frame: ListedFrame, lights: tuple[Illumination, ...]) -> Step:
+def _step(number: int, frame: ListedFrame, lights: tuple[Illumination, ...]) -> SessionStep:
     colour = WHITE if frame.kind == "white" else BLACK
     if frame.illumination is not None:
         colour = lights[frame.illumination].colour
-    return Step(number, frame.kind, frame.illumination, colour)
+    return SessionStep(number, frame.kind, frame.illumination, colour)
 
 
-def _take_over(session: Session, step: Step, frame: ListedFrame, settings: LabSettings) -> tuple[str | None, str]:
+def _take_over(session: Session, step: SessionStep, frame: ListedFrame, settings: LabSettings) -> tuple[str | None, str]:
     """Copy and judge a frame; return why it is refused, None if it is not, and the SHA-256 of its file."""
 
     def copy(into: BinaryIO) -> CapturedFrame:

@@ -13,7 +13,7 @@ from pathlib import Path
 from acquisition.config import LabSettings
 from acquisition.run.exposure import disagreement, measure_exposure, refusal
 from acquisition.run.lamp import await_health, complaint_of, make_ready
-from acquisition.session.folder import ACCEPTED, REFUSED, FrameKind, Session, Step
+from acquisition.session.folder import ACCEPTED, REFUSED, FrameKind, Session, SessionStep
 from drivers.camera import Camera, keep_awake
 from drivers.presenter import Presenter
 from drivers.projector import Projector
@@ -53,7 +53,7 @@ def take_session(
     session: Session,
     devices: Devices,
     settings: LabSettings,
-    observe: Callable[[Step, bool], None] = lambda step, accepted: None,
+    observe: Callable[[SessionStep, bool], None] = lambda step, accepted: None,
     announce: Callable[[str], None] = lambda sentence: None,
 ) -> Outcome:
     """Take every step of the session's plan that has no accepted frame yet.
@@ -80,7 +80,7 @@ def _take(
     session: Session,
     devices: Devices,
     settings: LabSettings,
-    observe: Callable[[Step, bool], None],
+    observe: Callable[[SessionStep, bool], None],
     announce: Callable[[str], None],
 ) -> Outcome:
     clock = devices.clock
@@ -134,7 +134,7 @@ def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None
 
 
 def _take_step(
-    session: Session, step: Step, devices: Devices, settings: LabSettings, tell: Callable[[str, str], None]
+    session: Session, step: SessionStep, devices: Devices, settings: LabSettings, tell: Callable[[str, str], None]
 ) -> str | None:
     """Try a step until its frame is accepted; return None then, else the last refusal."""
     clock = devices.clock
@@ -173,5 +173,5 @@ def _take_step(
     return reason
 
 
-def _name(step: Step) -> str:
+def _name(step: SessionStep) -> str:
     return f"light {step.illumination}" if step.illumination is not None else f"{step.kind} frame {step.number}"

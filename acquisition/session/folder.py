@@ -64,7 +64,7 @@ _TABLES = {"attempts", "plan", "events"}
 
 
 @dataclass(frozen=True)
-class Step:
+class SessionStep:
     """One frame of the plan: `number` in taking order, what kind, under which light, showing which codes."""
 
     number: int
@@ -79,7 +79,7 @@ class Step:
         return f"{self.number:04d}_{self.kind}{tail}"
 
 
-def plan_steps(illuminations: Sequence[Illumination], reference_every: int) -> tuple[Step, ...]:
+def plan_steps(illuminations: Sequence[Illumination], reference_every: int) -> tuple[SessionStep, ...]:
     """Return the whole session as data: a white and a dark frame first, every `reference_every` lights, and last.
 
     Parameters
@@ -89,10 +89,10 @@ def plan_steps(illuminations: Sequence[Illumination], reference_every: int) -> t
     reference_every
         Lights between two pairs of white and dark frames, ≥ 1.
     """
-    steps: list[Step] = []
+    steps: list[SessionStep] = []
 
     def add(kind: FrameKind, illumination: int | None, colour: Colour) -> None:
-        steps.append(Step(len(steps), kind, illumination, colour))
+        steps.append(SessionStep(len(steps), kind, illumination, colour))
 
     for position, light in enumerate(illuminations):
         if position % reference_every == 0:
@@ -173,7 +173,7 @@ class Session:
         self.chart: Chart = load_chart(folder / "chart.json")
         self.illuminations: tuple[Illumination, ...] = load_illuminations(folder / "illuminations.csv")
         rows = journal.execute("SELECT step, kind, illumination, red, green, blue FROM plan ORDER BY step")
-        self.steps: tuple[Step, ...] = tuple(Step(row[0], row[1], row[2], Colour(*row[3:])) for row in rows)
+        self.steps: tuple[SessionStep, ...] = tuple(SessionStep(row[0], row[1], row[2], Colour(*row[3:])) for row in rows)
         self._require_planned_lights()
 
     def _require_planned_lights(self) -> None:
@@ -202,7 +202,7 @@ class Session:
         settings: str,
         chart: Chart,
         illuminations: Sequence[Illumination],
-        steps: Sequence[Step] = (),
+        steps: Sequence[SessionStep] = (),
     ) -> Session:
         """Make a new session folder, whole or not at all, and open it.
 
@@ -318,7 +318,7 @@ class Session:
                 f"cannot read {path}, the settings of the session: {reason}; restore it from a copy"
             ) from error
 
-    def begin(self, step: Step, file: str, at: datetime) -> int:
+    def begin(self, step: SessionStep, file: str, at: datetime) -> int:
         """Note that an attempt at `step` begins, to be saved as `file`; return the attempt's id."""
         with self._writing():
             cursor = self._journal.execute(
@@ -424,7 +424,7 @@ class Session:
         rows = self._journal.execute("SELECT step, file, size FROM attempts WHERE verdict=?", (ACCEPTED,))
         return {step for step, file, size in rows if _has_size(self.folder / file, size)}
 
-    def kept_files(self, step: Step) -> int:
+    def kept_files(self, step: SessionStep) -> int:
         """Return how many raw files, accepted or refused, `step` has already."""
         query = "SELECT COUNT(*) FROM attempts WHERE step=? AND sha256 IS NOT NULL"
         return int(self._journal.execute(query, (step.number,)).fetchone()[0])

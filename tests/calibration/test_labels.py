@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.lights.illuminations import Illumination, plan_illuminations
-from acquisition.session.folder import Session, Step
+from acquisition.session.folder import Session, SessionStep
 from calibration.checks.labels import DEGREE, LIGHTS_A_TERM, angles_off_codes_deg
 from calibration.pipeline.build import build
 from calibration.pipeline.measuring import FrameFigures
@@ -155,7 +155,7 @@ def test_lights_exposed_otherwise_are_not_held_against_their_codes(
     def told(*_: object) -> _Array:
         return np.zeros(3)
 
-    def longer(step: Step) -> bytes:
+    def longer(step: SessionStep) -> bytes:
         exposed = replace(SETTINGS, shutter_s=0.6) if step.illumination == 1 else SETTINGS
         return lab.dng(step.colour, step.number, exposed)
 
@@ -174,7 +174,7 @@ def test_lights_exposed_otherwise_are_not_held_against_their_codes(
 def test_two_lights_of_one_file_make_no_table(lab: Lab, tmp_path: Path) -> None:
     one = lab.dng()
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         return one if step.illumination in (1, 2) else lab.dng(step.colour, step.number)
 
     with (

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session.folder import Session, Step
+from acquisition.session.folder import Session, SessionStep
 from calibration.cli import main
 from calibration.pipeline.build import append, build, check
 from calibration.pipeline.options import Choices
@@ -210,7 +210,7 @@ def test_a_checkpoint_of_another_choice_is_not_gone_on_from(session: Session, tm
 def test_without_dark_frames_it_is_refused(
     lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse_darks(step: Step) -> str:
+    def refuse_darks(step: SessionStep) -> str:
         return "refused" if step.kind == "dark" else "accepted"
 
     with take(lab, tmp_path / "session", LIGHTS[:2], verdict=refuse_darks) as session:
@@ -229,7 +229,7 @@ def test_without_dark_frames_it_is_refused(
 def test_lights_before_the_first_dark_frame_take_the_first(room: Lab, tmp_path: Path) -> None:
     """A session put together from files may have its dark frames at the end."""
 
-    def refuse_first(step: Step) -> str:
+    def refuse_first(step: SessionStep) -> str:
         return "refused" if step.kind == "dark" and step.number < 3 else "accepted"
 
     with take(room, tmp_path / "session", renumbered(LIGHTS[5:8]), verdict=refuse_first) as session:
