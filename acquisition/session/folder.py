@@ -146,7 +146,7 @@ class Attempt:
 
 
 @dataclass(frozen=True)
-class Event:
+class SessionEvent:
     """Something worth remembering that is no frame: start, stop, warm-up, a device's fault."""
 
     at: datetime
@@ -414,10 +414,10 @@ class Session:
             for row in rows
         ]
 
-    def events(self) -> list[Event]:
+    def events(self) -> list[SessionEvent]:
         """Return every event, oldest first."""
         rows = self._journal.execute("SELECT at, what, detail FROM events ORDER BY id")
-        return [Event(datetime.fromisoformat(row[0]), row[1], row[2]) for row in rows]
+        return [SessionEvent(datetime.fromisoformat(row[0]), row[1], row[2]) for row in rows]
 
     def done_steps(self) -> set[int]:
         """Return the numbers of the steps whose frame was taken, accepted, and is still there in full size."""

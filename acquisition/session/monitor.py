@@ -11,7 +11,7 @@ import json
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-from acquisition.session.folder import Event, Session
+from acquisition.session.folder import SessionEvent, Session
 from acquisition.session.progress import Progress, duration_text, session_progress
 from foundation.errors import CropError, InputError
 
@@ -37,7 +37,7 @@ dt {{ color: #666; }} dd {{ margin: 0; }}
 """
 
 
-def read_state(folder: Path) -> tuple[Progress, list[Event]]:
+def read_state(folder: Path) -> tuple[Progress, list[SessionEvent]]:
     """Return a session's progress and its newest events."""
     with Session.open(folder) as session:
         return session_progress(session), session.events()[-20:]
