@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.planes import Plane
-from acquisition.framing.tagless_field import Field
+from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.tags import TAG_MODULES, FoundTag, Framing
 
 _BLURS = np.geomspace(0.15, 4, 48)
@@ -63,7 +63,7 @@ def _edge_blurs(plane: Plane, tag: FoundTag) -> npt.NDArray[np.float64]:
     return found
 
 
-def _outline_blurs(plane: Plane, field: Field) -> npt.NDArray[np.float64]:
+def _outline_blurs(plane: Plane, field: FoundField) -> npt.NDArray[np.float64]:
     """Return the σ of the field's edge at places all round; none where the picture ends."""
     height, width = plane.values.shape
     reach = int(np.ceil(_INWARDS_PX + _ALONG_PX))

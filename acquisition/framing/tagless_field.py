@@ -43,7 +43,7 @@ _Points = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class FoundField:
     """The field of cells in a picture.
 
     Attributes
@@ -82,7 +82,7 @@ def find_field(
     what: str,
     corners_px: npt.ArrayLike | None = None,
     near_px: npt.ArrayLike | None = None,
-) -> Field:
+) -> FoundField:
     """Return where the field of a chart's cells lies in a picture.
 
     Parameters
@@ -163,7 +163,7 @@ def find_field(
     return placed.field(1 - unexplained)
 
 
-def _told_field(view: View, chart: Chart, corners_px: _Points, what: str) -> Field:
+def _told_field(view: View, chart: Chart, corners_px: _Points, what: str) -> FoundField:
     """Return the field whose corners are told."""
     require_corners(corners_px, view.shape)
     text = corners_text(corners_px)
@@ -272,10 +272,10 @@ class _Placed:
                 places[:, axis] += weight * np.interp(at, known, off[:, axis])
         return places
 
-    def field(self, explained: float) -> Field:
+    def field(self, explained: float) -> FoundField:
         """Return what is told of the field."""
         mm, px, normals = (np.concatenate(parts) for parts in (self.sides_mm, self.sides_px, self.normals))
-        return Field(self.corners_px, self.homography, mm, px, normals, explained)
+        return FoundField(self.corners_px, self.homography, mm, px, normals, explained)
 
 
 def _misfit(view: View, placed: _Placed, chart: Chart) -> tuple[float, float]:

@@ -25,7 +25,7 @@ from acquisition.chart.model import Chart
 from acquisition.framing.corners import corners_text
 from acquisition.framing.homography import project, rms, robust_homography
 from acquisition.framing.planes import CHANNELS, MIN_SIGNAL, Plane, frame_black, paper_level, plane_of, strongest_plane
-from acquisition.framing.tagless_field import Field, find_field
+from acquisition.framing.tagless_field import FoundField, find_field
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import InputError, RegistrationError
 
@@ -135,7 +135,7 @@ class Framing:
     fill: float
     inside: bool
     rotation_deg: float
-    field: Field | None = None
+    field: FoundField | None = None
 
     @property
     def complete(self) -> bool:

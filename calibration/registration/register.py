@@ -26,7 +26,7 @@ from acquisition.framing.homography import rms
 from acquisition.framing.outline import refined
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
 from acquisition.framing.sharpness import blur_px
-from acquisition.framing.tagless_field import Field
+from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.tags import Framing, find_chart
 from calibration.registration.colour_model import ColourModel
 from calibration.registration.displacement import Displacement
@@ -233,19 +233,19 @@ def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
     return Anchors(corners_mm, corners_px, np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2)))
 
 
-def _outline(field: Field) -> Anchors:
+def _outline(field: FoundField) -> Anchors:
     """Return the field's outline, whose places are known across alone."""
     known = np.einsum("ni,nj->nij", field.normals, field.normals) / _OUTLINE_SIGMA_PX**2
     return Anchors(field.outline_mm, field.outline_px, known)
 
 
-def _clear_edges(field: Field, planes: list[Plane], blur: float) -> Field:
+def _clear_edges(field: FoundField, planes: list[Plane], blur: float) -> FoundField:
     """Return the field with its outline measured finely, where it is clear enough for that."""
     places, clear = refined(planes, field.outline_px, field.normals, blur)
     return replace(field, outline_mm=field.outline_mm[clear], outline_px=places[clear], normals=field.normals[clear])
 
 
-def _field_through_lens(field: Field, frame_size: tuple[int, int]) -> tuple[Field, Lens, _Array]:
+def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple[FoundField, Lens, _Array]:
     """Return the field without points of its outline that stand apart, which are marks; its lens; and residuals."""
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
     for _ in range(2):
