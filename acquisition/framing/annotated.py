@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from acquisition.chart.model import Chart
 from acquisition.framing.homography import project
-from acquisition.framing.outline import View
+from acquisition.framing.outline import PreparedPicture
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of, strongest_plane
 from acquisition.framing.tags import Framing, find_tags
 from drivers.raw.rawfile import Mosaic
@@ -63,7 +63,7 @@ def _draw_missing_tags(image: _Image, plane: Plane, chart: Chart) -> None:
 
 
 def _draw_rectangles(image: _Image, planes: list[Plane], chart: Chart) -> None:
-    quads = View.of(planes).quads()
+    quads = PreparedPicture.of(planes).quads()
     for quad in quads:
         _draw_outline(image, quad, _AMBER, 1)
     _draw_text(

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from acquisition.chart.model import Chart
 from acquisition.framing.corners import corners_text, require_corners
 from acquisition.framing.homography import fit_homography, project
-from acquisition.framing.outline import SAME_PX, Outline, View, alike, follow
+from acquisition.framing.outline import SAME_PX, Outline, PreparedPicture, alike, follow
 from acquisition.framing.planes import MIN_SIGNAL, Plane, paper_level
 from foundation.errors import InputError, RegistrationError
 from foundation.robust import huber_weights, sigma_of
@@ -114,22 +114,22 @@ def find_field(
             f"{what} is dark: its brightest parts are {max(white, 0.0):.0f} counts above black, at least "
             f"{MIN_SIGNAL:.0f} expected; switch the projector on, open its shutter, expose longer"
         )
-    view = View.of(planes)
+    picture = PreparedPicture.of(planes)
     looked_for = f"the field of {chart.colour_count} cells, a rectangle of colours on white paper,"
     if corners_px is not None:
-        return _told_field(view, chart, np.asarray(corners_px, dtype=np.float64), what)
+        return _told_field(picture, chart, np.asarray(corners_px, dtype=np.float64), what)
     tries: list[tuple[float, float, int, _Placed]] = []
     outlines: list[Outline] = []
-    for quad in view.quads():
+    for quad in picture.quads():
         for start in _starts(quad, chart):
             if any(alike(start, known.corners_px, SAME_PX) for known in outlines):
                 continue
-            outline = follow(view, start)
+            outline = follow(picture, start)
             if outline is None or any(alike(outline.corners_px, known.corners_px, SAME_PX) for known in outlines):
                 continue
             outlines.append(outline)
             for way, placed in _ways(outline, chart, near_px):
-                tries.append((*_misfit(view, placed, chart), way, placed))
+                tries.append((*_misfit(picture, placed, chart), way, placed))
     if not tries:
         raise RegistrationError(
             f"{what}: {looked_for} was looked for, and no large rectangle was found; point the camera at the chart, "
@@ -163,18 +163,18 @@ def find_field(
     return placed.field(1 - unexplained)
 
 
-def _told_field(view: View, chart: Chart, corners_px: _Points, what: str) -> FoundField:
+def _told_field(picture: PreparedPicture, chart: Chart, corners_px: _Points, what: str) -> FoundField:
     """Return the field whose corners are told."""
-    require_corners(corners_px, view.shape)
+    require_corners(corners_px, picture.shape)
     text = corners_text(corners_px)
-    outline = follow(view, corners_px)
+    outline = follow(picture, corners_px)
     if outline is None:
         raise RegistrationError(
             f"{what}: near the corners told, {text}, no edge is seen between cells and bare paper on all four sides; "
             "give the corners of the field of cells (not of the sheet) to some 40 pixels, and uncover its margin"
         )
     ways = [_Placed.of(outline, chart, way) for way in range(8)]
-    misfits = [_misfit(view, placed, chart) for placed in ways]
+    misfits = [_misfit(picture, placed, chart) for placed in ways]
     explained = 1 - misfits[0][1]
     likely = int(np.argmin([misfit for misfit, _ in misfits]))
     other = likely > 0 and MIN_ADVANTAGE * misfits[likely][0] < misfits[0][0]
@@ -278,7 +278,7 @@ class _Placed:
         return FoundField(self.corners_px, self.homography, mm, px, normals, explained)
 
 
-def _misfit(view: View, placed: _Placed, chart: Chart) -> tuple[float, float]:
+def _misfit(picture: PreparedPicture, placed: _Placed, chart: Chart) -> tuple[float, float]:
     """Return how badly the chart's colours fit what is seen, and the share of its variation that they leave, 0 … 1.
 
     The former is the product, over the colours that carry light, of what is left over what there was, in standard
@@ -288,7 +288,7 @@ def _misfit(view: View, placed: _Placed, chart: Chart) -> tuple[float, float]:
     chosen = np.random.default_rng(1).permutation(chart.colour_count)[:_TRIED_CELLS]
     points = chart.centres_mm[chosen]
     places = placed.to_pixels(points)
-    height, width = view.shape
+    height, width = picture.shape
     inside = np.asarray(((places >= 0) & (places <= (width - 1, height - 1))).all(axis=1))
     if inside.mean() < 0.9:
         return 1.0, 1.0
@@ -300,7 +300,7 @@ def _misfit(view: View, placed: _Placed, chart: Chart) -> tuple[float, float]:
     colour = np.column_stack([codes, *(codes[:, i] * codes[:, j] for i, j in pairs)])
     product = 1.0
     left: list[float] = []
-    for channel, plane in zip(view.channels, view.planes, strict=True):
+    for channel, plane in zip(picture.channels, picture.planes, strict=True):
         x, y = (places - plane.offset_px).astype(np.float32).T
         seen = cv2.remap(plane.values, x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0].astype(np.float64)
         value = np.log(np.maximum(seen, 0.01 * float(np.median(np.abs(seen)) + 1e-9)))

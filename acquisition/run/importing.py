@@ -178,7 +178,9 @@ def _step(number: int, frame: ListedFrame, lights: tuple[Illumination, ...]) -> 
     return SessionStep(number, frame.kind, frame.illumination, colour)
 
 
-def _take_over(session: Session, step: SessionStep, frame: ListedFrame, settings: LabSettings) -> tuple[str | None, str]:
+def _take_over(
+    session: Session, step: SessionStep, frame: ListedFrame, settings: LabSettings
+) -> tuple[str | None, str]:
     """Copy and judge a frame; return why it is refused, None if it is not, and the SHA-256 of its file."""
 
     def copy(into: BinaryIO) -> CapturedFrame:

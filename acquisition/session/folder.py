@@ -173,7 +173,9 @@ class Session:
         self.chart: Chart = load_chart(folder / "chart.json")
         self.illuminations: tuple[Illumination, ...] = load_illuminations(folder / "illuminations.csv")
         rows = journal.execute("SELECT step, kind, illumination, red, green, blue FROM plan ORDER BY step")
-        self.steps: tuple[SessionStep, ...] = tuple(SessionStep(row[0], row[1], row[2], Colour(*row[3:])) for row in rows)
+        self.steps: tuple[SessionStep, ...] = tuple(
+            SessionStep(row[0], row[1], row[2], Colour(*row[3:])) for row in rows
+        )
         self._require_planned_lights()
 
     def _require_planned_lights(self) -> None:

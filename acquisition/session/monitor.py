@@ -11,7 +11,7 @@ import json
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-from acquisition.session.folder import SessionEvent, Session
+from acquisition.session.folder import Session, SessionEvent
 from acquisition.session.progress import Progress, duration_text, session_progress
 from foundation.errors import CropError, InputError
 

@@ -225,7 +225,9 @@ def _sampled(plane: Plane, places: _Points) -> _Points:
     return (np.roll(found, 1, axis=1) + 2 * found + np.roll(found, -1, axis=1)) / 4
 
 
-def _rigid(middles: _Points, normals: _Points, moved: _Points, weights: _Points, field: FoundField, softer: float) -> Shift:
+def _rigid(
+    middles: _Points, normals: _Points, moved: _Points, weights: _Points, field: FoundField, softer: float
+) -> Shift:
     """Return the shift, turn and growth that movements (K,) across strips tell of, robustly."""
     centre = field.corners_px.mean(axis=0)
     x, y = ((middles - centre) / np.abs(field.corners_px - centre).max()).T

@@ -184,7 +184,9 @@ def test_a_chart_moved_by_a_cell_is_followed(lab: Lab, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("left", "when"), [(0.05, later), (0.05, once), (0.7, once), (0.85, once)])
-def test_a_hand_in_the_light_is_refused(lab: Lab, tmp_path: Path, left: float, when: Callable[[SessionStep], bool]) -> None:
+def test_a_hand_in_the_light_is_refused(
+    lab: Lab, tmp_path: Path, left: float, when: Callable[[SessionStep], bool]
+) -> None:
     with session_of(lab, tmp_path, shaded(lab, left, when)) as session, pytest.raises(QualityError, match="no table"):
         build(session, tmp_path / "lut")
 
