@@ -21,7 +21,7 @@ from acquisition.run.exposure import measure_exposure, refusal
 from acquisition.run.lamp import make_ready
 from acquisition.run.rig import open_rig
 from acquisition.run.sequencer import Devices
-from acquisition.session.folder import FrameKind
+from acquisition.session.plan import FrameKind
 from drivers.camera import keep_awake
 from drivers.presenter import BLACK, WHITE, Colour, ReportsWarnings
 from drivers.raw.rawfile import Mosaic, read_raw

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquisition.session.folder import FrameKind
+from acquisition.session.plan import FrameKind
 
 if TYPE_CHECKING:
     from acquisition.config import LimitSettings

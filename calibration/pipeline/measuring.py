@@ -20,7 +20,7 @@ import numpy.typing as npt
 from acquisition.chart.model import Chart
 from acquisition.framing.planes import CHANNELS, Channel, Plane, channel_offset_px, phases
 from acquisition.framing.tags import Framing
-from acquisition.session.folder import FrameRecord
+from acquisition.session.journal import FrameRecord
 from calibration.checks.likeness import Expectation, Likeness
 from calibration.pipeline.frames import Decoded
 from calibration.radiometry.cell_field import field_of_cells

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import FrameRecord
+from acquisition.session.journal import FrameRecord
 from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
 
 HOT_COUNTS = 32.0

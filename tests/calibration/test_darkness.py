@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import FrameRecord
+from acquisition.session.journal import FrameRecord
 from calibration.radiometry.darkness import DarkFigures, HotSamples, additivity, darkness, drift_gains, read_dark
 from drivers.presenter import Colour
 
