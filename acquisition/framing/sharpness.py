@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.chart.model import TAG_MODULES
+from acquisition.framing.finding import Framing
 from acquisition.framing.planes import Plane
 from acquisition.framing.tagless_field import FoundField
-from acquisition.framing.tags import TAG_MODULES, FoundTag, Framing
+from acquisition.framing.tags import FoundTag
 
 _BLURS = np.geomspace(0.15, 4, 48)
 _OUTLINE_PLACES = 80

@@ -1,7 +1,7 @@
 """Whether a raw frame is well exposed: as asked for, neither clipped nor dark, and dark where it should be.
 
 Counts and what the file says of its exposure; where the chart lies in the picture is the business of
-`acquisition.framing.tags`.
+`acquisition.framing.finding`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from acquisition.framing.limits import CLIPPED_SHARE
+from acquisition.framing.planes import frame_black
 from acquisition.session.plan import FrameKind
 
 if TYPE_CHECKING:
@@ -19,8 +21,6 @@ if TYPE_CHECKING:
     from drivers.camera import ExposureSettings
     from drivers.raw.rawfile import Mosaic
 
-CLIPPING_SHARE = 0.98
-"""Counts above this share of saturation are treated as clipped (judgement: the knee of the response lies above)."""
 BRIGHTEST_PERCENTILE = 99.9
 EXPOSURE_TOLERANCE_STOPS = 0.25
 """How far a file's exposure may lie from the one asked for. Nominal values are rounded, and files state either: 0.3 s
@@ -35,7 +35,7 @@ class Exposure:
     Attributes
     ----------
     clipped
-        Share of photosites at or above `CLIPPING_SHARE` of saturation, 0 … 1.
+        Share of photosites at or above `CLIPPED_SHARE` of saturation, 0 … 1.
     brightest_dn
         `BRIGHTEST_PERCENTILE` of the counts above black, of the brightest Bayer phase.
     range_dn
@@ -54,9 +54,8 @@ class Exposure:
 
 def measure_exposure(mosaic: Mosaic) -> Exposure:
     """Measure the counts of a mosaic's visible area; every fourth 2×2 block is enough for the percentile."""
-    masked = mosaic.masked_black()
-    black = mosaic.black if masked is None else masked
-    clipped = np.count_nonzero(mosaic.counts >= CLIPPING_SHARE * mosaic.white_level) / mosaic.counts.size
+    black = frame_black(mosaic)
+    clipped = np.count_nonzero(mosaic.counts >= CLIPPED_SHARE * mosaic.white_level) / mosaic.counts.size
     planes = mosaic.block_planes()[:, :, ::2, ::2].reshape(2, 2, -1)
     brightest = np.percentile(planes, BRIGHTEST_PERCENTILE, axis=2) - black
     return Exposure(float(clipped), float(brightest.max()), float(mosaic.white_level - black.mean()))

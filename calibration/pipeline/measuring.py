@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
+from acquisition.framing.finding import Framing
 from acquisition.framing.planes import CHANNELS, Channel, Plane, channel_offset_px, phases
-from acquisition.framing.tags import Framing
 from acquisition.session.journal import FrameRecord
 from calibration.checks.likeness import Expectation, Likeness
 from calibration.pipeline.frames import Decoded

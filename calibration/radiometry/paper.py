@@ -21,12 +21,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.framing.limits import CLIPPED_SHARE as CLIPPED
 from calibration.radiometry.fitting import product
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import QualityError
-
-CLIPPED = 0.98
-"""Share of saturation from which a count is taken for clipped."""
 
 MAX_BLACK_DRIFT = 1.0
 """Counts that the black level may drift over a session before it is said aloud."""

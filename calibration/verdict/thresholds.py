@@ -13,14 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from acquisition.framing.limits import MIN_CELL_PX, MIN_TAG_SHARE
 from acquisition.framing.planes import MIN_SIGNAL
-from acquisition.framing.tags import MIN_TAG_SHARE
 from calibration.radiometry.paper import CLIPPED, MAX_BLACK_DRIFT
 from calibration.registration.register import (
     MAX_BLOCK_RESIDUAL_PX,
     MAX_TAG_RESIDUAL_PX,
     MIN_AGREEMENT,
-    MIN_CELL_PX,
     MIN_GOOD_BLOCKS,
 )
 
