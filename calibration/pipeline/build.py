@@ -43,7 +43,7 @@ from calibration.radiometry.dark_light import DarkLight
 from calibration.radiometry.darkness import DarkFigures, additivity, drift_gains
 from calibration.radiometry.greys import NAME as REFERENCES_FILE
 from calibration.radiometry.greys import references_csv
-from calibration.radiometry.paper import Field, corrections
+from calibration.radiometry.paper import FlatField, corrections
 from calibration.registration.movement import Shift
 from calibration.table.lut import SAMPLES as SAMPLES_FILE
 from calibration.table.lut import LutWriter, Provenance
@@ -392,7 +392,7 @@ class _Work:
         frames, limit, work, tally = self._frames, self._limit, self._measurement, self._tally
         self._told(len(self._figures), len(self._figures), "writing the report")
         white, error = np.zeros((len(lights), 3)), np.zeros((len(lights), 3))
-        fields: list[Field | None] = [None] * len(lights)
+        fields: list[FlatField | None] = [None] * len(lights)
         blacks, subtracted, at_zero = np.zeros((len(lights), 2, 2)), np.zeros((len(lights), 3)), np.zeros(len(lights))
         greys, grey_errors = (np.full((len(lights), len(work.levels.names), 3), np.nan) for _ in range(2))
         for figures in frames:

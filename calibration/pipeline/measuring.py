@@ -27,7 +27,7 @@ from calibration.radiometry.cell_field import field_of_cells
 from calibration.radiometry.dark_light import DarkLight, Subtraction, quiet_means, reflectances
 from calibration.radiometry.darkness import DarkFigures, read_dark
 from calibration.radiometry.greys import Levels
-from calibration.radiometry.paper import AROUND, CLIPPED, ORDERS, Field, Paper, PaperReader
+from calibration.radiometry.paper import AROUND, CLIPPED, ORDERS, FlatField, Paper, PaperReader
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.movement import Shift, gauge_boxes, shift_between
@@ -122,7 +122,7 @@ class FrameFigures:
     def recall(record: FrameRecord, page_mm: tuple[float, float], told: dict[str, Any]) -> FrameFigures:
         """Return the figures of a frame from what `told` returned."""
         red, green, blue = (tuple(np.array(factor) for factor in factors) for factors in told["field"])
-        field = Field(page_mm, (red, green, blue))
+        field = FlatField(page_mm, (red, green, blue))
         white, error, spread = (np.array(told[name]) for name in ("white", "error", "spread"))
         scatter, block, x_mm, y_mm = told["likeness"]
         return FrameFigures(

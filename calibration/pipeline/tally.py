@@ -19,7 +19,7 @@ from acquisition.chart.model import Chart
 from calibration.checks.stains import Stains, find_stains
 from calibration.pipeline.measuring import Measured, MeasuredDark, Stretch
 from calibration.radiometry.darkness import DarkFigures, Darkness, HotSamples, darkness, usual_noise
-from calibration.radiometry.paper import CLIPPED, Field
+from calibration.radiometry.paper import CLIPPED, FlatField
 from calibration.registration.matching import MIN_BLOCK_SCORE
 from calibration.sampling.samples import dead_samples, uneven
 from calibration.table.lut import Unfit
@@ -110,7 +110,7 @@ class Tally:
         level = np.percentile(self._even_sum.mean(axis=1) / frames, 99.5, axis=0)
         return np.sqrt(np.median(self._even_noise / frames, axis=0)) / np.maximum(level, 1e-6)
 
-    def stains(self, field: Field) -> Stains:
+    def stains(self, field: FlatField) -> Stains:
         """Return where the print is not of its codes' colours; `field` is that of a frame of even light."""
         cells = self._chart.centres_mm[self._chart.cell_of_colour]
         level = self._even_sum.mean(axis=1, dtype=np.float64) / max(self._even_frames, 1) / field.at(cells)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.radiometry.fitting import least_squares
-from calibration.radiometry.paper import Field, polynomial
+from calibration.radiometry.paper import FlatField, polynomial
 from calibration.registration.colour_model import code_polynomial, code_powers
 from foundation.robust import huber_weights, sigma_of
 
@@ -41,7 +41,7 @@ def field_of_cells(
     paper_mm: _Array,
     paper: _Array,
     page_mm: tuple[float, float],
-) -> Field:
+) -> FlatField:
     """Return the field of a frame from its cells.
 
     Parameters
@@ -93,4 +93,4 @@ def field_of_cells(
         smooth = least_squares(np.ascontiguousarray(light), shape, np.ones(len(shape)))
         factors.append((smooth / float((light @ smooth).mean()),))
     red, green, blue = factors
-    return Field(page_mm, (red, green, blue))
+    return FlatField(page_mm, (red, green, blue))

@@ -89,7 +89,7 @@ def _basis(points: bytes, page_mm: tuple[float, float], order: int) -> _Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class FlatField:
     """The shape of the light over the print, mean 1 over the cells' centres.
 
     Attributes
@@ -102,6 +102,11 @@ class Field:
 
     page_mm: tuple[float, float]
     coefficients: tuple[tuple[_Array, ...], tuple[_Array, ...], tuple[_Array, ...]]
+
+    @classmethod
+    def uniform(cls, page_mm: tuple[float, float]) -> FlatField:
+        """Return the field that is 1 everywhere on a page of that width and height."""
+        return cls(page_mm, ((), (), ()))
 
     def at(self, points_mm: npt.ArrayLike) -> _Array:
         """Return the field (N, 3) at points (N, 2) mm, > 0."""
@@ -129,11 +134,6 @@ def order_of(count: int) -> int:
     return round((np.sqrt(8 * count + 1) - 3) / 2)
 
 
-def even_field(page_mm: tuple[float, float]) -> Field:
-    """Return the field that is 1 everywhere."""
-    return Field(page_mm, ((), (), ()))
-
-
 @dataclass(frozen=True, eq=False)
 class Paper:
     """What the white references of a frame say.
@@ -152,7 +152,7 @@ class Paper:
         (3,) float64, RMS of all references about the field, stained ones included, relative to `white`.
     """
 
-    field: Field
+    field: FlatField
     white: _Array
     error: _Array
     references: int
@@ -182,10 +182,10 @@ class PaperReader:
         places_mm: _Array,
         centres_mm: _Array,
         page_mm: tuple[float, float],
-        base: Field | None = None,
+        base: FlatField | None = None,
         order: int = ORDERS[-1],
     ) -> None:
-        self.base = even_field(page_mm) if base is None else base
+        self.base = FlatField.uniform(page_mm) if base is None else base
         self._page_mm, self._order = page_mm, order
         self._at_places, self._base_at_places = polynomial(places_mm, page_mm, ORDERS[-1]), self.base.at(places_mm)
         self._base_at_centres = self.base.at(centres_mm)
@@ -240,7 +240,7 @@ class PaperReader:
             error[channel] = scatter / np.sqrt(float(weights.sum()))
             # All references count here: a stain that the fit rightly ignores must still be seen.
             spread[channel] = float(np.sqrt((residual**2).mean())) / max(abs(white[channel]), 1e-9)
-        field = Field(self._page_mm, (factors[0], factors[1], factors[2]))
+        field = FlatField(self._page_mm, (factors[0], factors[1], factors[2]))
         return Paper(field, white, error, int(there.sum()), spread), np.maximum(shape, _LEAST_FIELD)
 
 
@@ -273,7 +273,7 @@ def corrections(
     page_mm: tuple[float, float],
     black: _Array,
     saturation_counts: int,
-    fields: Sequence[Field],
+    fields: Sequence[FlatField],
     *,
     measured: bool = False,
     gains: _Array | None = None,

@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 
 from calibration.radiometry.paper import (
     AROUND,
-    Field,
+    FlatField,
     Paper,
     PaperReader,
     black_drift,
     corrections,
-    even_field,
     order_of,
     polynomial,
     saturation,
@@ -34,7 +33,7 @@ PLACES = RANDOM.random((400, 2)) * PAGE
 CENTRES = RANDOM.random((1000, 2)) * PAGE
 
 
-def read_paper(seen: npt.NDArray[np.float64], base: Field | None = None) -> Paper:
+def read_paper(seen: npt.NDArray[np.float64], base: FlatField | None = None) -> Paper:
     return PaperReader(PLACES, CENTRES, PAGE, base).read(seen)[0]
 
 
@@ -118,8 +117,8 @@ def test_the_table_says_enough_to_undo_the_field() -> None:
 
 
 def test_an_even_field_is_one() -> None:
-    assert even_field(PAGE).at(CENTRES) == pytest.approx(1)
-    assert isinstance(even_field(PAGE), Field)
+    assert FlatField.uniform(PAGE).at(CENTRES) == pytest.approx(1)
+    assert isinstance(FlatField.uniform(PAGE), FlatField)
 
 
 def test_saturation_is_what_the_frame_shows(lab: Lab, tmp_path: Path) -> None:

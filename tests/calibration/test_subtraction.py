@@ -16,7 +16,7 @@ from calibration.pipeline.build import append, build, check
 from calibration.pipeline.options import Choices
 from calibration.pipeline.result import BuildResult, Growth
 from calibration.radiometry.dark_light import Subtraction, quiet_means, reflectances
-from calibration.radiometry.paper import Paper, even_field
+from calibration.radiometry.paper import FlatField, Paper
 from calibration.report.report import summary
 from calibration.table.lut import open_lut
 from drivers.presenter import BLACK
@@ -39,7 +39,7 @@ def learnt(
     truth = light * reflectance + beyond
     for _ in range(frames):
         means = truth + random.normal(0, 1, truth.shape) * NOISE / 5
-        paper = Paper(even_field((1.0, 1.0)), light, np.full(3, 0.05), 400, np.zeros(3))
+        paper = Paper(FlatField.uniform((1.0, 1.0)), light, np.full(3, 0.05), 400, np.zeros(3))
         subtraction.add(means, NOISE, paper, np.ones_like(reflectance))
     return subtraction, truth
 
@@ -68,7 +68,9 @@ def test_where_it_is_wrong_what_cells_show_is_believed(reflectance: _Array) -> N
     assert (subtraction.now.share > 0.7).all()
     assert ((subtraction.now.patches - truth).std(axis=0) < 0.5 * (predicted - truth).std(axis=0)).all()
     subtraction.move()
-    subtraction.add(predicted, NOISE, Paper(even_field((1, 1)), np.full(3, 30.0), NOISE, 9, NOISE), np.ones((1, 3)))
+    subtraction.add(
+        predicted, NOISE, Paper(FlatField.uniform((1, 1)), np.full(3, 30.0), NOISE, 9, NOISE), np.ones((1, 3))
+    )
     assert subtraction.now.patches == pytest.approx(predicted, abs=0.01)
 
 
@@ -77,7 +79,7 @@ def test_what_was_learnt_comes_back_to_the_last_bit(reflectance: _Array) -> None
     whole, _ = learnt(light, reflectance, 2, 7)
     copy = Subtraction(reflectance, np.ones(PATCHES, dtype=bool), 25)
     copy.restore(whole.state())
-    paper = Paper(even_field((1.0, 1.0)), light, np.full(3, 0.05), 400, np.zeros(3))
+    paper = Paper(FlatField.uniform((1.0, 1.0)), light, np.full(3, 0.05), 400, np.zeros(3))
     means = light * reflectance + 0.3
     one, other = (each.add(means, NOISE, paper, np.ones_like(reflectance)) for each in (whole, copy))
     assert one.patches.tobytes() == other.patches.tobytes()
