@@ -21,7 +21,7 @@ from acquisition.chart.model import Chart
 from acquisition.framing.planes import CHANNELS, Channel, Plane, channel_offset_px, phases
 from acquisition.framing.tags import Framing
 from acquisition.session.folder import FrameRecord
-from calibration.checks.likeness import Expectation, Likeness
+from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency
 from calibration.pipeline.frames import Decoded
 from calibration.radiometry.cell_field import field_of_cells
 from calibration.radiometry.dark_light import DarkLight, Subtraction, quiet_means, reflectances
@@ -89,7 +89,7 @@ class FrameFigures:
     shift: Shift
     registered: bool
     paper: Paper
-    likeness: Likeness
+    likeness: FrameConsistency
     greys: _Array = field(default_factory=lambda: np.zeros((0, 3)))
     grey_errors: _Array = field(default_factory=lambda: np.zeros((0, 3)))
     dark: _Array = field(default_factory=lambda: np.zeros(3))
@@ -132,7 +132,7 @@ class FrameFigures:
             Shift(*told["shift"]),
             told["registered"],
             Paper(field, white, error, told["references"], spread),
-            Likeness(scatter, block, (x_mm, y_mm)),
+            FrameConsistency(scatter, block, (x_mm, y_mm)),
             np.array(told["greys"]).reshape(-1, 3),
             np.array(told["grey_errors"]).reshape(-1, 3),
             np.array(told["dark"]),
@@ -299,7 +299,7 @@ class Measurement:
         self.transfer: PhotonTransfer = photon_transfer(level, cells.var(axis=1, ddof=1), window**2)
         self._first_means = np.concatenate([level, samples.mean(axis=1, dtype=np.float64)])
         self._first_seen = seen
-        self._expected = Expectation(codes, self.cells_mm, level / base.at(self.cells_mm), there)
+        self._expected = ConsistencyCheck(codes, self.cells_mm, level / base.at(self.cells_mm), there)
         self.primaries: Primaries | None = None
         self.primaries = self._read_primaries(primaries)
 
@@ -487,7 +487,7 @@ class Measurement:
             values, highest = gather_values(decoded.mosaic, decoded.black, cells, shape, dark_cells)
             kept = noise = None
         mean = patch_means(values[self._expected.cells])
-        likeness = self._expected.held_against(mean, self.transfer.variance(mean) / self._window**2)
+        likeness = self._expected.compare(mean, self.transfer.variance(mean) / self._window**2)
         softer = 0.0 if registered else shift.softer_px2
         figures = FrameFigures(
             decoded.record,

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from calibration.checks.likeness import can_tell
+from calibration.checks.frame_consistency import has_enough_cells
 from calibration.pipeline.linearity import curve
 from calibration.pipeline.options import WINDOWS
 from calibration.radiometry.greys import tint_deg
@@ -155,7 +155,7 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         figures["doubtful_share"] = float(result.stains.doubtful.mean())
     if len(result.frames) > 1:
         figures["moved_anew"] = float(sum(frame.registered for frame in result.frames))
-    if can_tell(len(registration.strangers)):
+    if has_enough_cells(len(registration.strangers)):
         figures["unlike_scatter"] = max((frame.likeness.scatter for frame in result.frames), default=0.0)
         figures["unlike_block"] = max((frame.likeness.block for frame in result.frames), default=0.0)
     if registration.framing.field is None:
