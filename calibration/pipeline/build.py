@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from acquisition.framing.annotated import annotated_png
 from acquisition.session.folder import FrameRecord, Session
-from calibration.checks.labels import angles_off_codes_deg
+from calibration.checks.light_codes import angles_off_codes_deg
 from calibration.pipeline.checkpoint import Checkpoint, Growing, growing
 from calibration.pipeline.frames import (
     Progress,

@@ -81,8 +81,8 @@ class BuildResult:
         The primaries each alone, by which the field of coloured cells was told from that of paper; None where the plan
         has no light of each alone, or it is too dim.
     off_codes_deg
-        (L,) how far each white is off what its codes give, degrees (`calibration.checks.labels`); None where the lights
-        are too few, or not exposed alike.
+        (L,) how far each white is off what its codes give, degrees (`calibration.checks.light_codes`); None where the
+        lights are too few, or not exposed alike.
     """
 
     session: Path

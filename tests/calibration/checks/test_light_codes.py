@@ -13,7 +13,7 @@ import pytest
 
 from acquisition.lights.illuminations import Illumination, plan_illuminations
 from acquisition.session.folder import Session, SessionStep
-from calibration.checks.labels import DEGREE, LIGHTS_A_TERM, angles_off_codes_deg
+from calibration.checks.light_codes import DEGREE, LIGHTS_A_TERM, angles_off_codes_deg
 from calibration.pipeline.build import build
 from calibration.pipeline.measuring import FrameFigures
 from calibration.report.report import write_report
