@@ -288,7 +288,7 @@ class Measurement:
         base = PaperReader(self._white_mm, self.cells_mm, chart.page_mm).read(seen, first.record.file)[0].field
         cells = gather(first.mosaic, first.black, self.first.cells)[0].astype(np.float64)
         level = cells.mean(axis=1)
-        there = self.first.cells.inside & ~self.first.registration.strangers[chart.cell_of_colour]
+        there = self.first.cells.inside & ~self.first.registration.mismatched_cells[chart.cell_of_colour]
         codes = chart.rgb[chart.cell_of_colour]
         if not chart.tags:
             # Its references are in the margin, and do not tell what light there is in the middle.

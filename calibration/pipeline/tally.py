@@ -153,4 +153,4 @@ def _covered_cells(chart: Chart, stretch: Stretch) -> npt.NDArray[np.bool_]:
     """Return the cells that do not look like the chart's, alone or with their neighbourhood."""
     blocks, cells = stretch.registration.blocks, chart.cell_of_colour
     nearest = np.asarray(cKDTree(blocks.centres_mm).query(chart.centres_mm[cells])[1])
-    return stretch.registration.strangers[cells] | np.asarray(blocks.score[nearest] < MIN_BLOCK_SCORE)
+    return stretch.registration.mismatched_cells[cells] | np.asarray(blocks.score[nearest] < MIN_BLOCK_SCORE)

@@ -609,7 +609,7 @@ def _course(figure: Any, result: BuildResult) -> None:
 
 def _draw_likeness(axes: Any, count: npt.NDArray[np.integer], result: BuildResult) -> None:
     axes.set(title="cells off what their codes give", ylabel="%", xlabel="frame")
-    if not has_enough_cells(len(result.registration.strangers)):
+    if not has_enough_cells(len(result.registration.mismatched_cells)):
         axes.text(0.5, 0.5, "too few colours to tell", ha="center", va="center", transform=axes.transAxes)
         return
     axes.plot(
