@@ -39,8 +39,8 @@ from calibration.pipeline.measuring import FrameFigures, Measured, MeasuredDark,
 from calibration.pipeline.options import Choices
 from calibration.pipeline.result import BuildResult, Growth
 from calibration.pipeline.tally import Tally
+from calibration.radiometry.dark_frames import DarkFrameFigures, additivity, drift_gains
 from calibration.radiometry.dark_light import DarkLight
-from calibration.radiometry.darkness import DarkFigures, additivity, drift_gains
 from calibration.radiometry.greys import NAME as REFERENCES_FILE
 from calibration.radiometry.greys import references_csv
 from calibration.radiometry.paper import FlatField, corrections
@@ -252,7 +252,7 @@ class _Work:
             "primaries": [record.sha256 for record in self._pure],
         }
         self._before = self._usable(making.load())
-        self._figures: list[FrameFigures | DarkFigures] = []
+        self._figures: list[FrameFigures | DarkFrameFigures] = []
 
     @property
     def taken_in(self) -> int:
@@ -312,9 +312,9 @@ class _Work:
         self._limit = int(told["limit"])
         for record, figures in zip(self._chosen, told["figures"], strict=False):
             if record.kind == "dark":
-                self._figures.append(DarkFigures.recall(record, figures))
+                self._figures.append(DarkFrameFigures.from_json(record, figures))
             else:
-                self._figures.append(FrameFigures.recall(record, self._session.chart.page_mm, figures))
+                self._figures.append(FrameFigures.from_json(record, self._session.chart.page_mm, figures))
         if told["stretch"] != self._stretch.file:
             adopted = next(record for record in self._chosen if record.file == told["stretch"])
             self._stretch = self._measurement.register(decode(self._session, adopted))
@@ -333,8 +333,8 @@ class _Work:
         return self._choices.subtract_dark and record.kind == "dark"
 
     @property
-    def _darks(self) -> list[DarkFigures]:
-        return [figures for figures in self._figures if isinstance(figures, DarkFigures)]
+    def _darks(self) -> list[DarkFrameFigures]:
+        return [figures for figures in self._figures if isinstance(figures, DarkFrameFigures)]
 
     @property
     def _frames(self) -> list[FrameFigures]:
@@ -380,7 +380,7 @@ class _Work:
             "limit": self._limit,
             "stretch": self._stretch.file,
             "sha256": self._writer.sha256,
-            "figures": [figures.told() for figures in self._figures],
+            "figures": [figures.to_json() for figures in self._figures],
         }
         taken_in = self._keys[: len(self._figures)]
         state = {**self._tally.state(), **self._subtraction.state()}

@@ -24,8 +24,8 @@ from acquisition.session.folder import FrameRecord
 from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency
 from calibration.pipeline.frames import Decoded
 from calibration.radiometry.cell_field import field_of_cells
+from calibration.radiometry.dark_frames import DarkFrameFigures, measure_dark_frame
 from calibration.radiometry.dark_light import DarkLight, Subtraction, quiet_means, reflectances
-from calibration.radiometry.darkness import DarkFigures, read_dark
 from calibration.radiometry.greys import Levels
 from calibration.radiometry.paper import AROUND, CLIPPED, ORDERS, FlatField, Paper, PaperReader
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
@@ -97,8 +97,8 @@ class FrameFigures:
     blur_px: float = 0.0
     exposure: float = 0.0
 
-    def told(self) -> dict[str, Any]:
-        """Return the figures as JSON holds them; `recall` makes them again to the last bit."""
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as JSON holds them; `from_json` makes them again to the last bit."""
         return {
             "black": self.black.tolist(),
             "channel": self.channel,
@@ -119,8 +119,8 @@ class FrameFigures:
         }
 
     @staticmethod
-    def recall(record: FrameRecord, page_mm: tuple[float, float], told: dict[str, Any]) -> FrameFigures:
-        """Return the figures of a frame from what `told` returned."""
+    def from_json(record: FrameRecord, page_mm: tuple[float, float], told: dict[str, Any]) -> FrameFigures:
+        """Return the figures of a frame from what `to_json` returned."""
         red, green, blue = (tuple(np.array(factor) for factor in factors) for factors in told["field"])
         field = FlatField(page_mm, (red, green, blue))
         white, error, spread = (np.array(told[name]) for name in ("white", "error", "spread"))
@@ -217,7 +217,7 @@ class MeasuredDark:
         (P, 3) float64 mean counts of cells, then references.
     """
 
-    figures: DarkFigures
+    figures: DarkFrameFigures
     stretch: Stretch
     aside: npt.NDArray[np.int16]
     means: _Array
@@ -443,7 +443,7 @@ class Measurement:
         cells, _ = gather(decoded.mosaic, decoded.black, stretch.cells)
         references, _ = gather(decoded.mosaic, decoded.black, stretch.references)
         whites = np.flatnonzero(stretch.references.inside[: len(self._white_mm)])
-        figures, aside = read_dark(
+        figures, aside = measure_dark_frame(
             decoded.record, decoded.black, cells, references[whites], self._base_at_whites[whites]
         )
         means = np.concatenate([quiet_means(patches, figures.noise) for patches in (cells, references)])

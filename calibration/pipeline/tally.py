@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from acquisition.chart.model import Chart
 from calibration.checks.stains import Stains, find_stains
 from calibration.pipeline.measuring import Measured, MeasuredDark, Stretch
-from calibration.radiometry.darkness import DarkFigures, Darkness, HotSamples, darkness, usual_noise
+from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
 from calibration.radiometry.paper import CLIPPED, FlatField
 from calibration.registration.matching import MIN_BLOCK_SCORE
 from calibration.sampling.samples import dead_samples, uneven
@@ -50,8 +50,8 @@ class Tally:
         self._even_noise = np.zeros((count, 3))
         self._even_frames = 0
         self._covered = _covered_cells(chart, first)
-        self._hot = HotSamples(count, samples)
-        self._darks: list[DarkFigures] = []
+        self._hot = HotPixels(count, samples)
+        self._darks: list[DarkFrameFigures] = []
 
     def add(self, measured: Measured) -> None:
         """Take in a light or white frame."""
@@ -62,7 +62,7 @@ class Tally:
         self._outside |= ~measured.inside
         if measured.figures.registered:
             self._covered |= _covered_cells(self._chart, measured.stretch)
-            self._hot.move(usual_noise(self._darks))
+            self._hot.restart(median_noise(self._darks))
         if measured.samples is not None and measured.noise is not None:
             self._even_sum += measured.samples
             self._even_noise += measured.noise**2
@@ -83,10 +83,10 @@ class Tally:
             "even_sum": self._even_sum,
             "even_noise": self._even_noise,
             "even_frames": np.array(self._even_frames),
-            **self._hot.state(),
+            **self._hot.to_arrays(),
         }
 
-    def restore(self, state: dict[str, npt.NDArray[Any]], darks: list[DarkFigures]) -> None:
+    def restore(self, state: dict[str, npt.NDArray[Any]], darks: list[DarkFrameFigures]) -> None:
         """Go on from what `state` returned, and the figures of the dark frames."""
         self._highest, self._highest_at = state["highest"], state["highest_at"]
         self._outside, self._covered = state["outside"], state["covered"]
@@ -96,9 +96,9 @@ class Tally:
         self._darks = list(darks)
 
     @property
-    def darkness(self) -> Darkness:
+    def darkness(self) -> DarkSummary:
         """What the dark frames say."""
-        return darkness(self._darks, self._hot)
+        return dark_summary(self._darks, self._hot)
 
     def saturated(self, saturation_counts: int) -> bool:
         """Return whether a photosite of a cell reached saturation."""

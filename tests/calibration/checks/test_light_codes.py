@@ -165,8 +165,8 @@ def test_lights_exposed_otherwise_are_not_held_against_their_codes(
         assert result.off_codes_deg is not None
         assert result.frames[0].exposure == pytest.approx(0.5 * 100 / 8**2)
         # A checkpoint of before it was noted.
-        earlier = {name: value for name, value in result.frames[0].told().items() if name != "exposure"}
-        assert FrameFigures.recall(result.frames[0].record, lab.chart.page_mm, earlier).exposure == 0
+        earlier = {name: value for name, value in result.frames[0].to_json().items() if name != "exposure"}
+        assert FrameFigures.from_json(result.frames[0].record, lab.chart.page_mm, earlier).exposure == 0
     with take(lab, tmp_path / "longer", LIGHTS[:3], frame=longer) as session:
         assert build(session, tmp_path / "other").off_codes_deg is None
 
