@@ -40,7 +40,7 @@ from calibration.pipeline.options import Choices
 from calibration.pipeline.result import BuildResult, Growth
 from calibration.pipeline.tally import Tally
 from calibration.radiometry.dark_frames import DarkFrameFigures, additivity, drift_gains
-from calibration.radiometry.dark_light import DarkLight
+from calibration.radiometry.dark_subtraction import DarkLight
 from calibration.radiometry.greys import NAME as REFERENCES_FILE
 from calibration.radiometry.greys import references_csv
 from calibration.radiometry.paper import FlatField, corrections
@@ -320,7 +320,7 @@ class _Work:
             self._stretch = self._measurement.register(decode(self._session, adopted))
         self._tally.restore(before.arrays, self._darks)
         self._subtraction.restore(before.arrays)
-        self._dark = self._subtraction.now
+        self._dark = self._subtraction.current
 
     def _first_dark(self) -> DarkLight:
         """Return what is subtracted from the frames before the first dark one: what that one tells."""
@@ -360,7 +360,7 @@ class _Work:
             before = self._stretch
             self._stretch = self._measurement.register(decoded)
             shift = self._measurement.moved(before, self._stretch)
-            self._subtraction.move()
+            self._subtraction.restart()
             even = self._is_even(record)
             measured = self._measurement.measure_first(decoded, self._stretch, shift, even, self._dark)
         self._figures.append(measured.figures)
@@ -383,7 +383,7 @@ class _Work:
             "figures": [figures.to_json() for figures in self._figures],
         }
         taken_in = self._keys[: len(self._figures)]
-        state = {**self._tally.state(), **self._subtraction.state()}
+        state = {**self._tally.state(), **self._subtraction.to_arrays()}
         self._making.save(Checkpoint(self._identity, taken_in, told, state))
 
     def finish(self, out: Path, report: _Report | None) -> BuildResult:

@@ -25,7 +25,7 @@ from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsiste
 from calibration.pipeline.frames import Decoded
 from calibration.radiometry.cell_field import field_of_cells
 from calibration.radiometry.dark_frames import DarkFrameFigures, measure_dark_frame
-from calibration.radiometry.dark_light import DarkLight, Subtraction, quiet_means, reflectances
+from calibration.radiometry.dark_subtraction import DarkLight, DarkLightEstimator, reflectances, winsorised_means
 from calibration.radiometry.greys import Levels
 from calibration.radiometry.paper import AROUND, CLIPPED, ORDERS, FlatField, Paper, PaperReader
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
@@ -365,14 +365,14 @@ class Measurement:
             peaks.append(highest)
         return np.concatenate(means), np.concatenate(peaks)
 
-    def subtraction(self) -> Subtraction:
+    def subtraction(self) -> DarkLightEstimator:
         """Return what learns the dark light, with the reflectances that the first frame shows."""
         paper, shape = self._paper.read(self._first_seen, self._first_file)
         field = np.concatenate([shape, paper.field.at(self._references_mm)])
         inside = np.concatenate([self.first.cells.inside, self.first.references.inside])
-        return Subtraction(reflectances(self._first_means, field, paper.white), inside, self._window**2)
+        return DarkLightEstimator(reflectances(self._first_means, field, paper.white), inside, self._window**2)
 
-    def learn(self, subtraction: Subtraction, measured: MeasuredDark) -> DarkLight:
+    def learn(self, subtraction: DarkLightEstimator, measured: MeasuredDark) -> DarkLight:
         """Take a dark frame into a subtraction.
 
         Raises
@@ -446,7 +446,7 @@ class Measurement:
         figures, aside = measure_dark_frame(
             decoded.record, decoded.black, cells, references[whites], self._base_at_whites[whites]
         )
-        means = np.concatenate([quiet_means(patches, figures.noise) for patches in (cells, references)])
+        means = np.concatenate([winsorised_means(patches, figures.noise) for patches in (cells, references)])
         return MeasuredDark(figures, stretch, aside, means)
 
     def _require_geometry(self, mosaic: Mosaic, what: str) -> None:

@@ -4,7 +4,7 @@ Laws that hold inside:
 
 - Leak and ambient light cannot be told apart and are one figure, read on bare paper in the dark frames.
 - They are part of every light: samples and ground truth hold them alike, so nothing is subtracted unless asked for
-  (`calibration.radiometry.dark_light`).
+  (`calibration.radiometry.dark_subtraction`).
 - A photosite is hot when it stands out in every dark frame; what stands out once is a cosmic ray.
 """
 
