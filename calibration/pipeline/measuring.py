@@ -26,7 +26,7 @@ from calibration.pipeline.frames import Decoded
 from calibration.radiometry.cell_field import field_of_cells
 from calibration.radiometry.dark_frames import DarkFrameFigures, measure_dark_frame
 from calibration.radiometry.dark_subtraction import DarkLight, DarkLightEstimator, reflectances, winsorised_means
-from calibration.radiometry.greys import Levels
+from calibration.radiometry.greys import GreyLevels
 from calibration.radiometry.paper import AROUND, CLIPPED, ORDERS, FlatField, Paper, PaperReader
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries
@@ -269,7 +269,7 @@ class Measurement:
         self._chart, self._window = chart, window
         whites = [reference for reference in chart.references if reference.is_white]
         greys = [reference for reference in chart.references if not reference.is_white]
-        self.levels = Levels.of(greys)
+        self.levels = GreyLevels.of(greys)
         self._white_mm = np.array([reference.centre_mm for reference in whites]).reshape(-1, 2)
         self._grey_mm = np.array([reference.centre_mm for reference in greys]).reshape(-1, 2)
         self._references_mm = np.concatenate([self._white_mm, self._grey_mm])
