@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.radiometry.fitting import least_squares, product
-from calibration.registration.colour_model import code_polynomial, code_powers
+from calibration.fitting.least_squares import least_squares, product
+from calibration.fitting.polynomials import code_polynomial, code_powers
 from foundation.robust import huber_weights, sigma_of
 
 DEGREE = 4

@@ -21,9 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.planes import frame_black
+from calibration.fitting.least_squares import least_squares
 from calibration.pipeline.frames import strongest_channel
 from calibration.pipeline.measuring import STILL_PX, Measurement
-from calibration.radiometry.fitting import least_squares
 from calibration.radiometry.paper import CLIPPED, saturation
 from calibration.registration.movement import Shift
 from drivers.raw.rawfile import Mosaic, read_raw

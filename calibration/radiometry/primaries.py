@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.lights.illuminations import Illumination
-from calibration.radiometry.fitting import product
+from calibration.fitting.least_squares import product
 from calibration.radiometry.paper import FlatField, Paper
 
 LEAST_PAPER = 300.0

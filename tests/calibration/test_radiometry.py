@@ -17,10 +17,7 @@ from calibration.radiometry.paper import (
     PaperReader,
     black_drift,
     corrections,
-    order_of,
-    polynomial,
     saturation,
-    terms,
 )
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
@@ -40,13 +37,6 @@ def read_paper(seen: npt.NDArray[np.float64], base: FlatField | None = None) -> 
 def falloff(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     x, y = (2 * points / PAGE - 1).T
     return np.stack([1 / (1 + 0.2 * (x * x + y * y)), 1 / (1 + 0.25 * ((x - 0.1) ** 2 + y * y)), 1 - 0.1 * x], axis=-1)
-
-
-@pytest.mark.parametrize("order", range(8))
-def test_terms_and_orders_agree(order: int) -> None:
-    assert len(terms(order)) == (order + 1) * (order + 2) // 2
-    assert order_of(len(terms(order))) == order
-    assert polynomial(PLACES, PAGE, order).shape == (len(PLACES), len(terms(order)))
 
 
 def test_the_field_is_found_and_its_mean_over_the_cells_is_one() -> None:
