@@ -11,6 +11,9 @@ from acquisition.framing.planes import Plane
 from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.tags import TAG_MODULES, FoundTag, Framing
 
+MAX_BLUR_PX = 1.0
+"""σ beyond which the 25 samples of a cell take in light from its neighbours (more than 1 % at 10 px a cell)."""
+
 _BLURS = np.geomspace(0.15, 4, 48)
 _OUTLINE_PLACES = 80
 _INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0

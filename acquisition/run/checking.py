@@ -14,7 +14,7 @@ from acquisition.chart.model import load_chart
 from acquisition.config import LabSettings
 from acquisition.framing.annotated import annotated_png
 from acquisition.framing.corners import Corners
-from acquisition.framing.sharpness import blur_px
+from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
 from acquisition.framing.tags import MIN_MODULE_PX, Framing, find_chart
 from acquisition.lights.illuminations import load_illuminations
 from acquisition.run.exposure import measure_exposure, refusal
@@ -32,8 +32,6 @@ TARGET_LEVEL = 0.75
 """Paper white under white as a share of the sensor's range: below the 0.8 at which a session is sure not to clip."""
 LEVELS = (0.3, 0.8)
 """Between these shares the exposure is left as it is."""
-MAX_BLUR_PX = 1.0
-"""σ beyond which the 25 samples of a cell take in light from its neighbours (more than 1 % at 10 px a cell)."""
 DLP_TURN_S = 1 / 60
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from acquisition.framing.planes import CLIPPING_SHARE
 from acquisition.session.folder import FrameKind
 
 if TYPE_CHECKING:
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from drivers.camera import ExposureSettings
     from drivers.raw.rawfile import Mosaic
 
-CLIPPING_SHARE = 0.98
-"""Counts above this share of saturation are treated as clipped (judgement: the knee of the response lies above)."""
 BRIGHTEST_PERCENTILE = 99.9
 EXPOSURE_TOLERANCE_STOPS = 0.25
 """How far a file's exposure may lie from the one asked for. Nominal values are rounded, and files state either: 0.3 s

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
-from acquisition.framing.planes import CHANNELS, Channel, Plane, channel_offset_px, phases
+from acquisition.framing.planes import CHANNELS, CLIPPING_SHARE, Channel, Plane, channel_offset_px, phases
 from acquisition.framing.tags import Framing
 from acquisition.session.folder import FrameRecord
 from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency
@@ -27,7 +27,7 @@ from calibration.radiometry.cell_field import field_of_cells
 from calibration.radiometry.dark_frames import DarkFrameFigures, measure_dark_frame
 from calibration.radiometry.dark_subtraction import DarkLight, DarkLightEstimator, reflectances, winsorised_means
 from calibration.radiometry.greys import GreyLevels
-from calibration.radiometry.paper import AROUND, CLIPPED, ORDERS, FlatField, Paper, PaperReader
+from calibration.radiometry.paper import AROUND, ORDERS, FlatField, Paper, PaperReader
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.movement import Shift, gauge_boxes, shift_between
@@ -518,5 +518,5 @@ def _exposure(mosaic: Mosaic) -> float:
 def _means(samples: npt.NDArray[np.float32], highest: npt.NDArray[np.uint16], sites: Sites, saturation: int) -> _Array:
     """Return the mean counts (N, 3) of patches, NaN where one is cut off or clipped."""
     seen = samples.mean(axis=1, dtype=np.float64)
-    seen[~(sites.inside & (highest < CLIPPED * saturation))] = np.nan
+    seen[~(sites.inside & (highest < CLIPPING_SHARE * saturation))] = np.nan
     return seen

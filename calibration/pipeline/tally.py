@@ -16,10 +16,11 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from acquisition.chart.model import Chart
+from acquisition.framing.planes import CLIPPING_SHARE
 from calibration.checks.stains import Stains, find_stains
 from calibration.pipeline.measuring import Measured, MeasuredDark, Stretch
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
-from calibration.radiometry.paper import CLIPPED, FlatField
+from calibration.radiometry.paper import FlatField
 from calibration.registration.matching import MIN_BLOCK_SCORE
 from calibration.sampling.samples import dead_samples, uneven
 from calibration.table.lut import Unfit
@@ -122,7 +123,7 @@ class Tally:
         hottest = dark.hottest if len(dark.hottest) else np.zeros(self._chart.colour_count)
         dead = dead_samples(self._even_sum / frames)
         unevenness = uneven(self._even_sum / frames, np.sqrt(self._even_noise) / frames)
-        allowed, samples = CLIPPED * saturation_counts, self._even_sum.shape[1]
+        allowed, samples = CLIPPING_SHARE * saturation_counts, self._even_sum.shape[1]
         found: list[Unfit] = []
         for colour in range(self._chart.colour_count):
             cause = ""

@@ -20,13 +20,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.framing.planes import CLIPPING_SHARE
 from calibration.fitting.least_squares import linear_combinations, product, robust_least_squares
 from calibration.fitting.polynomials import order_of, page_polynomial, page_powers
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import QualityError
-
-CLIPPED = 0.98
-"""Share of saturation from which a count is taken for clipped."""
 
 MAX_BLACK_DRIFT = 1.0
 """Counts that the black level may drift over a session before it is said aloud."""
@@ -274,7 +272,7 @@ def corrections(
         *([] if subtracted is None else [_dark_correction(subtracted)]),
         {
             "name": "saturation",
-            "how": f"cells with a count of {CLIPPED:g} of it or more are unfit",
+            "how": f"cells with a count of {CLIPPING_SHARE:g} of it or more are unfit",
             "unit": "raw counts",
             "value": saturation_counts,
             "from": "measured: photosites of this session reached it"

@@ -25,9 +25,10 @@ from acquisition.chart.model import Chart
 from acquisition.framing.homography import rms
 from acquisition.framing.outline import refined
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
-from acquisition.framing.sharpness import blur_px
+from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
 from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.tags import Framing, find_chart
+from acquisition.framing.visibility import MIN_CELL_PX
 from calibration.registration.colour_model import ColourModel
 from calibration.registration.displacement import Displacement
 from calibration.registration.lens import Lens, fit_lens
@@ -38,13 +39,6 @@ from foundation.robust import MAD_TO_SIGMA, sigma_of
 
 SAMPLE_REACH_PX = 3.25
 """From a cell's true centre to the outer edge of its 25 pixels: 2.5, rounding 0.5, registration 0.25."""
-
-MIN_CELL_PX = 8.0
-"""Half-size pixels a cell must have for 25 of them to lie safely inside; 8.6 already bleeds 1 % at σ = 0.7."""
-
-MAX_BLUR_PX = 1.0
-"""σ of the tags' edges up to which cells of any size are found to a few hundredths of a pixel, as `acquire check` has
-it. What such a blur mixes into the samples depends on the cells' size, and the verdict judges it as bleed."""
 
 ROOM_PX = 1.75
 """From there to the edge of a cell of 10 px, for which the limits of places were found."""
@@ -287,6 +281,8 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
             f"{what}: a cell is {cell_px:.1f} px wide, at least {MIN_CELL_PX:g} expected for 25 pixels inside it; "
             "bring the camera nearer"
         )
+    # Up to MAX_BLUR_PX cells of any size are found to a few hundredths of a pixel. What such a blur mixes into their
+    # samples depends on the cells' size; the verdict judges it as bleed.
     allowed = max(MAX_BLUR_PX, (cell_px / 2 - SAMPLE_REACH_PX) / 2)
     if not blur <= allowed:
         raise RegistrationError(
