@@ -23,12 +23,19 @@ import numpy.typing as npt
 from acquisition.chart.model import TAG_MODULES, Chart
 from acquisition.framing.corners import corners_text
 from acquisition.framing.homography import project, rms, robust_homography
-from acquisition.framing.limits import MIN_MODULE_PX, MIN_TAG_SHARE, MIN_TAGS
 from acquisition.framing.planes import CHANNELS, MIN_SIGNAL, Plane, frame_black, paper_level, plane_of, strongest_plane
 from acquisition.framing.tagless_field import FoundField, find_field
-from acquisition.framing.tags import FoundTag, find_tags
+from acquisition.framing.tags import MIN_MODULE_PX, FoundTag, find_tags
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import InputError, RegistrationError
+
+MIN_TAGS = 2
+"""Tags without which no homography is looked for: two give eight points, twice as many as one needs."""
+
+MIN_TAG_SHARE = 0.8
+"""Share of the chart's tags that must be found; fewer mean that part of the chart is covered, dark or outside."""
+
+_Points = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,10 @@ from acquisition.framing.planes import Plane
 from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.tags import FoundTag
 
+MAX_BLUR_PX = 1.0
+"""σ of the print's edges up to which cells of any size are found to a few hundredths of a pixel; beyond it the 25
+samples of a cell of 10 px take in more than 1 % of light from its neighbours."""
+
 _BLURS = np.geomspace(0.15, 4, 48)
 _OUTLINE_PLACES = 80
 _INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0

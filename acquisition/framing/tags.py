@@ -15,6 +15,9 @@ import numpy.typing as npt
 
 from acquisition.framing.planes import MIN_SIGNAL, Plane, paper_level
 
+MIN_MODULE_PX = 3.0
+"""Half-size pixels a tag module must have; below, detectors fail one tag after another."""
+
 _CORNERS = [1, 0, 3, 2]
 """pyapriltags' corners in the order clockwise from the printed top-left."""
 

@@ -15,8 +15,8 @@ from acquisition.config import LabSettings
 from acquisition.framing.annotated import annotated_png
 from acquisition.framing.corners import Corners
 from acquisition.framing.finding import Framing, find_chart
-from acquisition.framing.limits import MAX_BLUR_PX, MIN_MODULE_PX
-from acquisition.framing.sharpness import blur_px
+from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
+from acquisition.framing.tags import MIN_MODULE_PX
 from acquisition.lights.illuminations import load_illuminations
 from acquisition.run.exposure import measure_exposure, refusal
 from acquisition.run.lamp import make_ready

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquisition.framing.limits import CLIPPED_SHARE
-from acquisition.framing.planes import frame_black
+from acquisition.framing.planes import CLIPPING_SHARE, frame_black
 from acquisition.session.plan import FrameKind
 
 if TYPE_CHECKING:
@@ -35,7 +34,7 @@ class Exposure:
     Attributes
     ----------
     clipped
-        Share of photosites at or above `CLIPPED_SHARE` of saturation, 0 … 1.
+        Share of photosites at or above `CLIPPING_SHARE` of saturation, 0 … 1.
     brightest_dn
         `BRIGHTEST_PERCENTILE` of the counts above black, of the brightest Bayer phase.
     range_dn
@@ -55,7 +54,7 @@ class Exposure:
 def measure_exposure(mosaic: Mosaic) -> Exposure:
     """Measure the counts of a mosaic's visible area; every fourth 2×2 block is enough for the percentile."""
     black = frame_black(mosaic)
-    clipped = np.count_nonzero(mosaic.counts >= CLIPPED_SHARE * mosaic.white_level) / mosaic.counts.size
+    clipped = np.count_nonzero(mosaic.counts >= CLIPPING_SHARE * mosaic.white_level) / mosaic.counts.size
     planes = mosaic.block_planes()[:, :, ::2, ::2].reshape(2, 2, -1)
     brightest = np.percentile(planes, BRIGHTEST_PERCENTILE, axis=2) - black
     return Exposure(float(clipped), float(brightest.max()), float(mosaic.white_level - black.mean()))

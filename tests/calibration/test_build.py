@@ -17,10 +17,10 @@ from acquisition.chart.model import Chart
 from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep, plan_steps
 from calibration.cli import main
+from calibration.fitting.polynomials import order_of, page_polynomial
 from calibration.pipeline.build import build, check
 from calibration.pipeline.frames import session_sha256
 from calibration.pipeline.result import BuildResult
-from calibration.radiometry.paper import order_of, polynomial
 from calibration.report.report import summary, write_report
 from calibration.table.lut import Lut, open_lut
 from drivers.camera import ExposureSettings
@@ -125,7 +125,7 @@ def test_the_primaries_correction_can_be_undone(table: Lut, built: BuildResult, 
     assert built.primaries is not None
     places = lab.chart.centres_mm[lab.chart.cell_of_colour]
     fields = [
-        np.prod([polynomial(places, lab.chart.page_mm, order_of(len(f))) @ np.array(f) for f in factors], axis=0)
+        np.prod([page_polynomial(places, lab.chart.page_mm, order_of(len(f))) @ np.array(f) for f in factors], axis=0)
         for factors in told["field"]
     ]
     alone = [table.samples[light].mean(axis=1) for light in told["lights"]]

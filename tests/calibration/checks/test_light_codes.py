@@ -14,7 +14,7 @@ import pytest
 from acquisition.lights.illuminations import Illumination, plan_illuminations
 from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep
-from calibration.checks.labels import DEGREE, LIGHTS_A_TERM, angles_off_codes_deg
+from calibration.checks.light_codes import DEGREE, LIGHTS_A_TERM, angles_off_codes_deg
 from calibration.pipeline.build import build
 from calibration.pipeline.measuring import FrameFigures
 from calibration.report.report import write_report
@@ -166,8 +166,8 @@ def test_lights_exposed_otherwise_are_not_held_against_their_codes(
         assert result.off_codes_deg is not None
         assert result.frames[0].exposure == pytest.approx(0.5 * 100 / 8**2)
         # A checkpoint of before it was noted.
-        earlier = {name: value for name, value in result.frames[0].told().items() if name != "exposure"}
-        assert FrameFigures.recall(result.frames[0].record, lab.chart.page_mm, earlier).exposure == 0
+        earlier = {name: value for name, value in result.frames[0].to_json().items() if name != "exposure"}
+        assert FrameFigures.from_json(result.frames[0].record, lab.chart.page_mm, earlier).exposure == 0
     with take(lab, tmp_path / "longer", LIGHTS[:3], frame=longer) as session:
         assert build(session, tmp_path / "other").off_codes_deg is None
 

@@ -49,7 +49,7 @@ class DarkLight:
     share: _Array
 
 
-def quiet_means(samples: npt.NDArray[np.float32], noise: _Array) -> _Array:
+def winsorised_means(samples: npt.NDArray[np.float32], noise: _Array) -> _Array:
     """Return the means (P, 3) of dark samples (P, S, 3), those beyond 6 σ of their patch's median brought back to it.
 
     A hot photosite, or a cosmic ray, is no light.
@@ -76,7 +76,7 @@ def reflectances(seen: _Array, field: _Array, white: _Array) -> _Array:
     return found
 
 
-class Subtraction:
+class DarkLightEstimator:
     """Learns the dark light from dark frames, one after another.
 
     Parameters
@@ -94,14 +94,14 @@ class Subtraction:
         self._left = np.zeros_like(reflectance)
         self._noise = np.zeros(3)
         self._frames = 0
-        self._now: DarkLight | None = None
+        self._current: DarkLight | None = None
 
     @property
-    def now(self) -> DarkLight | None:
+    def current(self) -> DarkLight | None:
         """The dark light of the last dark frame; None before the first."""
-        return self._now
+        return self._current
 
-    def move(self) -> None:
+    def restart(self) -> None:
         """Forget what cells showed beyond the prediction: they lie on other photosites from now on."""
         self._left[:] = 0
         self._noise[:] = 0
@@ -129,26 +129,26 @@ class Subtraction:
         spread = MAD_TO_SIGMA * np.median(np.abs(left[self._inside] - np.median(left[self._inside], axis=0)), axis=0)
         chance = self._noise / self._frames**2
         share = np.clip(1 - chance / np.maximum(spread**2, 1e-12), 0, 1)
-        self._now = DarkLight(paper.white, (predicted + share * left).astype(np.float32), share)
-        return self._now
+        self._current = DarkLight(paper.white, (predicted + share * left).astype(np.float32), share)
+        return self._current
 
-    def state(self) -> dict[str, npt.NDArray[Any]]:
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return all that was learnt."""
-        if self._now is None:
+        if self._current is None:
             return {}
         return {
             "dark_left": self._left,
             "dark_noise": self._noise,
             "dark_frames": np.array(self._frames),
-            "dark_paper": self._now.paper,
-            "dark_patches": self._now.patches,
-            "dark_share": self._now.share,
+            "dark_paper": self._current.paper,
+            "dark_patches": self._current.patches,
+            "dark_share": self._current.share,
         }
 
-    def restore(self, state: dict[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `state` returned."""
-        if "dark_left" not in state:
+    def restore(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
+        """Go on from what `to_arrays` returned."""
+        if "dark_left" not in arrays:
             return
-        self._left, self._noise = state["dark_left"], state["dark_noise"]
-        self._frames = int(state["dark_frames"])
-        self._now = DarkLight(state["dark_paper"], state["dark_patches"], state["dark_share"])
+        self._left, self._noise = arrays["dark_left"], arrays["dark_noise"]
+        self._frames = int(arrays["dark_frames"])
+        self._current = DarkLight(arrays["dark_paper"], arrays["dark_patches"], arrays["dark_share"])

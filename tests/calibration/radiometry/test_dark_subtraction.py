@@ -16,8 +16,8 @@ from calibration.cli import main
 from calibration.pipeline.build import append, build, check
 from calibration.pipeline.options import Choices
 from calibration.pipeline.result import BuildResult, Growth
-from calibration.radiometry.dark_light import Subtraction, quiet_means, reflectances
-from calibration.radiometry.paper import Paper, even_field
+from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances, winsorised_means
+from calibration.radiometry.paper import FlatField, Paper
 from calibration.report.report import summary
 from calibration.table.lut import open_lut
 from drivers.presenter import BLACK
@@ -33,14 +33,14 @@ _Array = npt.NDArray[np.float64]
 
 def learnt(
     light: _Array, reflectance: _Array, frames: int, seed: int, beyond: _Array | float = 0.0
-) -> tuple[Subtraction, _Array]:
+) -> tuple[DarkLightEstimator, _Array]:
     """Return a subtraction after dark frames of 25 samples, and the true dark light of the patches."""
     random = np.random.default_rng(seed)
-    subtraction = Subtraction(reflectance, np.ones(len(reflectance), dtype=bool), 25)
+    subtraction = DarkLightEstimator(reflectance, np.ones(len(reflectance), dtype=bool), 25)
     truth = light * reflectance + beyond
     for _ in range(frames):
         means = truth + random.normal(0, 1, truth.shape) * NOISE / 5
-        paper = Paper(even_field((1.0, 1.0)), light, np.full(3, 0.05), 400, np.zeros(3))
+        paper = Paper(FlatField.uniform((1.0, 1.0)), light, np.full(3, 0.05), 400, np.zeros(3))
         subtraction.add(means, NOISE, paper, np.ones_like(reflectance))
     return subtraction, truth
 
@@ -54,9 +54,9 @@ def reflectance() -> _Array:
 def test_where_the_prediction_is_right_no_noise_is_added(reflectance: _Array, frames: int) -> None:
     """The share that is believed by chance: the robust variance of 4000 values is good to 3.7 %, 5 σ."""
     subtraction, truth = learnt(np.array([3.0, 8.0, 5.0]), reflectance, frames, 2)
-    assert subtraction.now is not None
-    assert (subtraction.now.share < 0.19).all()
-    error = (subtraction.now.patches - truth).std(axis=0)
+    assert subtraction.current is not None
+    assert (subtraction.current.share < 0.19).all()
+    error = (subtraction.current.patches - truth).std(axis=0)
     assert (error < 0.2 * NOISE / 5 / np.sqrt(frames)).all()
 
 
@@ -64,32 +64,34 @@ def test_where_it_is_wrong_what_cells_show_is_believed(reflectance: _Array) -> N
     """A lamp of another colour in the room: patches reflect it otherwise than the projector's light, by 10 %."""
     beyond = 30 * reflectance * np.random.default_rng(5).normal(0, 0.1, (PATCHES, 1))
     subtraction, truth = learnt(np.array([30.0, 30.0, 30.0]), reflectance, 8, 6, beyond)
-    assert subtraction.now is not None
+    assert subtraction.current is not None
     predicted = 30 * reflectance
-    assert (subtraction.now.share > 0.7).all()
-    assert ((subtraction.now.patches - truth).std(axis=0) < 0.5 * (predicted - truth).std(axis=0)).all()
-    subtraction.move()
-    subtraction.add(predicted, NOISE, Paper(even_field((1, 1)), np.full(3, 30.0), NOISE, 9, NOISE), np.ones((1, 3)))
-    assert subtraction.now.patches == pytest.approx(predicted, abs=0.01)
+    assert (subtraction.current.share > 0.7).all()
+    assert ((subtraction.current.patches - truth).std(axis=0) < 0.5 * (predicted - truth).std(axis=0)).all()
+    subtraction.restart()
+    subtraction.add(
+        predicted, NOISE, Paper(FlatField.uniform((1, 1)), np.full(3, 30.0), NOISE, 9, NOISE), np.ones((1, 3))
+    )
+    assert subtraction.current.patches == pytest.approx(predicted, abs=0.01)
 
 
 def test_what_was_learnt_comes_back_to_the_last_bit(reflectance: _Array) -> None:
     light = np.array([3.0, 8.0, 5.0])
     whole, _ = learnt(light, reflectance, 2, 7)
-    copy = Subtraction(reflectance, np.ones(PATCHES, dtype=bool), 25)
-    copy.restore(whole.state())
-    paper = Paper(even_field((1.0, 1.0)), light, np.full(3, 0.05), 400, np.zeros(3))
+    copy = DarkLightEstimator(reflectance, np.ones(PATCHES, dtype=bool), 25)
+    copy.restore(whole.to_arrays())
+    paper = Paper(FlatField.uniform((1.0, 1.0)), light, np.full(3, 0.05), 400, np.zeros(3))
     means = light * reflectance + 0.3
     one, other = (each.add(means, NOISE, paper, np.ones_like(reflectance)) for each in (whole, copy))
     assert one.patches.tobytes() == other.patches.tobytes()
-    assert Subtraction(reflectance, np.ones(PATCHES, dtype=bool), 25).state() == {}
+    assert DarkLightEstimator(reflectance, np.ones(PATCHES, dtype=bool), 25).to_arrays() == {}
 
 
 def test_a_hot_photosite_is_no_light() -> None:
     samples = np.random.default_rng(3).normal(2, 6, (50, 25, 3)).astype(np.float32)
     hot = samples.copy()
     hot[7, 3] += 900
-    difference = np.abs(quiet_means(hot, np.full(3, 6.0)) - quiet_means(samples, np.full(3, 6.0)))
+    difference = np.abs(winsorised_means(hot, np.full(3, 6.0)) - winsorised_means(samples, np.full(3, 6.0)))
     assert difference[7].max() < 7 * 6 / 25 + 0.1
     assert not np.delete(difference, 7, axis=0).any()
 

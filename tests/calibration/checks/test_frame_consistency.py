@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.checks.likeness import Expectation, Likeness, can_tell
+from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency, has_enough_cells
 from calibration.verdict.thresholds import THRESHOLDS
 
 LIMITS = {limit.name: limit for limit in THRESHOLDS}
@@ -35,10 +35,10 @@ class Sheet:
         variance = (true / 1.8 + 36) / 25
         return true + np.sqrt(variance) * self.random.standard_normal(true.shape), variance
 
-    def compared(self, true: _Array, usable: npt.NDArray[np.bool_] | None = None) -> Likeness:
+    def compared(self, true: _Array, usable: npt.NDArray[np.bool_] | None = None) -> FrameConsistency:
         there = np.ones(len(true), dtype=np.bool_) if usable is None else usable
-        expected = Expectation(self.rgb, self.places, self.seen(self.white)[0], there)
-        return expected.held_against(*self.seen(true))
+        expected = ConsistencyCheck(self.rgb, self.places, self.seen(self.white)[0], there)
+        return expected.compare(*self.seen(true))
 
 
 @pytest.fixture(scope="module")
@@ -83,11 +83,11 @@ def test_too_few_cells_say_nothing() -> None:
     """64 cells of two inks that a plane through their codes cannot describe."""
     sheet = Sheet()
     few = np.flatnonzero((sheet.rgb % 80 == 0).all(axis=1))
-    expected = Expectation(sheet.rgb[few], sheet.places[few], sheet.white[few], np.ones(len(few), dtype=np.bool_))
+    expected = ConsistencyCheck(sheet.rgb[few], sheet.places[few], sheet.white[few], np.ones(len(few), dtype=np.bool_))
     assert len(few) == 64
-    assert not can_tell(64)
-    assert expected.held_against(*sheet.seen(sheet.other[few])) == Likeness()
+    assert not has_enough_cells(64)
+    assert expected.compare(*sheet.seen(sheet.other[few])) == FrameConsistency()
 
 
 def test_a_dark_frame_says_nothing(sheet: Sheet) -> None:
-    assert sheet.compared(0.001 * sheet.other) == Likeness()
+    assert sheet.compared(0.001 * sheet.other) == FrameConsistency()

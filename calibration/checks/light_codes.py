@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.lights.illuminations import Illumination
-from calibration.radiometry.fitting import product
+from calibration.fitting.least_squares import product
 from foundation.angles import angles_deg
 from foundation.robust import huber_weights, sigma_of
 

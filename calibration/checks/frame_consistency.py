@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.radiometry.fitting import least_squares, product
-from calibration.registration.colour_model import code_polynomial, code_powers
+from calibration.fitting.least_squares import least_squares, product
+from calibration.fitting.polynomials import code_polynomial, code_powers
 from foundation.robust import huber_weights, sigma_of
 
 DEGREE = 4
@@ -45,7 +45,7 @@ _Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Likeness:
+class FrameConsistency:
     """How a frame differs from what the print should look like under its light.
 
     Attributes
@@ -84,12 +84,12 @@ class _Channel:
         return _Channel(terms, level, there, some, terms[some] * level[some, None])
 
 
-def can_tell(cells: int) -> bool:
+def has_enough_cells(cells: int) -> bool:
     """Return whether a chart of so many cells can be held against its codes at all."""
     return cells >= CELLS_A_TERM * len(code_powers(DEGREE))
 
 
-class Expectation:
+class ConsistencyCheck:
     """What cells should look like under any light, from one frame of the print.
 
     Parameters
@@ -116,7 +116,7 @@ class Expectation:
         self._channels = [_Channel.of(terms, level[self.cells, channel], self._usable) for channel in range(3)]
         self._block, self._middles = _blocks(cells_mm[self.cells])
 
-    def held_against(self, mean: _Array, variance: _Array) -> Likeness:
+    def compare(self, mean: _Array, variance: _Array) -> FrameConsistency:
         """Return how like the print a frame is.
 
         Parameters
@@ -126,22 +126,22 @@ class Expectation:
         variance
             (N, 3) float64, of these means.
         """
-        worst = Likeness()
+        worst = FrameConsistency()
         light = np.median(mean[self._usable], axis=0)
         for channel in np.flatnonzero(light >= 0.2 * light.max()):
             here = self._of_channel(self._channels[channel], mean[:, channel], variance[:, channel])
             at_mm = here.at_mm if here.block > worst.block else worst.at_mm
-            worst = Likeness(max(worst.scatter, here.scatter), max(worst.block, here.block), at_mm)
+            worst = FrameConsistency(max(worst.scatter, here.scatter), max(worst.block, here.block), at_mm)
         return worst
 
-    def _of_channel(self, known: _Channel, mean: _Array, variance: _Array) -> Likeness:
+    def _of_channel(self, known: _Channel, mean: _Array, variance: _Array) -> FrameConsistency:
         if len(known.there) < CELLS_A_TERM * known.terms.shape[1]:
-            return Likeness()
+            return FrameConsistency()
         design, level, seen = known.design, known.level[known.some], mean[known.some]
         # Each cell counts by what it should tell, not by what it does: what is covered would count most.
         sigma = 0.02 * float(np.median(seen / level)) * level + 3
         if not sigma.min() > 0:
-            return Likeness()
+            return FrameConsistency()
         weights = 1 / sigma**2
         solution = least_squares(design, seen, weights)
         for _ in range(_ROUNDS):
@@ -151,7 +151,7 @@ class Expectation:
         expected, there = product(known.terms, solution) * known.level, known.there
         there = there[expected[there] > LEAST_COUNTS]
         if len(there) < LEAST_CELLS:
-            return Likeness()
+            return FrameConsistency()
         aside = np.clip(mean[there] / expected[there] - 1, -1, 1)
         spread2 = sigma_of(aside - np.median(aside)) ** 2
         noise2 = float(np.median(variance[there] / expected[there] ** 2))
@@ -161,11 +161,11 @@ class Expectation:
         full = np.flatnonzero(count >= LEAST_CELLS)
         scatter = float(np.sqrt(max(spread2 - noise2, 0)))
         if not len(full):
-            return Likeness(scatter)
+            return FrameConsistency(scatter)
         off = np.abs(total[full] / count[full]) - _CERTAIN * np.sqrt(spread2 / count[full])
         worst = full[int(np.argmax(off))]
         x, y = self._middles[worst].tolist()
-        return Likeness(scatter, max(float(off.max()), 0.0), (x, y))
+        return FrameConsistency(scatter, max(float(off.max()), 0.0), (x, y))
 
 
 def _blocks(cells_mm: _Array) -> tuple[npt.NDArray[np.int64], _Array]:

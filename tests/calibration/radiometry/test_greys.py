@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from acquisition.chart.model import Reference
-from calibration.radiometry.greys import Levels, references_csv, tint_deg
+from calibration.radiometry.greys import GreyLevels, references_csv, tint_deg
 
 GREYS = [
     Reference(f"grey {code}", (code, code, code), (float(n), 0.0), (5.0, 5.0)) for n, code in enumerate([71, 188] * 20)
@@ -17,7 +17,7 @@ GREYS = [
 
 
 def test_each_level_is_the_mean_of_its_patches_without_the_stained_one() -> None:
-    levels = Levels.of(GREYS)
+    levels = GreyLevels.of(GREYS)
     assert levels.names == ("grey 188", "grey 71")
     random = np.random.default_rng(2)
     field = random.uniform(0.8, 1.2, (40, 3))
@@ -31,7 +31,7 @@ def test_each_level_is_the_mean_of_its_patches_without_the_stained_one() -> None
 
 
 def test_a_level_without_patches_is_empty_in_the_file() -> None:
-    levels = Levels.of(GREYS)
+    levels = GreyLevels.of(GREYS)
     seen = np.where(levels.level[:, None] == 1, np.nan, 100.0) * np.ones(3)
     value, error = levels.read(seen, np.ones((40, 3)))
     text = references_csv(levels.names, np.full((1, 3), 200.0), np.ones((1, 3)), value[None], error[None])
