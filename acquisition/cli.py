@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from enum import Enum
 from pathlib import Path
@@ -29,9 +30,9 @@ class Arrangement(Enum):
     PAPER = "paper"
 
 
-def main() -> int:
-    """Run `acquire` and return its exit code."""
-    return console.run(app)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `acquire` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
+    return console.run(lambda: app(args=argv, prog_name="acquire"))
 
 
 @app.command(epilog=EXIT_CODES)
@@ -141,7 +142,7 @@ def devices(
 
     Reads and writes no file.
     """
-    from acquisition.run.rig import attached_devices, identify_displays
+    from acquisition.run.rig.attached import attached_devices, identify_displays
 
     for attached in attached_devices(search):
         print(f"{attached.kind}:")
@@ -182,7 +183,7 @@ def check(
 
         told = parse_corners(corners)
     if identify:
-        from acquisition.run.rig import identify_displays
+        from acquisition.run.rig.attached import identify_displays
 
         identify_displays(10.0)
     with orderly_end():
@@ -205,7 +206,7 @@ def run(
     refused; the next run tries those again.
     """
     from acquisition.config import load_lab
-    from acquisition.run.taking import run_session
+    from acquisition.run.run import run_session
     from foundation.console import progress
 
     settings = load_lab(lab)

@@ -8,33 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 from acquisition.config import LabSettings
-from acquisition.run.exposure import disagreement, measure_exposure, refusal
+from acquisition.run.devices import Devices
+from acquisition.run.judging import judge_file
 from acquisition.run.lamp import await_health, complaint_of, make_ready
 from acquisition.session.folder import Session
 from acquisition.session.journal import ACCEPTED, REFUSED
-from acquisition.session.plan import FrameKind, SessionStep
-from drivers.camera import Camera, keep_awake
-from drivers.presenter import Presenter
-from drivers.projector import Projector
-from drivers.raw.rawfile import read_raw
-from foundation.clock import Clock
-from foundation.errors import DeviceError, DeviceFault, DeviceRefused, FormatError
+from acquisition.session.plan import SessionStep
+from drivers.camera import keep_awake
+from foundation.errors import DeviceError, DeviceFault, DeviceRefused
 
 REFUSED_IN_A_ROW = 3
 """Steps refused one after another that end a run: something lasting is wrong."""
-
-
-@dataclass(frozen=True)
-class Devices:
-    """What a session is taken with; `projector` is None where its lamp is not under control."""
-
-    camera: Camera
-    presenter: Presenter
-    projector: Projector | None
-    clock: Clock
 
 
 @dataclass(frozen=True)
@@ -122,17 +108,6 @@ def _take(
         devices.projector.switch_off()
     session.journal.note(clock.now(), "complete" if outcome.complete else "incomplete", f"{outcome.left} frames left")
     return outcome
-
-
-def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None:
-    """Decode a raw file and return why it cannot be used, or None when it can."""
-    try:
-        mosaic = read_raw(path)
-    except FormatError as error:
-        return str(error)
-    # Of frames taken by other means nobody here knows what was asked for.
-    differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
-    return differs or refusal(measure_exposure(mosaic), kind, settings.limits)
 
 
 def _take_step(

@@ -110,11 +110,8 @@ def test_temperatures_that_are_none_are_refused(text: str, said: str) -> None:
         parse_ccts(text)
 
 
-def test_lights_do_not_overwrite_their_plot(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("sys.argv", ["acquire", "illuminations", str(tmp_path / "a.png"), "--grid", "1"])
-    assert main() == 2
+def test_lights_do_not_overwrite_their_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["illuminations", str(tmp_path / "a.png"), "--grid", "1"]) == 2
     assert "a.png is where the plot of the lights goes; name the lights" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

@@ -86,11 +86,10 @@ def test_a_list_that_is_missing_is_named_itself(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("verdict", "code"), [("refused: a hand", 4), ("accepted", 0)])
 def test_a_light_without_an_accepted_frame_is_told_by_the_exit_code(
-    folder: Path, verdict: str, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, verdict: str, code: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Another frame of the light may be refused."""
     write(folder, [light(0), light(1, verdict="refused: a hand"), light(1, verdict=verdict)])
     arguments = ("import", folder / "list.csv", folder / "chart.json", folder / "session")
-    monkeypatch.setattr("sys.argv", ["acquire", *map(str, arguments)])
-    assert main() == code
+    assert main(list(map(str, arguments))) == code
     assert ("without an accepted frame are 1: light 1; list other files" in capsys.readouterr().err) == (code == 4)

@@ -109,8 +109,7 @@ def test_ctrl_c_is_its_proper_end(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupted)
-    monkeypatch.setattr("sys.argv", ["acquire", "monitor", str(folder), "--port", "0"])
-    assert main() == 0
+    assert main(["monitor", str(folder), "--port", "0"]) == 0
     told = capsys.readouterr()
     assert "Ctrl-C ends it" in told.out
     assert told.err == ""

@@ -8,11 +8,19 @@ import pytest
 
 from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings, load_lab, parse_lab
-from acquisition.run.rig import attached_devices, open_rig, simulated_body, simulated_room
+from acquisition.run.rig.attached import attached_devices
+from acquisition.run.rig.opening import open_rig
+from acquisition.run.rig.simulated import simulated_body, simulated_room
+from foundation.clock import Clock
 from foundation.errors import ConfigurationError
 from sim.projectors.screen import Screen, SimulatedPresenter
 
 HEAD = 'rig = "simulated"\nchart = "c.json"\nilluminations = "l.csv"\n'
+
+
+def simulated_display(display: str | int | None, clock: Clock) -> SimulatedPresenter:
+    """Stand in for `FullScreen`: whatever display this machine has stays dark."""
+    return SimulatedPresenter(Screen(), clock)
 
 
 def settings(text: str) -> LabSettings:
@@ -71,8 +79,7 @@ def test_an_imported_session_cannot_be_taken() -> None:
     ],
 )
 def test_a_cable_that_is_not_named_is_said(text: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Whatever display this machine has stays dark.
-    monkeypatch.setattr("acquisition.run.rig.FullScreen", lambda display, clock: SimulatedPresenter(Screen(), clock))  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", simulated_display)
     real = parse_lab(HEAD.replace("simulated", "lab") + text, "LAB.toml")
     with pytest.raises(ConfigurationError, match=expected), open_rig(real, design_chart(bits=1)):
         pass

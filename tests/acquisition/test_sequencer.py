@@ -15,8 +15,9 @@ import pytest
 from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings, SequenceSettings
 from acquisition.lights.illuminations import Illumination
+from acquisition.run.devices import Devices
 from acquisition.run.lamp import PAUSE_S, POWER_LIMIT_S, RELIGHT_S, make_ready, require_healthy
-from acquisition.run.sequencer import Devices, take_session
+from acquisition.run.sequencer import take_session
 from acquisition.session.folder import Session
 from acquisition.session.plan import plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
+from acquisition.config import LabSettings, LimitSettings
 from acquisition.framing.planes import CLIPPING_SHARE, frame_black
 from acquisition.session.plan import FrameKind
-
-if TYPE_CHECKING:
-    from acquisition.config import LimitSettings
-    from drivers.camera import ExposureSettings
-    from drivers.raw.rawfile import Mosaic
+from drivers.camera import ExposureSettings
+from drivers.raw.rawfile import Mosaic, read_raw
+from foundation.errors import FormatError
 
 BRIGHTEST_PERCENTILE = 99.9
 EXPOSURE_TOLERANCE_STOPS = 0.25
@@ -99,3 +98,14 @@ def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str |
             f"{limits.too_dark_dn:g} expected; is the projector on, its picture not muted, the lens cap off?"
         )
     return None
+
+
+def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None:
+    """Decode a raw file and return why it cannot be used, or None when it can."""
+    try:
+        mosaic = read_raw(path)
+    except FormatError as error:
+        return str(error)
+    # Of frames taken by other means nobody here knows what was asked for.
+    differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
+    return differs or refusal(measure_exposure(mosaic), kind, settings.limits)

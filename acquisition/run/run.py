@@ -9,7 +9,7 @@ from typing import Any
 from acquisition.chart.model import load_chart
 from acquisition.config import LabSettings, parse_lab
 from acquisition.lights.illuminations import load_illuminations
-from acquisition.run.rig import open_rig
+from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import Outcome, take_session
 from acquisition.session.folder import Session, session_exists
 from acquisition.session.plan import plan_steps
