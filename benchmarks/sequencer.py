@@ -62,6 +62,10 @@ class PreparedCamera:
     def configure(self, settings: ExposureSettings) -> None:
         """Do nothing."""
 
+    def shutter_speeds(self) -> tuple[float, ...]:
+        """Offer none: nobody asks."""
+        return ()
+
     def capture(self, into: BinaryIO) -> CapturedFrame:
         """Write a file."""
         content = self.dark if self.screen.colour == BLACK else self.lit

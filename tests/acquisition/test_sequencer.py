@@ -87,6 +87,9 @@ class ScriptedCamera:
     def configure(self, settings: ExposureSettings) -> None:
         self.settings = settings
 
+    def shutter_speeds(self) -> tuple[float, ...]:
+        return ()
+
     def capture(self, into: BinaryIO) -> CapturedFrame:
         usual = NIGHT if self.screen.shown[-1] == BLACK else WELL
         scripted = self.script.get(self.captures, usual)
