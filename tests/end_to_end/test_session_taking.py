@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -287,3 +288,22 @@ def test_a_series_longer_than_a_battery_lasts(lab: Path) -> None:
         devices.camera.configure(settings.camera.exposure)
         frames = {devices.camera.capture(io.BytesIO()).name for _ in range(430)}
     assert len(frames) == 430
+
+
+@pytest.mark.parametrize(("shutter_s", "looks"), [(0.02, 1), (1.3, 4)])
+def test_following_what_a_look_recommends_leads_to_a_good_exposure(
+    lab: Path, shutter_s: float, looks: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = lab.read_text() + "[limits]\nclipped_percent = 100\n[camera]\nshutter_s = "
+    # Of a clipped frame nobody knows how much too bright it is, so that it takes several steps.
+    for _ in range(looks):
+        lab.write_text(f"{text}{shutter_s}\n")
+        assert run("check", lab) == 0
+        found = re.findall(r"; 30% to 80% wanted, try camera\.shutter_s = (\S+)", capsys.readouterr().out)
+        if not found:
+            break
+        shutter_s = float(found[0])
+        assert abs(shutter_s * 60 - round(shutter_s * 60)) < 0.01, "whole turns of a wheel of 60 Hz"
+    lab.write_text(f"{text}{shutter_s}\n")
+    assert run("check", lab) == 0
+    assert "wanted" not in capsys.readouterr().out

@@ -5,8 +5,9 @@ from __future__ import annotations
 import uuid
 from contextlib import ExitStack
 
-from acquisition.config import CameraCable, LabSettings, LightSource, ProjectorCable, require_whole_turns
+from acquisition.config import CameraCable, LabSettings, LightSource, ProjectorCable
 from acquisition.run.devices import Devices
+from acquisition.run.shutter import require_whole_turns
 from drivers.camera import Camera
 from drivers.canon.camera import CanonEos
 from drivers.display.fullscreen import FullScreen
