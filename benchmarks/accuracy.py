@@ -32,7 +32,7 @@ from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from drivers.camera import ExposureSettings
 from foundation.angles import angles_deg
-from sim.camera.sensors import BODIES, Body
+from sim.world.sensors import BODIES, Body
 from sim.world.world import World
 
 WELL_LIT_DN = 300

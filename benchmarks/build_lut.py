@@ -39,8 +39,10 @@ from calibration.registration.register import register
 from calibration.sampling.samples import gather_values, sites_at
 from drivers.raw.rawfile import read_raw
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
-from sim.world.world import REFERENCE_EXPOSURE, Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import REFERENCE_EXPOSURE, Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
 from tests.drivers.raw_files import write_cr2
 
 RUNS = 4

@@ -34,8 +34,10 @@ from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import CropError
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
-from sim.world.world import Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
 
 SILENT_PX = 1.0
 """A cell this far off lies beyond what its samples' window allows for, 0.25 px, by enough to hold another colour."""

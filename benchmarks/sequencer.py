@@ -27,8 +27,8 @@ from acquisition.session.plan import plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
 from sim.clock import SimulatedClock
+from sim.world.sensors import BODIES
 
 LIGHTS = 12
 BODY = BODIES["EOS 550D"]

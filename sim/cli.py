@@ -13,8 +13,8 @@ from foundation import console
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
-    from sim.projectors.pjlink import SimulatedProjector
-    from sim.world.world import Print
+    from sim.projectors.projector import SimulatedProjector
+    from sim.world.drawing import Print
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -58,7 +58,7 @@ def projector(
     from drivers.pjlink.wire import MAX_PASSWORD
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError, InputError
-    from sim.projectors.pjlink import SimulatedProjector
+    from sim.projectors.projector import SimulatedProjector
 
     if (pjlink is None) == (serial is None):
         raise ConfigurationError("one projector hangs on one cable: either --pjlink PORT or --serial LANGUAGE")
@@ -78,7 +78,8 @@ def projector(
 def _serve_network(
     device: SimulatedProjector, pjlink: int, password: str | None, udp: int | None, controller: tuple[str, int] | None
 ) -> None:
-    from sim.projectors.pjlink import ProjectorDatagrams, serve_pjlink
+    from sim.projectors.pjlink import serve_pjlink
+    from sim.projectors.pjlink_notices import ProjectorDatagrams
 
     with ExitStack() as served:
         host, port = served.enter_context(serve_pjlink(device, pjlink, password)).address
@@ -95,7 +96,7 @@ def _serve_serial(device: SimulatedProjector, name: str) -> None:
 
     spoken = language(name)
     try:
-        from sim.projectors.pty import PseudoTerminal
+        from sim.buses.pty import PseudoTerminal
     except ImportError as error:
         raise ConfigurationError("this system has no pseudo-terminals; --serial needs Linux or macOS") from error
     from sim.projectors.serial import PEERS
@@ -136,8 +137,9 @@ def camera(
     from sim.camera.eos import SimulatedEos
     from sim.camera.eos_bodies import EOS_BODIES
     from sim.camera.film import WorldFilm
-    from sim.camera.sensors import BODIES
-    from sim.world.world import REFERENCE_EXPOSURE, Room, World
+    from sim.world.room import REFERENCE_EXPOSURE, Room
+    from sim.world.sensors import BODIES
+    from sim.world.world import World
 
     if (port is None) == (usbip is None):
         raise ConfigurationError("one camera hangs on one cable: either --port N for PTP/IP or --usbip N for USB/IP")
@@ -162,7 +164,7 @@ def _grey_squares() -> Print:
     """Return an A4 sheet with five by three squares from black to paper white."""
     import numpy as np
 
-    from sim.world.world import Print
+    from sim.world.drawing import Print
 
     column, row = (grid.ravel() for grid in np.meshgrid(np.arange(5), np.arange(3)))
     left, top = 18 + 54.0 * column, 21 + 60.0 * row

@@ -24,7 +24,7 @@ from drivers.canon.records import PropertySetting, decode_events, number_value
 from drivers.canon.state import EosState, WaitingObject, host_destination
 from drivers.ptp.codes import CaptureDestination, Operation, Property, ReleaseButton, ResponseCode
 from drivers.ptp.datasets import DeviceInfo
-from drivers.ptp.session import PASSING_LIMIT_S, START_TIMEOUT_S, Declined, PtpSession
+from drivers.ptp.session import PASSING_LIMIT_S, START_TIMEOUT_S, OperationDeclined, PtpSession
 from drivers.ptp.transport import Transport
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolError
@@ -122,10 +122,10 @@ class EosBody:
         """Give the body back as it was found; a fault of the cable goes to the caller."""
         self.free_waiting()
         if self._destination is not None:
-            with contextlib.suppress(Declined):
+            with contextlib.suppress(OperationDeclined):
                 self._send(Property.EOS_CAPTURE_DESTINATION, self._destination)
         for operation in (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_SET_EVENT_MODE):
-            with contextlib.suppress(Declined):
+            with contextlib.suppress(OperationDeclined):
                 self._session.call(operation, _REMOTE_OFF, timeout=START_TIMEOUT_S, patience=1.0)
         self._session.close()
 
@@ -199,14 +199,14 @@ class EosBody:
                     patience=0.0,
                 )
                 break
-            except Declined as error:
+            except OperationDeclined as error:
                 # What keeps a body busy here is a release still held down, or events that nobody fetched.
                 self._let_go()
                 self.drain()
                 if error.code != ResponseCode.DEVICE_BUSY:
                     raise
                 if not left:
-                    raise Declined(
+                    raise OperationDeclined(
                         f"{error}; look for mirror lockup, a timer or a menu on its display", error.code
                     ) from error
                 self._clock.sleep(PASSING_LIMIT_S / RELEASE_TRIES)
@@ -247,7 +247,7 @@ class EosBody:
 
         Raises
         ------
-        Declined
+        OperationDeclined
             There is no such object (`ResponseCode.INVALID_OBJECT_HANDLE`), or the body will not give it.
         DeviceError
             It gives less than it announced, or announced a size that no frame has.
@@ -267,7 +267,7 @@ class EosBody:
         for left in reversed(range(_FREE_TRIES)):
             try:
                 self._session.call(Operation.EOS_TRANSFER_COMPLETE, waiting.handle)
-            except Declined as error:
+            except OperationDeclined as error:
                 if error.code != ResponseCode.INVALID_OBJECT_HANDLE:  # else it has gone, which is as well
                     if left:
                         self._clock.sleep(_PAUSES_S[-1])
@@ -289,7 +289,7 @@ class EosBody:
         for left in reversed(range(_PIECE_TRIES)):
             try:
                 sent, data = self._session.call(operation, waiting.handle, offset, wanted)
-            except Declined as error:
+            except OperationDeclined as error:
                 if not left or error.code in _LASTING:
                     raise
             else:
@@ -335,7 +335,7 @@ class EosBody:
         )
 
     def _let_go(self) -> None:
-        with contextlib.suppress(Declined):
+        with contextlib.suppress(OperationDeclined):
             self._session.call(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
 
     def _settled(self, condition: Callable[[], bool]) -> bool:
@@ -354,7 +354,7 @@ class EosBody:
         if now - self._spoken_at >= KEEP_ALIVE_S:
             self._spoken_at = now
             if self._offers(Operation.EOS_KEEP_DEVICE_ON):
-                with contextlib.suppress(Declined):
+                with contextlib.suppress(OperationDeclined):
                     self._session.call(Operation.EOS_KEEP_DEVICE_ON, patience=0.0)
 
     def _offers(self, operation: int) -> bool:

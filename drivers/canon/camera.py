@@ -23,7 +23,7 @@ from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.canon.body import EosBody
 from drivers.canon.state import WaitingObject, plan, shutter_speeds
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.session import PASSING, Declined
+from drivers.ptp.session import PASSING, OperationDeclined
 from drivers.ptp.transport import Transport
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
@@ -181,7 +181,7 @@ class CanonEos:
                 self._drop(error)
                 if not left:
                     # A body that is busy in every session is kept so by its own settings, not by a fault.
-                    busy = isinstance(error, Declined) and error.code == ResponseCode.DEVICE_BUSY
+                    busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
                     kind = DeviceRefused if busy else DeviceError
                     raise kind(
                         f"{error}; the connection was renewed {RECOVERIES} times without success: {_REMEDY}"
@@ -226,7 +226,7 @@ class CanonEos:
             shot.fetched = frame
             try:
                 body.fetch(frame, into, offset)
-            except Declined as error:
+            except OperationDeclined as error:
                 if error.code != ResponseCode.INVALID_OBJECT_HANDLE:
                     raise
                 shot.absent.add(frame.handle)
@@ -300,7 +300,9 @@ def _apply(body: EosBody, settings: ExposureSettings) -> None:
 
 def _curable(error: DeviceError) -> bool:
     """Return whether a new connection may help."""
-    return isinstance(error, LinkError | ProtocolError) or (isinstance(error, Declined) and error.code in _STUCK)
+    return isinstance(error, LinkError | ProtocolError) or (
+        isinstance(error, OperationDeclined) and error.code in _STUCK
+    )
 
 
 def _file_name(frame: WaitingObject) -> str:

@@ -99,7 +99,7 @@ def is_notice_of_start(line: bytes) -> bool:
 def _message(line: bytes) -> Found | Notice | None:
     try:
         reply = wire.parse_reply(line.strip())
-        if not isinstance(reply, wire.Reply) or reply.level != 2:
+        if not isinstance(reply, wire.PjLinkReply) or reply.level != 2:
             return None
         match reply.command:
             case "ACKN":

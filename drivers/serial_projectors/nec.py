@@ -30,7 +30,7 @@ _HEADER = 5
 
 
 @dataclass(frozen=True)
-class Command:
+class NecCommand:
     """What we say."""
 
     kind: int
@@ -39,7 +39,7 @@ class Command:
 
 
 @dataclass(frozen=True)
-class Reply:
+class NecReply:
     """What the projector says; `failed` holds the two bytes that tell why it did not do it."""
 
     kind: int
@@ -50,15 +50,15 @@ class Reply:
     model: int = 0x40
 
 
-POWER_ON = Command(2, 0x00)
-POWER_OFF = Command(2, 0x01)
-MUTE_ON = Command(2, 0x10)
-MUTE_OFF = Command(2, 0x11)
-ERRORS = Command(0, 0x88)
-RUNNING = Command(0, 0x85, b"\x01")
-MUTES = Command(0, 0x85, b"\x03")
-MODEL = Command(0, 0x85, b"\x04")
-INFORMATION = Command(3, 0x8A)
+POWER_ON = NecCommand(2, 0x00)
+POWER_OFF = NecCommand(2, 0x01)
+MUTE_ON = NecCommand(2, 0x10)
+MUTE_OFF = NecCommand(2, 0x11)
+ERRORS = NecCommand(0, 0x88)
+RUNNING = NecCommand(0, 0x85, b"\x01")
+MUTES = NecCommand(0, 0x85, b"\x03")
+MODEL = NecCommand(0, 0x85, b"\x04")
+INFORMATION = NecCommand(3, 0x8A)
 
 UNKNOWN_COMMAND = (0, 0)
 POWER_IS_OFF = (2, 0x0D)
@@ -98,13 +98,13 @@ def checksum(data: bytes) -> int:
     return sum(data) & 0xFF
 
 
-def encode_command(command: Command) -> bytes:
+def encode_command(command: NecCommand) -> bytes:
     """Return a command's frame."""
     frame = bytes([command.kind, command.code, 0, 0, len(command.data)]) + command.data
     return frame + bytes([checksum(frame)])
 
 
-def encode_reply(reply: Reply) -> bytes:
+def encode_reply(reply: NecReply) -> bytes:
     """Return a reply's frame."""
     data = reply.data if reply.failed is None else bytes(reply.failed)
     kind = reply.kind | (0x20 if reply.failed is None else 0xA0)
@@ -112,13 +112,13 @@ def encode_reply(reply: Reply) -> bytes:
     return frame + bytes([checksum(frame)])
 
 
-def take_command(data: bytes) -> tuple[Command, int] | None:
+def take_command(data: bytes) -> tuple[NecCommand, int] | None:
     """Take one command off the front of `data`."""
     frame = _take_frame(data)
-    return None if frame is None else (Command(frame[0], frame[1], frame[_HEADER:-1]), len(frame))
+    return None if frame is None else (NecCommand(frame[0], frame[1], frame[_HEADER:-1]), len(frame))
 
 
-def take_reply(data: bytes) -> tuple[Reply, int] | None:
+def take_reply(data: bytes) -> tuple[NecReply, int] | None:
     """Take one reply off the front of `data`."""
     if data and data[0] & 0xF0 not in (0x20, 0xA0):
         raise ProtocolError(f"the projector answers {quoted(data)}, which begins no reply; {CHECK_SPEED}")
@@ -132,7 +132,7 @@ def take_reply(data: bytes) -> tuple[Reply, int] | None:
         if len(content) != 2:
             raise ProtocolError(f"the projector refuses with {quoted(frame)}; expected two bytes that say why")
         failed, content = (content[0], content[1]), b""
-    return Reply(kind & 0x0F, code, content, failed, projector, model), len(frame)
+    return NecReply(kind & 0x0F, code, content, failed, projector, model), len(frame)
 
 
 def _take_frame(data: bytes) -> bytes | None:
@@ -288,7 +288,7 @@ class NecProjector:
         """Release the cable; the power state stays."""
         self._exchange.close()
 
-    def _ask(self, command: Command) -> bytes:
+    def _ask(self, command: NecCommand) -> bytes:
         reply = self._exchange.ask(encode_command(command), take_reply)
         asked = f"command {command.kind:02X}h {command.code:02X}h"
         if (reply.kind, reply.code) != (command.kind, command.code):

@@ -71,7 +71,7 @@ class PropertySpec:
 
 
 @dataclass(frozen=True)
-class EosBody:
+class EosModel:
     """An EOS body as the wire knows it.
 
     Attributes
@@ -410,7 +410,7 @@ _CHOICES_550D = _Choices(
     lens="EF-S18-55mm f/3.5-5.6 IS",
 )
 
-EOS_550D = EosBody(
+EOS_550D = EosModel(
     info=_device_info("Canon EOS 550D", "3-1.0.9", "Canon Inc.", 200),
     usb=(VENDOR_CANON_USB, 0x31EA),
     properties=_properties(_CHOICES_550D),
@@ -443,7 +443,7 @@ EOS_550D_AS_LISTED = replace(
 
 _JPEGS_6D2 = _jpegs((0, True), (1, True), (14, True), (15, False))
 
-EOS_6D_MARK_II = EosBody(
+EOS_6D_MARK_II = EosModel(
     info=_device_info("Canon EOS 6D Mark II", "3-1.0.2", "Canon.Inc", 100),
     usb=(VENDOR_CANON_USB, 0x32CA),
     properties=_properties(
@@ -502,7 +502,7 @@ TEST_BODY = replace(
 )
 """A 550D with the small frames of the test sensor."""
 
-EOS_BODIES: Mapping[str, EosBody] = MappingProxyType(
+EOS_BODIES: Mapping[str, EosModel] = MappingProxyType(
     {"EOS 550D": EOS_550D, "EOS 6D Mark II": EOS_6D_MARK_II, "Test": TEST_BODY}
 )
-"""Every body by the name that settings and commands use, the same as in `sim.camera.sensors.BODIES`."""
+"""Every body by the name that settings and commands use, the same as in `sim.world.sensors.BODIES`."""

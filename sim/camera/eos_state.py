@@ -31,9 +31,9 @@ from drivers.canon.records import (
     text_value,
 )
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, EventCode, ObjectFormat, Property, ResponseCode
-from drivers.ptp.messages import Event
+from drivers.ptp.messages import PtpEvent
 from foundation.clock import Clock
-from sim.camera.eos_bodies import MIRROR_LOCKUP, EosBody, custom_functions
+from sim.camera.eos_bodies import MIRROR_LOCKUP, EosModel, custom_functions
 from sim.camera.film import Film
 
 CARD = 0x00020001
@@ -53,7 +53,7 @@ _MOST_SHOTS = 0x7FFFFFFF
 _TEXTS = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT)
 
 
-class Declined(Exception):
+class OperationRefusal(Exception):
     """Ends an operation with another response than OK."""
 
     def __init__(self, code: int, *parameters: int) -> None:
@@ -62,7 +62,7 @@ class Declined(Exception):
         self.parameters = parameters
 
 
-class Reply(NamedTuple):
+class OperationResult(NamedTuple):
     """What an operation that was carried out answers."""
 
     data: bytes | None = None
@@ -123,12 +123,12 @@ class Card:
         return self.capacity - sum(len(item.data) for item in self.objects.values())
 
 
-class EosState:
+class SimulatedEosState:
     """The state of a body; see `sim.camera.eos.SimulatedEos` for the parameters."""
 
     def __init__(
         self,
-        body: EosBody,
+        body: EosModel,
         film: Film,
         clock: Clock,
         *,
@@ -164,7 +164,7 @@ class EosState:
         self._queue: list[Record] = []
         self._memory: dict[int, StoredObject] = {}
         self._host_bytes = 0
-        self._hints: list[Event] = []
+        self._hints: list[PtpEvent] = []
         self._idle_since = clock.monotonic()
         self._warned = False
         # What is under way: (when, order, what happens then), the earliest first.
@@ -210,18 +210,18 @@ class EosState:
 
     # Events.
 
-    def _get_event(self, _: Arguments) -> Reply:
+    def _get_event(self, _: Arguments) -> OperationResult:
         if self._bulb_since is not None and self._event_mode:
             open_s = int(self._clock.monotonic() - self._bulb_since[0])
             self._record(Notice(EosEvent.BULB_EXPOSURE_TIME, open_s))
         records, self._queue = self._queue, []
-        return Reply(encode_events(records))
+        return OperationResult(encode_events(records))
 
     def _record(self, record: Record) -> None:
         if not self._event_mode:
             return
         if not self._queue:
-            self._hints.append(Event(EventCode.EOS_REQUEST_GET_EVENT))
+            self._hints.append(PtpEvent(EventCode.EOS_REQUEST_GET_EVENT))
         self._queue.append(record)
 
     def _tell_list(self, code: int) -> None:
@@ -306,7 +306,7 @@ class EosState:
     def _require_remote(self) -> None:
         # Assumed: nothing shows what a body says to whoever has not taken control of it.
         if not self._remote_mode:
-            raise Declined(ResponseCode.EOS_OPERATION_REFUSED)
+            raise OperationRefusal(ResponseCode.EOS_OPERATION_REFUSED)
 
     def _blank_card(self, capacity: int) -> Card:
         now = self._clock.now()

@@ -15,7 +15,7 @@ from acquisition.framing.annotated import annotated_png
 from acquisition.framing.finding import find_chart
 from acquisition.framing.tagless_field import field_mm
 from drivers.raw.rawfile import read_raw
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import hang_chart
 from tests.data_files import shipped
 

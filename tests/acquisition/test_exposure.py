@@ -15,7 +15,7 @@ from acquisition.run.judging import Exposure, disagreement, measure_exposure, re
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import Mosaic, read_raw
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
+from sim.world.sensors import BODIES
 
 BODY = BODIES["Test"]
 RANGE = BODY.saturation - BODY.black

@@ -26,8 +26,10 @@ from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import RegistrationError
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
-from sim.world.world import Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
 from tests.data_files import available
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)

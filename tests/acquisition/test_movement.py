@@ -17,7 +17,7 @@ from acquisition.framing.planes import Plane, plane_of, strongest_plane
 from calibration.registration.movement import gauge_boxes, shift_between
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import Lab, hang, hang_chart
 
 CHART = paper_chart("A6", 3)

@@ -28,11 +28,13 @@ from drivers.presenter import BLACK, Colour
 from drivers.projector import Power, Severity
 from drivers.serial_projectors.optoma import OptomaProjector
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused, LinkClosed, LinkTimeout
+from sim.buses.serial_cable import SerialPeerLink
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer, SimulatedProjector, memory_link
-from sim.projectors.serial import OptomaPeer, SerialPeerLink
+from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.projector import SimulatedProjector
+from sim.projectors.serial import OptomaPeer
+from sim.world.sensors import BODIES
 
 BODY = BODIES["Test"]
 EXPOSURE = ExposureSettings(100, 8.0, 0.5)

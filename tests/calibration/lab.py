@@ -24,8 +24,10 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
-from sim.world.world import Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 Paint = Callable[[npt.NDArray[np.uint16]], None]

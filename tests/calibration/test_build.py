@@ -27,7 +27,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE
 from foundation.errors import FormatError, InputError, QualityError, RegistrationError
 from sim.camera.dng import write_dng
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
 
 

@@ -11,8 +11,10 @@ from acquisition.chart.printing import drawing
 from calibration.radiometry.cell_field import field_of_cells
 from calibration.radiometry.paper import PaperReader
 from drivers.presenter import WHITE, Colour
-from sim.camera.sensors import BODIES
-from sim.world.world import Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
 from tests.calibration.lab import SETTINGS
 
 CHART = paper_chart("A1", 4)

@@ -25,7 +25,7 @@ from calibration.pipeline.frames import lost_frames
 from calibration.pipeline.result import BuildResult, Growth
 from calibration.table.lut import damage, open_lut
 from foundation.errors import FormatError, InputError
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
 
 KILLER = """

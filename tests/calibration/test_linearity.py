@@ -20,7 +20,7 @@ from calibration.table.lut import damage, open_lut
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
 from foundation.errors import FormatError, InputError
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import Lab, hang
 
 TIMES = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)

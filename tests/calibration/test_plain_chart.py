@@ -16,7 +16,7 @@ from calibration.registration.register import register
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import RegistrationError
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import Lab, hang_chart
 
 SMALL = paper_chart("A6", 3)

@@ -19,7 +19,7 @@ from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from calibration.table.lut import open_lut
 from drivers.presenter import Colour
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang_chart, renumbered, take
 
 SMALL = paper_chart("A6", 3)

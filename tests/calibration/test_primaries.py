@@ -14,7 +14,7 @@ from calibration.pipeline.build import build
 from calibration.radiometry.paper import FlatField, Paper, PaperReader
 from calibration.radiometry.primaries import Primaries, pure_lights
 from calibration.table.lut import open_lut
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import SETTINGS, hang, renumbered, take
 
 PAGE = (400.0, 300.0)

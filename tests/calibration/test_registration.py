@@ -19,7 +19,7 @@ from calibration.registration.register import register
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import RegistrationError
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import Lab, hang
 from tests.data_files import shipped
 

@@ -13,7 +13,7 @@ from calibration.registration.register import register
 from calibration.report.report import write_report
 from calibration.table.lut import open_lut
 from calibration.verdict.verdict import figures_of
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, hang_chart, renumbered, take
 
 LIGHT = renumbered(LIGHTS[5:6])

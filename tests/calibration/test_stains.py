@@ -16,7 +16,7 @@ from calibration.checks.stains import Stains, find_stains
 from calibration.radiometry.paper import PaperReader
 from calibration.registration.register import register
 from calibration.sampling.samples import gather, sites_at
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import Lab, hang
 
 

@@ -16,7 +16,7 @@ from sim.buses.ptp_memory import MemoryPipes
 from sim.buses.responder import Responder
 from sim.buses.usb_device import PtpUsbDevice
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_550D, EosBody
+from sim.camera.eos_bodies import EOS_550D, EosModel
 from sim.clock import SimulatedClock
 from tests.contracts.camera import SeededFilm
 
@@ -24,7 +24,7 @@ from tests.contracts.camera import SeededFilm
 class Lab:
     """A simulated EOS on cables of memory: `device` and `pipes` may be put in trouble before the camera is used."""
 
-    def __init__(self, body: EosBody = EOS_550D, film_bytes: int = 600, **given: Any) -> None:
+    def __init__(self, body: EosModel = EOS_550D, film_bytes: int = 600, **given: Any) -> None:
         kind: dict[str, Any] = {"auto_power_off_s": 0, **given}
         self.clock = SimulatedClock()
         self.film = SeededFilm(film_bytes)

@@ -29,19 +29,19 @@ from drivers.links.pipes import Pipe, UsbPipes
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode
 from drivers.ptp.ip_transport import IpTransport
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.transport import Transaction, Transport
 from drivers.ptp.usb_transport import UsbTransport
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, StorageError
-from sim import faults
+from sim.buses import faults
+from sim.buses.faults import Occasion
 from sim.buses.ptpip_server import serve_ptpip
 from sim.buses.responder import Answer, Responder
 from sim.buses.usb import SimulatedBus
 from sim.buses.usb_device import PtpUsbDevice
 from sim.camera.eos import SimulatedEos
-from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D, EosBody
+from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D, EosModel
 from sim.clock import SimulatedClock
-from sim.faults import Occasion
 from tests.contracts.camera import SETTINGS, Bench, CameraContract
 from tests.drivers.eos_lab import Lab
 from tests.drivers.ptp.conversations import Recorded
@@ -66,7 +66,7 @@ class Replay:
 
     def transact(
         self,
-        request: Request,
+        request: PtpRequest,
         *,
         send: bytes | None = None,
         receive: Callable[[bytes], object] | None = None,
@@ -82,10 +82,12 @@ class Replay:
             if int(known["code"], 16) == request.code and tuple(known["params"]) == request.parameters and data == sent:
                 self.left = self.left[number + 1 :]
                 answer = bytes.fromhex(known["data"] or "") if known["dir"] == "in" else b""
-                return Transaction(Response(int(known["rc"], 16), request.transaction, tuple(known["rparams"])), answer)
+                return Transaction(
+                    PtpResponse(int(known["rc"], 16), request.transaction, tuple(known["rparams"])), answer
+                )
         pytest.fail(f"the recorded host did not ask {request} with {sent} here")
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         return ()
 
     def reset(self) -> None:
@@ -195,7 +197,7 @@ SPOILS: list[tuple[Callable[[SimulatedEos], None], str]] = [
 @pytest.mark.parametrize(("spoil", "reason"), SPOILS)
 @pytest.mark.parametrize("body", [EOS_550D, EOS_6D_MARK_II], ids=["550D", "6D Mark II"])
 def test_what_would_spoil_a_series_is_refused_with_its_remedy(
-    spoil: Callable[[SimulatedEos], None], reason: str, body: EosBody
+    spoil: Callable[[SimulatedEos], None], reason: str, body: EosModel
 ) -> None:
     lab = Lab(body)
     spoil(lab.eos)
@@ -244,7 +246,7 @@ def heard(lab: Lab) -> list[tuple[int, ...]]:
     pieces: list[tuple[int, ...]] = []
 
     class Listening(faults.TroubledResponder):
-        def answer(self, request: Request, data: bytes | None) -> Answer:
+        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
             if request.code == Operation.EOS_GET_PARTIAL_OBJECT:
                 pieces.append(request.parameters[1:])
             return super().answer(request, data)
@@ -419,7 +421,7 @@ class Announcing(faults.TroubledResponder):
         super().__init__(good)
         self._change = change
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         answer = super().answer(request, data)
         if request.code != Operation.EOS_GET_EVENT or answer.data is None:
             return answer
@@ -488,7 +490,7 @@ def test_an_announcement_that_comes_after_the_next_release_is_not_taken_for_its_
         return tuple(record for record in records if not is_frame(record))
 
     class Listening(faults.TroubledResponder):
-        def answer(self, request: Request, data: bytes | None) -> Answer:
+        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
             if request.code == Operation.EOS_REMOTE_RELEASE_ON:
                 released.append(1)
             return super().answer(request, data)
@@ -532,7 +534,7 @@ HINTS: dict[str, Callable[[Responder], Responder]] = {
     "lost": faults.LosingEvents,
     "late": lambda good: faults.DelayingEvents(good, 5),
     "flooding": lambda good: faults.RepeatingEvents(good, 2_000),
-    "unknown": lambda good: faults.StrangeEvents(good, Event(0xC1FE, 7, (1, 2, 3))),
+    "unknown": lambda good: faults.StrangeEvents(good, PtpEvent(0xC1FE, 7, (1, 2, 3))),
 }
 
 
@@ -586,7 +588,7 @@ def test_a_jpeg_beside_the_raw_is_freed(lab: Lab) -> None:
     freed: list[int] = []
 
     class Listening(faults.TroubledResponder):
-        def answer(self, request: Request, data: bytes | None) -> Answer:
+        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
             if request.code == Operation.EOS_TRANSFER_COMPLETE:
                 freed.append(request.parameters[0])
             return super().answer(request, data)
@@ -600,7 +602,7 @@ def test_what_a_killed_run_left_is_thrown_away(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     lab.take()
     # The host dies with the release pressed and the frame under way.
-    lab.device.answer(Request(Operation.EOS_REMOTE_RELEASE_ON, 1000, (3, 1)), None)
+    lab.device.answer(PtpRequest(Operation.EOS_REMOTE_RELEASE_ON, 1000, (3, 1)), None)
     assert len(lab.film.frames) == 2
     lab.camera = CanonEos(lab.open, lab.clock)
     goes_on(lab)
@@ -628,7 +630,7 @@ def test_a_body_that_went_to_sleep_is_waited_for(lab: Lab) -> None:
     asleep: list[bool] = []
 
     class Sleepy(faults.TroubledResponder):
-        def answer(self, request: Request, data: bytes | None) -> Answer:
+        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
             if asleep:
                 asleep.pop()
                 raise LinkClosed("it sleeps")

@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 
 from acquisition.lights.illuminations import plan_illuminations
-from drivers.display.fullscreen import Display, FullScreen, choose_display, identify_displays, list_displays
+from drivers.display.displays import Display, choose_display, list_displays
+from drivers.display.fullscreen import FullScreen, identify_displays
 from drivers.display.x11 import XScreen
 from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import ConfigurationError, DeviceError

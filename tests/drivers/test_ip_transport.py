@@ -13,7 +13,7 @@ from drivers.links.link import Link
 from drivers.links.memory import MemoryLink, memory_pair
 from drivers.links.tcp import TcpServer
 from drivers.ptp.ip_transport import IpTransport
-from drivers.ptp.messages import Request, Response
+from drivers.ptp.messages import PtpRequest, PtpResponse
 from foundation.clock import SystemClock
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.ptpip_server import serve_ptpip
@@ -87,8 +87,8 @@ def test_asks_and_sends_data_in_the_standards_bytes() -> None:
     transport = far.connect()
     far.heard(far.command)
     far.command.write(packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
-    done = transport.transact(Request(0x9110, 5, (1, 2)), send=bytes(70000), timeout=PATIENCE_S)
-    assert done.response == Response(0x2001, 5)
+    done = transport.transact(PtpRequest(0x9110, 5, (1, 2)), send=bytes(70000), timeout=PATIENCE_S)
+    assert done.response == PtpResponse(0x2001, 5)
     assert far.heard(far.command) == (
         packet(6, bytes.fromhex("02000000 1091 05000000 01000000 02000000"))
         + packet(9, bytes.fromhex("05000000 7011010000000000"))
@@ -104,7 +104,7 @@ def test_takes_data_in_any_packets() -> None:
     pieces = packet(10, bytes.fromhex("05000000") + b"ab") + packet(10, bytes.fromhex("05000000") + b"cdef")
     end = packet(12, bytes.fromhex("05000000"))
     far.command.write(start + pieces + end + packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
-    assert transport.transact(Request(0x9116, 5), timeout=PATIENCE_S).data == b"abcdef"
+    assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).data == b"abcdef"
 
 
 @pytest.mark.parametrize(("total", "wrong"), [(5, "announced 5"), (7, "announced 7")])
@@ -115,7 +115,7 @@ def test_data_must_be_as_long_as_announced(total: int, wrong: str) -> None:
     end = packet(12, bytes.fromhex("05000000") + b"abcdef")
     far.command.write(start + end + packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
     with pytest.raises(ProtocolError, match=wrong):
-        transport.transact(Request(0x9116, 5), timeout=PATIENCE_S)
+        transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S)
 
 
 def test_data_of_unknown_length_are_taken() -> None:
@@ -124,7 +124,7 @@ def test_data_of_unknown_length_are_taken() -> None:
     start = packet(9, bytes.fromhex("05000000") + b"\xff" * 8)
     end = packet(12, bytes.fromhex("05000000") + b"abcdef")
     far.command.write(start + end + packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
-    assert transport.transact(Request(0x9116, 5), timeout=PATIENCE_S).data == b"abcdef"
+    assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).data == b"abcdef"
 
 
 def test_waits_for_the_event_connection_to_be_accepted() -> None:
@@ -173,7 +173,7 @@ def test_pings_are_answered_between_transactions() -> None:
 
 
 def test_a_long_wait_for_a_response_answers_pings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.ptp.ip_transport._PING_EVERY_S", 0.01)
+    monkeypatch.setattr("drivers.ptp.ip_connection._PING_EVERY_S", 0.01)
     far = FarEnd()
     transport = far.connect()
     far.heard(far.event)
@@ -186,7 +186,7 @@ def test_a_long_wait_for_a_response_answers_pings(monkeypatch: pytest.MonkeyPatc
 
     thread = threading.Thread(target=device)
     thread.start()
-    assert transport.transact(Request(0x9116, 5), timeout=PATIENCE_S).response.ok
+    assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).response.ok
     thread.join()
     assert answers == [packet(14)]
 
@@ -225,7 +225,7 @@ def test_a_stranger_in_the_middle_of_a_transaction_is_refused() -> None:
     transport = far.connect()
     far.command.write(packet(4), PATIENCE_S)
     with pytest.raises(ProtocolError, match="InitEventAck"):
-        transport.transact(Request(0x9116, 5), timeout=PATIENCE_S)
+        transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S)
 
 
 def test_a_second_initiator_hears_that_the_device_is_busy() -> None:
@@ -233,7 +233,7 @@ def test_a_second_initiator_hears_that_the_device_is_busy() -> None:
         first = IpTransport.connect(*server.address, guid=GUID, name="CroP", clock=SystemClock())
         with pytest.raises(DeviceRefused, match="another program"):
             IpTransport.connect(*server.address, guid=GUID, name="CroP", clock=SystemClock())
-        assert first.transact(Request(0x9F01, 1, (3,)), timeout=PATIENCE_S).response.parameters == (3,)
+        assert first.transact(PtpRequest(0x9F01, 1, (3,)), timeout=PATIENCE_S).response.parameters == (3,)
         first.close()
 
 
@@ -262,9 +262,9 @@ def test_a_stream_that_ends_at_any_byte_is_closed_or_late(cut: int, hangs_up: bo
     if hangs_up:
         far.command.close()
     with pytest.raises(LinkClosed if hangs_up else LinkTimeout):
-        transport.transact(Request(0x9116, 5), timeout=0.0 if not hangs_up else PATIENCE_S)
+        transport.transact(PtpRequest(0x9116, 5), timeout=0.0 if not hangs_up else PATIENCE_S)
     with pytest.raises(LinkClosed if hangs_up else ProtocolError):
-        transport.transact(Request(0x9116, 6), timeout=PATIENCE_S)
+        transport.transact(PtpRequest(0x9116, 6), timeout=PATIENCE_S)
 
 
 @given(at=st.integers(0, len(answer(100)) - 1), value=st.integers(0, 255))
@@ -275,7 +275,7 @@ def test_a_garbled_byte_never_ends_in_anything_but_our_errors(at: int, value: in
     stream[at] = value
     far.command.write(bytes(stream), PATIENCE_S)
     try:
-        done = transport.transact(Request(0x9116, 5), timeout=0.0)
+        done = transport.transact(PtpRequest(0x9116, 5), timeout=0.0)
     except (ProtocolError, LinkTimeout):
         return
     assert done.response.transaction == 5
@@ -288,7 +288,7 @@ def test_a_reader_that_gets_byte_by_byte_gets_all() -> None:
         lambda: Dribbling(far.open_command()), far.open_event, guid=GUID, name="Cr", clock=SimulatedClock()
     )
     far.command.write(answer(3000), PATIENCE_S)
-    assert transport.transact(Request(0x9116, 5), timeout=PATIENCE_S).data == bytes(3000)
+    assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).data == bytes(3000)
 
 
 def test_reset_is_a_new_connection() -> None:
@@ -302,7 +302,7 @@ def test_reset_is_a_new_connection() -> None:
     with pytest.raises(LinkClosed):
         first.command.write(b"x", PATIENCE_S)
     second.command.write(packet(7, bytes.fromhex("0120 05000000")), PATIENCE_S)
-    assert transport.transact(Request(0x9116, 5), timeout=PATIENCE_S).response.ok
+    assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).response.ok
 
 
 def test_reset_waits_for_a_device_that_still_holds_the_old_connection() -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from drivers.display import lightcrafter_wire as wire
 from drivers.display.lightcrafter import PRODUCTS, VENDOR, LightCrafter, find_lightcrafter
-from drivers.display.lightcrafter_wire import Command, Reply, Request
+from drivers.display.lightcrafter_wire import LightCrafterCommand, LightCrafterReply, LightCrafterRequest
 from drivers.links.hid import HidDevice, open_hid
 from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
@@ -58,30 +58,30 @@ def golden(text: str) -> bytes:
 
 
 GOLDEN = (
-    (Request(1, 0x1A00, b"\x01"), "40 01 03 00 00 1A 01"),
-    (Request(2, 0x1203, b"\x00"), "40 02 03 00 03 12 00"),
+    (LightCrafterRequest(1, 0x1A00, b"\x01"), "40 01 03 00 00 1A 01"),
+    (LightCrafterRequest(2, 0x1203, b"\x00"), "40 02 03 00 03 12 00"),
     # 1023, 514 = 128 · 1023 / 255 rounded, 0; background black.
-    (Request(3, 0x1204, wire.encode_colour(Colour(255, 128, 0))), "40 03 0E 00 04 12 FF 03 02 02 00 00"),
-    (Request(255, 0x1A1B, b"\x00"), "40 FF 03 00 1B 1A 00"),
-    (Request(4, 0x1204, b"", reads=True), "C0 04 02 00 04 12"),
+    (LightCrafterRequest(3, 0x1204, wire.encode_colour(Colour(255, 128, 0))), "40 03 0E 00 04 12 FF 03 02 02 00 00"),
+    (LightCrafterRequest(255, 0x1A1B, b"\x00"), "40 FF 03 00 1B 1A 00"),
+    (LightCrafterRequest(4, 0x1204, b"", reads=True), "C0 04 02 00 04 12"),
 )
 
 
 @pytest.mark.parametrize(("request_", "report"), GOLDEN)
-def test_requests_are_laid_out_as_published(request_: Request, report: str) -> None:
+def test_requests_are_laid_out_as_published(request_: LightCrafterRequest, report: str) -> None:
     assert wire.encode_request(request_) == golden(report)
     assert wire.parse_request(golden(report)) == request_
 
 
 def test_replies_are_laid_out_as_published() -> None:
-    assert wire.parse_reply(golden("C0 04 01 00 02")) == Reply(4, b"\x02")
-    assert wire.parse_reply(golden("60 05 00 00")) == Reply(5, b"", refused=True)
-    assert wire.encode_reply(Reply(4, b"\x02"), reads=True) == golden("C0 04 01 00 02")
+    assert wire.parse_reply(golden("C0 04 01 00 02")) == LightCrafterReply(4, b"\x02")
+    assert wire.parse_reply(golden("60 05 00 00")) == LightCrafterReply(5, b"", refused=True)
+    assert wire.encode_reply(LightCrafterReply(4, b"\x02"), reads=True) == golden("C0 04 01 00 02")
 
 
 @given(st.integers(0, 255), st.integers(0, 0xFFFF), st.binary(max_size=wire.MAX_DATA), st.booleans())
 def test_requests_survive_the_wire(sequence: int, command: int, data: bytes, reads: bool) -> None:
-    request = Request(sequence, command, data, reads)
+    request = LightCrafterRequest(sequence, command, data, reads)
     assert wire.parse_request(wire.encode_request(request)) == request
 
 
@@ -125,19 +125,19 @@ def test_waits_until_the_mode_has_changed(table: Table) -> None:
     before = table.clock.monotonic()
     table.presenter()
     assert table.clock.monotonic() > before
-    assert table.controller.read(Command.DISPLAY_MODE) == b"\0"
+    assert table.controller.read(LightCrafterCommand.DISPLAY_MODE) == b"\0"
 
 
 @pytest.mark.parametrize(
     ("command", "value", "reason"),
     [
-        (Command.PATTERN_COLOUR, wire.encode_colour(Colour(1, 2, 3)), "colour"),
-        (Command.INPUT_SOURCE, b"\0", "0 in place of 1 for input source"),
-        (Command.TEST_PATTERN, b"\4", "4 in place of 0 for test pattern"),
-        (Command.DISPLAY_MODE, b"\1", "1 in place of 0 for display mode"),
+        (LightCrafterCommand.PATTERN_COLOUR, wire.encode_colour(Colour(1, 2, 3)), "colour"),
+        (LightCrafterCommand.INPUT_SOURCE, b"\0", "0 in place of 1 for input source"),
+        (LightCrafterCommand.TEST_PATTERN, b"\4", "4 in place of 0 for test pattern"),
+        (LightCrafterCommand.DISPLAY_MODE, b"\1", "1 in place of 0 for display mode"),
     ],
 )
-def test_what_another_program_changes_is_noticed(command: Command, value: bytes, reason: str) -> None:
+def test_what_another_program_changes_is_noticed(command: LightCrafterCommand, value: bytes, reason: str) -> None:
     table = Table(lag=0)
     presenter = table.presenter()
     write = table.controller.write
@@ -153,7 +153,7 @@ def test_what_another_program_changes_is_noticed(command: Command, value: bytes,
 
 
 def test_a_command_that_the_firmware_does_not_know(table: Table) -> None:
-    del table.controller.registers[Command.PATTERN_COLOUR]
+    del table.controller.registers[LightCrafterCommand.PATTERN_COLOUR]
     with pytest.raises(DeviceRefused, match="refuses command 0x1204"):
         table.presenter()
 
@@ -173,7 +173,7 @@ def test_goes_on_after_the_cable_was_pulled(table: Table) -> None:
 
 def test_a_late_answer_is_no_answer(table: Table) -> None:
     presenter = table.presenter()
-    table.device.report_out(wire.encode_request(Request(200, Command.DISPLAY_MODE, reads=True)))
+    table.device.report_out(wire.encode_request(LightCrafterRequest(200, LightCrafterCommand.DISPLAY_MODE, reads=True)))
     presenter.show(Colour(5, 6, 7))
     assert table.screen.colour == Colour(5, 6, 7)
 
@@ -185,7 +185,9 @@ def test_silence_and_foreign_answers_are_timeouts(table: Table, swallow: bool) -
     def report_out(report: bytes) -> None:
         if not swallow:
             for _ in range(20):
-                LightCrafterUsb.report_out(table.device, wire.encode_request(Request(99, 0x1A00, reads=True)))
+                LightCrafterUsb.report_out(
+                    table.device, wire.encode_request(LightCrafterRequest(99, 0x1A00, reads=True))
+                )
 
     table.device.report_out = report_out
     with pytest.raises(LinkTimeout):

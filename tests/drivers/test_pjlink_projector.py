@@ -16,7 +16,8 @@ from drivers.pjlink.wire import Input, NoResolution, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
 from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer, ProjectorTraits, SimulatedProjector, memory_link, serve_pjlink
+from sim.projectors.pjlink import PjLinkPeer, memory_link, serve_pjlink
+from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling, Slow
 

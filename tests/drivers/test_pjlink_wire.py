@@ -14,9 +14,9 @@ from drivers.pjlink.wire import (
     InputKind,
     LineCutter,
     NoResolution,
+    PjLinkReply,
+    PjLinkRequest,
     Refused,
-    Reply,
-    Request,
     Resolution,
 )
 from drivers.projector import Fault, Lamp, Power, Severity
@@ -74,20 +74,21 @@ def test_what_is_no_greeting_is_quoted(line: bytes) -> None:
 
 def test_commands_are_the_standards_bytes() -> None:
     # PJLink 1.04, 4.1 and 5.1.
-    assert wire.encode_request(Request("POWR", "1")) == b"%1POWR 1\r"
-    assert wire.encode_request(Request("INPT")) == b"%1INPT ?\r"
-    assert wire.encode_request(Request("AVMT", "31")) == b"%1AVMT 31\r"
+    assert wire.encode_request(PjLinkRequest("POWR", "1")) == b"%1POWR 1\r"
+    assert wire.encode_request(PjLinkRequest("INPT")) == b"%1INPT ?\r"
+    assert wire.encode_request(PjLinkRequest("AVMT", "31")) == b"%1AVMT 31\r"
     assert (
-        wire.encode_request(Request("POWR", digest="5d8409bc1c3fa39749434aa3a5c38682"))
+        wire.encode_request(PjLinkRequest("POWR", digest="5d8409bc1c3fa39749434aa3a5c38682"))
         == b"5d8409bc1c3fa39749434aa3a5c38682%1POWR ?\r"
     )
-    assert wire.encode_request(Request("SNUM", level=2)) == b"%2SNUM ?\r"
+    assert wire.encode_request(PjLinkRequest("SNUM", level=2)) == b"%2SNUM ?\r"
 
 
 @pytest.mark.parametrize(
-    "request_", [Request("powr"), Request("POW"), Request("POWR", "1\r"), Request("POWR", "x" * 129)]
+    "request_",
+    [PjLinkRequest("powr"), PjLinkRequest("POW"), PjLinkRequest("POWR", "1\r"), PjLinkRequest("POWR", "x" * 129)],
 )
-def test_our_own_mistakes_never_reach_the_cable(request_: Request) -> None:
+def test_our_own_mistakes_never_reach_the_cable(request_: PjLinkRequest) -> None:
     with pytest.raises(ValueError, match="is no PJLink"):
         wire.encode_request(request_)
 
@@ -95,21 +96,21 @@ def test_our_own_mistakes_never_reach_the_cable(request_: Request) -> None:
 @pytest.mark.parametrize(
     ("line", "reply"),
     [
-        (b"%1POWR=0", Reply("POWR", "0")),
-        (b"%1POWR=OK", Reply("POWR", "OK")),
-        (b"%1powr=ERR3", Reply("POWR", "ERR3")),
-        (b"%1LAMP=120 1 3000 0", Reply("LAMP", "120 1 3000 0")),
-        (b"%1NAME=", Reply("NAME", "")),
-        ("%1NAME=Höllenmaschine".encode(), Reply("NAME", "Höllenmaschine")),
-        (b"%2SNUM=42", Reply("SNUM", "42", level=2)),
-        (b"%2INNM=HDMI 1", Reply("INNM", "HDMI 1", level=2)),
-        (b"%2IRES=-", Reply("IRES", "-", level=2)),
-        (b"%2IRES=*", Reply("IRES", "*", level=2)),
+        (b"%1POWR=0", PjLinkReply("POWR", "0")),
+        (b"%1POWR=OK", PjLinkReply("POWR", "OK")),
+        (b"%1powr=ERR3", PjLinkReply("POWR", "ERR3")),
+        (b"%1LAMP=120 1 3000 0", PjLinkReply("LAMP", "120 1 3000 0")),
+        (b"%1NAME=", PjLinkReply("NAME", "")),
+        ("%1NAME=Höllenmaschine".encode(), PjLinkReply("NAME", "Höllenmaschine")),
+        (b"%2SNUM=42", PjLinkReply("SNUM", "42", level=2)),
+        (b"%2INNM=HDMI 1", PjLinkReply("INNM", "HDMI 1", level=2)),
+        (b"%2IRES=-", PjLinkReply("IRES", "-", level=2)),
+        (b"%2IRES=*", PjLinkReply("IRES", "*", level=2)),
         (b"PJLINK ERRA", Refused.WRONG_PASSWORD),
         (b"pjlink erra", Refused.WRONG_PASSWORD),
     ],
 )
-def test_replies(line: bytes, reply: Reply | Refused) -> None:
+def test_replies(line: bytes, reply: PjLinkReply | Refused) -> None:
     assert wire.parse_reply(line) == reply
 
 
@@ -120,11 +121,11 @@ def test_what_is_no_reply_is_quoted(line: bytes) -> None:
 
 
 def test_errors_are_values_of_their_own() -> None:
-    assert Reply("POWR", "ERR1").error is ErrorCode.UNDEFINED
-    assert Reply("POWR", "err2").error is ErrorCode.OUT_OF_PARAMETER
-    assert Reply("POWR", "ERR3").error is ErrorCode.UNAVAILABLE
-    assert Reply("POWR", "ERR4").error is ErrorCode.FAILURE
-    assert Reply("NAME", "ERR5").error is None
+    assert PjLinkReply("POWR", "ERR1").error is ErrorCode.UNDEFINED
+    assert PjLinkReply("POWR", "err2").error is ErrorCode.OUT_OF_PARAMETER
+    assert PjLinkReply("POWR", "ERR3").error is ErrorCode.UNAVAILABLE
+    assert PjLinkReply("POWR", "ERR4").error is ErrorCode.FAILURE
+    assert PjLinkReply("NAME", "ERR5").error is None
 
 
 def test_values_of_the_standard() -> None:
@@ -225,20 +226,20 @@ def test_inputs_come_back_as_capitals(code: str) -> None:
 def test_a_sha256_digest_before_a_command_comes_back(challenge: bytes, nonce: bytes, password: str) -> None:
     digest = wire.sha256_digest(challenge, nonce, password)
     assert len(digest) == wire.MAX_DIGEST
-    request = Request("POWR", digest=digest)
+    request = PjLinkRequest("POWR", digest=digest)
     assert wire.parse_request(wire.encode_request(request)[:-1]) == request
 
 
 @given(
     st.builds(
-        Request,
+        PjLinkRequest,
         st.from_regex("[A-Z0-9]{4}", fullmatch=True),
         PRINTABLE.filter(bool),
         st.sampled_from((1, 2)),
         st.sampled_from(("", "5d8409bc1c3fa39749434aa3a5c38682")),
     )
 )
-def test_requests_come_back(request_: Request) -> None:
+def test_requests_come_back(request_: PjLinkRequest) -> None:
     assert wire.parse_request(wire.encode_request(request_)[:-1]) == request_
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from drivers.ptp.codes import Operation, ResponseCode
-from drivers.ptp.messages import LAST_TRANSACTION, Event, Request, Response
-from drivers.ptp.session import OPEN_TRIES, PASSING_LIMIT_S, Declined, PtpSession
+from drivers.ptp.messages import LAST_TRANSACTION, PtpEvent, PtpRequest, PtpResponse
+from drivers.ptp.session import OPEN_TRIES, PASSING_LIMIT_S, OperationDeclined, PtpSession
 from drivers.ptp.transport import Transaction
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
@@ -21,12 +21,12 @@ class Scripted:
 
     def __init__(self, *script: int | Exception) -> None:
         self.script = list(script)
-        self.asked: list[Request] = []
+        self.asked: list[PtpRequest] = []
         self.resets = 0
 
     def transact(
         self,
-        request: Request,
+        request: PtpRequest,
         *,
         send: bytes | None = None,
         receive: Callable[[bytes], object] | None = None,
@@ -36,10 +36,10 @@ class Scripted:
         step = self.script.pop(0) if self.script else ResponseCode.OK
         if isinstance(step, Exception):
             raise step
-        return Transaction(Response(step, request.transaction, (7,)), b"data")
+        return Transaction(PtpResponse(step, request.transaction, (7,)), b"data")
 
-    def events(self) -> tuple[Event, ...]:
-        return (Event(0xC101),)
+    def events(self) -> tuple[PtpEvent, ...]:
+        return (PtpEvent(0xC101),)
 
     def reset(self) -> None:
         self.resets += 1
@@ -59,7 +59,7 @@ def test_opens_with_number_0_and_counts_from_1(answer: int) -> None:
     session, cable, _ = opened(answer)
     assert session.call(Operation.GET_DEVICE_INFO) == ((7,), b"data")
     session.close()
-    assert cable.asked == [Request(0x1002, 0, (1,)), Request(0x1001, 1), Request(0x1003, 2)]
+    assert cable.asked == [PtpRequest(0x1002, 0, (1,)), PtpRequest(0x1001, 1), PtpRequest(0x1003, 2)]
 
 
 def test_takes_the_next_session_number_where_one_is_not_taken() -> None:
@@ -100,7 +100,7 @@ def test_what_is_declined_for_the_moment_is_asked_again_under_a_new_number(code:
 
 def test_patience_ends_by_the_clock() -> None:
     session, _, clock = opened(ResponseCode.OK, *[0x2019] * 1000)
-    with pytest.raises(Declined, match="wait until it is idle") as caught:
+    with pytest.raises(OperationDeclined, match="wait until it is idle") as caught:
         session.call(Operation.EOS_KEEP_DEVICE_ON)
     assert caught.value.code == 0x2019
     assert clock.monotonic() == pytest.approx(PASSING_LIMIT_S)
@@ -108,7 +108,7 @@ def test_patience_ends_by_the_clock() -> None:
 
 def test_no_patience_asks_once() -> None:
     session, cable, clock = opened(ResponseCode.OK, 0x2019)
-    with pytest.raises(Declined):
+    with pytest.raises(OperationDeclined):
         session.call(Operation.EOS_REMOTE_RELEASE_ON, 3, 1, patience=0.0)
     assert (len(cable.asked), clock.monotonic()) == (2, 0.0)
 

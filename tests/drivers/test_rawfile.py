@@ -23,7 +23,7 @@ from drivers.raw.rawfile import Area, Mosaic, read_raw
 from drivers.tiff import reading as tiff
 from foundation.errors import FormatError
 from sim.camera.dng import write_dng as write_simulated_dng
-from sim.camera.sensors import BODIES, Rectangle
+from sim.world.sensors import BODIES, Rectangle
 from tests.data_files import available, shipped
 from tests.drivers.raw_files import Tags, longs, lossless_jpeg, ratios, shorts, text, write_cr2, write_dng
 

@@ -31,9 +31,10 @@ from foundation.errors import (
     LinkTimeout,
     ProtocolError,
 )
+from sim.buses.serial_cable import SerialPeerLink
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import SimulatedProjector
-from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer, SerialPeerLink
+from sim.projectors.projector import SimulatedProjector
+from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling
 
@@ -125,7 +126,7 @@ class TestOverAPseudoTerminal(ProjectorContract):
     @pytest.fixture(params=NAMES)
     def bench(self, request: pytest.FixtureRequest) -> Iterator[Bench]:
         from drivers.links.serial import SerialLink
-        from sim.projectors.pty import PseudoTerminal
+        from sim.buses.pty import PseudoTerminal
 
         spoken = LANGUAGES[request.param]
         device = SimulatedProjector(SimulatedClock())
@@ -629,10 +630,10 @@ def test_whatever_is_said_to_a_simulated_one_it_goes_on_answering(name: str, noi
 
 @given(kind=st.integers(0, 3), code=st.integers(0, 255), data=st.binary(max_size=255))
 def test_nec_frames_survive_both_ends(kind: int, code: int, data: bytes) -> None:
-    command = nec.Command(kind, code, data)
+    command = nec.NecCommand(kind, code, data)
     frame = nec.encode_command(command)
     assert nec.take_command(frame + b"more") == (command, len(frame))
-    reply = nec.Reply(kind, code, data)
+    reply = nec.NecReply(kind, code, data)
     frame = nec.encode_reply(reply)
     assert nec.take_reply(frame + b"more") == (reply, len(frame))
 
@@ -711,7 +712,7 @@ def test_a_late_answer_never_meets_a_later_question(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cable_pulled_out_is_told(name: str) -> None:
     from drivers.links.serial import SerialLink
-    from sim.projectors.pty import PseudoTerminal
+    from sim.buses.pty import PseudoTerminal
 
     spoken = language(name)
     with PseudoTerminal(PEERS[name](SimulatedProjector(SimulatedClock(), Power.ON))) as terminal:

@@ -9,7 +9,7 @@ import usb.core
 
 from drivers.links.pipes import Pipe, PipeStalled
 from drivers.links.usb import UDEV_RULE, UsbDevice, list_devices, open_usb
-from drivers.ptp.messages import Request
+from drivers.ptp.messages import PtpRequest
 from drivers.ptp.usb_transport import UsbTransport
 from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
 from sim.buses.usb import SimulatedBus
@@ -123,7 +123,7 @@ def test_an_unconfigured_device_is_configured() -> None:
     bus = bus_with(device)
     device.control(Setup(0x00, 9, 0, 0, 0))
     transport = UsbTransport(open_usb(backend=bus), SimulatedClock())
-    assert transport.transact(Request(ECHO, 1), timeout=PATIENCE_S).response.ok
+    assert transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
 
 
 def test_the_pipes_know_their_sizes() -> None:
@@ -162,10 +162,10 @@ def test_a_restarted_camera_is_found_again_by_its_number() -> None:
     before = list_devices(backend=bus)
     bus.replug(device)
     with pytest.raises(LinkClosed):
-        transport.transact(Request(ECHO, 1), timeout=PATIENCE_S)
+        transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S)
     transport.close()
     again = UsbTransport(open_usb(serial="7", backend=bus), SimulatedClock())
-    assert again.transact(Request(ECHO, 1), timeout=PATIENCE_S).response.ok
+    assert again.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
     assert {found.address for found in before} != {found.address for found in list_devices(backend=bus)}
     assert {found.port for found in before} == {found.port for found in list_devices(backend=bus)}
 
@@ -175,7 +175,7 @@ def test_a_port_reset_keeps_the_pipes() -> None:
     pipes = open_usb(backend=bus_with(device))
     transport = UsbTransport(pipes, SimulatedClock())
     pipes.reset_port()
-    assert transport.transact(Request(ECHO, 1), timeout=PATIENCE_S).response.ok
+    assert transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
 
 
 def test_no_library_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

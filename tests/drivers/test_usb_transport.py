@@ -7,13 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.links.pipes import Pipe, PipeStalled, UsbPipes
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.usb_transport import UsbTransport
 from foundation.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
+from sim.buses.faults import CutOff, Deaf, Garbling, HeaderAlone, Joining, ShortReads, Stalling, WithoutEmptyPackets
 from sim.buses.ptp_memory import MemoryPipes
 from sim.buses.usb_device import PtpUsbDevice
 from sim.clock import SimulatedClock
-from sim.faults import CutOff, Deaf, Garbling, HeaderAlone, Joining, ShortReads, Stalling, WithoutEmptyPackets
 from tests.contracts.transport import (
     ECHO,
     GIVE,
@@ -127,24 +127,24 @@ def data(length: int, body: bytes) -> bytes:
 
 
 def get(script: Script) -> bytes:
-    return over(script).transact(Request(0x9116, 5), timeout=PATIENCE_S).data
+    return over(script).transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).data
 
 
 def test_a_command_is_one_container() -> None:
     # USB Still Image Capture Device Definition 1.0, 7.1.
     script = Script(bytes.fromhex("10000000 0300 0120 05000000 2a000000"))
-    done = over(script).transact(Request(0x9128, 5, (3, 1)), timeout=PATIENCE_S)
+    done = over(script).transact(PtpRequest(0x9128, 5, (3, 1)), timeout=PATIENCE_S)
     assert script.written == [bytes.fromhex("14000000 0100 2891 05000000 03000000 01000000")]
-    assert done.response == Response(0x2001, 5, (42,))
+    assert done.response == PtpResponse(0x2001, 5, (42,))
 
 
 def test_data_are_one_container_closed_by_an_empty_packet_when_full() -> None:
     script = Script(OK)
-    over(script).transact(Request(0x9110, 5), send=bytes(500), timeout=PATIENCE_S)
+    over(script).transact(PtpRequest(0x9110, 5), send=bytes(500), timeout=PATIENCE_S)
     header = bytes.fromhex("00020000 0200 1091 05000000")
     assert script.written[1:] == [header + bytes(500), b""]
     script = Script(OK)
-    over(script).transact(Request(0x9110, 5), send=bytes(501), timeout=PATIENCE_S)
+    over(script).transact(PtpRequest(0x9110, 5), send=bytes(501), timeout=PATIENCE_S)
     assert script.written[1:] == [b"\x01" + header[1:] + bytes(501)]
 
 
@@ -158,7 +158,7 @@ def test_the_tail_is_read_in_whole_packets() -> None:
         OK,
     )
     pieces: list[bytes] = []
-    over(script).transact(Request(0x9116, 5), receive=pieces.append, timeout=PATIENCE_S)
+    over(script).transact(PtpRequest(0x9116, 5), receive=pieces.append, timeout=PATIENCE_S)
     assert sum(map(len, pieces)) == 1_000_000
     assert script.limits == [512, 524288, 475_136, 512, 512]
 
@@ -195,7 +195,7 @@ def test_a_stall_on_the_way_out_is_tried_again(transfer: int) -> None:
     pipes = Stalling(MemoryPipes(PtpUsbDevice(bench)), Pipe.BULK_OUT, {transfer})
     transport = UsbTransport(pipes, SimulatedClock())
     for _ in range(2):
-        done = transport.transact(Request(TAKE, 1), send=payload(500), timeout=PATIENCE_S)
+        done = transport.transact(PtpRequest(TAKE, 1), send=payload(500), timeout=PATIENCE_S)
         assert done.response.parameters[0] == 500
 
 
@@ -234,7 +234,7 @@ def test_events_are_joined_from_packets_of_eight() -> None:
             bytes.fromhex("05000000"),
         )
     )
-    assert over(script).events() == (Event(0xC101, 0xFFFFFFFF, (42,)), Event(0xC102, 5))
+    assert over(script).events() == (PtpEvent(0xC101, 0xFFFFFFFF, (42,)), PtpEvent(0xC102, 5))
 
 
 def test_half_an_event_waits_for_the_rest() -> None:
@@ -242,7 +242,7 @@ def test_half_an_event_waits_for_the_rest() -> None:
     transport = over(script)
     assert transport.events() == ()
     script.events.append(bytes.fromhex("05000000"))
-    assert transport.events() == (Event(0xC101, 5),)
+    assert transport.events() == (PtpEvent(0xC101, 5),)
 
 
 def test_garbage_on_the_interrupt_pipe_is_told_once() -> None:
@@ -251,7 +251,7 @@ def test_garbage_on_the_interrupt_pipe_is_told_once() -> None:
     with pytest.raises(ProtocolError):
         transport.events()
     script.events[:] = [bytes.fromhex("0c000000 0400 01c1"), bytes.fromhex("05000000")]
-    assert transport.events() == (Event(0xC101, 5),)
+    assert transport.events() == (PtpEvent(0xC101, 5),)
 
 
 def test_reset_asks_the_class_and_waits_until_the_device_is_ready() -> None:
@@ -277,11 +277,11 @@ def test_a_caller_who_cannot_take_data_cancels() -> None:
     script = Script(data(2000, bytes(500)), status=bytes.fromhex("0400 0120"))
     transport = over(script)
     with pytest.raises(KeyboardInterrupt):
-        transport.transact(Request(0x9116, 5), receive=full, timeout=PATIENCE_S)
+        transport.transact(PtpRequest(0x9116, 5), receive=full, timeout=PATIENCE_S)
     # 5.2.1: the cancellation code, then the transaction.
     assert script.written[1:3] == [(0x64, bytes.fromhex("0140 05000000")), (0x67, b"")]
     script.reads.append(OK)
-    assert transport.transact(Request(0x9116, 5), timeout=PATIENCE_S).response.ok
+    assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).response.ok
 
 
 def camera() -> MemoryPipes:
@@ -290,7 +290,7 @@ def camera() -> MemoryPipes:
 
 def _give_twice(transport: UsbTransport, pieces: list[bytes]) -> None:
     for number in range(2):
-        transport.transact(Request(GIVE, number, (2000,)), receive=pieces.append, timeout=PATIENCE_S)
+        transport.transact(PtpRequest(GIVE, number, (2000,)), receive=pieces.append, timeout=PATIENCE_S)
 
 
 @given(after=st.integers(0, 3100))
@@ -306,7 +306,7 @@ def test_pulled_out_at_any_byte_is_closed(after: int) -> None:
 def test_silence_at_any_read_is_a_timeout(reads: int) -> None:
     transport = UsbTransport(Deaf(camera(), reads), SimulatedClock())
     with pytest.raises(LinkTimeout):
-        transport.transact(Request(GIVE, 1, (3000,)), timeout=PATIENCE_S)
+        transport.transact(PtpRequest(GIVE, 1, (3000,)), timeout=PATIENCE_S)
 
 
 @given(at=st.integers(0, 11), value=st.integers(0, 255))
@@ -316,7 +316,7 @@ def test_a_garbled_byte_in_a_response_is_never_taken_for_another_message(at: int
 
     transport = UsbTransport(Garbling(camera(), change), SimulatedClock())
     try:
-        done = transport.transact(Request(ECHO, 0x01020304), timeout=PATIENCE_S)
+        done = transport.transact(PtpRequest(ECHO, 0x01020304), timeout=PATIENCE_S)
     except (ProtocolError, LinkTimeout):
         return
     # Only the code may differ, for any is allowed.
@@ -327,6 +327,6 @@ def test_a_garbled_byte_in_a_response_is_never_taken_for_another_message(at: int
 
 def test_a_flood_of_events_does_not_keep_us() -> None:
     transport = UsbTransport(camera(), SimulatedClock())
-    transport.transact(Request(RAISE, 1, (5000,)), timeout=PATIENCE_S)
+    transport.transact(PtpRequest(RAISE, 1, (5000,)), timeout=PATIENCE_S)
     assert len(transport.events()) == 4096
     assert len(transport.events()) == 904

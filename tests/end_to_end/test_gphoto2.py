@@ -33,8 +33,10 @@ from sim.buses.ptpip_server import serve_ptpip
 from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D_AS_LISTED, TEST_BODY
 from sim.camera.film import Film, WorldFilm
-from sim.camera.sensors import BODIES
-from sim.world.world import Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
 
 SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
 LIMIT_S = 60

@@ -31,16 +31,18 @@ from drivers.projector import Power
 from drivers.raw.rawfile import read_raw
 from foundation.clock import Clock, SystemClock
 from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.pty import PseudoTerminal
+from sim.buses.serial_cable import serve_network
 from sim.buses.usb import SimulatedBus
 from sim.buses.usb_device import PtpUsbDevice
 from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_BODIES
 from sim.camera.film import WorldFilm
 from sim.clock import OPENING
-from sim.projectors.pjlink import SimulatedProjector, serve_pjlink
-from sim.projectors.pty import PseudoTerminal
+from sim.projectors.pjlink import serve_pjlink
+from sim.projectors.projector import SimulatedProjector
 from sim.projectors.screen import Screen, SimulatedPresenter
-from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer, serve_network
+from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer
 from sim.world.world import World
 
 FRAMES = 10

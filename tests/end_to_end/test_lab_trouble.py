@@ -18,7 +18,7 @@ if sys.platform == "win32":
     pytest.skip("Windows has no pseudo-terminals", allow_module_level=True)
 
 from acquisition.cli import main
-from drivers.display.fullscreen import Display, choose_display
+from drivers.display.displays import Display, choose_display
 from drivers.links.tcp import TcpLink, TcpServer
 from drivers.links.usb import open_usb
 from drivers.pjlink.projector import PjLinkProjector
@@ -26,12 +26,13 @@ from drivers.projector import Power
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceRefused
 from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.pty import PseudoTerminal
 from sim.buses.usb import SimulatedBus
 from sim.buses.usb_device import Identity, PtpUsbDevice
 from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_BODIES
-from sim.projectors.pjlink import SimulatedProjector, serve_pjlink
-from sim.projectors.pty import PseudoTerminal
+from sim.projectors.pjlink import serve_pjlink
+from sim.projectors.projector import SimulatedProjector
 from sim.projectors.screen import Screen, SimulatedPresenter
 from sim.projectors.serial import EpsonPeer
 from tests.contracts.camera import SeededFilm

@@ -24,7 +24,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from foundation.angles import angles_deg
 from foundation.errors import CropError, QualityError
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
 
 FEW = renumbered([LIGHTS[4], LIGHTS[5], LIGHTS[0]])

@@ -18,7 +18,7 @@ from drivers.presenter import Colour
 from foundation.angles import angles_deg
 from generator.lights.gamut import Gamut
 from generator.lights.lighting import Mixture, plain
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import SETTINGS, Lab, hang, take
 
 CODES = (

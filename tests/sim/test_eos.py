@@ -56,7 +56,7 @@ from drivers.ptp.datasets import (
     decode_value,
     encode_string,
 )
-from drivers.ptp.messages import Request
+from drivers.ptp.messages import PtpRequest
 from foundation.errors import DeviceRefused, LinkClosed
 from sim.buses.ptp_memory import MemoryTransport
 from sim.buses.responder import Answer
@@ -68,7 +68,7 @@ from sim.camera.eos_bodies import (
     EOS_BODIES,
     OPERATIONS,
     TEST_BODY,
-    EosBody,
+    EosModel,
 )
 from sim.camera.eos_state import CARD, DCIM, EMPTY_SLOT, FOLDER
 from sim.clock import OPENING, SimulatedClock
@@ -112,7 +112,7 @@ class Host:
         self.transaction = 0
 
     def ask(self, code: int, *parameters: int, data: bytes | None = None) -> Answer:
-        request = Request(code, 0 if code == Operation.OPEN_SESSION else self.next(), parameters)
+        request = PtpRequest(code, 0 if code == Operation.OPEN_SESSION else self.next(), parameters)
         if code == Operation.OPEN_SESSION:
             self.transaction = 0
         answer = self.eos.answer(request, data)
@@ -185,7 +185,7 @@ def statuses(records: tuple[Record, ...]) -> list[int]:
     return [r.number for r in records if isinstance(r, Notice) and r.type == EosEvent.CAMERA_STATUS_CHANGED]
 
 
-def host_of(body: EosBody = TEST_BODY, *, card_bytes: int | None = 8 << 30, battery: float = 1.0) -> Host:
+def host_of(body: EosModel = TEST_BODY, *, card_bytes: int | None = 8 << 30, battery: float = 1.0) -> Host:
     clock, film = SimulatedClock(), NumberedFilm()
     return Host(
         SimulatedEos(body, film, clock, card_bytes=card_bytes, battery=battery, auto_power_off_s=0), clock, film
@@ -231,7 +231,7 @@ def test_holds_the_conversation_of_a_real_60d(real: Callable[[], list[Recorded]]
     sessions = 0
     for number, recorded in enumerate(real()):
         code = int(recorded["code"], 16)
-        request = Request(code, recorded["tid"], tuple(recorded["params"]))
+        request = PtpRequest(code, recorded["tid"], tuple(recorded["params"]))
         if code == Operation.OPEN_SESSION:
             sessions += 1
             if sessions == 2:
@@ -311,7 +311,7 @@ def test_bodies_have_their_usb_ids(name: str, product: int) -> None:
 
 def test_tells_what_it_is_without_a_session() -> None:
     host = host_of()
-    assert host.eos.answer(Request(Operation.GET_DEVICE_INFO), None).response.ok
+    assert host.eos.answer(PtpRequest(Operation.GET_DEVICE_INFO), None).response.ok
     assert host.code(Operation.GET_STORAGE_IDS) == ResponseCode.SESSION_NOT_OPEN
     assert host.code(Operation.OPEN_SESSION, 0) == ResponseCode.INVALID_PARAMETER
 
@@ -331,7 +331,7 @@ def test_a_transaction_number_is_used_once() -> None:
     host.ok(Operation.OPEN_SESSION, 1)
 
     def code(transaction: int) -> int:
-        return host.eos.answer(Request(Operation.GET_STORAGE_IDS, transaction), None).response.code
+        return host.eos.answer(PtpRequest(Operation.GET_STORAGE_IDS, transaction), None).response.code
 
     assert [code(n) for n in (1, 1, 3, 2, 0, 0xFFFFFFFF, 4)] == [
         ResponseCode.OK,
@@ -345,7 +345,7 @@ def test_a_transaction_number_is_used_once() -> None:
 
 
 @pytest.mark.parametrize("body", EOS_BODIES.values(), ids=lambda body: body.model)
-def test_carries_out_all_that_it_lists_and_nothing_else(body: EosBody) -> None:
+def test_carries_out_all_that_it_lists_and_nothing_else(body: EosModel) -> None:
     host = host_of(body)
     listed = DeviceInfo.decode(host.ok(Operation.GET_DEVICE_INFO)).operations
     assert listed == tuple(OPERATIONS)
@@ -381,7 +381,7 @@ def test_answers_whatever_is_asked(code: int, parameters: list[int], data: bytes
     answer = host.ask(code, *parameters, data=data)
     assert answer.response.ok or answer.data is None
     host.clock.sleep(60)
-    assert host.eos.answer(Request(Operation.OPEN_SESSION, 0, (1,)), None)
+    assert host.eos.answer(PtpRequest(Operation.OPEN_SESSION, 0, (1,)), None)
     host.transaction = 1000
     host.events()
 
@@ -737,7 +737,7 @@ def test_a_half_press_alone_focuses_and_takes_nothing(host: Host) -> None:
 
 
 @pytest.mark.parametrize("body", [EOS_550D, EOS_6D_MARK_II], ids=lambda body: body.model)
-def test_mirror_lockup_blocks_the_release(body: EosBody) -> None:
+def test_mirror_lockup_blocks_the_release(body: EosModel) -> None:
     host = host_of(body).take_control()
     host.eos.switch_mirror_lockup(True)
     assert changes(host.events()), "the host can know"
@@ -880,7 +880,7 @@ def test_a_frame_under_way_outlives_its_session(host: Host) -> None:
     "body", [EOS_550D, EOS_6D_MARK_II, replace(EOS_6D_MARK_II, wide_objects=True)], ids=["550D", "6D2", "wide"]
 )
 @pytest.mark.parametrize("without", [(), (Operation.EOS_REMOTE_RELEASE_ON,)], ids=["press", "release"])
-def test_our_driver_takes_a_series(body: EosBody, without: tuple[int, ...]) -> None:
+def test_our_driver_takes_a_series(body: EosModel, without: tuple[int, ...]) -> None:
     clock, film = SimulatedClock(), NumberedFilm()
     eos = SimulatedEos(body, film, clock, auto_power_off_s=0, without=without)
     camera = CanonEos(lambda: MemoryTransport(eos), clock)

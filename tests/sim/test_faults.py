@@ -8,16 +8,11 @@ import pytest
 
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.messages import Event, Request
+from drivers.ptp.messages import PtpEvent, PtpRequest
 from drivers.ptp.transport import Transport
 from drivers.ptp.usb_transport import UsbTransport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.ptp_memory import MemoryTransport
-from sim.buses.responder import Responder
-from sim.buses.usb import SimulatedBus
-from sim.buses.usb_device import PtpUsbDevice
-from sim.clock import SimulatedClock
-from sim.faults import (
+from sim.buses.faults import (
     Declining,
     DelayingEvents,
     Falsifying,
@@ -30,11 +25,16 @@ from sim.faults import (
     RepeatingEvents,
     StrangeEvents,
 )
+from sim.buses.ptp_memory import MemoryTransport
+from sim.buses.responder import Responder
+from sim.buses.usb import SimulatedBus
+from sim.buses.usb_device import PtpUsbDevice
+from sim.clock import SimulatedClock
 from tests.contracts.transport import ECHO, GIVE, PATIENCE_S, RAISE, TAKE, Echo, payload
 
 
 def ask(transport: Transport, code: int, *parameters: int) -> int:
-    return transport.transact(Request(code, 1, parameters), timeout=PATIENCE_S).response.code
+    return transport.transact(PtpRequest(code, 1, parameters), timeout=PATIENCE_S).response.code
 
 
 def test_an_occasion_counts_its_own_operations() -> None:
@@ -55,7 +55,7 @@ def test_declining_carries_nothing_out() -> None:
 
 def test_a_declined_data_phase_is_still_taken() -> None:
     transport = MemoryTransport(Declining(Echo(), ResponseCode.STORE_FULL, Occasion()))
-    done = transport.transact(Request(TAKE, 1), send=bytes(5000), timeout=PATIENCE_S)
+    done = transport.transact(PtpRequest(TAKE, 1), send=bytes(5000), timeout=PATIENCE_S)
     assert done.response.code == ResponseCode.STORE_FULL
     assert ask(transport, ECHO) == ResponseCode.OK
 
@@ -86,7 +86,7 @@ def test_a_restart_at_any_operation_closes_the_cable_and_comes_back(number: int)
     assert echo.unplugs == 1
     transport.close()
     again = UsbTransport(open_usb(serial=device[0].identity.serial, backend=bus), SimulatedClock())
-    done = again.transact(Request(GIVE, 1, (1000,)), timeout=PATIENCE_S)
+    done = again.transact(PtpRequest(GIVE, 1, (1000,)), timeout=PATIENCE_S)
     assert done.data == payload(1000)
 
 
@@ -105,19 +105,19 @@ def _empty(data: bytes) -> bytes:
 @pytest.mark.parametrize("change", [_shorter, _longer, _empty])
 def test_objects_of_another_size_come_through_as_they_are(change: Callable[[bytes], bytes]) -> None:
     transport = MemoryTransport(Falsifying(Echo(), change, Occasion({GIVE})))
-    done = transport.transact(Request(GIVE, 1, (1000,)), timeout=PATIENCE_S)
+    done = transport.transact(PtpRequest(GIVE, 1, (1000,)), timeout=PATIENCE_S)
     assert done.data == change(payload(1000))
-    assert transport.transact(Request(GIVE, 1, (1000,)), timeout=PATIENCE_S).data == payload(1000)
+    assert transport.transact(PtpRequest(GIVE, 1, (1000,)), timeout=PATIENCE_S).data == payload(1000)
 
 
-def told(responder: Responder, calls: int = 1) -> list[tuple[Event, ...]]:
+def told(responder: Responder, calls: int = 1) -> list[tuple[PtpEvent, ...]]:
     transport = MemoryTransport(responder)
     ask(transport, RAISE, 2)
     return [transport.events() for _ in range(calls)]
 
 
-A, B = Event(0xC101, parameters=(0,)), Event(0xC101, parameters=(1,))
-STRANGER = Event(0xC1FF)
+A, B = PtpEvent(0xC101, parameters=(0,)), PtpEvent(0xC101, parameters=(1,))
+STRANGER = PtpEvent(0xC1FF)
 
 
 def test_events_in_trouble() -> None:
@@ -152,4 +152,4 @@ def test_wrappers_can_be_wrapped() -> None:
     assert ask(transport, RAISE, 1) == ResponseCode.OK
     assert len(transport.events()) == 3
     with pytest.raises(ProtocolError):
-        transport.transact(Request(GIVE, 1, (5_000_000,)), timeout=PATIENCE_S)
+        transport.transact(PtpRequest(GIVE, 1, (5_000_000,)), timeout=PATIENCE_S)

@@ -13,7 +13,9 @@ from drivers.pjlink.wire import NoResolution
 from drivers.projector import Fault, Power, Severity
 from foundation.errors import DeviceFault, LinkTimeout
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import Announcer, PjLinkPeer, ProjectorDatagrams, ProjectorTraits, SimulatedProjector
+from sim.projectors.pjlink import PjLinkPeer
+from sim.projectors.pjlink_notices import Announcer, ProjectorDatagrams
+from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from tests.contracts.projector import Bench, ProjectorContract
 
 

@@ -23,11 +23,12 @@ from drivers.projector import Power, Severity
 from drivers.serial_projectors import LANGUAGES
 from drivers.serial_projectors.benq import BenqProjector
 from drivers.serial_projectors.epson import EpsonProjector
+from sim.buses.pty import PseudoTerminal
+from sim.buses.serial_cable import serve_network
 from sim.cli import main
 from sim.clock import SimulatedClock
-from sim.projectors.pjlink import ProjectorTraits, SimulatedProjector
-from sim.projectors.pty import PseudoTerminal
-from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer, serve_network
+from sim.projectors.projector import ProjectorTraits, SimulatedProjector
+from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer
 
 AT_ONCE = ProjectorTraits(warm_up_s=0.0, cool_down_s=0.0)
 """Other software waits by its own clock; a projector that is on at once keeps it short."""

@@ -20,7 +20,7 @@ from drivers.links.pipes import Pipe, PipeStalled
 from drivers.links.tcp import TcpServer
 from drivers.ptp.container import ContainerReader, DataPiece, DataStart, encode
 from drivers.ptp.datasets import DeviceInfo
-from drivers.ptp.messages import Request, Response
+from drivers.ptp.messages import PtpRequest, PtpResponse
 from drivers.ptp.usb_transport import UsbTransport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.usb_device import BULK_IN, BULK_OUT, INTERRUPT_IN, Identity, PtpUsbDevice
@@ -150,10 +150,10 @@ def test_a_client_by_others_imports_a_camera_and_talks_to_it(lender: TcpServer) 
     camera = usbip.open(0x04A9, 0x32CA, transport=usbip.USBIP(*lender.address))
     assert camera.device_descriptor.idProduct == 0x32CA
     assert camera.control(0x80, 6, 0x0302, 0x0409, 255)[2:].decode("utf-16-le") == "EOS 6D Mark II"
-    camera.bulk_out(BULK_OUT, encode(Request(GIVE, 1, (1000,))))
+    camera.bulk_out(BULK_OUT, encode(PtpRequest(GIVE, 1, (1000,))))
     messages = ContainerReader().feed(camera.bulk_in(BULK_IN, 4096) + camera.bulk_in(BULK_IN, 512))
-    assert messages == [DataStart(GIVE, 1, 1000), DataPiece(payload(1000), last=True), Response(0x2001, 1)]
-    camera.bulk_out(BULK_OUT, encode(Request(RAISE, 2, (1,))))
+    assert messages == [DataStart(GIVE, 1, 1000), DataPiece(payload(1000), last=True), PtpResponse(0x2001, 1)]
+    camera.bulk_out(BULK_OUT, encode(PtpRequest(RAISE, 2, (1,))))
     assert camera.interrupt_in(INTERRUPT_IN, 8) == bytes.fromhex("10000000040001c1")
     assert camera.interrupt_in(INTERRUPT_IN, 8) == bytes.fromhex("ffffffff00000000")
     camera.close()
@@ -163,7 +163,7 @@ def test_a_client_by_others_asks_a_simulated_eos_what_it_is() -> None:
     eos = SimulatedEos(EOS_550D, SeededFilm(600), SimulatedClock())
     with serve_usbip([PtpUsbDevice(eos)], 0) as server:
         camera = usbip.open(0x04A9, 0x31EA, transport=usbip.USBIP(*server.address))
-        camera.bulk_out(BULK_OUT, encode(Request(0x1001, 0)))
+        camera.bulk_out(BULK_OUT, encode(PtpRequest(0x1001, 0)))
         container = camera.bulk_in(BULK_IN, 65536)
         camera.close()
     info = DeviceInfo.decode(container[12:])
@@ -181,7 +181,7 @@ def test_a_stall_is_told_and_cleared(lender: TcpServer) -> None:
     camera.control(0x02, 1, 0, BULK_OUT, b"")
     camera.control(0x02, 1, 0, BULK_IN, b"")
     camera.control(0x21, 0x66, 0, 0, b"")
-    camera.bulk_out(BULK_OUT, encode(Request(GIVE, 1, (0,))))
+    camera.bulk_out(BULK_OUT, encode(PtpRequest(GIVE, 1, (0,))))
     assert len(camera.bulk_in(BULK_IN, 512)) == 12
     camera.close()
 
@@ -250,7 +250,7 @@ def results(heard: bytes) -> list[tuple[int, int, int, bytes]]:
 
 
 def test_transfers_in_end_in_their_order_once_there_is_something() -> None:
-    command = encode(Request(GIVE, 1, (4,)))
+    command = encode(PtpRequest(GIVE, 1, (4,)))
     heard = Conversation(Echo()).say(
         IMPORT, submit(1, 1, 1, 512), submit(2, 1, 1, 512), submit(100, 0, 2, len(command), command)
     )
@@ -268,7 +268,7 @@ def test_unlinked_transfers_do_not_end() -> None:
 
 
 def test_the_rest_of_a_read_that_came_up_short_is_held() -> None:
-    command = encode(Request(GIVE, 1, (4,)))
+    command = encode(PtpRequest(GIVE, 1, (4,)))
     conversation = (
         IMPORT,
         submit(1, 1, 1, 1024, flags=1),
@@ -279,7 +279,7 @@ def test_the_rest_of_a_read_that_came_up_short_is_held() -> None:
 
 
 def test_a_full_packet_is_closed_where_the_flag_asks() -> None:
-    request = encode(Request(0x9F03, 1))
+    request = encode(PtpRequest(0x9F03, 1))
     data = (512).to_bytes(4, "little") + bytes.fromhex("0200 039f 01000000") + bytes(500)
     for flags, answered in ((0, False), (0x40, True)):
         heard = Conversation(Echo()).say(
@@ -292,7 +292,7 @@ def test_a_full_packet_is_closed_where_the_flag_asks() -> None:
 
 
 def test_a_silent_device_keeps_nobody_from_leaving() -> None:
-    command = encode(Request(HANG, 1))
+    command = encode(PtpRequest(HANG, 1))
     responder = Echo()
     Conversation(responder).say(IMPORT, submit(1, 1, 1, 512), submit(100, 0, 2, len(command), command))
     assert responder.unplugs == 1

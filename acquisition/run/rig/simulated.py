@@ -29,11 +29,14 @@ from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_BODIES
 from sim.camera.film import Film, WorldFilm
 from sim.camera.replay import RecordedFrame, ReplayFilm
-from sim.camera.sensors import BODIES, Body
 from sim.clock import OPENING, SimulatedClock
-from sim.projectors.pjlink import PjLinkPeer, SimulatedProjector, memory_link
+from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.projector import SimulatedProjector
 from sim.projectors.screen import Screen, SimulatedPresenter
-from sim.world.world import Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES, Body
+from sim.world.world import World
 
 SERIAL = "0000000001"
 """Serial number of the simulated body, on its wire and in its frames; one lab has one body."""

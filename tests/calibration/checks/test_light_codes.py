@@ -22,7 +22,7 @@ from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.verdict import judge
 from foundation.errors import FormatError, QualityError
 from foundation.srgb import decode_srgb
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, take
 
 PLAN = plan_illuminations(13, (3000, 6500))

@@ -22,7 +22,7 @@ from calibration.report.report import summary
 from calibration.table.lut import open_lut
 from drivers.presenter import BLACK
 from foundation.errors import FormatError
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
 
 PATCHES = 4000

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from drivers.ptp import container
 from drivers.ptp.codes import EventCode, Operation, ResponseCode
 from drivers.ptp.container import ContainerReader, DataPiece, DataStart, DeviceStatus, Message
-from drivers.ptp.messages import Event, Request, Response, next_transaction
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse, next_transaction
 from foundation.errors import ProtocolError
 from tests.drivers.ptp import examples
 
@@ -20,9 +20,9 @@ U16 = st.integers(0, 0xFFFF)
 U32 = st.integers(0, 0xFFFFFFFF)
 PARAMETERS = st.lists(U32, max_size=5).map(tuple)
 MESSAGES = st.one_of(
-    st.builds(Request, U16, U32, PARAMETERS),
-    st.builds(Response, U16, U32, PARAMETERS),
-    st.builds(Event, U16, U32, PARAMETERS),
+    st.builds(PtpRequest, U16, U32, PARAMETERS),
+    st.builds(PtpResponse, U16, U32, PARAMETERS),
+    st.builds(PtpEvent, U16, U32, PARAMETERS),
 )
 
 
@@ -45,22 +45,22 @@ def split(data: bytes, cuts: Iterable[int]) -> list[bytes]:
 
 def test_commands_are_the_standards_bytes() -> None:
     # USB Still Image 1.0, 7.1.1: length, type, code, transaction, parameters.
-    assert container.encode(Request(Operation.OPEN_SESSION, 0, (1,))) == bytes.fromhex(
+    assert container.encode(PtpRequest(Operation.OPEN_SESSION, 0, (1,))) == bytes.fromhex(
         "10000000 0100 0210 00000000 01000000"
     )
-    assert container.encode(Response(ResponseCode.OK, 7)) == bytes.fromhex("0c000000 0300 0120 07000000")
-    assert container.encode(Event(EventCode.OBJECT_ADDED, 0xFFFFFFFF, (0x91910021,))) == bytes.fromhex(
+    assert container.encode(PtpResponse(ResponseCode.OK, 7)) == bytes.fromhex("0c000000 0300 0120 07000000")
+    assert container.encode(PtpEvent(EventCode.OBJECT_ADDED, 0xFFFFFFFF, (0x91910021,))) == bytes.fromhex(
         "10000000 0400 0240 ffffffff 21009191"
     )
 
 
 def test_a_transaction_as_the_60d_sends_it() -> None:
     assert joined(ContainerReader().feed(examples.USB_STREAM)) == [
-        Request(Operation.GET_DEVICE_PROP_DESC, 22, (0x5001,)),
+        PtpRequest(Operation.GET_DEVICE_PROP_DESC, 22, (0x5001,)),
         DataStart(Operation.GET_DEVICE_PROP_DESC, 22, 20),
         DataPiece(examples.BATTERY_DESC, last=True),
-        Response(ResponseCode.OK, 22),
-        Event(EventCode.EOS_REQUEST_GET_EVENT, 0xFFFFFFFF, (7,)),
+        PtpResponse(ResponseCode.OK, 22),
+        PtpEvent(EventCode.EOS_REQUEST_GET_EVENT, 0xFFFFFFFF, (7,)),
     ]
 
 
@@ -83,15 +83,15 @@ def test_empty_packets_are_passed_over() -> None:
     reader = ContainerReader()
     phase = container.encode_data(0x1009, 5, bytes(500))
     assert container.ends_with_empty_packet(len(phase), 512)
-    pieces = (phase, b"", container.encode(Response(0x2001, 5)))
+    pieces = (phase, b"", container.encode(PtpResponse(0x2001, 5)))
     messages = [message for piece in pieces for message in reader.feed(piece)]
-    assert messages == [DataStart(0x1009, 5, 500), DataPiece(bytes(500), last=True), Response(0x2001, 5)]
+    assert messages == [DataStart(0x1009, 5, 500), DataPiece(bytes(500), last=True), PtpResponse(0x2001, 5)]
 
 
 def test_a_response_may_share_a_read_with_the_data() -> None:
     reader = ContainerReader()
-    stream = container.encode_data(0x1009, 5, b"abc") + container.encode(Response(0x2001, 5, (3,)))
-    assert reader.feed(stream)[-1] == Response(0x2001, 5, (3,))
+    stream = container.encode_data(0x1009, 5, b"abc") + container.encode(PtpResponse(0x2001, 5, (3,)))
+    assert reader.feed(stream)[-1] == PtpResponse(0x2001, 5, (3,))
 
 
 def test_an_empty_data_phase_is_closed_at_once() -> None:
@@ -115,7 +115,7 @@ def test_a_phase_of_unknown_length_ends_with_a_short_packet(length: int, alone: 
     reader = ContainerReader(512)
     messages = joined(message for piece in pieces for message in reader.feed(piece))
     assert messages == [DataStart(0x1009, 5, None), DataPiece(payload, last=True)]
-    assert reader.feed(container.encode(Response(0x2001, 5))) == [Response(0x2001, 5)]
+    assert reader.feed(container.encode(PtpResponse(0x2001, 5))) == [PtpResponse(0x2001, 5)]
 
 
 def test_lengths_beyond_32_bits_are_unknown() -> None:
@@ -148,12 +148,12 @@ def test_what_is_no_container_is_named(octets: str, says: str) -> None:
     with pytest.raises(ProtocolError, match=says):
         reader.feed(bytes.fromhex(octets))
     with pytest.raises(ProtocolError, match=says):
-        reader.feed(container.encode(Response(0x2001, 5)))
+        reader.feed(container.encode(PtpResponse(0x2001, 5)))
 
 
 def test_a_message_before_the_fault_is_not_lost() -> None:
     reader = ContainerReader()
-    assert reader.feed(container.encode(Response(0x2001, 5)) + b"\xff" * 12) == [Response(0x2001, 5)]
+    assert reader.feed(container.encode(PtpResponse(0x2001, 5)) + b"\xff" * 12) == [PtpResponse(0x2001, 5)]
     with pytest.raises(ProtocolError, match="container of type 65535"):
         reader.feed(b"")
 
@@ -167,9 +167,9 @@ def test_nothing_of_a_payload_stays_in_the_reader() -> None:
 
 def test_six_parameters_are_our_own_mistake() -> None:
     with pytest.raises(ValueError, match="at most 5"):
-        container.encode(Request(0x1002, 0, (0,) * 6))
+        container.encode(PtpRequest(0x1002, 0, (0,) * 6))
     with pytest.raises(ValueError, match="does not fit"):
-        container.encode(Request(0x10002))
+        container.encode(PtpRequest(0x10002))
 
 
 @given(
@@ -177,7 +177,7 @@ def test_six_parameters_are_our_own_mistake() -> None:
     st.lists(st.integers(0, 10_000), max_size=12),
 )
 def test_any_split_gives_the_same_messages(
-    items: list[Request | Response | Event | tuple[int, int, bytes]], cuts: list[int]
+    items: list[PtpRequest | PtpResponse | PtpEvent | tuple[int, int, bytes]], cuts: list[int]
 ) -> None:
     stream, expected = b"", list[Message]()
     for item in items:
@@ -212,7 +212,7 @@ def test_transactions_are_numbered_past_the_reserved_ones() -> None:
 
 
 def test_messages_read_well() -> None:
-    assert [Response(code).ok for code in (0x2001, 0x2019)] == [True, False]
-    assert str(Request(0x1002, 0, (1,))) == "OPEN_SESSION (0x1002)(0x1)"
-    assert str(Response(0x2019)) == "DEVICE_BUSY (0x2019)"
-    assert str(Event(0xC999)) == "0xc999"
+    assert [PtpResponse(code).ok for code in (0x2001, 0x2019)] == [True, False]
+    assert str(PtpRequest(0x1002, 0, (1,))) == "OPEN_SESSION (0x1002)(0x1)"
+    assert str(PtpResponse(0x2019)) == "DEVICE_BUSY (0x2019)"
+    assert str(PtpEvent(0xC999)) == "0xc999"

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.ptp import ptpip
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.ptpip import (
     Cancel,
     Data,
@@ -36,13 +36,13 @@ CONVERSATION: tuple[Packet, ...] = (
     InitEventRequest(7),
     InitEventAck(),
     InitFail(1),
-    OperationRequest(Request(0x1002, 0, (1,))),
-    OperationRequest(Request(0x9110, 5), sends_data=True),
+    OperationRequest(PtpRequest(0x1002, 0, (1,))),
+    OperationRequest(PtpRequest(0x9110, 5), sends_data=True),
     StartData(5, 12),
     Data(5, b"\x0c\0\0\0"),
     EndData(5, b"\x1c\xd1\0\0\x04\0\0\0"),
-    Response(0x2001, 5),
-    Event(0x4002, 0xFFFFFFFF, (0x91910021,)),
+    PtpResponse(0x2001, 5),
+    PtpEvent(0x4002, 0xFFFFFFFF, (0x91910021,)),
     Cancel(5),
     Ping(),
     Pong(),
@@ -54,7 +54,7 @@ U32 = st.integers(0, 0xFFFFFFFF)
 PARAMETERS = st.lists(U32, max_size=5).map(tuple)
 NAMES = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=40)
 GUIDS = st.binary(min_size=16, max_size=16)
-REQUESTS = st.builds(Request, U16, U32, PARAMETERS)
+REQUESTS = st.builds(PtpRequest, U16, U32, PARAMETERS)
 PACKETS = st.one_of(
     st.builds(InitCommandRequest, GUIDS, NAMES, U32),
     st.builds(InitCommandAck, U32, GUIDS, NAMES, U32),
@@ -62,8 +62,8 @@ PACKETS = st.one_of(
     st.just(InitEventAck()),
     st.builds(InitFail, U32),
     st.builds(OperationRequest, REQUESTS, st.booleans()),
-    st.builds(Response, U16, U32, PARAMETERS),
-    st.builds(Event, U16, U32, PARAMETERS),
+    st.builds(PtpResponse, U16, U32, PARAMETERS),
+    st.builds(PtpEvent, U16, U32, PARAMETERS),
     st.builds(StartData, U32, st.one_of(st.none(), st.integers(0, ptpip.UNKNOWN_TOTAL - 1))),
     st.builds(Data, U32, st.binary(max_size=300)),
     st.builds(EndData, U32, st.binary(max_size=300)),
@@ -179,7 +179,7 @@ def test_a_length_that_is_not_the_packets() -> None:
         InitCommandRequest(bytes(16), "a\0b"),
         InitCommandRequest(bytes(16), "x" * 256),
         InitEventRequest(1 << 32),
-        OperationRequest(Request(0x1002, 0, (0,) * 6)),
+        OperationRequest(PtpRequest(0x1002, 0, (0,) * 6)),
         StartData(5, 1 << 64),
     ],
 )

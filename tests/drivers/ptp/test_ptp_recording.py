@@ -23,7 +23,7 @@ from drivers.ptp.datasets import (
     decode_u32_array,
     encode_u32_array,
 )
-from drivers.ptp.messages import Request, Response
+from drivers.ptp.messages import PtpRequest, PtpResponse
 from drivers.ptp.ptpip import EndData, OperationRequest, PacketCutter, StartData, encode
 from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded
 
@@ -80,7 +80,7 @@ def test_every_dataset_is_rebuilt_to_the_byte(recording: list[Recorded]) -> None
 def test_every_transaction_crosses_both_cables(recording: list[Recorded]) -> None:
     for entry in recording:
         code, tid, data = int(entry["code"], 16), entry["tid"], payload(entry)
-        request, response = Request(code, tid, tuple(entry["params"])), Response(int(entry["rc"], 16), tid)
+        request, response = PtpRequest(code, tid, tuple(entry["params"])), PtpResponse(int(entry["rc"], 16), tid)
         phase = container.encode_data(code, tid, data) if entry["data"] is not None else b""
         stream = container.encode(request) + phase + container.encode(response)
         pieces = (stream[at : at + 64] for at in range(0, len(stream), 64))
@@ -99,7 +99,7 @@ def test_commands_are_the_bytes_that_the_host_sent(recording: list[Recorded]) ->
     written = ["10000000 0100 0210 00000000 01000000", "0c000000 0100 0110 01000000"]
     written += ["10000000 0100 1491 02000000 01000000", "10000000 0100 1491 03000000 01000000"]
     for entry, octets in zip(recording, written, strict=False):
-        request = Request(int(entry["code"], 16), entry["tid"], tuple(entry["params"]))
+        request = PtpRequest(int(entry["code"], 16), entry["tid"], tuple(entry["params"]))
         assert container.encode(request) == bytes.fromhex(octets)
     settings = [payload(entry) for entry in recording if entry["dir"] == "out"]
     destination, aperture = Property.EOS_CAPTURE_DESTINATION, Property.EOS_APERTURE

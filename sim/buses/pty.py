@@ -15,14 +15,18 @@ import select
 import threading
 import tty
 from types import TracebackType
+from typing import Final
 
 from drivers.links.memory import Peer
 from foundation.errors import LinkClosed
-from sim.projectors.serial import POLLING_S
+from sim.buses.serial_cable import POLLING_S
 
-_WAKE = b"w"
-_END = b"e"
-_PATIENCE_S = 10.0
+_WAKE: Final = b"w"
+_END: Final = b"e"
+"""What rings the serving thread: to say when it has caught up, and to end."""
+
+_PATIENCE_S: Final = 10.0
+"""Longest wait for the thread to catch up; it takes milliseconds unless the machine is overloaded."""
 
 
 class PseudoTerminal:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection
 
 from drivers.links.pipes import Pipe, PipeStalled, UsbPipes
 from drivers.ptp.container import HEADER_LENGTH
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.transport import Transaction, Transport
 from foundation.errors import LinkClosed, LinkTimeout
 from sim.buses.responder import Answer, NoAnswer, Responder
@@ -47,15 +47,15 @@ class TroubledResponder:
     def __init__(self, good: Responder) -> None:
         self.good = good
 
-    def takes_data(self, request: Request) -> bool:
+    def takes_data(self, request: PtpRequest) -> bool:
         """Ask the good device."""
         return self.good.takes_data(request)
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Ask the good device."""
         return self.good.answer(request, data)
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Ask the good device."""
         return self.good.events()
 
@@ -76,10 +76,10 @@ class Declining(TroubledResponder):
         self._code = code
         self._occasion = occasion
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Decline, or ask the good device."""
         if self._occasion.has_come(request.code):
-            return Answer(Response(self._code, request.transaction))
+            return Answer(PtpResponse(self._code, request.transaction))
         return super().answer(request, data)
 
 
@@ -91,7 +91,7 @@ class Hanging(TroubledResponder):
         self._occasion = occasion
         self._obeys = obeys
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Hang, or ask the good device."""
         if self._occasion.has_come(request.code):
             if self._obeys:
@@ -108,7 +108,7 @@ class Interrupting(TroubledResponder):
         self._happens = happens
         self._occasion = occasion
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Let it happen, then ask the good device."""
         if self._occasion.has_come(request.code):
             self._happens()
@@ -123,7 +123,7 @@ class Falsifying(TroubledResponder):
         self._change = change
         self._occasion = occasion
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Ask the good device, and change the data."""
         answer = super().answer(request, data)
         if self._occasion.has_come(request.code) and answer.data is not None:
@@ -134,7 +134,7 @@ class Falsifying(TroubledResponder):
 class LosingEvents(TroubledResponder):
     """Has no events, ever."""
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Take the good device's events, and lose them."""
         super().events()
         return ()
@@ -145,9 +145,9 @@ class DelayingEvents(TroubledResponder):
 
     def __init__(self, good: Responder, calls: int) -> None:
         super().__init__(good)
-        self._under_way: list[tuple[Event, ...]] = [()] * calls
+        self._under_way: list[tuple[PtpEvent, ...]] = [()] * calls
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Return what came up some calls ago."""
         self._under_way.append(super().events())
         return self._under_way.pop(0)
@@ -160,7 +160,7 @@ class RepeatingEvents(TroubledResponder):
         super().__init__(good)
         self._times = times
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Return the good device's events, each several times."""
         return tuple(event for event in super().events() for _ in range(self._times))
 
@@ -168,11 +168,11 @@ class RepeatingEvents(TroubledResponder):
 class StrangeEvents(TroubledResponder):
     """Tells of `stranger`, an event that nobody knows, before each real one."""
 
-    def __init__(self, good: Responder, stranger: Event) -> None:
+    def __init__(self, good: Responder, stranger: PtpEvent) -> None:
         super().__init__(good)
         self._stranger = stranger
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Return the good device's events among strangers."""
         return tuple(event for real in super().events() for event in (self._stranger, real))
 
@@ -392,7 +392,7 @@ class TroubledTransport:
 
     def transact(
         self,
-        request: Request,
+        request: PtpRequest,
         *,
         send: bytes | None = None,
         receive: Callable[[bytes], object] | None = None,
@@ -401,7 +401,7 @@ class TroubledTransport:
         """Carry it out over the good cable."""
         return self.good.transact(request, send=send, receive=receive, timeout=timeout)
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Ask the good cable."""
         return self.good.events()
 
@@ -423,7 +423,7 @@ class LosingResponses(TroubledTransport):
 
     def transact(
         self,
-        request: Request,
+        request: PtpRequest,
         *,
         send: bytes | None = None,
         receive: Callable[[bytes], object] | None = None,
@@ -445,7 +445,7 @@ class PulledOut(TroubledTransport):
 
     def transact(
         self,
-        request: Request,
+        request: PtpRequest,
         *,
         send: bytes | None = None,
         receive: Callable[[bytes], object] | None = None,
