@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
-from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +13,7 @@ from acquisition.lights.illuminations import Illumination, save_illuminations
 from acquisition.session.folder import Session
 from acquisition.session.plan import plan_steps
 from drivers.camera import CapturedFrame
-from drivers.presenter import BLACK, WHITE, Colour
+from drivers.presenter import Colour
 from foundation.errors import FormatError, InputError
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
@@ -28,16 +26,6 @@ LIGHT_SHA = "99a7026172d42714d0293e5598ec1c8e8260d7d0c4b8582ad002c1883494e216"
 @pytest.fixture
 def session(tmp_path: Path) -> Session:
     return Session.create(tmp_path / "s", "", design_chart(bits=1), LIGHTS, plan_steps(LIGHTS, 2))
-
-
-def test_the_plan_puts_white_and_dark_before_between_and_after() -> None:
-    steps = plan_steps(LIGHTS, 2)
-    kinds = "".join(step.kind[0] for step in steps)
-    assert kinds == "wdllwdllwdlwd"
-    assert [step.number for step in steps] == list(range(len(steps)))
-    assert {step.colour for step in steps if step.kind == "white"} == {WHITE}
-    assert {step.colour for step in steps if step.kind == "dark"} == {BLACK}
-    assert [step.illumination for step in steps if step.kind == "light"] == [0, 1, 2, 3, 4]
 
 
 def test_the_plan_survives_the_disk(session: Session) -> None:
@@ -122,43 +110,6 @@ def test_lights_edited_since_are_refused(session: Session, lights: tuple[Illumin
         Session.open(session.folder)
 
 
-def test_a_damaged_journal(session: Session) -> None:
-    session.close()
-    (session.folder / "journal.sqlite").write_bytes(b"not a database at all" * 100)
-    with pytest.raises(FormatError, match="damaged"):
-        Session.open(session.folder)
-
-
-def test_a_journal_without_its_plan(session: Session) -> None:
-    session.close()
-    with closing(sqlite3.connect(session.folder / "journal.sqlite")) as journal, journal:
-        journal.execute("DROP TABLE plan")
-    with pytest.raises(FormatError, match=r"journal\.sqlite is damaged: it lacks its table plan; restore"):
-        Session.open(session.folder)
-
-
-def test_a_journal_that_may_not_be_read_is_not_damaged(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    session.close()
-
-    def refuse(path: Path, mode: str) -> None:
-        raise PermissionError(13, "Permission denied", str(path))
-
-    monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(FormatError, match=r"cannot read .*journal\.sqlite: Permission denied; check its permissions"):
-        Session.open(session.folder)
-
-
-def test_a_journal_that_another_holds_is_not_damaged(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    session.close()
-
-    def locked(path: Path, timeout: float) -> None:
-        raise sqlite3.OperationalError("database is locked")
-
-    monkeypatch.setattr(sqlite3, "connect", locked)
-    with pytest.raises(FormatError, match="database is locked; see that no other program holds it"):
-        Session.open(session.folder)
-
-
 def test_a_session_without_its_settings(session: Session) -> None:
     (session.folder / "session.toml").unlink()
     with pytest.raises(FormatError, match=r"session\.toml, the settings of the session: No such file .*; restore it"):
@@ -169,12 +120,3 @@ def test_a_session_without_its_frames(session: Session) -> None:
     session.frames_folder.rmdir()
     with pytest.raises(FormatError, match=r"frames is missing, .*; restore it from a copy"):
         session.set_aside_strays()
-
-
-def test_a_journal_of_the_future(session: Session) -> None:
-    session.close()
-    with sqlite3.connect(session.folder / "journal.sqlite") as journal:
-        journal.execute("PRAGMA user_version = 99")
-    journal.close()
-    with pytest.raises(FormatError, match="version 99"):
-        Session.open(session.folder)
