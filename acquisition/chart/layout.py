@@ -76,7 +76,7 @@ exposed. None is a colour of the chart: its low bits are not zero.
 """
 
 LEAST_WHITES = 18
-"""White references from which on calibration sees the light fall towards the corners; fewer tell a slope alone."""
+"""White references from which on calibration sees the light fall towards the corners; from fewer, a slope alone."""
 
 LARGEST_PAGE_MM = 10_000.0
 

@@ -94,7 +94,7 @@ class Chart:
     tags, references
         Fiducials and achromatic patches; a print without fiducials has none.
     seed, software
-        What the chart was designed with and by, if its file tells; printed in the margin.
+        What the chart was designed with and by, if its file states it; printed in the margin.
     """
 
     page_mm: tuple[float, float]

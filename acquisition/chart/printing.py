@@ -186,7 +186,7 @@ def _tag_rectangles(tag: Tag) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.u
 
 
 def label_lines(chart: Chart) -> tuple[str, str]:
-    """Return the two lines printed in the margin: what tells this sheet from another, and how to print it."""
+    """Return the two lines printed in the margin: what distinguishes this sheet from others, and how to print it."""
     width, height = chart.page_mm
     bits = "1 bit" if chart.bits == 1 else f"{chart.bits} bits"
     parts = [f"CroP chart, {bits}, {width:g} x {height:g} mm", f"chart.json {chart.sha256[:16]}"]

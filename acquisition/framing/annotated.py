@@ -1,6 +1,6 @@
-"""A frame as a picture for the eye: what of the chart was found on it, or what was looked for and not found.
+"""A frame as a picture to look at: what of the chart was found on it, or what was looked for and not found.
 
-Along the border stand raw pixels, the ones in which corners are told by hand (`acquisition.framing.corners`).
+The ticks along the border count raw pixels, in which corners are given by hand (`acquisition.framing.corners`).
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ _Points = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Framing:
-    """How the chart stands in a picture.
+    """The place and the pose of the chart in a picture.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ def find_chart(
     corners: npt.ArrayLike | None = None,
     near: Framing | None = None,
 ) -> Framing:
-    """Return how `chart` stands in a picture.
+    """Return the place and the pose of `chart` in a picture.
 
     Parameters
     ----------
@@ -103,20 +103,20 @@ def find_chart(
         The frame's name for messages.
     corners
         (4, 2) half-size px, corners of the field of cells, clockwise from the printed top-left, for a chart without
-        tags; found by themselves if not given.
+        tags; found automatically if not given.
     near
-        How the chart stands in another frame of the session: without tags, it then hangs the same way up.
+        The framing of another frame of the session: a chart without tags then has the same orientation.
 
     Raises
     ------
     InputError
-        Corners are told that cannot be, or of a chart with tags.
+        Corners are given that cannot be those of a field, or for a chart with tags.
     RegistrationError
         None of the chart is seen; it is mirrored, too small, another chart, or too little of it fits.
     """
     if chart.tags and corners is not None:
         raise InputError(
-            f"corners are told ({corners_text(corners)}), and this chart has {len(chart.tags)} tags by which it is "
+            f"corners are given ({corners_text(corners)}), and this chart has {len(chart.tags)} tags by which it is "
             "found; leave the corners out, or name the chart.json of the print that hangs before the camera"
         )
     if not chart.tags and isinstance(frame, Mosaic):
@@ -159,10 +159,10 @@ def find_chart(
             )
         )
     residual = project(homography, chart_points[fits]) - frame_points[fits]
-    return Framing(plane, tags, missing, homography, rms(residual), module, *_stand(homography, chart, plane))
+    return Framing(plane, tags, missing, homography, rms(residual), module, *_pose(homography, chart, plane))
 
 
-def _stand(homography: npt.NDArray[np.float64], chart: Chart, plane: Plane) -> tuple[float, bool, float]:
+def _pose(homography: npt.NDArray[np.float64], chart: Chart, plane: Plane) -> tuple[float, bool, float]:
     """Return how much of the picture the page fills, whether it lies inside, and how it is turned, degrees."""
     height, width = plane.values.shape
     page_w, page_h = chart.page_mm
@@ -182,14 +182,14 @@ def _find_field(
     field = find_field(planes, chart, what, corners, before)
     off = ((project(field.homography, field.outline_mm) - field.outline_px) * field.normals).sum(axis=1)
     plane = max(planes, key=paper_level)
-    stand = _stand(field.homography, chart, plane)
-    return Framing(plane, (), (), field.homography, float(np.sqrt((off**2).mean())), float("nan"), *stand, field=field)
+    pose = _pose(field.homography, chart, plane)
+    return Framing(plane, (), (), field.homography, float(np.sqrt((off**2).mean())), float("nan"), *pose, field=field)
 
 
 def _not_found(
     plane: Plane, found: tuple[FoundTag, ...], tags: tuple[FoundTag, ...], looked_for: str, what: str
 ) -> RegistrationError:
-    """Return why the chart is not there, as far as the picture tells."""
+    """Return the likeliest reason, from what the picture shows, why too few of the chart's tags were found."""
     white = paper_level(plane)
     if white < MIN_SIGNAL:
         return RegistrationError(
@@ -199,7 +199,7 @@ def _not_found(
     turned = np.ascontiguousarray(plane.values[:, ::-1])
     if len(find_tags(Plane(plane.channel, turned, (0.0, 0.0)))) > max(1, len(found)):
         return RegistrationError(
-            f"{what} is mirrored: none of {looked_for} reads true, but in a mirror they do; "
+            f"{what} is mirrored: none of {looked_for} is found, but mirrored they are; "
             "take the frame without a mirror, or print the chart unmirrored"
         )
     larger = cv2.resize(plane.values, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)

@@ -1,4 +1,4 @@
-"""A look before the session: do all devices answer, is the chart there, sharp, whole and well exposed.
+"""Check a rig before the session: do all devices answer, is the chart there, sharp, whole and well exposed.
 
 Takes one frame under white and one under black into a temporary folder and keeps neither.
 """
@@ -33,7 +33,7 @@ from foundation.files import write_whole
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What was seen, line by line, and what would not do."""
+    """What was found, line by line, and what is not good enough, a sentence each with its remedy."""
 
     lines: tuple[str, ...]
     faults: tuple[str, ...]
@@ -45,7 +45,7 @@ def check_lab(
     announce: Callable[[str], None] = lambda sentence: None,
     corners: Corners | None = None,
 ) -> CheckReport:
-    """Look through the rig that the settings name; record nothing.
+    """Check the rig that the settings name; record nothing.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def check_lab(
     Raises
     ------
     InputError, DeviceError
-        The settings or a device make a look impossible.
+        The settings or a device make a check impossible.
     """
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
@@ -94,7 +94,7 @@ def check_lab(
 
 
 def _meet(devices: Devices, settings: LabSettings, announce: Callable[[str], None]) -> list[str]:
-    """Make every device ready for a frame; return what they say of themselves, a line each."""
+    """Make every device ready for a frame; return a line about each."""
     body = devices.camera.identity()
     name = body.model if body.model.startswith(body.maker.split()[0]) else f"{body.maker} {body.model}"
     lines = [f"camera      {name}, serial {body.serial}"]
@@ -147,7 +147,7 @@ def _framing_lines(framing: Framing, blur: float) -> list[str]:
 
 
 def _framing_faults(framing: Framing, blur: float) -> list[str]:
-    """Return what of place, size and sharpness would not do, each with its remedy; `blur` in half-size px."""
+    """Return what of place, size and sharpness is not good enough, each with its remedy; `blur` in half-size px."""
     faults: list[str] = []
     if not framing.inside:
         faults.append("the sheet does not lie in the frame with all four corners; move the camera back or turn it")

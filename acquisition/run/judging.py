@@ -1,6 +1,6 @@
-"""Whether a raw frame is well exposed: as asked for, neither clipped nor dark, and dark where it should be.
+"""Judge the exposure of a raw frame: as asked for, neither clipped nor too dark, and dark where it should be.
 
-Counts and what the file says of its exposure; where the chart lies in the picture is the business of
+Reads counts and the exposure that the file states; where the chart lies in the picture is found by
 `acquisition.framing.finding`.
 """
 
@@ -20,6 +20,9 @@ from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import FormatError
 
 BRIGHTEST_PERCENTILE = 99.9
+"""Percentile that stands for the brightest counts: bare paper fills more than a thousandth of a frame, hot photosites
+and reflections less."""
+
 EXPOSURE_TOLERANCE_STOPS = 0.25
 """How far a file's exposure may lie from the one asked for. Nominal values are rounded, and files state either: 0.3 s
 stands for 0.354 s on a dial of half stops, which is 0.24 stops. A dial turned by one third differs by 0.2 to 0.5 stops
@@ -28,14 +31,14 @@ in what the file states, so that most such turns are seen, and every one of more
 
 @dataclass(frozen=True)
 class Exposure:
-    """What a frame's counts say.
+    """How bright a frame's counts are.
 
     Attributes
     ----------
     clipped
         Share of photosites at or above `CLIPPING_SHARE` of saturation, 0 … 1.
     brightest_dn
-        `BRIGHTEST_PERCENTILE` of the counts above black, of the brightest Bayer phase.
+        `BRIGHTEST_PERCENTILE` of the counts above black, of the brightest position of the 2×2 block.
     range_dn
         Saturation minus black.
     """
@@ -62,7 +65,7 @@ def measure_exposure(mosaic: Mosaic) -> Exposure:
 def disagreement(mosaic: Mosaic, asked: ExposureSettings) -> str | None:
     """Return how the exposure that a raw file states differs from the one asked for, or None where it does not.
 
-    What the file does not state cannot differ, nor what it states as 0: the aperture of a lens without contacts.
+    A value that the file does not state is passed over, and so is 0, the aperture of a lens without contacts.
     """
     differing = [
         f"{name} {stated:g} instead of {wanted:g}"
@@ -89,13 +92,13 @@ def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str |
         return None
     if exposure.clipped * 100 > limits.clipped_percent:
         return (
-            f"{exposure.clipped:.1%} of photosites clipped, {limits.clipped_percent:g} % allowed; "
-            "expose shorter and begin a new session"
+            f"{exposure.clipped:.1%} of the photosites are clipped, {limits.clipped_percent:g} % allowed; "
+            "set a shorter exposure (acquire check recommends one) and begin a new session"
         )
     if exposure.brightest_dn < limits.too_dark_dn:
         return (
-            f"the brightest photosites reach {exposure.brightest_dn:.0f} counts above black, "
-            f"{limits.too_dark_dn:g} expected; is the projector on, its picture not muted, the lens cap off?"
+            f"the brightest photosites are {exposure.brightest_dn:.0f} counts above black, "
+            f"at least {limits.too_dark_dn:g} expected; is the projector on, its picture not muted, the lens cap off?"
         )
     return None
 
@@ -106,6 +109,6 @@ def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None
         mosaic = read_raw(path)
     except FormatError as error:
         return str(error)
-    # Of frames taken by other means nobody here knows what was asked for.
+    # What was asked for is not known of frames taken by other means.
     differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
     return differs or refusal(measure_exposure(mosaic), kind, settings.limits)

@@ -1,4 +1,4 @@
-"""Walks the plan: shows each light, settles, releases, saves, judges, and writes all of it down.
+"""Take the frames of a plan, one after another: show the light, settle, release, save, judge, and journal it.
 
 Knows devices by contract only. The plan is a value, why a run ended is a value; what has been taken stays taken
 whatever happens, and a second call goes on where the first stopped.
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
 from acquisition.run.judging import judge_file
-from acquisition.run.lamp import await_health, complaint_of, make_ready
+from acquisition.run.lamp import await_health, health_fault, make_ready
 from acquisition.session.folder import Session
 from acquisition.session.journal import ACCEPTED, REFUSED
 from acquisition.session.plan import SessionStep
@@ -73,7 +73,7 @@ def _take(
 ) -> Outcome:
     clock = devices.clock
     for stray in session.set_aside_strays():
-        session.journal.note(clock.now(), "stray", f"{stray.name}: complete but never counted; kept, not used")
+        session.journal.note(clock.now(), "stray", f"{stray.name}: complete, but not in the journal; kept, not used")
     steps = session.steps
     done = session.done_steps()
     open_steps = [step for step in steps if step.number not in done]
@@ -82,21 +82,21 @@ def _take(
     session.journal.note(clock.now(), "start", f"{len(open_steps)} of {len(steps)} frames to take")
     devices.camera.configure(settings.camera.exposure)
 
-    def tell(what: str, sentence: str) -> None:
+    def report(what: str, sentence: str) -> None:
         session.journal.note(clock.now(), what, sentence)
         announce(f"{what}: {sentence}")
 
     if devices.projector is not None:
-        make_ready(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), tell)
+        make_ready(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), report)
     refused: list[str] = []
     taken = 0
     in_a_row = 0
     for step in open_steps:
-        reason = _take_step(session, step, devices, settings, tell)
+        reason = _take_step(session, step, devices, settings, report)
         observe(step, reason is None)
         if reason is None:
             taken += 1
-            if step.kind != "dark":  # a dark frame is well taken in a dark room, too
+            if step.kind != "dark":  # a dark frame is accepted where no light reaches the chart, too
                 in_a_row = 0
             continue
         refused.append(f"{_name(step)}: {reason}")
@@ -111,14 +111,14 @@ def _take(
 
 
 def _take_step(
-    session: Session, step: SessionStep, devices: Devices, settings: LabSettings, tell: Callable[[str, str], None]
+    session: Session, step: SessionStep, devices: Devices, settings: LabSettings, report: Callable[[str, str], None]
 ) -> str | None:
     """Try a step until its frame is accepted; return None then, else the last refusal."""
     clock = devices.clock
     reason: str | None = None
     for remaining in reversed(range(settings.sequence.attempts)):
         if devices.projector is not None:
-            await_health(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), tell)
+            await_health(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), report)
         kept = session.journal.kept_files(step)
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
         attempt = session.journal.begin(step, f"frames/{stem}", clock.now())
@@ -130,10 +130,10 @@ def _take_step(
             session.journal.fail(attempt, clock.now(), str(error))
             if remaining == 0 or isinstance(error, DeviceFault | DeviceRefused):
                 raise
-            tell("retry", f"{_name(step)}: {error}")
+            report("retry", f"{_name(step)}: {error}")
             continue
-        complaint = complaint_of(devices.projector)
-        reason = judge_file(received.path, step.kind, settings) or (None if complaint is None else str(complaint))
+        fault = health_fault(devices.projector)
+        reason = judge_file(received.path, step.kind, settings) or (None if fault is None else str(fault))
         session.commit(
             attempt,
             file=f"frames/{received.path.name}",

@@ -7,7 +7,7 @@ Rules that hold inside:
 - Rows are never deleted. Times are ISO 8601 text with microseconds and zone, files are named relative to the session's
   folder.
 
-Knows one file; which raw files are really there is the business of `acquisition.session.folder`.
+Knows one file; `acquisition.session.folder` knows which raw files are really there.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class FrameRecord:
 class Attempt:
     """One try at a step as the journal has it.
 
-    `verdict` is None while it is under way, or if it was cut off; `has_frame` tells whether a raw file came of it.
+    `verdict` is None while it is under way, or if it was cut off; `has_frame` is whether a raw file came of it.
     """
 
     id: int
@@ -110,7 +110,7 @@ class Attempt:
 
 @dataclass(frozen=True)
 class SessionEvent:
-    """Something worth remembering that is no frame: start, stop, warm-up, a device's fault."""
+    """What happened at some time that is no frame: start, stop, warm-up, a device's fault."""
 
     at: datetime
     what: str

@@ -98,7 +98,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: the terminal belongs to the user."""
+        """Log nothing: the terminal is the user's."""
 
 
 def open_monitor(folder: Path, port: int) -> ThreadingHTTPServer:

@@ -21,8 +21,8 @@ def test_raw_pixels_become_half_size_ones() -> None:
 @pytest.mark.parametrize(
     ("told", "message"),
     [
-        (GOOD[:3], "3 corners are told"),
-        ((*GOOD, "1,1"), "5 corners are told"),
+        (GOOD[:3], "3 corners are given"),
+        ((*GOOD, "1,1"), "5 corners are given"),
         ((*GOOD[:3], "session"), "'session' is no corner"),
         ((*GOOD[:3], "95"), "'95' is no corner"),
         ((*GOOD[:3], "95,nan"), "'95,nan' is no corner"),

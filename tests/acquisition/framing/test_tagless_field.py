@@ -114,7 +114,7 @@ def test_a_mirror_is_called_a_mirror(white: Mosaic) -> None:
 
 def test_a_light_that_does_not_tell_which_way_up_is_not_guessed_at(tmp_path: Path) -> None:
     mosaic = frame_of(tmp_path, UPRIGHT, Colour(255, 0, 0))
-    with pytest.raises(RegistrationError, match="does not tell which way up it hangs; take a white frame"):
+    with pytest.raises(RegistrationError, match="it is not certain which way up it hangs; take a white frame"):
         find_chart(mosaic, CHART)
     # Known from another frame of the session, or told.
     corners = truth(UPRIGHT, mosaic, field_mm(CHART))
@@ -125,7 +125,7 @@ def test_a_light_that_does_not_tell_which_way_up_is_not_guessed_at(tmp_path: Pat
 
 def test_another_order_of_colours_is_told_apart(white: Mosaic) -> None:
     shuffled = np.random.default_rng(1).permutation(CHART.colours)
-    with pytest.raises(RegistrationError, match=r"rectangle likest to it .* name the chart\.json of this print"):
+    with pytest.raises(RegistrationError, match=r"most similar rectangle .* name the chart\.json of this print"):
         find_chart(white, replace(CHART, colours=shuffled))
 
 
@@ -155,7 +155,7 @@ def test_told_corners_are_drawn_onto_the_outline(white: Mosaic) -> None:
         ([(10, 10), (300, 10), (300, 200)], InputError, "no convex quadrilateral"),
         ([(10, 10), (2000, 10), (2000, 1200), (10, 1200)], InputError, r"do not lie in the picture of \d+×\d+ pixels"),
         ([(36, 25), (34, 247), (358, 248), (361, 30)], InputError, "counter-clockwise"),
-        ([(100, 80), (180, 80), (180, 180), (100, 180)], InputError, "too near to each other: 160 pixels"),
+        ([(100, 80), (180, 80), (180, 180), (100, 180)], InputError, "too close together: 160 pixels"),
         ([(361, 30), (358, 248), (34, 247), (36, 25)], InputError, "fit if they are 72,50 722,60 716,496 68,494"),
         ([(100, 60), (260, 60), (260, 200), (100, 200)], RegistrationError, "corners of the field of cells"),
     ],

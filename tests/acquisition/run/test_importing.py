@@ -92,4 +92,4 @@ def test_a_light_without_an_accepted_frame_is_told_by_the_exit_code(
     write(folder, [light(0), light(1, verdict="refused: a hand"), light(1, verdict=verdict)])
     arguments = ("import", folder / "list.csv", folder / "chart.json", folder / "session")
     assert main(list(map(str, arguments))) == code
-    assert ("without an accepted frame are 1: light 1; list other files" in capsys.readouterr().err) == (code == 4)
+    assert ("1 are without an accepted frame: light 1; list other files" in capsys.readouterr().err) == (code == 4)

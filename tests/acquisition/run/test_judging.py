@@ -52,9 +52,9 @@ def test_the_measure_is_that_of_the_counts(tmp_path: Path) -> None:
     [
         (0.0, 8000, "light", None),
         (0.001, 8000, "light", None),
-        (0.0011, 8000, "light", "0.1% of photosites clipped, 0.1 % allowed"),
-        (0.031, 8000, "white", "3.1% of photosites clipped"),
-        (0.0, 99, "light", "reach 99 counts above black, 100 expected"),
+        (0.0011, 8000, "light", "0.1% of the photosites are clipped, 0.1 % allowed"),
+        (0.031, 8000, "white", "3.1% of the photosites are clipped"),
+        (0.0, 99, "light", "are 99 counts above black, at least 100 expected"),
         (0.0, 100, "white", None),
         (0.0, 8, "dark", None),
         (0.0, 0.06 * RANGE, "dark", "6.0% of saturation, 5 % allowed"),

@@ -351,7 +351,7 @@ def test_a_projector_long_out_of_reach_may_have_lost_its_power(folder: Path) -> 
 
 def test_a_lost_cable_ends_the_run_when_patience_does(folder: Path) -> None:
     disturbed = Disturbed(folder)
-    with pytest.raises(LinkClosed, match=r"nothing listens at .*; the run waited 600 s for that: then run again"):
+    with pytest.raises(LinkClosed, match=r"nothing listens at .*; the run waited 600 s for that and ended:"):
         disturbed.run(disturbed.pull)
     assert len(disturbed.lab.session.frames()) == 2
     disturbed.pull(False)
