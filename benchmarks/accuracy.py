@@ -25,8 +25,8 @@ from acquisition.chart.layout import design_chart
 from acquisition.chart.model import Chart
 from acquisition.config import LabSettings, SequenceSettings, SimulatedSettings
 from acquisition.lights.illuminations import Illumination, plan_illuminations, save_illuminations
-from acquisition.run.rig import sheet, simulated_body, simulated_room
-from acquisition.run.taking import run_session
+from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
+from acquisition.run.run import run_session
 from acquisition.session.folder import Session
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut

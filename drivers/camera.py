@@ -66,6 +66,16 @@ class Camera(Protocol):
         """
         ...
 
+    def shutter_speeds(self) -> tuple[float, ...]:
+        """Return the shutter times that the body offers now, as engraved, seconds, rising; empty if it lists none.
+
+        Raises
+        ------
+        DeviceError
+            It cannot be reached.
+        """
+        ...
+
     def capture(self, into: BinaryIO) -> CapturedFrame:
         """Release the shutter without autofocus and write the raw file, whole and unchanged, to `into`.
 

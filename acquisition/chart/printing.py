@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.margins import PX_MM, Boxes, margin_marks, whole_px
-from acquisition.chart.model import PAPER_WHITE, Chart, Tag
+from acquisition.chart.model import PAPER_WHITE, TAG_MODULES, Chart, Tag
 from foundation.errors import InputError
 from foundation.files import whole_file, write_whole
 
@@ -41,8 +41,6 @@ POINTS_PER_MM = 72 / MM_PER_INCH
 _STRIP_ROWS = 64
 _SUPERSAMPLING = 8
 _LAP_PX, _INSET_PX = 0.2, 0.01
-TAG_MODULES = 8
-"""Modules along the black square of a tag 36h11: 6 of data inside a black border of one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +186,7 @@ def _tag_rectangles(tag: Tag) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.u
 
 
 def label_lines(chart: Chart) -> tuple[str, str]:
-    """Return the two lines printed in the margin: what tells this sheet from another, and how to print it."""
+    """Return the two lines printed in the margin: what distinguishes this sheet from others, and how to print it."""
     width, height = chart.page_mm
     bits = "1 bit" if chart.bits == 1 else f"{chart.bits} bits"
     parts = [f"CroP chart, {bits}, {width:g} x {height:g} mm", f"chart.json {chart.sha256[:16]}"]

@@ -128,7 +128,7 @@ def save_proof(chart: Chart, path: Path) -> None:
 
 
 def instructions(chart: Chart, tiff: bool = True) -> str:
-    """Return what to tell the print shop, with the sheet's own sizes; `tiff` says whether there is one."""
+    """Return instructions for the print shop, with the sheet's own sizes; `tiff` is whether there is one."""
     width, height = chart.page_mm
     left, top, right, bottom = (field_px(chart) * PX_MM).tolist()
     across, down = (math.floor((end - start) / 100) * 100 for start, end in ((left, right), (top, bottom)))

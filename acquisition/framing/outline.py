@@ -52,7 +52,7 @@ _Points = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PreparedPicture:
     """A picture prepared for the search.
 
     Attributes
@@ -82,7 +82,7 @@ class View:
     paleness: _Float
 
     @classmethod
-    def of(cls, planes: Sequence[Plane]) -> View:
+    def of(cls, planes: Sequence[Plane]) -> PreparedPicture:
         """Prepare the planes of red, green and blue."""
         height, width = planes[0].values.shape
         factor = max(1, round(width / _VIEW_PX))
@@ -178,7 +178,7 @@ def _outwards(start: _Points, end: _Points) -> _Points:
     return np.array([y, -x])
 
 
-def follow(view: View, corners_px: _Points) -> Outline | None:
+def follow(picture: PreparedPicture, corners_px: _Points) -> Outline | None:
     """Return the edge between cells and paper near a quadrilateral; None where there is none along one of its sides."""
     corners = np.asarray(corners_px, dtype=np.float64)
     curves = [np.zeros(1)] * 4
@@ -196,7 +196,7 @@ def follow(view: View, corners_px: _Points) -> Outline | None:
             normal = _outwards(start, end)
 
             middle = _bent(along, curves[side], start, end)
-            off, strength = _edges(view.pale_at(middle[:, None] + across[None, :, None] * normal), across, known)
+            off, strength = _edges(picture.pale_at(middle[:, None] + across[None, :, None] * normal), across, known)
             seen = strength > _MIN_EDGE
             if seen.mean() < 0.4:
                 return None

@@ -20,6 +20,9 @@ from drivers.raw.rawfile import Mosaic
 Channel = Literal["R", "G", "B"]
 CHANNELS: tuple[Channel, Channel, Channel] = ("R", "G", "B")
 
+CLIPPING_SHARE = 0.98
+"""Counts above this share of saturation are treated as clipped (judgement: the knee of the response lies above)."""
+
 MIN_SIGNAL = 12.0
 """Counts above black that the brightest parts of the strongest plane must have for a chart to be looked for."""
 

@@ -167,28 +167,28 @@ def parse_ccts(text: str) -> tuple[float, ...]:
         The text is neither, its steps lead away from LAST or are too many, or a temperature is not within
         1000 … 100 000 K.
     """
-    said = f"black bodies {text!r}"
+    given = f"black bodies {text!r}"
     try:
         named = [float(part) for part in text.split(":" if ":" in text else ",") if part.strip()]
     except ValueError as error:
-        raise InputError(f"{said}: expected FIRST:LAST:STEP or K,K,… in kelvin") from error
+        raise InputError(f"{given}: expected FIRST:LAST:STEP or K,K,… in kelvin") from error
     if ":" in text:
         if len(named) != 3:
-            raise InputError(f"{said}: expected FIRST:LAST:STEP or K,K,… in kelvin")
+            raise InputError(f"{given}: expected FIRST:LAST:STEP or K,K,… in kelvin")
         first, last, step = named
-        _require_kelvin((first, last), said)
+        _require_kelvin((first, last), given)
         steps = (last - first) / step if step else math.nan
         if not 0 <= steps < MOST_CCTS:
             raise InputError(
-                f"{said}: steps of {step:g} K do not lead from {first:g} to {last:g} K in at most {MOST_CCTS} "
+                f"{given}: steps of {step:g} K do not lead from {first:g} to {last:g} K in at most {MOST_CCTS} "
                 "temperatures; a fall has a step below 0"
             )
         return tuple(first + step * number for number in range(int(steps + 1e-9) + 1))
-    _require_kelvin(named, said)
+    _require_kelvin(named, given)
     return tuple(named)
 
 
-def _require_kelvin(ccts: Sequence[float], said: str) -> None:
+def _require_kelvin(ccts: Sequence[float], given: str) -> None:
     for cct_k in ccts:
         if not 1000 <= cct_k <= 100_000:
-            raise InputError(f"{said}: {cct_k:g} K is not within 1000 … 100 000 K")
+            raise InputError(f"{given}: {cct_k:g} K is not within 1000 … 100 000 K")

@@ -11,7 +11,8 @@ import json
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-from acquisition.session.folder import Event, Session
+from acquisition.session.folder import Session
+from acquisition.session.journal import SessionEvent
 from acquisition.session.progress import Progress, duration_text, session_progress
 from foundation.errors import CropError, InputError
 
@@ -37,10 +38,10 @@ dt {{ color: #666; }} dd {{ margin: 0; }}
 """
 
 
-def read_state(folder: Path) -> tuple[Progress, list[Event]]:
+def read_state(folder: Path) -> tuple[Progress, list[SessionEvent]]:
     """Return a session's progress and its newest events."""
     with Session.open(folder) as session:
-        return session_progress(session), session.events()[-20:]
+        return session_progress(session), session.journal.events()[-20:]
 
 
 def page(folder: Path) -> str:
@@ -97,7 +98,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: the terminal belongs to the user."""
+        """Log nothing: the terminal is the user's."""
 
 
 def open_monitor(folder: Path, port: int) -> ThreadingHTTPServer:

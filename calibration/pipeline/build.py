@@ -21,8 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.annotated import annotated_png
-from acquisition.session.folder import FrameRecord, Session
-from calibration.checks.labels import angles_off_codes_deg
+from acquisition.session.folder import Session
+from acquisition.session.journal import FrameRecord
+from calibration.checks.light_codes import angles_off_codes_deg
 from calibration.pipeline.checkpoint import Checkpoint, Growing, growing
 from calibration.pipeline.frames import (
     Progress,
@@ -39,11 +40,12 @@ from calibration.pipeline.measuring import FrameFigures, Measured, MeasuredDark,
 from calibration.pipeline.options import Choices
 from calibration.pipeline.result import BuildResult, Growth
 from calibration.pipeline.tally import Tally
-from calibration.radiometry.dark_light import DarkLight
-from calibration.radiometry.darkness import DarkFigures, additivity, drift_gains
+from calibration.radiometry.dark_frames import DarkFrameFigures
+from calibration.radiometry.dark_subtraction import DarkLight
 from calibration.radiometry.greys import NAME as REFERENCES_FILE
 from calibration.radiometry.greys import references_csv
-from calibration.radiometry.paper import Field, corrections
+from calibration.radiometry.paper import FlatField, corrections
+from calibration.radiometry.projector import additivity, drift_gains
 from calibration.registration.movement import Shift
 from calibration.table.lut import SAMPLES as SAMPLES_FILE
 from calibration.table.lut import LutWriter, Provenance
@@ -252,7 +254,7 @@ class _Work:
             "primaries": [record.sha256 for record in self._pure],
         }
         self._before = self._usable(making.load())
-        self._figures: list[FrameFigures | DarkFigures] = []
+        self._figures: list[FrameFigures | DarkFrameFigures] = []
 
     @property
     def taken_in(self) -> int:
@@ -312,15 +314,15 @@ class _Work:
         self._limit = int(told["limit"])
         for record, figures in zip(self._chosen, told["figures"], strict=False):
             if record.kind == "dark":
-                self._figures.append(DarkFigures.recall(record, figures))
+                self._figures.append(DarkFrameFigures.from_json(record, figures))
             else:
-                self._figures.append(FrameFigures.recall(record, self._session.chart.page_mm, figures))
+                self._figures.append(FrameFigures.from_json(record, self._session.chart.page_mm, figures))
         if told["stretch"] != self._stretch.file:
             adopted = next(record for record in self._chosen if record.file == told["stretch"])
             self._stretch = self._measurement.register(decode(self._session, adopted))
         self._tally.restore(before.arrays, self._darks)
         self._subtraction.restore(before.arrays)
-        self._dark = self._subtraction.now
+        self._dark = self._subtraction.current
 
     def _first_dark(self) -> DarkLight:
         """Return what is subtracted from the frames before the first dark one: what that one tells."""
@@ -333,8 +335,8 @@ class _Work:
         return self._choices.subtract_dark and record.kind == "dark"
 
     @property
-    def _darks(self) -> list[DarkFigures]:
-        return [figures for figures in self._figures if isinstance(figures, DarkFigures)]
+    def _darks(self) -> list[DarkFrameFigures]:
+        return [figures for figures in self._figures if isinstance(figures, DarkFrameFigures)]
 
     @property
     def _frames(self) -> list[FrameFigures]:
@@ -360,7 +362,7 @@ class _Work:
             before = self._stretch
             self._stretch = self._measurement.register(decoded)
             shift = self._measurement.moved(before, self._stretch)
-            self._subtraction.move()
+            self._subtraction.restart()
             even = self._is_even(record)
             measured = self._measurement.measure_first(decoded, self._stretch, shift, even, self._dark)
         self._figures.append(measured.figures)
@@ -380,10 +382,10 @@ class _Work:
             "limit": self._limit,
             "stretch": self._stretch.file,
             "sha256": self._writer.sha256,
-            "figures": [figures.told() for figures in self._figures],
+            "figures": [figures.to_json() for figures in self._figures],
         }
         taken_in = self._keys[: len(self._figures)]
-        state = {**self._tally.state(), **self._subtraction.state()}
+        state = {**self._tally.state(), **self._subtraction.to_arrays()}
         self._making.save(Checkpoint(self._identity, taken_in, told, state))
 
     def finish(self, out: Path, report: _Report | None) -> BuildResult:
@@ -392,7 +394,7 @@ class _Work:
         frames, limit, work, tally = self._frames, self._limit, self._measurement, self._tally
         self._told(len(self._figures), len(self._figures), "writing the report")
         white, error = np.zeros((len(lights), 3)), np.zeros((len(lights), 3))
-        fields: list[Field | None] = [None] * len(lights)
+        fields: list[FlatField | None] = [None] * len(lights)
         blacks, subtracted, at_zero = np.zeros((len(lights), 2, 2)), np.zeros((len(lights), 3)), np.zeros(len(lights))
         greys, grey_errors = (np.full((len(lights), len(work.levels.names), 3), np.nan) for _ in range(2))
         for figures in frames:

@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import frame_black
+from acquisition.framing.planes import CLIPPING_SHARE, frame_black
+from calibration.fitting.least_squares import least_squares
 from calibration.pipeline.frames import strongest_channel
 from calibration.pipeline.measuring import STILL_PX, Measurement
-from calibration.radiometry.fitting import least_squares
-from calibration.radiometry.paper import CLIPPED, saturation
+from calibration.radiometry.paper import saturation
 from calibration.registration.movement import Shift
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import FormatError, InputError
@@ -121,7 +121,7 @@ def read_linearity(folder: Path, work: Measurement) -> Linearity:
         limit = saturation(mosaic)
         _require_in_place(work.movement(mosaic, black, strongest_channel(mosaic, black), str(path)), path)
         means, highest = work.patches(mosaic, black)
-        means[highest >= CLIPPED * limit] = np.nan
+        means[highest >= CLIPPING_SHARE * limit] = np.nan
         seen.append(means)
         limits.append(limit - float(black.mean()))
     if len(set(times)) < LEAST_FRAMES:

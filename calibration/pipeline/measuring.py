@@ -18,16 +18,16 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
-from acquisition.framing.planes import CHANNELS, Channel, Plane, channel_offset_px, phases
-from acquisition.framing.tags import Framing
-from acquisition.session.folder import FrameRecord
-from calibration.checks.likeness import Expectation, Likeness
+from acquisition.framing.finding import Framing
+from acquisition.framing.planes import CHANNELS, CLIPPING_SHARE, Channel, Plane, channel_offset_px, phases
+from acquisition.session.journal import FrameRecord
+from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency
 from calibration.pipeline.frames import Decoded
 from calibration.radiometry.cell_field import field_of_cells
-from calibration.radiometry.dark_light import DarkLight, Subtraction, quiet_means, reflectances
-from calibration.radiometry.darkness import DarkFigures, read_dark
-from calibration.radiometry.greys import Levels
-from calibration.radiometry.paper import AROUND, CLIPPED, ORDERS, Field, Paper, PaperReader
+from calibration.radiometry.dark_frames import DarkFrameFigures, measure_dark_frame
+from calibration.radiometry.dark_subtraction import DarkLight, DarkLightEstimator, reflectances, winsorised_means
+from calibration.radiometry.greys import GreyLevels
+from calibration.radiometry.paper import AROUND, ORDERS, FlatField, Paper, PaperReader
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.movement import Shift, gauge_boxes, shift_between
@@ -89,7 +89,7 @@ class FrameFigures:
     shift: Shift
     registered: bool
     paper: Paper
-    likeness: Likeness
+    likeness: FrameConsistency
     greys: _Array = field(default_factory=lambda: np.zeros((0, 3)))
     grey_errors: _Array = field(default_factory=lambda: np.zeros((0, 3)))
     dark: _Array = field(default_factory=lambda: np.zeros(3))
@@ -97,8 +97,8 @@ class FrameFigures:
     blur_px: float = 0.0
     exposure: float = 0.0
 
-    def told(self) -> dict[str, Any]:
-        """Return the figures as JSON holds them; `recall` makes them again to the last bit."""
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as JSON holds them; `from_json` makes them again to the last bit."""
         return {
             "black": self.black.tolist(),
             "channel": self.channel,
@@ -119,10 +119,10 @@ class FrameFigures:
         }
 
     @staticmethod
-    def recall(record: FrameRecord, page_mm: tuple[float, float], told: dict[str, Any]) -> FrameFigures:
-        """Return the figures of a frame from what `told` returned."""
+    def from_json(record: FrameRecord, page_mm: tuple[float, float], told: dict[str, Any]) -> FrameFigures:
+        """Return the figures of a frame from what `to_json` returned."""
         red, green, blue = (tuple(np.array(factor) for factor in factors) for factors in told["field"])
-        field = Field(page_mm, (red, green, blue))
+        field = FlatField(page_mm, (red, green, blue))
         white, error, spread = (np.array(told[name]) for name in ("white", "error", "spread"))
         scatter, block, x_mm, y_mm = told["likeness"]
         return FrameFigures(
@@ -132,7 +132,7 @@ class FrameFigures:
             Shift(*told["shift"]),
             told["registered"],
             Paper(field, white, error, told["references"], spread),
-            Likeness(scatter, block, (x_mm, y_mm)),
+            FrameConsistency(scatter, block, (x_mm, y_mm)),
             np.array(told["greys"]).reshape(-1, 3),
             np.array(told["grey_errors"]).reshape(-1, 3),
             np.array(told["dark"]),
@@ -217,7 +217,7 @@ class MeasuredDark:
         (P, 3) float64 mean counts of cells, then references.
     """
 
-    figures: DarkFigures
+    figures: DarkFrameFigures
     stretch: Stretch
     aside: npt.NDArray[np.int16]
     means: _Array
@@ -269,7 +269,7 @@ class Measurement:
         self._chart, self._window = chart, window
         whites = [reference for reference in chart.references if reference.is_white]
         greys = [reference for reference in chart.references if not reference.is_white]
-        self.levels = Levels.of(greys)
+        self.levels = GreyLevels.of(greys)
         self._white_mm = np.array([reference.centre_mm for reference in whites]).reshape(-1, 2)
         self._grey_mm = np.array([reference.centre_mm for reference in greys]).reshape(-1, 2)
         self._references_mm = np.concatenate([self._white_mm, self._grey_mm])
@@ -288,7 +288,7 @@ class Measurement:
         base = PaperReader(self._white_mm, self.cells_mm, chart.page_mm).read(seen, first.record.file)[0].field
         cells = gather(first.mosaic, first.black, self.first.cells)[0].astype(np.float64)
         level = cells.mean(axis=1)
-        there = self.first.cells.inside & ~self.first.registration.strangers[chart.cell_of_colour]
+        there = self.first.cells.inside & ~self.first.registration.mismatched_cells[chart.cell_of_colour]
         codes = chart.rgb[chart.cell_of_colour]
         if not chart.tags:
             # Its references are in the margin, and do not tell what light there is in the middle.
@@ -299,7 +299,7 @@ class Measurement:
         self.transfer: PhotonTransfer = photon_transfer(level, cells.var(axis=1, ddof=1), window**2)
         self._first_means = np.concatenate([level, samples.mean(axis=1, dtype=np.float64)])
         self._first_seen = seen
-        self._expected = Expectation(codes, self.cells_mm, level / base.at(self.cells_mm), there)
+        self._expected = ConsistencyCheck(codes, self.cells_mm, level / base.at(self.cells_mm), there)
         self.primaries: Primaries | None = None
         self.primaries = self._read_primaries(primaries)
 
@@ -365,14 +365,14 @@ class Measurement:
             peaks.append(highest)
         return np.concatenate(means), np.concatenate(peaks)
 
-    def subtraction(self) -> Subtraction:
+    def subtraction(self) -> DarkLightEstimator:
         """Return what learns the dark light, with the reflectances that the first frame shows."""
         paper, shape = self._paper.read(self._first_seen, self._first_file)
         field = np.concatenate([shape, paper.field.at(self._references_mm)])
         inside = np.concatenate([self.first.cells.inside, self.first.references.inside])
-        return Subtraction(reflectances(self._first_means, field, paper.white), inside, self._window**2)
+        return DarkLightEstimator(reflectances(self._first_means, field, paper.white), inside, self._window**2)
 
-    def learn(self, subtraction: Subtraction, measured: MeasuredDark) -> DarkLight:
+    def learn(self, subtraction: DarkLightEstimator, measured: MeasuredDark) -> DarkLight:
         """Take a dark frame into a subtraction.
 
         Raises
@@ -443,10 +443,10 @@ class Measurement:
         cells, _ = gather(decoded.mosaic, decoded.black, stretch.cells)
         references, _ = gather(decoded.mosaic, decoded.black, stretch.references)
         whites = np.flatnonzero(stretch.references.inside[: len(self._white_mm)])
-        figures, aside = read_dark(
+        figures, aside = measure_dark_frame(
             decoded.record, decoded.black, cells, references[whites], self._base_at_whites[whites]
         )
-        means = np.concatenate([quiet_means(patches, figures.noise) for patches in (cells, references)])
+        means = np.concatenate([winsorised_means(patches, figures.noise) for patches in (cells, references)])
         return MeasuredDark(figures, stretch, aside, means)
 
     def _require_geometry(self, mosaic: Mosaic, what: str) -> None:
@@ -487,7 +487,7 @@ class Measurement:
             values, highest = gather_values(decoded.mosaic, decoded.black, cells, shape, dark_cells)
             kept = noise = None
         mean = patch_means(values[self._expected.cells])
-        likeness = self._expected.held_against(mean, self.transfer.variance(mean) / self._window**2)
+        likeness = self._expected.compare(mean, self.transfer.variance(mean) / self._window**2)
         softer = 0.0 if registered else shift.softer_px2
         figures = FrameFigures(
             decoded.record,
@@ -518,5 +518,5 @@ def _exposure(mosaic: Mosaic) -> float:
 def _means(samples: npt.NDArray[np.float32], highest: npt.NDArray[np.uint16], sites: Sites, saturation: int) -> _Array:
     """Return the mean counts (N, 3) of patches, NaN where one is cut off or clipped."""
     seen = samples.mean(axis=1, dtype=np.float64)
-    seen[~(sites.inside & (highest < CLIPPED * saturation))] = np.nan
+    seen[~(sites.inside & (highest < CLIPPING_SHARE * saturation))] = np.nan
     return seen

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from calibration.checks.stains import Stains
 from calibration.pipeline.linearity import Linearity
 from calibration.pipeline.measuring import FrameFigures
-from calibration.radiometry.darkness import Darkness
+from calibration.radiometry.dark_frames import DarkSummary
 from calibration.radiometry.paper import black_drift
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
@@ -81,8 +81,8 @@ class BuildResult:
         The primaries each alone, by which the field of coloured cells was told from that of paper; None where the plan
         has no light of each alone, or it is too dim.
     off_codes_deg
-        (L,) how far each white is off what its codes give, degrees (`calibration.checks.labels`); None where the lights
-        are too few, or not exposed alike.
+        (L,) how far each white is off what its codes give, degrees (`calibration.checks.light_codes`); None where the
+        lights are too few, or not exposed alike.
     """
 
     session: Path
@@ -102,7 +102,7 @@ class BuildResult:
     grey_names: tuple[str, ...] = ()
     greys: _Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
     grey_errors: _Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
-    darkness: Darkness = field(default_factory=Darkness)
+    darkness: DarkSummary = field(default_factory=DarkSummary)
     added: _Array | None = None
     gains: _Array = field(default_factory=lambda: np.ones((0, 3)))
     transfer: PhotonTransfer | None = None

@@ -16,10 +16,11 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from acquisition.chart.model import Chart
+from acquisition.framing.planes import CLIPPING_SHARE
 from calibration.checks.stains import Stains, find_stains
 from calibration.pipeline.measuring import Measured, MeasuredDark, Stretch
-from calibration.radiometry.darkness import DarkFigures, Darkness, HotSamples, darkness, usual_noise
-from calibration.radiometry.paper import CLIPPED, Field
+from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
+from calibration.radiometry.paper import FlatField
 from calibration.registration.matching import MIN_BLOCK_SCORE
 from calibration.sampling.samples import dead_samples, uneven
 from calibration.table.lut import Unfit
@@ -50,8 +51,8 @@ class Tally:
         self._even_noise = np.zeros((count, 3))
         self._even_frames = 0
         self._covered = _covered_cells(chart, first)
-        self._hot = HotSamples(count, samples)
-        self._darks: list[DarkFigures] = []
+        self._hot = HotPixels(count, samples)
+        self._darks: list[DarkFrameFigures] = []
 
     def add(self, measured: Measured) -> None:
         """Take in a light or white frame."""
@@ -62,7 +63,7 @@ class Tally:
         self._outside |= ~measured.inside
         if measured.figures.registered:
             self._covered |= _covered_cells(self._chart, measured.stretch)
-            self._hot.move(usual_noise(self._darks))
+            self._hot.restart(median_noise(self._darks))
         if measured.samples is not None and measured.noise is not None:
             self._even_sum += measured.samples
             self._even_noise += measured.noise**2
@@ -83,10 +84,10 @@ class Tally:
             "even_sum": self._even_sum,
             "even_noise": self._even_noise,
             "even_frames": np.array(self._even_frames),
-            **self._hot.state(),
+            **self._hot.to_arrays(),
         }
 
-    def restore(self, state: dict[str, npt.NDArray[Any]], darks: list[DarkFigures]) -> None:
+    def restore(self, state: dict[str, npt.NDArray[Any]], darks: list[DarkFrameFigures]) -> None:
         """Go on from what `state` returned, and the figures of the dark frames."""
         self._highest, self._highest_at = state["highest"], state["highest_at"]
         self._outside, self._covered = state["outside"], state["covered"]
@@ -96,9 +97,9 @@ class Tally:
         self._darks = list(darks)
 
     @property
-    def darkness(self) -> Darkness:
+    def darkness(self) -> DarkSummary:
         """What the dark frames say."""
-        return darkness(self._darks, self._hot)
+        return dark_summary(self._darks, self._hot)
 
     def saturated(self, saturation_counts: int) -> bool:
         """Return whether a photosite of a cell reached saturation."""
@@ -110,7 +111,7 @@ class Tally:
         level = np.percentile(self._even_sum.mean(axis=1) / frames, 99.5, axis=0)
         return np.sqrt(np.median(self._even_noise / frames, axis=0)) / np.maximum(level, 1e-6)
 
-    def stains(self, field: Field) -> Stains:
+    def stains(self, field: FlatField) -> Stains:
         """Return where the print is not of its codes' colours; `field` is that of a frame of even light."""
         cells = self._chart.centres_mm[self._chart.cell_of_colour]
         level = self._even_sum.mean(axis=1, dtype=np.float64) / max(self._even_frames, 1) / field.at(cells)
@@ -122,7 +123,7 @@ class Tally:
         hottest = dark.hottest if len(dark.hottest) else np.zeros(self._chart.colour_count)
         dead = dead_samples(self._even_sum / frames)
         unevenness = uneven(self._even_sum / frames, np.sqrt(self._even_noise) / frames)
-        allowed, samples = CLIPPED * saturation_counts, self._even_sum.shape[1]
+        allowed, samples = CLIPPING_SHARE * saturation_counts, self._even_sum.shape[1]
         found: list[Unfit] = []
         for colour in range(self._chart.colour_count):
             cause = ""
@@ -153,4 +154,4 @@ def _covered_cells(chart: Chart, stretch: Stretch) -> npt.NDArray[np.bool_]:
     """Return the cells that do not look like the chart's, alone or with their neighbourhood."""
     blocks, cells = stretch.registration.blocks, chart.cell_of_colour
     nearest = np.asarray(cKDTree(blocks.centres_mm).query(chart.centres_mm[cells])[1])
-    return stretch.registration.strangers[cells] | np.asarray(blocks.score[nearest] < MIN_BLOCK_SCORE)
+    return stretch.registration.mismatched_cells[cells] | np.asarray(blocks.score[nearest] < MIN_BLOCK_SCORE)

@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from calibration.radiometry.fitting import least_squares
-from calibration.radiometry.paper import Field, polynomial
-from calibration.registration.colour_model import code_polynomial, code_powers
+from calibration.fitting.least_squares import least_squares
+from calibration.fitting.polynomials import code_polynomial, code_powers, page_polynomial
+from calibration.radiometry.paper import FlatField
 from foundation.robust import huber_weights, sigma_of
 
 CODE_DEGREE = 8
@@ -41,7 +41,7 @@ def field_of_cells(
     paper_mm: _Array,
     paper: _Array,
     page_mm: tuple[float, float],
-) -> Field:
+) -> FlatField:
     """Return the field of a frame from its cells.
 
     Parameters
@@ -65,7 +65,7 @@ def field_of_cells(
     # Few cells in few blocks cannot tell more light apart from a colour that reacts to another ink.
     order = LIGHT_ORDER if degree == CODE_DEGREE else min(2, degree)
     codes = code_polynomial(rgb, degree)
-    light, at_paper = polynomial(cells_mm, page_mm, order), polynomial(paper_mm, page_mm, order)
+    light, at_paper = page_polynomial(cells_mm, page_mm, order), page_polynomial(paper_mm, page_mm, order)
     # Light's constant is the colours' too; bare paper need not be what ink of code 255 is.
     design = np.block(
         [
@@ -93,4 +93,4 @@ def field_of_cells(
         smooth = least_squares(np.ascontiguousarray(light), shape, np.ones(len(shape)))
         factors.append((smooth / float((light @ smooth).mean()),))
     red, green, blue = factors
-    return Field(page_mm, (red, green, blue))
+    return FlatField(page_mm, (red, green, blue))

@@ -29,7 +29,7 @@ _Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Levels:
+class GreyLevels:
     """The printed levels of grey of a chart.
 
     Attributes
@@ -44,7 +44,7 @@ class Levels:
     level: npt.NDArray[np.int64]
 
     @classmethod
-    def of(cls, references: Sequence[Reference]) -> Levels:
+    def of(cls, references: Sequence[Reference]) -> GreyLevels:
         """Return the levels among references, one for each printed code."""
         codes = sorted({reference.rgb for reference in references}, reverse=True)
         first = {reference.rgb: reference.name for reference in reversed(references)}

@@ -15,18 +15,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from calibration.radiometry.fitting import product
+from acquisition.framing.planes import CLIPPING_SHARE
+from calibration.fitting.least_squares import linear_combinations, product, robust_least_squares
+from calibration.fitting.polynomials import order_of, page_polynomial, page_powers
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import QualityError
-
-CLIPPED = 0.98
-"""Share of saturation from which a count is taken for clipped."""
 
 MAX_BLACK_DRIFT = 1.0
 """Counts that the black level may drift over a session before it is said aloud."""
@@ -56,40 +54,8 @@ def saturation(mosaic: Mosaic) -> int:
     return mosaic.white_level
 
 
-def terms(order: int) -> list[tuple[int, int]]:
-    """Return the degrees (i, j) of a polynomial of total order `order`, lower totals first."""
-    return [(total - j, j) for total in range(order + 1) for j in range(total + 1)]
-
-
-def polynomial(points_mm: npt.ArrayLike, page_mm: tuple[float, float], order: int) -> _Array:
-    """Return the basis (N, terms) at points: products P_i(x) P_j(y) of Legendre polynomials, x, y −1 … 1 on the page.
-
-    Parameters
-    ----------
-    points_mm
-        (N, 2) on the print.
-    page_mm
-        Width and height of the page.
-    order
-        Total order, i + j ≤ order.
-    """
-    points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 2)
-    # Terms stand in rising order, so a lower order's basis is the beginning of a higher one's.
-    return _basis(points.tobytes(), page_mm, max(order, ORDERS[-1]))[:, : len(terms(order))]
-
-
-@lru_cache(maxsize=8)
-def _basis(points: bytes, page_mm: tuple[float, float], order: int) -> _Array:
-    """Return the basis at points (N, 2) float64, read-only; the same cells and references are asked for every frame."""
-    unit = 2 * np.frombuffer(points).reshape(-1, 2) / np.asarray(page_mm, dtype=np.float64) - 1
-    x, y = (np.polynomial.legendre.legvander(unit[:, axis], order) for axis in (0, 1))
-    basis = np.stack([x[:, i] * y[:, j] for i, j in terms(order)], axis=1)
-    basis.setflags(write=False)
-    return basis
-
-
 @dataclass(frozen=True, eq=False)
-class Field:
+class FlatField:
     """The shape of the light over the print, mean 1 over the cells' centres.
 
     Attributes
@@ -103,13 +69,18 @@ class Field:
     page_mm: tuple[float, float]
     coefficients: tuple[tuple[_Array, ...], tuple[_Array, ...], tuple[_Array, ...]]
 
+    @classmethod
+    def uniform(cls, page_mm: tuple[float, float]) -> FlatField:
+        """Return the field that is 1 everywhere on a page of that width and height."""
+        return cls(page_mm, ((), (), ()))
+
     def at(self, points_mm: npt.ArrayLike) -> _Array:
         """Return the field (N, 3) at points (N, 2) mm, > 0."""
         points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
         shape = np.ones((len(points), 3))
         for channel, factors in enumerate(self.coefficients):
             for factor in factors:
-                shape[:, channel] *= product(polynomial(points, self.page_mm, order_of(len(factor))), factor)
+                shape[:, channel] *= product(page_polynomial(points, self.page_mm, order_of(len(factor))), factor)
         return np.maximum(shape, _LEAST_FIELD)
 
     def orders(self) -> tuple[int, ...]:
@@ -122,16 +93,6 @@ class Field:
             [[float(f"{value:.7g}") for value in factor.tolist()] for factor in factors]
             for factors in self.coefficients
         ]
-
-
-def order_of(count: int) -> int:
-    """Return the total order of a polynomial of `count` terms."""
-    return round((np.sqrt(8 * count + 1) - 3) / 2)
-
-
-def even_field(page_mm: tuple[float, float]) -> Field:
-    """Return the field that is 1 everywhere."""
-    return Field(page_mm, ((), (), ()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +113,7 @@ class Paper:
         (3,) float64, RMS of all references about the field, stained ones included, relative to `white`.
     """
 
-    field: Field
+    field: FlatField
     white: _Array
     error: _Array
     references: int
@@ -182,15 +143,15 @@ class PaperReader:
         places_mm: _Array,
         centres_mm: _Array,
         page_mm: tuple[float, float],
-        base: Field | None = None,
+        base: FlatField | None = None,
         order: int = ORDERS[-1],
     ) -> None:
-        self.base = even_field(page_mm) if base is None else base
+        self.base = FlatField.uniform(page_mm) if base is None else base
         self._page_mm, self._order = page_mm, order
-        self._at_places, self._base_at_places = polynomial(places_mm, page_mm, ORDERS[-1]), self.base.at(places_mm)
+        self._at_places, self._base_at_places = page_polynomial(places_mm, page_mm, ORDERS[-1]), self.base.at(places_mm)
         self._base_at_centres = self.base.at(centres_mm)
         # Term by term, so that the compiled loop runs along the cells.
-        self._at_centres = np.ascontiguousarray(polynomial(centres_mm, page_mm, ORDERS[-1]).T)
+        self._at_centres = np.ascontiguousarray(page_polynomial(centres_mm, page_mm, ORDERS[-1]).T)
 
     def read(self, seen: _Array, what: str = "the frame") -> tuple[Paper, _Array]:
         """Return what a frame's paper says, and the frame's field (C, 3) at the cells' centres.
@@ -207,8 +168,6 @@ class PaperReader:
         QualityError
             Fewer than six references can be used.
         """
-        from calibration.sampling import loops
-
         there = np.isfinite(seen).all(axis=1)
         if there.sum() < MIN_REFERENCES:
             raise QualityError(
@@ -220,8 +179,7 @@ class PaperReader:
         solutions = np.zeros((3, basis.shape[1]))
         for channel, (solution, _) in enumerate(fits):
             solutions[channel, : len(solution)] = solution
-        local = np.empty((3, self._at_centres.shape[1]))
-        loops.combined(self._at_centres, solutions, local)
+        local = linear_combinations(self._at_centres, solutions)
         factors: list[tuple[_Array, ...]] = []
         shape = self._base_at_centres.copy()
         white, error, spread = np.zeros(3), np.zeros(3), np.zeros(3)
@@ -240,20 +198,18 @@ class PaperReader:
             error[channel] = scatter / np.sqrt(float(weights.sum()))
             # All references count here: a stain that the fit rightly ignores must still be seen.
             spread[channel] = float(np.sqrt((residual**2).mean())) / max(abs(white[channel]), 1e-9)
-        field = Field(self._page_mm, (factors[0], factors[1], factors[2]))
+        field = FlatField(self._page_mm, (factors[0], factors[1], factors[2]))
         return Paper(field, white, error, int(there.sum()), spread), np.maximum(shape, _LEAST_FIELD)
 
 
 def _best_fit(basis: _Array, known: _Array, values: _Array, highest: int) -> tuple[_Array, _Array]:
     """Return solution (terms,) and weights (N,) of the order that says most with least (BIC), shape `known` given."""
-    from calibration.sampling import loops
-
     best: tuple[float, _Array, _Array] | None = None
     for order in ORDERS[: highest + 1]:
-        count = len(terms(order))
+        count = len(page_powers(order))
         if 3 * count > len(values):
             break
-        solution, weights, residual = loops.robust_fit(basis[:, :count] * known[:, None], values, _ROUNDS)
+        solution, weights, residual = robust_least_squares(basis[:, :count] * known[:, None], values, _ROUNDS)
         variance = float((weights * residual**2).sum() / weights.sum())
         criterion = len(values) * np.log(max(variance, 1e-12)) + count * np.log(len(values))
         if best is None or criterion < best[0]:
@@ -273,7 +229,7 @@ def corrections(
     page_mm: tuple[float, float],
     black: _Array,
     saturation_counts: int,
-    fields: Sequence[Field],
+    fields: Sequence[FlatField],
     *,
     measured: bool = False,
     gains: _Array | None = None,
@@ -316,7 +272,7 @@ def corrections(
         *([] if subtracted is None else [_dark_correction(subtracted)]),
         {
             "name": "saturation",
-            "how": f"cells with a count of {CLIPPED:g} of it or more are unfit",
+            "how": f"cells with a count of {CLIPPING_SHARE:g} of it or more are unfit",
             "unit": "raw counts",
             "value": saturation_counts,
             "from": "measured: photosites of this session reached it"

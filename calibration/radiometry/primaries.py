@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.lights.illuminations import Illumination
-from calibration.radiometry.fitting import product
-from calibration.radiometry.paper import Field, Paper
+from calibration.fitting.least_squares import product
+from calibration.radiometry.paper import FlatField, Paper
 
 LEAST_PAPER = 300.0
 """Counts above black that paper must show under a primary for its field to be told."""
@@ -62,7 +62,7 @@ class Primaries:
     """
 
     lights: tuple[int, int, int]
-    fields: tuple[Field, Field, Field]
+    fields: tuple[FlatField, FlatField, FlatField]
     paper: _Array
     at_cells: _Array
     cells: _Array
@@ -144,6 +144,6 @@ class Primaries:
         }
 
 
-def _for_all_channels(field: Field, channel: int) -> Field:
+def _for_all_channels(field: FlatField, channel: int) -> FlatField:
     factors = field.coefficients[channel]
-    return Field(field.page_mm, (factors, factors, factors))
+    return FlatField(field.page_mm, (factors, factors, factors))

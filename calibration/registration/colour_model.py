@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.radiometry.fitting import least_squares
+from calibration.fitting.least_squares import least_squares
+from calibration.fitting.polynomials import code_powers
 from foundation.robust import huber_weights, sigma_of
 
 _Array = npt.NDArray[np.float64]
@@ -48,18 +49,6 @@ class ColourModel:
     def seen(self, rgb: npt.ArrayLike, points_mm: _Array) -> _Array:
         """Return camera RGB (N, 3), counts, of printed codes at points of the page."""
         return self.flat(rgb) * self.light_at(points_mm)
-
-
-def code_powers(degree: int) -> list[tuple[int, int, int]]:
-    """Return the degrees in red, green and blue of each term of a polynomial in codes of total degree `degree`."""
-    return [(i, j, k) for i in range(degree + 1) for j in range(degree + 1 - i) for k in range(degree + 1 - i - j)]
-
-
-def code_polynomial(rgb: npt.ArrayLike, degree: int) -> _Array:
-    """Return the basis (C, terms) of printed codes (C, 3): products of Legendre polynomials as in `code_powers`."""
-    unit = 2 * np.asarray(rgb, dtype=np.float64) / 255 - 1
-    axes = [np.asarray(np.polynomial.legendre.legvander(unit[:, axis], degree), dtype=np.float64) for axis in range(3)]
-    return np.stack([axes[0][:, i] * axes[1][:, j] * axes[2][:, k] for i, j, k in code_powers(degree)], axis=-1)
 
 
 def _code_terms(rgb: npt.ArrayLike, degree: int) -> _Array:

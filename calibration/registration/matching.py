@@ -49,7 +49,7 @@ _PART_WORTH = 8
 _COLOUR_MISFIT, _MOST_NOISE = 0.003, 0.01
 """Of paper white: what the model of the colours leaves, and what noise may count for beside it."""
 
-_STRANGE = 20.0
+_MOST_MISFIT = 20.0
 _LOOK_CELLS = 0.6
 _COLOUR_PATCHES = 5000
 _INTERPOLATION_PX = 0.28
@@ -298,11 +298,11 @@ class Matcher:
             score = self._compared_softly(_LOOK_CELLS)[3]
         return self._blocks(information, pull, score)
 
-    def slipped(self, strangers: _Mask) -> tuple[_Array, int]:
+    def slipped(self, mismatched_cells: _Mask) -> tuple[_Array, int]:
         """Return the middles (B, 2) mm of parts of the field that look like their neighbours, and of how many parts.
 
         By the colours' own level, which steps and correlations do not look at: what is seen less what is wanted is
-        held against what the next cell would change, part by part. `strangers` (N,) are cells left out.
+        held against what the next cell would change, part by part. `mismatched_cells` (N,) are cells left out.
         """
         seen, wanted, paper = self.patches()
         count = self._chart.colour_count
@@ -311,7 +311,7 @@ class Matcher:
         grid = np.full((2, rows + 2, columns + 2, 3), np.nan)
         for picture, colours in zip(grid, (seen, wanted), strict=True):
             picture[row + 1, column + 1] = colours[:count]
-        grid[0, row[strangers] + 1, column[strangers] + 1] = np.nan
+        grid[0, row[mismatched_cells] + 1, column[mismatched_cells] + 1] = np.nan
         error = (grid[0] - grid[1])[1:-1, 1:-1]
         # Noise, from neighbour to neighbour, and what a model of colours leaves; a slip must not count as usual.
         noise = 1.0484 * np.nanmedian(np.abs(np.diff(error, axis=1)), axis=(0, 1))
@@ -320,7 +320,7 @@ class Matcher:
             (grid[1, 1:-1, 2:] - grid[1, 1:-1, :-2]) / 2 / usual,
             (grid[1, 2:, 1:-1] - grid[1, :-2, 1:-1]) / 2 / usual,
         )
-        error = np.clip(error / usual, -_STRANGE, _STRANGE)
+        error = np.clip(error / usual, -_MOST_MISFIT, _MOST_MISFIT)
         places: list[_Array] = []
         parts_seen = 0
         size = int(np.clip(min(rows, columns) // 2, 4, _SLIP_CELLS))

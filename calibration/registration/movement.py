@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.framing.finding import Framing
 from acquisition.framing.planes import Plane
-from acquisition.framing.tagless_field import Field
-from acquisition.framing.tags import FoundTag, Framing
+from acquisition.framing.tagless_field import FoundField
+from acquisition.framing.tags import FoundTag
 from foundation.robust import huber_weights, sigma_of
 
 MAX_SHIFT_PX = 3.0
@@ -156,7 +157,7 @@ def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
     return np.append(shift, softer) if correlation > 0.5 else None
 
 
-def _strips(field: Field) -> tuple[_Points, _Points]:
+def _strips(field: FoundField) -> tuple[_Points, _Points]:
     """Return the middles (K, 2) px of strips spread over the field's outline, and the directions (K, 2) across it."""
     chosen = np.unique(np.linspace(0, len(field.outline_px) - 1, _STRIPS).round().astype(int))
     return field.outline_px[chosen], field.normals[chosen]
@@ -170,7 +171,7 @@ def _strip_places(middles: _Points, normals: _Points) -> _Points:
     return middles[:, None, None] + u * along[:, None, None] + v * normals[:, None, None]
 
 
-def _field_shift(reference: Plane, plane: Plane, field: Field) -> Shift:
+def _field_shift(reference: Plane, plane: Plane, field: FoundField) -> Shift:
     """Return the movement of the field, from how far strips of its outline moved across themselves."""
     unknown = Shift(0.0, 0.0, 0.0, 0)
     middles, normals = _strips(field)
@@ -225,7 +226,9 @@ def _sampled(plane: Plane, places: _Points) -> _Points:
     return (np.roll(found, 1, axis=1) + 2 * found + np.roll(found, -1, axis=1)) / 4
 
 
-def _rigid(middles: _Points, normals: _Points, moved: _Points, weights: _Points, field: Field, softer: float) -> Shift:
+def _rigid(
+    middles: _Points, normals: _Points, moved: _Points, weights: _Points, field: FoundField, softer: float
+) -> Shift:
     """Return the shift, turn and growth that movements (K,) across strips tell of, robustly."""
     centre = field.corners_px.mean(axis=0)
     x, y = ((middles - centre) / np.abs(field.corners_px - centre).max()).T

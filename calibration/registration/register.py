@@ -22,12 +22,13 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from acquisition.chart.model import Chart
+from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.homography import rms
 from acquisition.framing.outline import refined
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
-from acquisition.framing.sharpness import blur_px
-from acquisition.framing.tagless_field import Field
-from acquisition.framing.tags import Framing, find_chart
+from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
+from acquisition.framing.tagless_field import FoundField
+from acquisition.framing.visibility import MIN_CELL_PX
 from calibration.registration.colour_model import ColourModel
 from calibration.registration.displacement import Displacement
 from calibration.registration.lens import Lens, fit_lens
@@ -38,13 +39,6 @@ from foundation.robust import MAD_TO_SIGMA, sigma_of
 
 SAMPLE_REACH_PX = 3.25
 """From a cell's true centre to the outer edge of its 25 pixels: 2.5, rounding 0.5, registration 0.25."""
-
-MIN_CELL_PX = 8.0
-"""Half-size pixels a cell must have for 25 of them to lie safely inside; 8.6 already bleeds 1 % at σ = 0.7."""
-
-MAX_BLUR_PX = 1.0
-"""σ of the tags' edges up to which cells of any size are found to a few hundredths of a pixel, as `acquire check` has
-it. What such a blur mixes into the samples depends on the cells' size, and the verdict judges it as bleed."""
 
 ROOM_PX = 1.75
 """From there to the edge of a cell of 10 px, for which the limits of places were found."""
@@ -77,12 +71,12 @@ _SLIPPED_SHARE = 0.015
 _LEAST_COLOURS = 64
 """A model fitted on fewer colours is no judge of one of them."""
 
-_STRANGE_SIGMA = 10.0
+_MISMATCH_SIGMA = 10.0
 _NEIGHBOURS = 13
 """A cell and the twelve within two cells of it."""
 
-_STRANGE_NEIGHBOURS = 0.35
-_STRANGE_SHARE = 0.08
+_MISMATCH_NEIGHBOURS = 0.35
+_MISMATCH_SHARE = 0.08
 """Of paper white: the model's own errors at the gamut's corners stay below."""
 
 _Array = npt.NDArray[np.float64]
@@ -107,7 +101,7 @@ class Registration:
         Fit of the cells.
     colours
         The colour model of the frame.
-    strangers
+    mismatched_cells
         (N,) bool, cells in the chart's order whose colour is not nearly the model's: covered, damaged, misprinted.
     agreement
         Correlation of the cells' colours with the model's, the mean of the channels that carry light.
@@ -126,7 +120,7 @@ class Registration:
     lens_residual_px: float
     blocks: Blocks
     colours: ColourModel
-    strangers: _Mask
+    mismatched_cells: _Mask
     agreement: float
     blur_px: float
     cell_px: float
@@ -222,7 +216,7 @@ def register(
     registration = _registered(chart, framing, matcher, marks, lens_rms)
     _judge(registration, MIN_AGREEMENT if chart.tags else MIN_PLAIN_AGREEMENT, what)
     if not chart.tags:
-        _require_own_cells(matcher, registration.strangers, what)
+        _require_own_cells(matcher, registration.mismatched_cells, what)
     return registration
 
 
@@ -233,19 +227,19 @@ def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
     return Anchors(corners_mm, corners_px, np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2)))
 
 
-def _outline(field: Field) -> Anchors:
+def _outline(field: FoundField) -> Anchors:
     """Return the field's outline, whose places are known across alone."""
     known = np.einsum("ni,nj->nij", field.normals, field.normals) / _OUTLINE_SIGMA_PX**2
     return Anchors(field.outline_mm, field.outline_px, known)
 
 
-def _clear_edges(field: Field, planes: list[Plane], blur: float) -> Field:
+def _clear_edges(field: FoundField, planes: list[Plane], blur: float) -> FoundField:
     """Return the field with its outline measured finely, where it is clear enough for that."""
     places, clear = refined(planes, field.outline_px, field.normals, blur)
     return replace(field, outline_mm=field.outline_mm[clear], outline_px=places[clear], normals=field.normals[clear])
 
 
-def _field_through_lens(field: Field, frame_size: tuple[int, int]) -> tuple[Field, Lens, _Array]:
+def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple[FoundField, Lens, _Array]:
     """Return the field without points of its outline that stand apart, which are marks; its lens; and residuals."""
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
     for _ in range(2):
@@ -261,9 +255,9 @@ def _field_through_lens(field: Field, frame_size: tuple[int, int]) -> tuple[Fiel
     return field, lens, residual
 
 
-def _require_own_cells(matcher: Matcher, strangers: _Mask, what: str) -> None:
+def _require_own_cells(matcher: Matcher, mismatched_cells: _Mask, what: str) -> None:
     """Refuse a map on which parts of the field show the colours of the cells beside them."""
-    places, parts = matcher.slipped(strangers)
+    places, parts = matcher.slipped(mismatched_cells)
     if len(places) >= max(_FEW_SLIPPED, _SLIPPED_SHARE * parts):
         x, y = places[0]
         raise RegistrationError(
@@ -287,6 +281,8 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
             f"{what}: a cell is {cell_px:.1f} px wide, at least {MIN_CELL_PX:g} expected for 25 pixels inside it; "
             "bring the camera nearer"
         )
+    # Up to MAX_BLUR_PX cells of any size are found to a few hundredths of a pixel. What such a blur mixes into their
+    # samples depends on the cells' size; the verdict judges it as bleed.
     allowed = max(MAX_BLUR_PX, (cell_px / 2 - SAMPLE_REACH_PX) / 2)
     if not blur <= allowed:
         raise RegistrationError(
@@ -302,15 +298,15 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
     residual = marks.places_px - matcher.to_pixels(marks.points_mm)
     if framing.field is not None:
         residual = (residual * framing.field.normals).sum(axis=1, keepdims=True) * framing.field.normals
-    strangers = np.zeros(chart.colour_count, dtype=np.bool_)
+    mismatched_cells = np.zeros(chart.colour_count, dtype=np.bool_)
     if chart.colour_count >= _LEAST_COLOURS:
-        strangers = _with_neighbours(
-            _strangers(seen, wanted, paper)[: chart.colour_count], chart.centres_mm / np.array(chart.cell_mm)
+        mismatched_cells = _with_neighbours(
+            _mismatched_cells(seen, wanted, paper)[: chart.colour_count], chart.centres_mm / np.array(chart.cell_mm)
         )
     blocks = matcher.blocks()
     if not chart.tags:
-        there[: chart.colour_count] &= ~strangers
-        blocks = _without_strangers(blocks, strangers, chart)
+        there[: chart.colour_count] &= ~mismatched_cells
+        blocks = _without_mismatched_cells(blocks, mismatched_cells, chart)
     return Registration(
         framing=framing,
         lens=matcher.lens,
@@ -319,36 +315,39 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
         lens_residual_px=lens_rms,
         blocks=blocks,
         colours=matcher.colours,
-        strangers=strangers,
+        mismatched_cells=mismatched_cells,
         agreement=_agreement(seen[there], wanted[there]),
         blur_px=matcher.blur_px,
         cell_px=matcher.cell_px,
     )
 
 
-def _without_strangers(blocks: Blocks, strangers: _Mask, chart: Chart) -> Blocks:
-    """Return blocks whose score sinks with the share of strangers: a smooth order looks alike through a wide window."""
+def _without_mismatched_cells(blocks: Blocks, mismatched_cells: _Mask, chart: Chart) -> Blocks:
+    """Return blocks whose score sinks with their share of mismatched cells.
+
+    In a smooth order of colours neighbouring cells look alike through a wide window, covered or not.
+    """
     block = np.asarray(cKDTree(blocks.centres_mm).query(chart.centres_mm)[1])
     cells = np.maximum(np.bincount(block, minlength=len(blocks.score)), 1)
-    share = np.bincount(block, strangers, minlength=len(blocks.score)) / cells
+    share = np.bincount(block, mismatched_cells, minlength=len(blocks.score)) / cells
     return replace(blocks, score=blocks.score * (1 - share))
 
 
-def _strangers(seen: _Array, wanted: _Array, paper: _Array) -> _Mask:
+def _mismatched_cells(seen: _Array, wanted: _Array, paper: _Array) -> _Mask:
     """Return which patches (N,) differ from their model far more than is usual, and by a visible share of white."""
     residual = np.abs(seen - wanted)
     usual = MAD_TO_SIGMA * np.nanmedian(residual, axis=0)
-    return np.asarray(((residual > _STRANGE_SIGMA * usual) & (residual > _STRANGE_SHARE * paper)).any(axis=1))
+    return np.asarray(((residual > _MISMATCH_SIGMA * usual) & (residual > _MISMATCH_SHARE * paper)).any(axis=1))
 
 
-def _with_neighbours(strangers: _Mask, centres: _Array) -> _Mask:
-    """Return the strangers (N,) and the cells amid them, which a cover of their own colour would hide.
+def _with_neighbours(mismatched_cells: _Mask, centres: _Array) -> _Mask:
+    """Return the mismatched cells (N,) and the cells amid them, which a cover of their own colour would hide.
 
     `centres` (N, 2) in cells.
     """
     near = cKDTree(centres).query(centres, k=min(_NEIGHBOURS, len(centres)))[1]
-    share = strangers[np.asarray(near).reshape(len(centres), -1)].mean(axis=1)
-    return np.asarray(strangers | (share > _STRANGE_NEIGHBOURS))
+    share = mismatched_cells[np.asarray(near).reshape(len(centres), -1)].mean(axis=1)
+    return np.asarray(mismatched_cells | (share > _MISMATCH_NEIGHBOURS))
 
 
 def _agreement(seen: _Array, wanted: _Array) -> float:

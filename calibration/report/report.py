@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from acquisition.chart.model import Chart
 from acquisition.session.folder import Session
-from calibration.checks.likeness import can_tell
+from calibration.checks.frame_consistency import has_enough_cells
 from calibration.checks.stains import Stains
 from calibration.pipeline.result import BuildResult
 from calibration.radiometry.paper import MAX_BLACK_DRIFT
@@ -609,7 +609,7 @@ def _course(figure: Any, result: BuildResult) -> None:
 
 def _draw_likeness(axes: Any, count: npt.NDArray[np.integer], result: BuildResult) -> None:
     axes.set(title="cells off what their codes give", ylabel="%", xlabel="frame")
-    if not can_tell(len(result.registration.strangers)):
+    if not has_enough_cells(len(result.registration.mismatched_cells)):
         axes.text(0.5, 0.5, "too few colours to tell", ha="center", va="center", transform=axes.transAxes)
         return
     axes.plot(

@@ -89,11 +89,11 @@ def gather(
     highest
         (N,) uint16, the highest raw count of a patch's photosites.
     """
-    from calibration.sampling import loops
+    from calibration.sampling import kernels
 
     samples = np.empty((len(sites.rows), sites.window**2, 3), dtype=np.float32)
     highest = np.empty(len(sites.rows), dtype=np.uint16)
-    loops.sample(*_photosites(mosaic, black, sites), samples, highest)
+    kernels.sample(*_photosites(mosaic, black, sites), samples, highest)
     return samples, highest
 
 
@@ -109,7 +109,7 @@ def _photosites(
     int,
     npt.NDArray[np.float32],
 ]:
-    """Return the sensor, and where on it patches lie, as the compiled loops want them."""
+    """Return the sensor, and where on it patches lie, as the kernels expect them."""
     width, reach = mosaic.sensor.shape[1], sites.window // 2
     corner = (mosaic.visible.top + 2 * (sites.rows - reach)) * width + mosaic.visible.left + 2 * (sites.columns - reach)
     found = phases(mosaic)
@@ -150,11 +150,11 @@ def table_values(
     ndarray
         (N, S, 3) uint16.
     """
-    from calibration.sampling import loops
+    from calibration.sampling import kernels
 
     dark = np.zeros(field.shape, dtype=np.float32) if dark is None else dark
     values = np.empty(samples.shape, dtype=np.uint16)
-    loops.tabulate(samples, dark, field.astype(np.float32), values)
+    kernels.tabulate(samples, dark, field.astype(np.float32), values)
     return values
 
 
@@ -166,21 +166,21 @@ def gather_values(
     dark: npt.NDArray[np.float32] | None = None,
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
     """Return `table_values` of what `gather` finds, and the highest counts, in a third of the time of both."""
-    from calibration.sampling import loops
+    from calibration.sampling import kernels
 
     dark = np.zeros(field.shape, dtype=np.float32) if dark is None else dark
     values = np.empty((len(sites.rows), sites.window**2, 3), dtype=np.uint16)
     highest = np.empty(len(sites.rows), dtype=np.uint16)
-    loops.sample_to_table(*_photosites(mosaic, black, sites), dark, field.astype(np.float32), values, highest)
+    kernels.sample_to_table(*_photosites(mosaic, black, sites), dark, field.astype(np.float32), values, highest)
     return values, highest
 
 
 def patch_means(values: npt.NDArray[np.uint16]) -> npt.NDArray[np.float64]:
     """Return the means (N, 3) of patches' values (N, S, 3), in an eighth of numpy's time."""
-    from calibration.sampling import loops
+    from calibration.sampling import kernels
 
     means = np.empty((values.shape[0], 3))
-    loops.patch_means(values, means)
+    kernels.patch_means(values, means)
     return means
 
 

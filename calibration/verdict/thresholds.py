@@ -13,14 +13,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from acquisition.framing.planes import MIN_SIGNAL
-from acquisition.framing.tags import MIN_TAG_SHARE
-from calibration.radiometry.paper import CLIPPED, MAX_BLACK_DRIFT
+from acquisition.framing.finding import MIN_TAG_SHARE
+from acquisition.framing.planes import CLIPPING_SHARE, MIN_SIGNAL
+from acquisition.framing.visibility import MIN_CELL_PX
+from calibration.radiometry.paper import MAX_BLACK_DRIFT
 from calibration.registration.register import (
     MAX_BLOCK_RESIDUAL_PX,
     MAX_TAG_RESIDUAL_PX,
     MIN_AGREEMENT,
-    MIN_CELL_PX,
     MIN_GOOD_BLOCKS,
 )
 
@@ -231,7 +231,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
     ),
     Threshold(
         "brightest_share", "Bare paper under the brightest light, of saturation", "share", "at most",
-        0.9, CLIPPED,
+        0.9, CLIPPING_SHARE,
         "the unevenness of the light carries cells into saturation",
         JUDGEMENT + ": 0.8 leaves room for 20 % unevenness",
         "expose less",

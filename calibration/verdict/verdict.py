@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from calibration.checks.likeness import can_tell
+from calibration.checks.frame_consistency import has_enough_cells
 from calibration.pipeline.linearity import curve
 from calibration.pipeline.options import WINDOWS
 from calibration.radiometry.greys import tint_deg
@@ -140,7 +140,7 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "block_residual_px": registration.block_rms_px / registration.room,
         "blocks_good": float(registration.blocks.good.mean()),
         "agreement": registration.agreement,
-        "unfit_share": len(result.unfit) / max(len(registration.strangers), 1),
+        "unfit_share": len(result.unfit) / max(len(registration.mismatched_cells), 1),
         "softer_bleed": max(
             (_bleed_beyond(registration, frame.blur_px, result.window) for frame in result.frames), default=0.0
         ),
@@ -155,7 +155,7 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         figures["doubtful_share"] = float(result.stains.doubtful.mean())
     if len(result.frames) > 1:
         figures["moved_anew"] = float(sum(frame.registered for frame in result.frames))
-    if can_tell(len(registration.strangers)):
+    if has_enough_cells(len(registration.mismatched_cells)):
         figures["unlike_scatter"] = max((frame.likeness.scatter for frame in result.frames), default=0.0)
         figures["unlike_block"] = max((frame.likeness.block for frame in result.frames), default=0.0)
     if registration.framing.field is None:

@@ -21,7 +21,7 @@ from typing import BinaryIO, TypeVar
 
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.canon.body import EosBody
-from drivers.canon.state import WaitingObject, plan
+from drivers.canon.state import WaitingObject, plan, shutter_speeds
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.session import PASSING, OperationDeclined
 from drivers.ptp.transport import Transport
@@ -114,6 +114,21 @@ class CanonEos:
         self._settings = None
         self._carry_out(configured)
         self._settings = settings
+
+    def shutter_speeds(self) -> tuple[float, ...]:
+        """Return the shutter times that the body offers now, as engraved, seconds, rising; empty if it lists none.
+
+        Raises
+        ------
+        DeviceError
+            It cannot be reached.
+        """
+
+        def listed(body: EosBody) -> tuple[float, ...]:
+            body.drain()
+            return shutter_speeds(body.state)
+
+        return self._carry_out(listed)
 
     def capture(self, into: BinaryIO) -> CapturedFrame:
         """Release the shutter without autofocus and write the raw file, whole and unchanged, to `into`.

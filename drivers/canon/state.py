@@ -219,6 +219,12 @@ def plan(state: EosState, settings: ExposureSettings) -> dict[int, bytes]:
     return wanted
 
 
+def shutter_speeds(state: EosState) -> tuple[float, ...]:
+    """Return the nominal shutter times that a body lists, seconds, rising; bulb and codes in no table are left out."""
+    values = {step.code: step.value for step in SHUTTER.steps}
+    return tuple(sorted({values[code] for code in state.lists.get(Property.EOS_SHUTTER_SPEED, ()) if code in values}))
+
+
 def host_destination(state: EosState) -> bytes:
     """Return the value of property 0xd11c that sends frames to the host.
 

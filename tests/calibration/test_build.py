@@ -14,12 +14,13 @@ import pytest
 
 from acquisition.chart.layout import A_SERIES_MM, design_chart
 from acquisition.chart.model import Chart
-from acquisition.session.folder import Session, Step, plan_steps
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep, plan_steps
 from calibration.cli import main
+from calibration.fitting.polynomials import order_of, page_polynomial
 from calibration.pipeline.build import build, check
 from calibration.pipeline.frames import session_sha256
 from calibration.pipeline.result import BuildResult
-from calibration.radiometry.paper import order_of, polynomial
 from calibration.report.report import summary, write_report
 from calibration.table.lut import Lut, open_lut
 from drivers.camera import ExposureSettings
@@ -124,7 +125,7 @@ def test_the_primaries_correction_can_be_undone(table: Lut, built: BuildResult, 
     assert built.primaries is not None
     places = lab.chart.centres_mm[lab.chart.cell_of_colour]
     fields = [
-        np.prod([polynomial(places, lab.chart.page_mm, order_of(len(f))) @ np.array(f) for f in factors], axis=0)
+        np.prod([page_polynomial(places, lab.chart.page_mm, order_of(len(f))) @ np.array(f) for f in factors], axis=0)
         for factors in told["field"]
     ]
     alone = [table.samples[light].mean(axis=1) for light in told["lights"]]
@@ -180,7 +181,7 @@ def test_a_hot_and_a_dead_photosite_are_named(lab: Lab, tmp_path: Path) -> None:
     rgb = codes(chart)
     hot, dead = 100, int(np.argmax((rgb.min(axis=1) > 150) & (rgb.max(axis=1) < 255)))
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         def paint(counts: npt.NDArray[np.uint16]) -> None:
             places = np.rint(lab.world.project(chart.centres_mm[chart.cell_of_colour[[hot, dead]]])).astype(int)
             rows, columns = visible.top + 2 * places[:, 1], visible.left + 2 * places[:, 0]
@@ -202,7 +203,7 @@ def test_a_lamp_that_fades_is_told_and_not_corrected(lab: Lab, tmp_path: Path) -
     lights = LIGHTS[:6]
     steps = len(plan_steps(lights, 2))
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         counts = lab.world.expose(step.colour, SETTINGS, key=(step.number,), lamp=1 - 0.03 * step.number / (steps - 1))
         stream = BytesIO()
         write_dng(stream, counts, lab.world.body, settings=SETTINGS, taken_at=TAKEN_AT)
@@ -301,7 +302,7 @@ def test_a_bump_in_the_night_is_followed(lab: Lab, tmp_path: Path) -> None:
     bumped = hang(room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
     lights = renumbered(LIGHTS[4:8])
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         return (bumped if step.number >= 4 else lab).dng(step.colour, step.number)
 
     with take(lab, tmp_path / "session", lights, frame=frame) as session:
@@ -320,7 +321,7 @@ def test_a_bump_in_the_night_is_followed(lab: Lab, tmp_path: Path) -> None:
 def test_a_small_movement_is_followed_without_registering_anew(lab: Lab, tmp_path: Path) -> None:
     lights = renumbered(LIGHTS[4:6])
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         def move(counts: npt.NDArray[np.uint16]) -> None:
             if step.kind == "light":
                 # A picture mixed with itself one half-size pixel to the right lies a share of a pixel to the right.
@@ -355,7 +356,7 @@ def test_cells_that_cannot_be_used_are_listed_with_their_cause(lab: Lab, tmp_pat
     visible, chart = lab.world.body.visible, lab.chart
     clipped, dusty = int(chart.cell_of_colour[100]), int(chart.cell_of_colour[300])
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         def paint(counts: npt.NDArray[np.uint16]) -> None:
             places = np.rint(lab.world.project(chart.centres_mm[[clipped, dusty]])).astype(int)
             rows, columns = visible.top + 2 * places[:, 1], visible.left + 2 * places[:, 0]
@@ -378,7 +379,7 @@ def test_cells_under_a_cover_are_listed(lab: Lab, tmp_path: Path) -> None:
     visible = lab.world.body.visible
     corner = np.array([220, 130])
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         def cover(counts: npt.NDArray[np.uint16]) -> None:
             top, left = visible.top + 2 * int(corner[1]), visible.left + 2 * int(corner[0])
             counts[top : top + 110, left : left + 110] = 2300

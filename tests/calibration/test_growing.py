@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 import calibration.pipeline.build as building
-from acquisition.session.folder import Session, Step
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep
 from calibration.pipeline.build import append, build
 from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, growing
 from calibration.pipeline.frames import lost_frames
@@ -134,7 +135,7 @@ def test_damage_to_what_was_done_is_noticed(
 def test_a_bump_before_the_interruption_is_remembered(lab: Lab, tmp_path: Path) -> None:
     bumped = hang(room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         return (bumped if step.number >= 3 else lab).dng(step.colour, step.number)
 
     with take(lab, tmp_path / "session", renumbered(LIGHTS[3:9]), frame=frame) as session:

@@ -54,7 +54,7 @@ def test_the_paper_s_whole_grid_on_a_sheet_that_waves_by_six_millimetres(tmp_pat
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert error.max() < 0.7
     assert registration.blocks.good.all()
-    assert not registration.strangers.any()
+    assert not registration.mismatched_cells.any()
     assert registration.agreement > 0.999
 
 
@@ -115,8 +115,8 @@ def test_a_covered_part_is_named_and_does_not_pull_its_neighbours(plain: Lab, tm
     hidden = (np.abs(truth - middle) < 14).all(axis=1)
     free = (np.abs(truth - middle) > 35).any(axis=1)
     assert hidden.sum() >= 4
-    assert registration.strangers[hidden].all()
-    assert not registration.strangers[free].any()
+    assert registration.mismatched_cells[hidden].all()
+    assert not registration.mismatched_cells[free].any()
     error = np.linalg.norm(registration.to_pixels(plain.chart.centres_mm) - truth, axis=1)
     assert error[free].max() < 0.6
 

@@ -12,7 +12,8 @@ import pytest
 from acquisition.chart.layout import A_SERIES_MM, design_chart, paper_chart
 from acquisition.framing.tagless_field import field_mm
 from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import ACCEPTED, Step
+from acquisition.session.journal import ACCEPTED
+from acquisition.session.plan import SessionStep
 from calibration.cli import main
 from calibration.pipeline.build import build
 from calibration.report.report import write_report
@@ -58,7 +59,7 @@ def test_a_bump_is_followed_and_told(plain: Lab, tmp_path: Path, by: tuple[float
     bumped = moved_by(*by)
     lights = renumbered([*LIGHTS[4:8], RED])
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         return (bumped if step.number >= 4 else plain).dng(step.colour, step.number)
 
     with take(plain, tmp_path / "session", lights, frame=frame) as session:
@@ -79,7 +80,7 @@ def test_a_turn_is_registered_anew(plain: Lab, tmp_path: Path) -> None:
     turned = moved_by(0.0, 0.0, roll_deg=0.7)
     lights = renumbered(LIGHTS[4:7])
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         return (turned if step.number >= 3 else plain).dng(step.colour, step.number)
 
     with take(plain, tmp_path / "session", lights, frame=frame) as session:

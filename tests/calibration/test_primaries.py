@@ -11,7 +11,7 @@ import pytest
 
 from acquisition.lights.illuminations import plan_illuminations
 from calibration.pipeline.build import build
-from calibration.radiometry.paper import Field, Paper, PaperReader
+from calibration.radiometry.paper import FlatField, Paper, PaperReader
 from calibration.radiometry.primaries import Primaries, pure_lights
 from calibration.table.lut import open_lut
 from sim.world.room import Room
@@ -67,7 +67,7 @@ def test_one_primary_has_papers_field() -> None:
 
 
 def test_a_dim_primary_tells_nothing() -> None:
-    even = Field(PAGE, ((), (), ()))
+    even = FlatField(PAGE, ((), (), ()))
     dim = [Paper(even, np.array([1000.0, 10, 10]), np.ones(3), 9, np.zeros(3)) for _ in range(2)]
     dim.append(Paper(even, np.array([1.0, 10, 200]), np.ones(3), 9, np.zeros(3)))
     assert Primaries.of((0, 1, 2), dim, [np.ones((10, 3)) for _ in range(3)], RANDOM.random((10, 2))) is None

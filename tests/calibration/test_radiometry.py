@@ -12,16 +12,12 @@ from hypothesis import strategies as st
 
 from calibration.radiometry.paper import (
     AROUND,
-    Field,
+    FlatField,
     Paper,
     PaperReader,
     black_drift,
     corrections,
-    even_field,
-    order_of,
-    polynomial,
     saturation,
-    terms,
 )
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
@@ -34,20 +30,13 @@ PLACES = RANDOM.random((400, 2)) * PAGE
 CENTRES = RANDOM.random((1000, 2)) * PAGE
 
 
-def read_paper(seen: npt.NDArray[np.float64], base: Field | None = None) -> Paper:
+def read_paper(seen: npt.NDArray[np.float64], base: FlatField | None = None) -> Paper:
     return PaperReader(PLACES, CENTRES, PAGE, base).read(seen)[0]
 
 
 def falloff(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     x, y = (2 * points / PAGE - 1).T
     return np.stack([1 / (1 + 0.2 * (x * x + y * y)), 1 / (1 + 0.25 * ((x - 0.1) ** 2 + y * y)), 1 - 0.1 * x], axis=-1)
-
-
-@pytest.mark.parametrize("order", range(8))
-def test_terms_and_orders_agree(order: int) -> None:
-    assert len(terms(order)) == (order + 1) * (order + 2) // 2
-    assert order_of(len(terms(order))) == order
-    assert polynomial(PLACES, PAGE, order).shape == (len(PLACES), len(terms(order)))
 
 
 def test_the_field_is_found_and_its_mean_over_the_cells_is_one() -> None:
@@ -118,8 +107,8 @@ def test_the_table_says_enough_to_undo_the_field() -> None:
 
 
 def test_an_even_field_is_one() -> None:
-    assert even_field(PAGE).at(CENTRES) == pytest.approx(1)
-    assert isinstance(even_field(PAGE), Field)
+    assert FlatField.uniform(PAGE).at(CENTRES) == pytest.approx(1)
+    assert isinstance(FlatField.uniform(PAGE), FlatField)
 
 
 def test_saturation_is_what_the_frame_shows(lab: Lab, tmp_path: Path) -> None:

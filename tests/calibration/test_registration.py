@@ -126,8 +126,8 @@ def test_a_covered_corner_does_not_pull_its_neighbours(tmp_path: Path) -> None:
     assert error[free].max() < 0.6
     hidden = (np.abs(truth - middle) < 95).all(axis=1)
     assert hidden.sum() > 30
-    assert registration.strangers[hidden].all()
-    assert not registration.strangers[free].any()
+    assert registration.mismatched_cells[hidden].all()
+    assert not registration.mismatched_cells[free].any()
 
 
 def test_out_of_focus_is_refused(tmp_path: Path) -> None:

@@ -21,14 +21,15 @@ import pytest
 from acquisition.chart.model import load_chart
 from acquisition.cli import main
 from acquisition.config import load_lab
-from acquisition.run.rig import open_rig, sheet, simulated_body, simulated_room
-from acquisition.run.taking import run_session
+from acquisition.run.rig.opening import open_rig
+from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
+from acquisition.run.run import run_session
 from acquisition.session.folder import Session
 from drivers.links.usb import open_usb
 from drivers.presenter import Colour
 from drivers.projector import Power
 from drivers.raw.rawfile import read_raw
-from foundation.clock import SystemClock
+from foundation.clock import Clock, SystemClock
 from sim.buses.ptpip_server import serve_ptpip
 from sim.buses.pty import PseudoTerminal
 from sim.buses.serial_cable import serve_network
@@ -52,6 +53,11 @@ shutter_s = 0.1
 lamp_drift_per_hour = 0.0
 white_level_share = 3.5
 """
+
+
+def simulated_display(display: str | int | None, clock: Clock) -> SimulatedPresenter:
+    """Stand in for `FullScreen`: whatever display this machine has stays dark."""
+    return SimulatedPresenter(Screen(), clock)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +115,7 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
             text += '[lab.camera]\nconnection = "usb"\n'
             text += f'[lab.projector]\ncontrol = "benq"\ndevice = "{terminal.path}"\n'
         lab.write_text(text)
-        monkeypatch.setattr("acquisition.run.rig.open_usb", partial(open_usb, backend=bus))
+        monkeypatch.setattr("acquisition.run.rig.lab.open_usb", partial(open_usb, backend=bus))
         assert run_session(load_lab(lab), folder / "real", lambda done, total: None).complete
         assert beamer.power() is not Power.ON, "a complete session switches the lamp off"
         assert look() == Colour(0, 0, 0), "the screen is black when the lab is left"
@@ -127,13 +133,12 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
 def test_a_look_tells_what_may_bend_the_light(
     lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    class Doubting(SimulatedPresenter):
+    class WarningPresenter(SimulatedPresenter):
         def warnings(self) -> tuple[str, ...]:
             return ("the gamma ramp is not straight: switch off night light",)
 
-    monkeypatch.setattr("acquisition.run.rig.SimulatedPresenter", Doubting)
-    monkeypatch.setattr(sys, "argv", ["acquire", "check", str(lab)])
-    assert main() == 0
+    monkeypatch.setattr("acquisition.run.rig.simulated.SimulatedPresenter", WarningPresenter)
+    assert main(["check", str(lab)]) == 0
     told = capsys.readouterr()
     assert "gamma ramp is not straight" in told.out
     assert "tags" in told.out
@@ -142,7 +147,7 @@ def test_a_look_tells_what_may_bend_the_light(
 
 @pytest.mark.parametrize("maker", ["epson", "benq"])
 def test_a_makers_language_over_the_network(lab: Path, maker: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("acquisition.run.rig.FullScreen", lambda display, clock: SimulatedPresenter(Screen(), clock))  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", simulated_display)
     beamer = SimulatedProjector(SystemClock(), power=Power.ON)
     peer = partial(EpsonPeer, beamer, network=True) if maker == "epson" else partial(BenqPeer, beamer, network=True)
     with serve_network(peer) as server:

@@ -71,8 +71,7 @@ class Bench:
         return self.lab.parent / "session"
 
     def _outcome(self, *arguments: str) -> tuple[int, str]:
-        self.monkeypatch.setattr(sys, "argv", ["acquire", *arguments])
-        code = main()
+        code = main(arguments)
         lines = [line for line in self.capsys.readouterr().err.splitlines() if line.startswith("error: ")]
         assert len(lines) == 1
         # What was left of a time limit is never twice the same.
@@ -87,8 +86,8 @@ def bench(lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
         choose_display(bench.displays, display)
         return SimulatedPresenter(Screen(), clock)
 
-    monkeypatch.setattr("acquisition.run.rig.FullScreen", presenter)
-    monkeypatch.setattr("acquisition.run.rig.open_usb", partial(open_usb, backend=bench.bus))
+    monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", presenter)
+    monkeypatch.setattr("acquisition.run.rig.lab.open_usb", partial(open_usb, backend=bench.bus))
     return bench
 
 
@@ -163,7 +162,7 @@ def test_a_port_that_answers_something_else(bench: Bench, camera: str) -> None:
 
 
 def test_a_projector_that_does_not_answer(bench: Bench, camera: str) -> None:
-    bench.monkeypatch.setattr("acquisition.run.rig.PjLinkProjector", partial(PjLinkProjector, timeout=0.05))
+    bench.monkeypatch.setattr("acquisition.run.rig.lab.PjLinkProjector", partial(PjLinkProjector, timeout=0.05))
 
     def say_nothing(link: TcpLink) -> None:
         link.read(1, 60.0)

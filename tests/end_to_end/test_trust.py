@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session.folder import Session, Step
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep
 from benchmarks.accuracy import Held, beyond_noise, hold, repeated_variance
 from benchmarks.rooms import random_case
 from calibration.pipeline.build import BuildResult, build
@@ -53,36 +54,36 @@ def wrong(held: Held) -> float:
     return max(beyond_noise(held.error[[n]], held.noise[[n]], chosen[[n]])[2] for n in one if chosen[n].any())
 
 
-def session_of(lab: Lab, folder: Path, frame: Callable[[Step], bytes]) -> Session:
+def session_of(lab: Lab, folder: Path, frame: Callable[[SessionStep], bytes]) -> Session:
     return take(lab, folder / "session", FEW, every=2, frame=frame)
 
 
-def later(step: Step) -> bool:
+def later(step: SessionStep) -> bool:
     """Return whether a step lies in the later half of these sessions."""
     return step.number >= 4
 
 
-def once(step: Step) -> bool:
+def once(step: SessionStep) -> bool:
     """Return whether a step is the first light's, between two white frames that know nothing of it."""
     return step.illumination == 0
 
 
-def swapped(lab: Lab, other: Lab, when: Callable[[Step], bool]) -> Callable[[Step], bytes]:
+def swapped(lab: Lab, other: Lab, when: Callable[[SessionStep], bool]) -> Callable[[SessionStep], bytes]:
     """Return frames of one room, and of another when it is time."""
     return lambda step: (other if when(step) else lab).dng(step.colour, step.number)
 
 
-def exposed(lab: Lab, settings: Callable[[Step], ExposureSettings]) -> Callable[[Step], bytes]:
+def exposed(lab: Lab, settings: Callable[[SessionStep], ExposureSettings]) -> Callable[[SessionStep], bytes]:
     """Return frames of which each has an exposure of its own."""
     return lambda step: lab.dng(step.colour, step.number, settings(step))
 
 
-def shaded(lab: Lab, left: float, when: Callable[[Step], bool]) -> Callable[[Step], bytes]:
+def shaded(lab: Lab, left: float, when: Callable[[SessionStep], bool]) -> Callable[[SessionStep], bytes]:
     """Return frames in which a hand's breadth of the print has so much of its light left when it is time."""
     visible = lab.world.body.visible
     area = np.s_[visible.top + 180 : visible.top + 300, visible.left + 300 : visible.left + 420]
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         def shade(counts: npt.NDArray[np.uint16]) -> None:
             if when(step):
                 light = counts[area].astype(np.float64) - lab.world.body.black
@@ -153,7 +154,7 @@ def test_a_random_room_is_refused_or_right(seed: int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("when", [later, once])
 def test_another_poster_that_is_hung_up_midway_is_refused(
-    lab: Lab, tmp_path: Path, when: Callable[[Step], bool]
+    lab: Lab, tmp_path: Path, when: Callable[[SessionStep], bool]
 ) -> None:
     """Its tags lie where those of the first lay, so that nothing seems to have moved."""
     frame = swapped(lab, hang(seed=7), when)
@@ -168,7 +169,7 @@ def test_a_chart_moved_by_a_cell_is_followed(lab: Lab, tmp_path: Path) -> None:
     visible = lab.world.body.visible
     seen = np.s_[visible.top : visible.top + visible.height, visible.left : visible.left + visible.width]
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         def move(counts: npt.NDArray[np.uint16]) -> None:
             if later(step):
                 counts[seen] = np.roll(counts[seen], 2 * round(across), axis=1)
@@ -184,7 +185,9 @@ def test_a_chart_moved_by_a_cell_is_followed(lab: Lab, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("left", "when"), [(0.05, later), (0.05, once), (0.7, once), (0.85, once)])
-def test_a_hand_in_the_light_is_refused(lab: Lab, tmp_path: Path, left: float, when: Callable[[Step], bool]) -> None:
+def test_a_hand_in_the_light_is_refused(
+    lab: Lab, tmp_path: Path, left: float, when: Callable[[SessionStep], bool]
+) -> None:
     with session_of(lab, tmp_path, shaded(lab, left, when)) as session, pytest.raises(QualityError, match="no table"):
         build(session, tmp_path / "lut")
 
@@ -215,7 +218,7 @@ def test_a_lamp_that_flickers_is_told_and_harms_no_colour(lab: Lab, tmp_path: Pa
 
 @pytest.mark.parametrize(("blur_px", "when"), [(3.0, later), (1.5, later), (1.15, once), (2.5, once)])
 def test_a_focus_that_is_lost_midway_is_refused(
-    lab: Lab, tmp_path: Path, blur_px: float, when: Callable[[Step], bool]
+    lab: Lab, tmp_path: Path, blur_px: float, when: Callable[[SessionStep], bool]
 ) -> None:
     """1.15 px of blur set dark cells off by 4 %, 1.5 px by a sixth of their neighbours."""
     soft = hang(room=replace(lab.world.room, blur_px=blur_px))

@@ -1,0 +1,108 @@
+"""The inner loops of least squares, compiled.
+
+Compiled for the processor at hand at the first call and kept on disk for the next. No state, no lock, and the
+interpreter's is released, so that each frame has a thread to itself. Without licence to reorder sums: a table's bytes
+depend on neither processor nor thread. They are called through `calibration.fitting.least_squares`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.compiled import compiled
+from foundation.robust import MAD_TO_SIGMA
+
+_Array = npt.NDArray[np.float64]
+
+
+@compiled
+def linear_combinations(basis: _Array, factors: _Array, out: _Array) -> None:
+    """Fill out (3, N) with the sums over k of factors[c, k] · basis[k, n]."""
+    out[:] = 0
+    for start in range(0, basis.shape[1], 2048):
+        end = min(start + 2048, basis.shape[1])
+        for term in range(basis.shape[0]):
+            line = basis[term, start:end]
+            for channel in range(3):
+                factor = factors[channel, term]
+                if factor != 0:
+                    sums = out[channel, start:end]
+                    for point in range(end - start):
+                        sums[point] += factor * line[point]
+
+
+@compiled
+def weighted_fit(design: _Array, values: _Array, weights: _Array) -> _Array:
+    """Return the x (K,) that minimises Σ w (values − design x)²."""
+    count, unknowns = design.shape
+    gram, solution = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    for point in range(count):
+        line = design[point]
+        for i in range(unknowns):
+            weighted = weights[point] * line[i]
+            solution[i] += weighted * values[point]
+            for j in range(i + 1):
+                gram[i, j] += weighted * line[j]
+    trace = 0.0
+    for i in range(unknowns):
+        trace += gram[i, i]
+    for i in range(unknowns):
+        gram[i, i] += 1e-10 * max(trace / unknowns, 1e-30)
+    _solve_positive_definite(gram, solution)
+    return solution
+
+
+@compiled
+def robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Array, _Array]:
+    """Return solution (K,), weights (N,) and residuals (N,) of a fit without what lies far off.
+
+    Least squares by the normal equations, reweighted by Tukey's biweight at six robust standard deviations. The
+    design's condition is squared: fit for orthogonal-like bases of order unity. A ridge of 1e-10 keeps equal columns
+    solvable.
+
+    Parameters
+    ----------
+    design
+        (N, K) float64, C order.
+    values
+        (N,) float64.
+    rounds
+        Solutions in a row.
+    """
+    count, unknowns = design.shape
+    weights, residual = np.ones(count), values.copy()
+    solution = np.zeros(unknowns)
+    for _ in range(rounds):
+        solution = weighted_fit(design, values, weights)
+        for point in range(count):
+            predicted = 0.0
+            for i in range(unknowns):
+                predicted += design[point, i] * solution[i]
+            residual[point] = values[point] - predicted
+        scale = MAD_TO_SIGMA * np.median(np.abs(residual)) + 1e-9
+        for point in range(count):
+            inside = max(1 - (residual[point] / (6 * scale)) ** 2, 0.0)
+            weights[point] = inside * inside
+    return solution, weights, residual
+
+
+@compiled
+def _solve_positive_definite(gram: _Array, solution: _Array) -> None:
+    """Replace a right side by the solution, given the lower half of a positive definite matrix (Cholesky)."""
+    unknowns = len(solution)
+    for j in range(unknowns):
+        for k in range(j):
+            for i in range(j, unknowns):
+                gram[i, j] -= gram[i, k] * gram[j, k]
+        pivot = np.sqrt(max(gram[j, j], 1e-300))
+        for i in range(j, unknowns):
+            gram[i, j] /= pivot
+    for i in range(unknowns):
+        for k in range(i):
+            solution[i] -= gram[i, k] * solution[k]
+        solution[i] /= gram[i, i]
+    for i in range(unknowns - 1, -1, -1):
+        for k in range(i + 1, unknowns):
+            solution[i] -= gram[k, i] * solution[k]
+        solution[i] /= gram[i, i]
