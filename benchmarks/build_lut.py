@@ -32,7 +32,7 @@ from acquisition.framing.planes import frame_black
 from acquisition.lights.illuminations import plan_illuminations
 from acquisition.session.folder import ACCEPTED, Session, plan_steps
 from calibration.pipeline.build import build
-from calibration.pipeline.frames import threads
+from calibration.pipeline.prefetching import threads
 from calibration.registration.register import register
 from calibration.sampling.samples import gather_values, sites_at
 from drivers.raw.rawfile import read_raw
