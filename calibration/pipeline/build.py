@@ -39,11 +39,12 @@ from calibration.pipeline.measuring import FrameFigures, Measured, MeasuredDark,
 from calibration.pipeline.options import Choices
 from calibration.pipeline.result import BuildResult, Growth
 from calibration.pipeline.tally import Tally
+from calibration.radiometry.corrections import corrections
 from calibration.radiometry.dark_frames import DarkFrameFigures
 from calibration.radiometry.dark_subtraction import DarkLight
+from calibration.radiometry.flat_field import FlatField
 from calibration.radiometry.greys import NAME as REFERENCES_FILE
 from calibration.radiometry.greys import references_csv
-from calibration.radiometry.paper import FlatField, corrections
 from calibration.radiometry.projector import additivity, drift_gains
 from calibration.registration.movement import Shift
 from calibration.table.lut import SAMPLES as SAMPLES_FILE

@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from acquisition.framing.planes import CHANNELS, Channel, frame_black, phases
 from acquisition.session.folder import FrameRecord, Session
-from calibration.radiometry.paper import saturation
 from calibration.radiometry.primaries import pure_lights
+from calibration.radiometry.sensor_range import saturation
 from calibration.table.lut import Frame, Lut, frames_sha256
 from drivers.raw.rawfile import Mosaic, decode_raw
 from foundation.errors import FormatError

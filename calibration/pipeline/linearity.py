@@ -24,7 +24,7 @@ from acquisition.framing.planes import CLIPPING_SHARE, frame_black
 from calibration.fitting.least_squares import least_squares
 from calibration.pipeline.frames import strongest_channel
 from calibration.pipeline.measuring import STILL_PX, Measurement
-from calibration.radiometry.paper import saturation
+from calibration.radiometry.sensor_range import saturation
 from calibration.registration.movement import Shift
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import FormatError, InputError

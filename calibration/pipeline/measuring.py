@@ -26,8 +26,9 @@ from calibration.pipeline.frames import Decoded
 from calibration.radiometry.cell_field import field_of_cells
 from calibration.radiometry.dark_frames import DarkFrameFigures, measure_dark_frame
 from calibration.radiometry.dark_subtraction import DarkLight, DarkLightEstimator, reflectances, winsorised_means
+from calibration.radiometry.flat_field import FlatField
 from calibration.radiometry.greys import GreyLevels
-from calibration.radiometry.paper import AROUND, ORDERS, FlatField, Paper, PaperReader
+from calibration.radiometry.paper import MAX_ORDER, MAX_ORDER_AROUND, Paper, PaperReader
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.movement import Shift, gauge_boxes, shift_between
@@ -293,7 +294,7 @@ class Measurement:
         if not chart.tags:
             # Its references are in the margin, and do not tell what light there is in the middle.
             base = field_of_cells(codes, self.cells_mm, level, there, self._white_mm, seen, chart.page_mm)
-        order = ORDERS[-1] if chart.tags else AROUND
+        order = MAX_ORDER if chart.tags else MAX_ORDER_AROUND
         self._paper = PaperReader(self._white_mm, self.cells_mm, chart.page_mm, base, order)
         self._base_at_whites = base.at(self._white_mm)
         self.transfer: PhotonTransfer = photon_transfer(level, cells.var(axis=1, ddof=1), window**2)

@@ -12,9 +12,9 @@ from calibration.checks.stains import Stains
 from calibration.pipeline.linearity import Linearity
 from calibration.pipeline.measuring import FrameFigures
 from calibration.radiometry.dark_frames import DarkSummary
-from calibration.radiometry.paper import black_drift
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
+from calibration.radiometry.sensor_range import black_drift
 from calibration.registration.register import Registration
 from calibration.sampling.samples import WINDOW
 from calibration.table.lut import Unfit

@@ -20,7 +20,7 @@ from acquisition.framing.planes import CLIPPING_SHARE
 from calibration.checks.stains import Stains, find_stains
 from calibration.pipeline.measuring import Measured, MeasuredDark, Stretch
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
-from calibration.radiometry.paper import FlatField
+from calibration.radiometry.flat_field import FlatField
 from calibration.registration.matching import MIN_BLOCK_SCORE
 from calibration.sampling.samples import dead_samples, uneven
 from calibration.table.lut import Unfit

@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from acquisition.lights.illuminations import Illumination
 from calibration.fitting.least_squares import product
-from calibration.radiometry.paper import FlatField, Paper
+from calibration.radiometry.flat_field import FlatField
+from calibration.radiometry.paper import Paper
 
 LEAST_PAPER = 300.0
 """Counts above black that paper must show under a primary for its field to be told."""

@@ -26,7 +26,7 @@ from acquisition.session.folder import Session
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.checks.stains import Stains
 from calibration.pipeline.result import BuildResult
-from calibration.radiometry.paper import MAX_BLACK_DRIFT
+from calibration.radiometry.sensor_range import MAX_BLACK_DRIFT
 from calibration.registration.register import Registration
 from calibration.report.mosaic import half_size
 from calibration.sampling.samples import noise_of, rim_against_middle, sites_at

@@ -16,7 +16,8 @@ from calibration.pipeline.build import append, build, check
 from calibration.pipeline.options import Choices
 from calibration.pipeline.result import BuildResult, Growth
 from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances, winsorised_means
-from calibration.radiometry.paper import FlatField, Paper
+from calibration.radiometry.flat_field import FlatField
+from calibration.radiometry.paper import Paper
 from calibration.report.report import summary
 from calibration.table.lut import open_lut
 from drivers.presenter import BLACK

@@ -11,7 +11,8 @@ import pytest
 
 from acquisition.lights.illuminations import plan_illuminations
 from calibration.pipeline.build import build
-from calibration.radiometry.paper import FlatField, Paper, PaperReader
+from calibration.radiometry.flat_field import FlatField
+from calibration.radiometry.paper import Paper, PaperReader
 from calibration.radiometry.primaries import Primaries, pure_lights
 from calibration.table.lut import open_lut
 from sim.world.world import Room
