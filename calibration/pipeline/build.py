@@ -43,12 +43,12 @@ from calibration.radiometry.corrections import corrections
 from calibration.radiometry.dark_frames import DarkFrameFigures
 from calibration.radiometry.dark_subtraction import DarkLight
 from calibration.radiometry.flat_field import FlatField
-from calibration.radiometry.greys import NAME as REFERENCES_FILE
 from calibration.radiometry.greys import references_csv
 from calibration.radiometry.projector import additivity, drift_gains
 from calibration.registration.movement import Shift
-from calibration.table.lut import SAMPLES as SAMPLES_FILE
-from calibration.table.lut import LutWriter, Provenance
+from calibration.table.file_names import REFERENCES, SAMPLES
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
 from calibration.verdict.verdict import refusal, truth_errors_deg
 from foundation.errors import FormatError, QualityError, RegistrationError, first_of
 from foundation.files import write_whole
@@ -266,7 +266,7 @@ class _Work:
         if before is None or before.identity != self._identity or not before.frames:
             return None
         known = before.frames == self._keys[: len(before.frames)]
-        return before if known and (self._making.folder / SAMPLES_FILE).is_file() else None
+        return before if known and (self._making.folder / SAMPLES).is_file() else None
 
     def _open_writer(self) -> LutWriter:
         """Return the writer of the samples, in a folder that holds what the checkpoint tells and nothing else."""
@@ -471,7 +471,7 @@ class _Work:
                 unfit=list(unfit),
             ),
             listed(records),
-            {REFERENCES_FILE: references_csv(work.levels.names, white, error, greys, grey_errors)}
+            {REFERENCES: references_csv(work.levels.names, white, error, greys, grey_errors)}
             if work.levels.names
             else {},
         )

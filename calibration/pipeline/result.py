@@ -17,7 +17,7 @@ from calibration.radiometry.primaries import Primaries
 from calibration.radiometry.sensor_range import black_drift
 from calibration.registration.register import Registration
 from calibration.sampling.samples import WINDOW
-from calibration.table.lut import Unfit
+from calibration.table.provenance import Unfit
 from calibration.verdict.verdict import Verdict, figures_of, judge
 
 _Array = npt.NDArray[np.float64]

@@ -23,7 +23,7 @@ from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, Ho
 from calibration.radiometry.flat_field import FlatField
 from calibration.registration.matching import MIN_BLOCK_SCORE
 from calibration.sampling.samples import dead_samples, uneven
-from calibration.table.lut import Unfit
+from calibration.table.provenance import Unfit
 
 _Array = npt.NDArray[np.float64]
 

@@ -22,7 +22,8 @@ from calibration.pipeline.build import append, build
 from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, growing
 from calibration.pipeline.frames import lost_frames
 from calibration.pipeline.result import BuildResult, Growth
-from calibration.table.lut import damage, open_lut
+from calibration.table.lut import open_lut
+from calibration.table.verification import find_faults
 from foundation.errors import FormatError, InputError
 from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
@@ -227,7 +228,7 @@ def test_a_checkpoint_comes_back_to_the_last_bit(tmp_path: Path) -> None:
 def test_the_frames_of_a_table_are_found_again(session: Session, growing_session: Session, tmp_path: Path) -> None:
     build(session, tmp_path / "lut")
     lut = open_lut(tmp_path / "lut")
-    assert damage(lut) == []
+    assert find_faults(lut) == []
     assert lost_frames(lut, growing_session) == []
     first, second = (growing_session.folder / frame.file for frame in lut.frames[1:3])
     first.unlink()

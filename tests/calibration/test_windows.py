@@ -14,7 +14,9 @@ from calibration.pipeline.build import build, check
 from calibration.pipeline.options import WINDOWS, Choices
 from calibration.report.report import summary as report_summary
 from calibration.report.report import write_report
-from calibration.table.lut import damage, open_lut, summary
+from calibration.table.description import describe
+from calibration.table.lut import open_lut
+from calibration.table.verification import find_faults
 from calibration.verdict.verdict import bleed, figures_of, largest_window
 from foundation.errors import InputError
 
@@ -38,8 +40,8 @@ def test_three_by_three_are_the_inner_samples_of_five_by_five(session: Session, 
     small = build(session, tmp_path / "3", report=write_report, choices=Choices(3))
     five, three = open_lut(tmp_path / "5"), open_lut(tmp_path / "3")
     assert three.samples.shape == (*five.samples.shape[:2], 9, 3)
-    assert "9 samples each" in dict(summary(three))["Colours"]
-    assert damage(three) == []
+    assert "9 samples each" in dict(describe(three))["Colours"]
+    assert find_faults(three) == []
     inner = five.samples.reshape(*five.samples.shape[:2], 5, 5, 3)[:, :, 1:4, 1:4].reshape(three.samples.shape)
     # The same photosites; the field differs, since the references are sampled by the same window.
     off = inner.astype(np.float64) - three.samples
