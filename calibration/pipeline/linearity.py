@@ -146,8 +146,8 @@ def _exposure_s(mosaic: Mosaic, path: Path) -> float:
 
 
 def _require_in_place(shift: Shift, path: Path) -> None:
-    if shift.tags == 0 or shift.largest_px > 5 * STILL_PX:
-        moved = "its tags are not seen" if shift.tags == 0 else f"it lies {shift.largest_px:.2f} px further"
+    if shift.gauges == 0 or shift.largest_px > 5 * STILL_PX:
+        moved = "its tags are not seen" if shift.gauges == 0 else f"it lies {shift.largest_px:.2f} px further"
         raise FormatError(
             f"{path}: the chart is not where the session has it ({moved}); take the series with camera and print as "
             "they stand in the session, before it or after it"

@@ -418,7 +418,7 @@ class Measurement:
         )
         # A turn or a change of distance moves the tags differently; moving the grid along would not mend it.
         turned = shift.largest_px > shift.length_px + STILL_PX
-        if shift.tags == 0 or shift.length_px > BUMP_PX or turned:
+        if shift.gauges == 0 or shift.length_px > BUMP_PX or turned:
             return shift
         cells, references = stretch.cells, stretch.references
         if shift.length_px > STILL_PX:
@@ -479,7 +479,7 @@ class Measurement:
         whites = len(self._white_mm)
         paper, shape = self._paper.read(seen[:whites], decoded.record.file)
         if self.primaries is not None:
-            shape = shape * self.primaries.beside_paper(paper.white)
+            shape = shape * self.primaries.field_ratio(paper.white)
         greys, grey_errors = self.levels.read(seen[whites:], paper.field.at(self._grey_mm))
         if even:
             kept, highest = gather(decoded.mosaic, decoded.black, cells)

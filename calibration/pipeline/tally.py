@@ -136,7 +136,7 @@ class Tally:
             elif self._covered[colour]:
                 cause = "covered: it does not look like the chart's (covered, damaged, or printed otherwise)"
             elif stains.stained[colour]:
-                aside = stains.told(colour)
+                aside = stains.deviation_of(colour)
                 how = f"{abs(aside):.1%} {'darker' if aside < 0 else 'brighter'}"
                 cause = f"stained: it is, or its surroundings are, {how} than their codes elsewhere on the print"
             elif hottest[colour] > 0:

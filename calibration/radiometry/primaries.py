@@ -104,7 +104,7 @@ class Primaries:
 
         return np.asarray(nnls(self.paper.T, np.maximum(white, 0))[0])
 
-    def beside_paper(self, white: _Array) -> _Array:
+    def field_ratio(self, white: _Array) -> _Array:
         """Return the field of each cell over the field of paper in its place, (C, 3), near 1.
 
         Parameters

@@ -46,7 +46,7 @@ class Shift:
         further right or down.
     largest_px
         The largest movement of a tag, or of a corner of the field, so that a rotation shows.
-    tags
+    gauges
         Tags, or strips, that could be measured; 0 leaves the rest 0 and means unknown.
     softer_px2
         How much more blurred the later frame is: the difference of the blurs' variances, half-size px², negative when
@@ -56,7 +56,7 @@ class Shift:
     dx: float
     dy: float
     largest_px: float
-    tags: int
+    gauges: int
     softer_px2: float = 0.0
 
     @property

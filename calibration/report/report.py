@@ -518,7 +518,7 @@ def _field(figure: Any, chart: Chart, result: BuildResult) -> None:
 
 def _print_drawn(chart: Chart, stains: Stains) -> list[tuple[str, str, bytes]]:
     """Return the picture of the print, or none where nothing can be told of it: a clean sheet would be a claim."""
-    if not stains.tells:
+    if not stains.known:
         return []
     caption = (
         "How far cells and their surroundings are off what their codes give elsewhere on the sheet, in the channel "
@@ -536,7 +536,7 @@ def _print(figure: Any, chart: Chart, stains: Stains) -> None:
     # A marker's size is an area in points: of a cell, with the axes about 8.2 inches wide.
     side = 72 * 8.2 / page_w * float(np.mean(chart.cell_mm))
     image = axes.scatter(
-        *places.T, c=100 * stains.largest(), s=side**2, marker="s", linewidths=0, cmap="RdBu", vmin=-3, vmax=3
+        *places.T, c=100 * stains.largest_deviation(), s=side**2, marker="s", linewidths=0, cmap="RdBu", vmin=-3, vmax=3
     )
     axes.plot(*places[stains.stained].T, "x", color=_INK, markersize=max(3.0, 0.5 * side), markeredgewidth=0.8)
     axes.set(xlabel="mm", ylabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal")

@@ -136,8 +136,8 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "cell_px": registration.cell_px,
         "bleed": bleed(registration.cell_px, registration.blur_px, result.window),
         "tag_residual_px": registration.lens_residual_px,
-        "tag_final_px": registration.marks_rms_px / registration.room,
-        "block_residual_px": registration.block_rms_px / registration.room,
+        "tag_final_px": registration.marks_rms_px / registration.clearance,
+        "block_residual_px": registration.block_rms_px / registration.clearance,
         "blocks_good": float(registration.blocks.good.mean()),
         "agreement": registration.agreement,
         "unfit_share": len(result.unfit) / max(len(registration.mismatched_cells), 1),
@@ -151,7 +151,7 @@ def figures_of(result: BuildResult) -> dict[str, float]:
         "brightest_share": float(paper.max()) / result.white_level,
         "darkest_counts": float(paper.min()),
     }
-    if result.stains.tells:
+    if result.stains.known:
         figures["doubtful_share"] = float(result.stains.doubtful.mean())
     if len(result.frames) > 1:
         figures["moved_anew"] = float(sum(frame.registered for frame in result.frames))

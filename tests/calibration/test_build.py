@@ -137,7 +137,7 @@ def test_the_primaries_correction_can_be_undone(table: Lut, built: BuildResult, 
         plain = np.sum([f[:, None] * white for f, white in zip(fields, paper, strict=True)], axis=0)
         plain /= np.sum(paper, axis=0)
         lit = np.sum(parts, axis=0) > 50
-        factor = built.primaries.beside_paper(table.white[light])
+        factor = built.primaries.field_ratio(table.white[light])
         assert (cell / plain)[lit] == pytest.approx(factor[lit], abs=1e-4)
 
 

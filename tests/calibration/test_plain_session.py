@@ -94,7 +94,7 @@ def test_nothing_is_registered_anew_where_nothing_moves(plain: Lab, tmp_path: Pa
         result = build(session, tmp_path / "lut")
     assert not any(figures.registered for figures in result.frames)
     assert result.largest_shift_px < 0.05
-    assert min(figures.shift.tags for figures in result.frames) >= 16
+    assert min(figures.shift.gauges for figures in result.frames) >= 16
     assert worst_error(plain, tmp_path / "lut") < 0.05
 
 
