@@ -33,16 +33,8 @@ from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transf
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.movement import Shift, gauge_boxes, shift_between
 from calibration.registration.register import Registration, register
-from calibration.sampling.samples import (
-    WINDOW,
-    Sites,
-    gather,
-    gather_values,
-    noise_of,
-    patch_means,
-    sites_at,
-    table_values,
-)
+from calibration.sampling.patch_statistics import patch_means, sample_noise
+from calibration.sampling.samples import WINDOW, Sites, gather, gather_values, sites_at, table_values
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import FormatError, RegistrationError
 
@@ -483,7 +475,7 @@ class Measurement:
         greys, grey_errors = self.levels.read(seen[whites:], paper.field.at(self._grey_mm))
         if even:
             kept, highest = gather(decoded.mosaic, decoded.black, cells)
-            values, noise = table_values(kept, shape, dark_cells), noise_of(kept)
+            values, noise = table_values(kept, shape, dark_cells), sample_noise(kept)
         else:
             values, highest = gather_values(decoded.mosaic, decoded.black, cells, shape, dark_cells)
             kept = noise = None

@@ -22,7 +22,7 @@ from calibration.pipeline.measuring import Measured, MeasuredDark, Stretch
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
 from calibration.radiometry.flat_field import FlatField
 from calibration.registration.matching import MIN_BLOCK_SCORE
-from calibration.sampling.samples import dead_samples, uneven
+from calibration.sampling.patch_statistics import has_dead_photosite, unevenness
 from calibration.table.provenance import Unfit
 
 _Array = npt.NDArray[np.float64]
@@ -121,8 +121,8 @@ class Tally:
         """Return the cells not to be used, each with the first cause that applies."""
         frames, dark = max(self._even_frames, 1), self.darkness
         hottest = dark.hottest if len(dark.hottest) else np.zeros(self._chart.colour_count)
-        dead = dead_samples(self._even_sum / frames)
-        unevenness = uneven(self._even_sum / frames, np.sqrt(self._even_noise) / frames)
+        dead = has_dead_photosite(self._even_sum / frames)
+        uneven = unevenness(self._even_sum / frames, np.sqrt(self._even_noise) / frames)
         allowed, samples = CLIPPING_SHARE * saturation_counts, self._even_sum.shape[1]
         found: list[Unfit] = []
         for colour in range(self._chart.colour_count):
@@ -143,8 +143,8 @@ class Tally:
                 cause = f"hot: a photosite stands out by {hottest[colour]:.0f} counts in every dark frame"
             elif dead[colour]:
                 cause = "dead: a photosite sees less than half of the light of its cell"
-            elif unevenness[colour] > 0:
-                cause = f"uneven: rim and middle differ by {unevenness[colour]:.1%} under white"
+            elif uneven[colour] > 0:
+                cause = f"uneven: rim and middle differ by {uneven[colour]:.1%} under white"
             if cause:
                 found.append(Unfit(colour=colour, cause=cause))
         return tuple(found)

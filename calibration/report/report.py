@@ -29,7 +29,8 @@ from calibration.pipeline.result import BuildResult
 from calibration.radiometry.sensor_range import MAX_BLACK_DRIFT
 from calibration.registration.register import Registration
 from calibration.report.mosaic import half_size
-from calibration.sampling.samples import noise_of, rim_against_middle, sites_at
+from calibration.sampling.patch_statistics import rim_difference, sample_noise
+from calibration.sampling.samples import sites_at
 from calibration.verdict.verdict import Judged, Verdict, bleed, grey_tints_deg, largest_window, report_json, shown
 from drivers.raw.rawfile import read_raw
 from foundation.files import write_whole
@@ -641,7 +642,7 @@ def _worst(figure: Any, picture: _Image, chart: Chart, registration: Registratio
     at = np.flatnonzero(sites.inside)
     samples = picture[sites.rows[at, None, None] + offsets[:, None], sites.columns[at, None, None] + offsets]
     samples = samples.reshape(len(at), window**2, 3)
-    difference, sigma = rim_against_middle(samples, noise_of(samples))
+    difference, sigma = rim_difference(samples, sample_noise(samples))
     score = (difference / np.maximum(sigma, 1e-6)).max(axis=1)
     shown = _stretched(picture)
     order = np.argsort(-score)[:_WORST]
