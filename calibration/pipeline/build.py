@@ -21,7 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.annotated import annotated_png
-from acquisition.session.folder import FrameRecord, Session
+from acquisition.session.folder import Session
+from acquisition.session.journal import FrameRecord
 from calibration.checks.light_codes import angles_off_codes_deg
 from calibration.pipeline.checkpoint import Checkpoint, Growing, growing
 from calibration.pipeline.frames import (

@@ -20,7 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.planes import CHANNELS, Channel, frame_black, phases
-from acquisition.session.folder import FrameRecord, Session
+from acquisition.session.folder import Session
+from acquisition.session.journal import FrameRecord
 from calibration.radiometry.primaries import pure_lights
 from calibration.radiometry.sensor_range import saturation
 from calibration.table.lut import Lut

@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
+from acquisition.framing.finding import Framing
 from acquisition.framing.planes import CHANNELS, CLIPPING_SHARE, Channel, Plane, channel_offset_px, phases
-from acquisition.framing.tags import Framing
-from acquisition.session.folder import FrameRecord
+from acquisition.session.journal import FrameRecord
 from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency
 from calibration.pipeline.frames import Decoded
 from calibration.radiometry.cell_field import field_of_cells

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.framing.finding import Framing
 from acquisition.framing.planes import Plane
 from acquisition.framing.tagless_field import FoundField
-from acquisition.framing.tags import FoundTag, Framing
+from acquisition.framing.tags import FoundTag
 from foundation.robust import huber_weights, sigma_of
 
 MAX_SHIFT_PX = 3.0

@@ -22,12 +22,12 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from acquisition.chart.model import Chart
+from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.homography import rms
 from acquisition.framing.outline import refined
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
 from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
 from acquisition.framing.tagless_field import FoundField
-from acquisition.framing.tags import Framing, find_chart
 from acquisition.framing.visibility import MIN_CELL_PX
 from calibration.registration.colour_model import ColourModel
 from calibration.registration.displacement import Displacement

@@ -14,7 +14,8 @@ import pytest
 
 from acquisition.chart.layout import A_SERIES_MM, design_chart
 from acquisition.chart.model import Chart
-from acquisition.session.folder import Session, SessionStep, plan_steps
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep, plan_steps
 from calibration.cli import main
 from calibration.fitting.polynomials import order_of, page_polynomial
 from calibration.pipeline.build import build, check

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 import calibration.pipeline.build as building
-from acquisition.session.folder import Session, SessionStep
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep
 from calibration.pipeline.build import append, build
 from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, growing
 from calibration.pipeline.frames import lost_frames

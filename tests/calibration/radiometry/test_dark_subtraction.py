@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session.folder import Session, SessionStep
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep
 from calibration.cli import main
 from calibration.pipeline.build import append, build, check
 from calibration.pipeline.options import Choices

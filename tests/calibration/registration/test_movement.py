@@ -12,8 +12,8 @@ import pytest
 from scipy import ndimage
 
 from acquisition.chart.layout import paper_chart
+from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.planes import Plane, plane_of, strongest_plane
-from acquisition.framing.tags import Framing, find_chart
 from calibration.registration.movement import gauge_boxes, shift_between
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic
