@@ -30,7 +30,9 @@ from acquisition.chart.layout import design_chart
 from acquisition.chart.printing import drawing
 from acquisition.framing.planes import frame_black
 from acquisition.lights.illuminations import plan_illuminations
-from acquisition.session.folder import ACCEPTED, Session, plan_steps
+from acquisition.session.folder import Session
+from acquisition.session.journal import ACCEPTED
+from acquisition.session.plan import plan_steps
 from calibration.pipeline.build import build
 from calibration.pipeline.prefetching import threads
 from calibration.registration.register import register
@@ -80,7 +82,7 @@ def take(folder: Path, body: str = "EOS 550D", cr2: bool = False, lights: int = 
             write_dng(stream, counts, world.body, settings=REFERENCE_EXPOSURE, taken_at=at)
             data = stream.getvalue()
         at += timedelta(seconds=4)
-        attempt = session.begin(step, file, at)
+        attempt = session.journal.begin(step, file, at)
         (folder / file).write_bytes(data)
         session.commit(
             attempt,

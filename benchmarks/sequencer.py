@@ -20,7 +20,8 @@ from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings
 from acquisition.lights.illuminations import Illumination
 from acquisition.run.sequencer import Devices, judge_file, take_session
-from acquisition.session.folder import Session, plan_steps
+from acquisition.session.folder import Session
+from acquisition.session.plan import plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from sim.camera.dng import write_dng

@@ -260,18 +260,20 @@ def _build(
 
 
 def _print_table(folder: Path) -> None:
-    from calibration.table.lut import open_lut, summary
+    from calibration.table.description import describe
+    from calibration.table.lut import open_lut
 
-    for name, value in summary(open_lut(folder)):
+    for name, value in describe(open_lut(folder)):
         print(f"{name + ':':17}{value}")
 
 
 def _verify(folder: Path, session: Path | None) -> None:
-    from calibration.table.lut import damage, open_lut
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import find_faults
 
     lut = open_lut(folder)
     with _bar("reading the samples") as progress:
-        faults = damage(lut, lambda done, total: progress(done, total, "reading the samples"))
+        faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
     if session is not None:
         from acquisition.session.folder import Session
         from calibration.pipeline.frames import lost_frames
@@ -289,7 +291,8 @@ def _verify(folder: Path, session: Path | None) -> None:
 
 
 def _match(one: Path, other: Path) -> None:
-    from calibration.table.lut import open_lut, require_match
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import require_match
 
     tables = open_lut(one), open_lut(other)
     require_match(*tables)

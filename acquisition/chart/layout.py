@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import PAPER_WHITE, Chart, Reference, Tag
+from acquisition.chart.model import PAPER_WHITE, TAG_MODULES, Chart, Reference, Tag
 from foundation.errors import InputError
 from foundation.version import software
 
@@ -41,9 +41,6 @@ LEAST_SLOT_PX = 25
 
 TAG_FAMILY = "36h11"
 TAG_SLOTS = 4
-TAG_MODULES = 8
-"""Modules along a tag's black square: 6 of data and a black border of one; the white rim comes on top."""
-
 TAG_SPACING_SLOTS = 38
 TAG_IDS = 587
 """Codes in the family 36h11."""

@@ -24,6 +24,10 @@ from foundation.files import write_whole
 FORMAT = "crop.chart"
 VERSION = 1
 PAPER_WHITE = (255, 255, 255)
+"""Printed code of bare paper: no ink."""
+
+TAG_MODULES = 8
+"""Modules along the black square of a tag 36h11: 6 of data and a black border of one; the white rim comes on top."""
 
 
 def colour_of_index(index: npt.ArrayLike, bits: int) -> npt.NDArray[np.uint8]:

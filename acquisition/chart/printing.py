@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.margins import PX_MM, Boxes, margin_marks, whole_px
-from acquisition.chart.model import PAPER_WHITE, Chart, Tag
+from acquisition.chart.model import PAPER_WHITE, TAG_MODULES, Chart, Tag
 from foundation.errors import InputError
 from foundation.files import whole_file, write_whole
 
@@ -41,8 +41,6 @@ POINTS_PER_MM = 72 / MM_PER_INCH
 _STRIP_ROWS = 64
 _SUPERSAMPLING = 8
 _LAP_PX, _INSET_PX = 0.2, 0.01
-TAG_MODULES = 8
-"""Modules along the black square of a tag 36h11: 6 of data inside a black border of one."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
+from acquisition.framing.finding import Framing
 from acquisition.framing.homography import project
 from acquisition.framing.outline import PreparedPicture
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of, strongest_plane
-from acquisition.framing.tags import Framing, find_tags
+from acquisition.framing.tags import find_tags
 from drivers.raw.rawfile import Mosaic
 
 _GREEN, _RED, _AMBER, _GREY = (60, 200, 60), (40, 40, 255), (40, 200, 255), (200, 200, 200)

@@ -7,12 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.chart.model import TAG_MODULES
+from acquisition.framing.finding import Framing
 from acquisition.framing.planes import Plane
 from acquisition.framing.tagless_field import FoundField
-from acquisition.framing.tags import TAG_MODULES, FoundTag, Framing
+from acquisition.framing.tags import FoundTag
 
 MAX_BLUR_PX = 1.0
-"""σ beyond which the 25 samples of a cell take in light from its neighbours (more than 1 % at 10 px a cell)."""
+"""σ of the print's edges up to which cells of any size are found to a few hundredths of a pixel; beyond it the 25
+samples of a cell of 10 px take in more than 1 % of light from its neighbours."""
 
 _BLURS = np.geomspace(0.15, 4, 48)
 _OUTLINE_PLACES = 80

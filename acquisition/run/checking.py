@@ -14,14 +14,15 @@ from acquisition.chart.model import load_chart
 from acquisition.config import LabSettings
 from acquisition.framing.annotated import annotated_png
 from acquisition.framing.corners import Corners
+from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
-from acquisition.framing.tags import MIN_MODULE_PX, Framing, find_chart
+from acquisition.framing.tags import MIN_MODULE_PX
 from acquisition.lights.illuminations import load_illuminations
 from acquisition.run.exposure import measure_exposure, refusal
 from acquisition.run.lamp import make_ready
 from acquisition.run.rig import open_rig
 from acquisition.run.sequencer import Devices
-from acquisition.session.folder import FrameKind
+from acquisition.session.plan import FrameKind
 from drivers.camera import keep_awake
 from drivers.presenter import BLACK, WHITE, Colour, ReportsWarnings
 from drivers.raw.rawfile import Mosaic, read_raw

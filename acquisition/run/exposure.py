@@ -1,7 +1,7 @@
 """Whether a raw frame is well exposed: as asked for, neither clipped nor dark, and dark where it should be.
 
 Counts and what the file says of its exposure; where the chart lies in the picture is the business of
-`acquisition.framing.tags`.
+`acquisition.framing.finding`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquisition.framing.planes import CLIPPING_SHARE
-from acquisition.session.folder import FrameKind
+from acquisition.framing.planes import CLIPPING_SHARE, frame_black
+from acquisition.session.plan import FrameKind
 
 if TYPE_CHECKING:
     from acquisition.config import LimitSettings
@@ -53,8 +53,7 @@ class Exposure:
 
 def measure_exposure(mosaic: Mosaic) -> Exposure:
     """Measure the counts of a mosaic's visible area; every fourth 2×2 block is enough for the percentile."""
-    masked = mosaic.masked_black()
-    black = mosaic.black if masked is None else masked
+    black = frame_black(mosaic)
     clipped = np.count_nonzero(mosaic.counts >= CLIPPING_SHARE * mosaic.white_level) / mosaic.counts.size
     planes = mosaic.block_planes()[:, :, ::2, ::2].reshape(2, 2, -1)
     brightest = np.percentile(planes, BRIGHTEST_PERCENTILE, axis=2) - black

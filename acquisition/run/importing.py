@@ -19,7 +19,9 @@ from acquisition.chart.model import load_chart
 from acquisition.config import LabSettings
 from acquisition.lights.illuminations import Illumination, load_illuminations
 from acquisition.run.sequencer import judge_file
-from acquisition.session.folder import ACCEPTED, FRAME_COLUMNS, REFUSED, FrameKind, Session, SessionStep
+from acquisition.session.folder import FRAME_COLUMNS, Session
+from acquisition.session.journal import ACCEPTED, REFUSED
+from acquisition.session.plan import FrameKind, SessionStep
 from drivers.camera import CapturedFrame
 from drivers.presenter import BLACK, WHITE
 from foundation.errors import FormatError
@@ -152,7 +154,7 @@ def import_session(
                 if reason:
                     refused.append(f"{frame.path.name}: {reason}")
                 observe(step.number + 1, len(frames))
-            session.note(datetime.now(UTC), "import", f"{len(frames)} frames from {frame_list.name}")
+            session.journal.note(datetime.now(UTC), "import", f"{len(frames)} frames from {frame_list.name}")
         except BaseException:
             session.close()
             shutil.rmtree(folder)
@@ -188,7 +190,7 @@ def _take_over(
             shutil.copyfileobj(stream, into, 1 << 20)
         return CapturedFrame(frame.path.name, frame.path.stat().st_size, frame.taken_at)
 
-    attempt = session.begin(step, f"frames/{step.stem}", frame.taken_at)
+    attempt = session.journal.begin(step, f"frames/{step.stem}", frame.taken_at)
     received = session.receive(step.stem, copy)
     if frame.verdict:
         listed = frame.verdict.removeprefix(REFUSED).removeprefix(":").strip() or "for no reason that is listed"

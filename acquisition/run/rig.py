@@ -262,11 +262,13 @@ def _exposed(session: Session | None) -> Counter[Colour]:
     if session is None:
         return Counter()
     colours = {step.number: step.colour for step in session.steps}
-    return Counter(colours[attempt.step] for attempt in session.attempts() if attempt.has_frame)
+    return Counter(colours[attempt.step] for attempt in session.journal.attempts() if attempt.has_frame)
 
 
 def _last_moment(session: Session) -> datetime:
-    ends = [attempt.ended_at for attempt in session.attempts() if attempt.has_frame and attempt.ended_at is not None]
+    ends = [
+        attempt.ended_at for attempt in session.journal.attempts() if attempt.has_frame and attempt.ended_at is not None
+    ]
     return max(ends, default=OPENING)
 
 

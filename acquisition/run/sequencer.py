@@ -13,7 +13,9 @@ from pathlib import Path
 from acquisition.config import LabSettings
 from acquisition.run.exposure import disagreement, measure_exposure, refusal
 from acquisition.run.lamp import await_health, complaint_of, make_ready
-from acquisition.session.folder import ACCEPTED, REFUSED, FrameKind, Session, SessionStep
+from acquisition.session.folder import Session
+from acquisition.session.journal import ACCEPTED, REFUSED
+from acquisition.session.plan import FrameKind, SessionStep
 from drivers.camera import Camera, keep_awake
 from drivers.presenter import Presenter
 from drivers.projector import Projector
@@ -85,17 +87,17 @@ def _take(
 ) -> Outcome:
     clock = devices.clock
     for stray in session.set_aside_strays():
-        session.note(clock.now(), "stray", f"{stray.name}: complete but never counted; kept, not used")
+        session.journal.note(clock.now(), "stray", f"{stray.name}: complete but never counted; kept, not used")
     steps = session.steps
     done = session.done_steps()
     open_steps = [step for step in steps if step.number not in done]
     if not open_steps:
         return Outcome(len(steps), 0, ())
-    session.note(clock.now(), "start", f"{len(open_steps)} of {len(steps)} frames to take")
+    session.journal.note(clock.now(), "start", f"{len(open_steps)} of {len(steps)} frames to take")
     devices.camera.configure(settings.camera.exposure)
 
     def tell(what: str, sentence: str) -> None:
-        session.note(clock.now(), what, sentence)
+        session.journal.note(clock.now(), what, sentence)
         announce(f"{what}: {sentence}")
 
     if devices.projector is not None:
@@ -118,7 +120,7 @@ def _take(
     outcome = Outcome(len(steps), len(open_steps) - taken, tuple(refused))
     if outcome.complete and settings.sequence.switch_off and devices.projector is not None:
         devices.projector.switch_off()
-    session.note(clock.now(), "complete" if outcome.complete else "incomplete", f"{outcome.left} frames left")
+    session.journal.note(clock.now(), "complete" if outcome.complete else "incomplete", f"{outcome.left} frames left")
     return outcome
 
 
@@ -142,15 +144,15 @@ def _take_step(
     for remaining in reversed(range(settings.sequence.attempts)):
         if devices.projector is not None:
             await_health(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), tell)
-        kept = session.kept_files(step)
+        kept = session.journal.kept_files(step)
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
-        attempt = session.begin(step, f"frames/{stem}", clock.now())
+        attempt = session.journal.begin(step, f"frames/{stem}", clock.now())
         try:
             devices.presenter.show(step.colour)
             clock.sleep(settings.sequence.settle_s)
             received = session.receive(stem, devices.camera.capture)
         except DeviceError as error:
-            session.fail(attempt, clock.now(), str(error))
+            session.journal.fail(attempt, clock.now(), str(error))
             if remaining == 0 or isinstance(error, DeviceFault | DeviceRefused):
                 raise
             tell("retry", f"{_name(step)}: {error}")

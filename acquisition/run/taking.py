@@ -11,7 +11,8 @@ from acquisition.config import LabSettings, parse_lab
 from acquisition.lights.illuminations import load_illuminations
 from acquisition.run.rig import open_rig
 from acquisition.run.sequencer import Outcome, take_session
-from acquisition.session.folder import Session, plan_steps, session_exists
+from acquisition.session.folder import Session, session_exists
+from acquisition.session.plan import plan_steps
 from foundation.errors import ConfigurationError
 
 FIXED = ("rig", "camera", "simulated", "sequence.reference_every")

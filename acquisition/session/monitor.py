@@ -11,7 +11,8 @@ import json
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-from acquisition.session.folder import Session, SessionEvent
+from acquisition.session.folder import Session
+from acquisition.session.journal import SessionEvent
 from acquisition.session.progress import Progress, duration_text, session_progress
 from foundation.errors import CropError, InputError
 
@@ -40,7 +41,7 @@ dt {{ color: #666; }} dd {{ margin: 0; }}
 def read_state(folder: Path) -> tuple[Progress, list[SessionEvent]]:
     """Return a session's progress and its newest events."""
     with Session.open(folder) as session:
-        return session_progress(session), session.events()[-20:]
+        return session_progress(session), session.journal.events()[-20:]
 
 
 def page(folder: Path) -> str:

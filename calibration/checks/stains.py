@@ -76,15 +76,15 @@ class Stains:
         return _beyond(self.deviation, self.error, DOUBTFUL)
 
     @property
-    def tells(self) -> bool:
+    def known(self) -> bool:
         """Whether anything can be told of the print."""
         return bool(np.isfinite(self.deviation).any())
 
-    def largest(self) -> _Array:
+    def largest_deviation(self) -> _Array:
         """Return (C,) the deviation, with its sign, of the channel that deviates most; 0 where it cannot be told."""
         return _largest(self.deviation)
 
-    def told(self, cell: int) -> float:
+    def deviation_of(self, cell: int) -> float:
         """Return a stained cell's deviation, with its sign: of its neighbourhood, or its own where that is larger."""
         both = np.array([_largest(self.deviation[[cell]])[0], _largest(self.alone[[cell]])[0]])
         return float(both[np.abs(both).argmax()])

@@ -17,11 +17,11 @@ from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.radiometry.dark_frames import DarkSummary
 from calibration.radiometry.greys import tint_deg
-from calibration.radiometry.paper import black_drift
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
+from calibration.radiometry.sensor_range import black_drift
 from calibration.registration.register import Registration
-from calibration.table.lut import Unfit
+from calibration.table.provenance import Unfit
 
 _Array = npt.NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from calibration.pipeline.options import AS_IN_THE_PAPER, BuildOptions
 from calibration.pipeline.registered_frame import ChartPoints, RegisteredFrame, gauges_of, register_frame
 from calibration.radiometry.cell_field import field_of_cells
 from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances
-from calibration.radiometry.paper import AROUND, ORDERS, PaperReader
+from calibration.radiometry.paper import MAX_ORDER, MAX_ORDER_AROUND, PaperReader
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.movement import Shift, shift_between
@@ -194,7 +194,7 @@ def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = AS_IN
     if not chart.tags:
         # Its references are in the margin, and do not show what light there is in the middle.
         base = field_of_cells(codes, points.cells_mm, level, there, points.whites_mm, whites, chart.page_mm)
-    order = ORDERS[-1] if chart.tags else AROUND
+    order = MAX_ORDER if chart.tags else MAX_ORDER_AROUND
     return Baseline(
         chart=chart,
         points=points,

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from acquisition.framing.annotated import annotated_png
-from acquisition.session.folder import FrameRecord, Session
+from acquisition.session.folder import Session
+from acquisition.session.journal import FrameRecord
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.figures.table_figures import TableFigures
 from calibration.pipeline.baseline import baseline_of
@@ -39,12 +40,12 @@ from calibration.pipeline.measuring import (
 )
 from calibration.pipeline.options import AS_IN_THE_PAPER, BuildOptions
 from calibration.pipeline.prefetching import prefetched
-from calibration.radiometry.greys import NAME as REFERENCES_FILE
+from calibration.radiometry.corrections import corrections
 from calibration.radiometry.greys import references_csv
-from calibration.radiometry.paper import corrections
 from calibration.registration.movement import Shift
-from calibration.table.lut import SAMPLES as SAMPLES_FILE
-from calibration.table.lut import LutWriter, Provenance
+from calibration.table.file_names import REFERENCES, SAMPLES
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
 from calibration.verdict.result import BuildResult
 from calibration.verdict.thresholds import THRESHOLDS, Threshold
 from calibration.verdict.values import judged_values
@@ -261,7 +262,7 @@ class _Job:
         found = self.unfinished.load()
         if found is None or not found.fits(self.identity, self.keys):
             return None
-        return found if (self.unfinished.folder / SAMPLES_FILE).is_file() else None
+        return found if (self.unfinished.folder / SAMPLES).is_file() else None
 
     def writer(self, checkpoint: Checkpoint | None) -> tuple[LutWriter, Checkpoint | None]:
         """Return the writer of the samples, and the checkpoint if the samples on the disk are those that it names."""
@@ -375,7 +376,7 @@ def _write_table(work: _Work, figures: TableFigures) -> None:
         unfit=list(figures.cells.unfit),
     )
     references = references_csv(greys.names, lights.white, lights.white_error, greys.values, greys.errors)
-    files = {REFERENCES_FILE: references} if greys.names else {}
+    files = {REFERENCES: references} if greys.names else {}
     work.writer.finish(session.illuminations, lights.white, provenance, listed(records), files)
 
 

@@ -25,10 +25,10 @@ from calibration.checks.stains import Stains, find_stains
 from calibration.pipeline.measuring import MeasuredDarkFrame, MeasuredFrame
 from calibration.pipeline.registered_frame import RegisteredFrame
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
-from calibration.radiometry.paper import FlatField
+from calibration.radiometry.flat_field import FlatField
 from calibration.registration.matching import MIN_BLOCK_SCORE
-from calibration.sampling.samples import dead_samples, uneven
-from calibration.table.lut import Unfit
+from calibration.sampling.patch_statistics import has_dead_photosite, unevenness
+from calibration.table.provenance import Unfit
 
 _BRIGHTEST_PERCENTILE = 99.5
 """Of the cells' levels, what is taken for paper white: the brightest of all may be a reflection."""
@@ -194,8 +194,8 @@ class CellStatistics:
         """
         frames, dark = max(self.even_frames, 1), self.dark_summary()
         hottest = dark.hottest if len(dark.hottest) else np.zeros(self.chart.colour_count)
-        dead = dead_samples(self.even_sum / frames)
-        unevenness = uneven(self.even_sum / frames, np.sqrt(self.even_noise2) / frames)
+        dead = has_dead_photosite(self.even_sum / frames)
+        uneven = unevenness(self.even_sum / frames, np.sqrt(self.even_noise2) / frames)
         allowed, samples = CLIPPING_SHARE * saturation_counts, self.even_sum.shape[1]
         found: list[Unfit] = []
         for colour in range(self.chart.colour_count):
@@ -209,15 +209,15 @@ class CellStatistics:
             elif self.covered[colour]:
                 cause = "covered: it does not look like the chart's (covered, damaged, or printed otherwise)"
             elif stains.stained[colour]:
-                deviation = stains.told(colour)
+                deviation = stains.deviation_of(colour)
                 how = f"{abs(deviation):.1%} {'darker' if deviation < 0 else 'brighter'}"
                 cause = f"stained: it is, or its surroundings are, {how} than their codes elsewhere on the print"
             elif hottest[colour] > 0:
                 cause = f"hot: a photosite stands out by {hottest[colour]:.0f} counts in every dark frame"
             elif dead[colour]:
                 cause = "dead: a photosite sees less than half of the light of its cell"
-            elif unevenness[colour] > 0:
-                cause = f"uneven: rim and middle differ by {unevenness[colour]:.1%} under white"
+            elif uneven[colour] > 0:
+                cause = f"uneven: rim and middle differ by {uneven[colour]:.1%} under white"
             if cause:
                 found.append(Unfit(colour=colour, cause=cause))
         return tuple(found)

@@ -18,10 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.planes import CHANNELS, Channel, frame_black, phases
-from acquisition.session.folder import FrameRecord, Session
-from calibration.radiometry.paper import saturation
+from acquisition.session.folder import Session
+from acquisition.session.journal import FrameRecord
 from calibration.radiometry.primaries import pure_lights
-from calibration.table.lut import Frame, Lut, frames_sha256
+from calibration.radiometry.sensor_range import saturation
+from calibration.table.lut import Lut
+from calibration.table.source_frames import SourceFrame, frames_sha256
 from drivers.raw.rawfile import Mosaic, decode_raw
 from foundation.errors import FormatError
 from foundation.files import read_whole
@@ -189,9 +191,9 @@ def session_sha256(records: Sequence[FrameRecord]) -> str:
     return frames_sha256(listed(records))
 
 
-def listed(records: Sequence[FrameRecord]) -> list[Frame]:
+def listed(records: Sequence[FrameRecord]) -> list[SourceFrame]:
     """Return frames as a table lists them."""
-    return [Frame(record.kind, record.illumination, record.file, record.sha256) for record in records]
+    return [SourceFrame(record.kind, record.illumination, record.file, record.sha256) for record in records]
 
 
 def lost_frames(lut: Lut, session: Session, progress: Progress | None = None) -> list[str]:

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.session.folder import FrameRecord, Session
+from acquisition.session.folder import Session
+from acquisition.session.journal import FrameRecord
 from calibration.figures.frame_figures import FrameFigures
 from calibration.pipeline.baseline import Baseline
 from calibration.pipeline.cell_statistics import CellStatistics

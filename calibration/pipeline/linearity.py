@@ -24,7 +24,7 @@ from calibration.figures.linearity_figures import LinearityFigures
 from calibration.fitting.least_squares import least_squares
 from calibration.pipeline.baseline import Baseline
 from calibration.pipeline.frames import strongest_channel
-from calibration.radiometry.paper import saturation
+from calibration.radiometry.sensor_range import saturation
 from calibration.registration.movement import STILL_PX, Shift
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import FormatError, InputError
@@ -113,8 +113,8 @@ def _exposure_s(mosaic: Mosaic, path: Path) -> float:
 
 
 def _require_in_place(shift: Shift, path: Path) -> None:
-    if shift.tags == 0 or shift.largest_px > 5 * STILL_PX:
-        moved = "its tags are not seen" if shift.tags == 0 else f"it lies {shift.largest_px:.2f} px further"
+    if shift.gauges == 0 or shift.largest_px > 5 * STILL_PX:
+        moved = "its tags are not seen" if shift.gauges == 0 else f"it lies {shift.largest_px:.2f} px further"
         raise FormatError(
             f"{path}: the chart is not where the session has it ({moved}); take the series with camera and print as "
             "they stand in the session, before it or after it"

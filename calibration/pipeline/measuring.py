@@ -25,7 +25,8 @@ from calibration.radiometry.dark_subtraction import DarkLight, winsorised_means
 from calibration.radiometry.paper import Paper
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.movement import BUMP_PX, STILL_PX, Shift, shift_between
-from calibration.sampling.samples import Sites, gather, gather_values, noise_of, patch_means, table_values
+from calibration.sampling.patch_statistics import patch_means, sample_noise
+from calibration.sampling.samples import Sites, gather, gather_values, table_values
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import RegistrationError
 
@@ -128,7 +129,7 @@ def measure_frame(
     shift = shift_between(registered.gauges[channel], framing, gauges)
     # A turn or a change of distance moves the tags differently; moving the grid along would not mend it.
     turned = shift.largest_px > shift.length_px + STILL_PX
-    if shift.tags == 0 or shift.length_px > BUMP_PX or turned:
+    if shift.gauges == 0 or shift.length_px > BUMP_PX or turned:
         return shift
     cells, references = registered.cells, registered.references
     if shift.length_px > STILL_PX:
@@ -230,11 +231,11 @@ def _measured(
     whites, greys = np.split(seen, [len(points.whites_mm)])
     paper, shape = baseline.paper.read(whites, decoded.record.file)
     if baseline.primaries is not None:
-        shape = shape * baseline.primaries.beside_paper(paper.white)
+        shape = shape * baseline.primaries.field_ratio(paper.white)
     grey_values, grey_errors = points.levels.read(greys, paper.field.at(points.greys_mm))
     if keep_samples:
         kept, highest = gather(decoded.mosaic, decoded.black, grid.cells)
-        values, noise = table_values(kept, shape, dark_cells), noise_of(kept)
+        values, noise = table_values(kept, shape, dark_cells), sample_noise(kept)
     else:
         values, highest = gather_values(decoded.mosaic, decoded.black, grid.cells, shape, dark_cells)
         kept = noise = None

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
+from acquisition.framing.finding import Framing
 from acquisition.framing.planes import CHANNELS, Channel, Plane, channel_offset_px, phases
-from acquisition.framing.tags import Framing
 from calibration.pipeline.frames import DecodedFrame
 from calibration.pipeline.options import BuildOptions
 from calibration.radiometry.greys import GreyLevels

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from calibration.fitting.least_squares import least_squares
 from calibration.fitting.polynomials import code_polynomial, code_powers, page_polynomial
-from calibration.radiometry.paper import FlatField
+from calibration.radiometry.flat_field import FlatField
 from foundation.robust import huber_weights, sigma_of
 
 CODE_DEGREE = 8

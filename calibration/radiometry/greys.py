@@ -22,7 +22,6 @@ from acquisition.chart.model import Reference
 from foundation.angles import angles_deg
 from foundation.robust import MAD_TO_SIGMA
 
-NAME = "references.csv"
 COLUMNS = ("light", "name", "r", "g", "b", "r_error", "g_error", "b_error")
 
 _Array = npt.NDArray[np.float64]

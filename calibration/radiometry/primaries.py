@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from acquisition.lights.illuminations import Illumination
 from calibration.fitting.least_squares import product
-from calibration.radiometry.paper import FlatField, Paper
+from calibration.radiometry.flat_field import FlatField
+from calibration.radiometry.paper import Paper
 
 LEAST_PAPER = 300.0
 """Counts above black that paper must show under a primary for its field to be told."""
@@ -103,7 +104,7 @@ class Primaries:
 
         return np.asarray(nnls(self.paper.T, np.maximum(white, 0))[0])
 
-    def beside_paper(self, white: _Array) -> _Array:
+    def field_ratio(self, white: _Array) -> _Array:
         """Return the field of each cell over the field of paper in its place, (C, 3), near 1.
 
         Parameters

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.framing.finding import Framing
 from acquisition.framing.planes import Plane
 from acquisition.framing.tagless_field import FoundField
-from acquisition.framing.tags import FoundTag, Framing
+from acquisition.framing.tags import FoundTag
 from foundation.robust import huber_weights, sigma_of
 
 MAX_SHIFT_PX = 3.0
@@ -52,7 +53,7 @@ class Shift:
         further right or down.
     largest_px
         The largest movement of a tag, or of a corner of the field, so that a rotation shows.
-    tags
+    gauges
         Tags, or strips, that could be measured; 0 leaves the rest 0 and means unknown.
     softer_px2
         How much more blurred the later frame is: the difference of the blurs' variances, half-size px², negative when
@@ -62,7 +63,7 @@ class Shift:
     dx: float
     dy: float
     largest_px: float
-    tags: int
+    gauges: int
     softer_px2: float = 0.0
 
     @property

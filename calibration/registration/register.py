@@ -22,12 +22,12 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from acquisition.chart.model import Chart
+from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.homography import rms
 from acquisition.framing.outline import refined
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
 from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
 from acquisition.framing.tagless_field import FoundField
-from acquisition.framing.tags import Framing, find_chart
 from acquisition.framing.visibility import MIN_CELL_PX
 from calibration.registration.colour_model import ColourModel
 from calibration.registration.displacement import Displacement
@@ -145,7 +145,7 @@ class Registration:
         return rms(self.blocks.residual_px[self.blocks.good])
 
     @property
-    def room(self) -> float:
+    def clearance(self) -> float:
         """How much further samples are from their cells' edges than in cells of 10 px, ≥ 1: places matter less by it.
 
         Cells of a hundred pixels are found to a pixel, which is nothing to them.
@@ -370,7 +370,7 @@ def _judge(registration: Registration, least_agreement: float, what: str) -> Non
             what,
             f"{share:.0%} of the blocks of cells look as the chart has them, at least {MIN_GOOD_BLOCKS:.0%} needed",
         )
-    allowed = MAX_BLOCK_RESIDUAL_PX * registration.room
+    allowed = MAX_BLOCK_RESIDUAL_PX * registration.clearance
     if registration.block_rms_px > allowed:
         raise RegistrationError(
             f"{what}: blocks of cells still ask for movements of {registration.block_rms_px:.2f} px RMS, "

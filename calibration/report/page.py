@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from calibration.report.plots import INK
 from calibration.report.summary import summary
-from calibration.table.lut import Unfit
+from calibration.table.provenance import Unfit
 from calibration.verdict.result import BuildResult
 from calibration.verdict.verdict import JudgedValue, Outcome, Verdict, format_value
 

@@ -16,10 +16,11 @@ from acquisition.chart.model import Chart
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.checks.stains import Stains
 from calibration.figures.table_figures import TableFigures
-from calibration.radiometry.paper import FlatField
+from calibration.radiometry.flat_field import FlatField
 from calibration.registration.movement import STILL_PX
 from calibration.registration.register import Registration
-from calibration.sampling.samples import noise_of, rim_against_middle, sites_at
+from calibration.sampling.patch_statistics import rim_difference, sample_noise
+from calibration.sampling.samples import sites_at
 from foundation.srgb import decode_srgb
 
 INK, FAINT, MARK = "#22262b", "#8a929c", "#e8502a"
@@ -240,7 +241,7 @@ def draw_print(figure: Any, chart: Chart, stains: Stains) -> None:
     # A marker's size is an area in points: of a cell, with the axes about 8.2 inches wide.
     side = 72 * 8.2 / page_w * float(np.mean(chart.cell_mm))
     image = axes.scatter(
-        *places.T, c=100 * stains.largest(), s=side**2, marker="s", linewidths=0, cmap="RdBu", vmin=-3, vmax=3
+        *places.T, c=100 * stains.largest_deviation(), s=side**2, marker="s", linewidths=0, cmap="RdBu", vmin=-3, vmax=3
     )
     axes.plot(*places[stains.stained].T, "x", color=INK, markersize=max(3.0, 0.5 * side), markeredgewidth=0.8)
     axes.set(xlabel="mm", ylabel="mm", xlim=(0, page_w), ylim=(page_h, 0), aspect="equal")
@@ -363,7 +364,7 @@ def draw_worst_cells(figure: Any, picture: _Image, chart: Chart, registration: R
     at = np.flatnonzero(sites.inside)
     samples = picture[sites.rows[at, None, None] + offsets[:, None], sites.columns[at, None, None] + offsets]
     samples = samples.reshape(len(at), window**2, 3)
-    difference, sigma = rim_against_middle(samples, noise_of(samples))
+    difference, sigma = rim_difference(samples, sample_noise(samples))
     score = (difference / np.maximum(sigma, 1e-6)).max(axis=1)
     shown = _stretched(picture)
     order = np.argsort(-score)[:WORST_CELLS]

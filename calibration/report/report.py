@@ -16,7 +16,7 @@ from acquisition.chart.model import Chart
 from acquisition.session.folder import Session
 from calibration.checks.stains import Stains
 from calibration.figures.table_figures import TableFigures
-from calibration.radiometry.paper import FlatField
+from calibration.radiometry.flat_field import FlatField
 from calibration.report.half_size import half_size
 from calibration.report.page import Picture, page
 from calibration.report.plots import (
@@ -120,7 +120,7 @@ def _primaries_caption(figures: TableFigures) -> str:
 
 def _print_picture(chart: Chart, stains: Stains) -> list[Picture]:
     """Return the picture of the print, or none where nothing is known of it: a clean sheet would be a claim."""
-    if not stains.tells:
+    if not stains.known:
         return []
     caption = (
         "How far cells and their surroundings deviate from their codes' colours elsewhere on the sheet, in the channel "

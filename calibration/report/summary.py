@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from acquisition.framing.visibility import MIN_CELL_PX
 from calibration.figures.table_figures import TableFigures
-from calibration.radiometry.paper import MAX_BLACK_DRIFT
+from calibration.radiometry.sensor_range import MAX_BLACK_DRIFT
 from calibration.sampling.windows import SAFE_BLEED, bleed, largest_window
 
 

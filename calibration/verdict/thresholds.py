@@ -13,10 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from acquisition.framing.finding import MIN_TAG_SHARE
 from acquisition.framing.planes import CLIPPING_SHARE, MIN_SIGNAL
-from acquisition.framing.tags import MIN_TAG_SHARE
 from acquisition.framing.visibility import MIN_CELL_PX
-from calibration.radiometry.paper import MAX_BLACK_DRIFT
+from calibration.radiometry.sensor_range import MAX_BLACK_DRIFT
 from calibration.registration.register import (
     MAX_BLOCK_RESIDUAL_PX,
     MAX_TAG_RESIDUAL_PX,

@@ -34,8 +34,8 @@ def _registration_values(figures: TableFigures) -> dict[str, float]:
         "cell_px": registration.cell_px,
         "bleed": bleed(registration.cell_px, registration.blur_px, figures.cells.window),
         "tag_residual_px": registration.lens_residual_px,
-        "tag_final_px": registration.marks_rms_px / registration.room,
-        "block_residual_px": registration.block_rms_px / registration.room,
+        "tag_final_px": registration.marks_rms_px / registration.clearance,
+        "block_residual_px": registration.block_rms_px / registration.clearance,
         "blocks_good": float(registration.blocks.good.mean()),
         "agreement": registration.agreement,
     }
@@ -49,7 +49,7 @@ def _cell_values(figures: TableFigures) -> dict[str, float]:
     """Return how many cells are unfit, or doubtful."""
     cells = figures.cells
     values = {"unfit_share": len(cells.unfit) / max(_cell_count(figures), 1)}
-    if cells.stains.tells:
+    if cells.stains.known:
         values["doubtful_share"] = float(cells.stains.doubtful.mean())
     return values
 

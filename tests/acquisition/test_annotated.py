@@ -12,8 +12,8 @@ import pytest
 from acquisition.chart.layout import design_chart, paper_chart
 from acquisition.chart.model import Chart
 from acquisition.framing.annotated import annotated_png
+from acquisition.framing.finding import find_chart
 from acquisition.framing.tagless_field import field_mm
-from acquisition.framing.tags import find_chart
 from drivers.raw.rawfile import read_raw
 from sim.world.world import Room
 from tests.calibration.lab import hang_chart

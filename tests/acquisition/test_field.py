@@ -17,11 +17,11 @@ import pytest
 from acquisition.chart.layout import design_chart, paper_chart
 from acquisition.chart.model import Chart
 from acquisition.chart.printing import drawing
+from acquisition.framing.finding import find_chart
 from acquisition.framing.outline import refined
 from acquisition.framing.planes import CHANNELS, Plane, plane_of
 from acquisition.framing.sharpness import blur_px
 from acquisition.framing.tagless_field import field_mm, find_field
-from acquisition.framing.tags import find_chart
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw

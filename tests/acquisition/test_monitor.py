@@ -16,8 +16,9 @@ import pytest
 from acquisition.chart.layout import design_chart
 from acquisition.cli import main
 from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import Session, plan_steps
+from acquisition.session.folder import Session
 from acquisition.session.monitor import open_monitor
+from acquisition.session.plan import plan_steps
 from acquisition.session.progress import duration_text
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -35,7 +36,7 @@ def folder(tmp_path: Path) -> Path:
         for number, verdict, reason in ((0, "accepted", ""), (1, "accepted", ""), (2, "refused", "3 % clipped")):
             step = session.steps[number]
             begun = BEGUN + timedelta(seconds=10 * number)
-            attempt = session.begin(step, f"frames/{step.stem}", begun)
+            attempt = session.journal.begin(step, f"frames/{step.stem}", begun)
             received = session.receive(step.stem, lambda into: CapturedFrame("a.cr2", into.write(b"raw"), BEGUN))
             session.commit(
                 attempt,
@@ -48,7 +49,7 @@ def folder(tmp_path: Path) -> Path:
                 verdict=verdict,
                 reason=reason,
             )
-        session.note(BEGUN, "start", "8 <frames>")
+        session.journal.note(BEGUN, "start", "8 <frames>")
     return folder
 
 

@@ -17,7 +17,8 @@ from acquisition.config import LabSettings, SequenceSettings
 from acquisition.lights.illuminations import Illumination
 from acquisition.run.lamp import PAUSE_S, POWER_LIMIT_S, RELIGHT_S, make_ready, require_healthy
 from acquisition.run.sequencer import Devices, take_session
-from acquisition.session.folder import Session, plan_steps
+from acquisition.session.folder import Session
+from acquisition.session.plan import plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.links.link import Link
 from drivers.pjlink.projector import PjLinkProjector
@@ -117,7 +118,7 @@ class Lab:
         return Devices(self.camera, self.screen, self.projector, self.clock)
 
     def verdicts(self) -> list[str | None]:
-        return [attempt.verdict for attempt in self.session.attempts()]
+        return [attempt.verdict for attempt in self.session.journal.attempts()]
 
 
 @pytest.fixture
@@ -162,7 +163,7 @@ def test_a_cut_transfer_is_noticed(folder: Path) -> None:
     lab = Lab(folder)
     lab.camera.claims = len(WELL) + 1
     assert take_session(lab.session, lab.devices, SETTINGS).complete
-    assert "bytes" in lab.session.attempts()[0].reason
+    assert "bytes" in lab.session.journal.attempts()[0].reason
     assert lab.verdicts()[0] == "failed"
 
 
@@ -189,7 +190,7 @@ def test_a_bad_frame_is_kept_refused_and_taken_again(folder: Path, bad: bytes, r
 def test_a_lit_dark_frame_is_refused(folder: Path) -> None:
     lab = Lab(folder, {1: WELL})
     assert take_session(lab.session, lab.devices, SETTINGS).complete
-    assert "another light" in lab.session.attempts()[1].reason
+    assert "another light" in lab.session.journal.attempts()[1].reason
 
 
 def test_lasting_darkness_ends_the_run_with_its_reason(folder: Path) -> None:
@@ -248,8 +249,8 @@ def test_a_muted_picture_pauses_the_run_until_it_is_released(folder: Path) -> No
     said: list[str] = []
     assert take_session(lab.session, lab.devices, SETTINGS, mute, said.append).complete
     assert [sentence.split(":")[0] for sentence in said] == ["paused", "resumed"]
-    assert [event.what for event in lab.session.events()] == ["start", "paused", "resumed", "complete"]
-    assert "mute" in lab.session.events()[1].detail
+    assert [event.what for event in lab.session.journal.events()] == ["start", "paused", "resumed", "complete"]
+    assert "mute" in lab.session.journal.events()[1].detail
     assert lab.verdicts() == ["accepted"] * 6
 
 

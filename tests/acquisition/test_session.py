@@ -12,7 +12,8 @@ import pytest
 
 from acquisition.chart.layout import design_chart
 from acquisition.lights.illuminations import Illumination, save_illuminations
-from acquisition.session.folder import Session, plan_steps
+from acquisition.session.folder import Session
+from acquisition.session.plan import plan_steps
 from drivers.camera import CapturedFrame
 from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import FormatError, InputError
@@ -48,7 +49,7 @@ def test_the_plan_survives_the_disk(session: Session) -> None:
 
 def take(session: Session, number: int, content: bytes, verdict: str = "accepted", reason: str = "") -> None:
     step = session.steps[number]
-    attempt = session.begin(step, f"frames/{step.stem}", NOW)
+    attempt = session.journal.begin(step, f"frames/{step.stem}", NOW)
     received = session.receive(step.stem, lambda into: CapturedFrame("IMG_1.CR2", into.write(content), NOW))
     session.commit(
         attempt,

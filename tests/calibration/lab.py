@@ -17,7 +17,9 @@ from acquisition.chart.layout import A_SERIES_MM, design_chart
 from acquisition.chart.model import Chart
 from acquisition.chart.printing import drawing
 from acquisition.lights.illuminations import Illumination, plan_illuminations
-from acquisition.session.folder import ACCEPTED, Session, SessionStep, plan_steps
+from acquisition.session.folder import Session
+from acquisition.session.journal import ACCEPTED
+from acquisition.session.plan import SessionStep, plan_steps
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
@@ -106,7 +108,7 @@ def take(
         data = lab.dng(step.colour, step.number) if frame is None else frame(step)
         file = f"frames/{step.stem}.dng"
         at = TAKEN_AT + timedelta(seconds=4 * step.number)
-        attempt = session.begin(step, file, at)
+        attempt = session.journal.begin(step, file, at)
         (folder / file).write_bytes(data)
         session.commit(
             attempt,

@@ -13,7 +13,7 @@ from calibration.cli import main
 from calibration.pipeline.build import build
 from tests.calibration.lab import LIGHTS
 
-VERSION_1 = Path(__file__).parent / "table_v1"
+VERSION_1 = Path(__file__).parent / "table" / "table_v1"
 
 Command = Callable[..., tuple[int, str, str]]
 

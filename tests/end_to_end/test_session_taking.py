@@ -25,7 +25,7 @@ Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 KILLER = """
 import os, signal, sys
 from acquisition.cli import main
-import acquisition.session.folder, foundation.files
+import acquisition.session.folder, acquisition.session.journal, foundation.files
 
 place, count = sys.argv[1], int(sys.argv[2])
 del sys.argv[1:3]
@@ -33,7 +33,7 @@ owner, name = {
     "renaming": (foundation.files.Path, "replace"),
     "committing": (acquisition.session.folder.Session, "commit"),
     "deriving": (acquisition.session.folder.Session, "write_frames_csv"),
-    "beginning": (acquisition.session.folder.Session, "begin"),
+    "beginning": (acquisition.session.journal.Journal, "begin"),
 }[place]
 real = getattr(owner, name)
 

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session.folder import Session, SessionStep
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep
 from benchmarks.accuracy import Held, beyond_noise, hold, repeated_variance
 from benchmarks.rooms import random_case
 from calibration.pipeline.build import build

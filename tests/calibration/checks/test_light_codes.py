@@ -12,7 +12,8 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.lights.illuminations import Illumination, plan_illuminations
-from acquisition.session.folder import Session, SessionStep
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep
 from calibration.checks.light_codes import DEGREE, LIGHTS_A_TERM, angles_off_codes_deg
 from calibration.pipeline.build import build
 from calibration.report.report import write_report

@@ -14,7 +14,8 @@ import pytest
 
 from acquisition.chart.layout import A_SERIES_MM, design_chart
 from acquisition.chart.model import Chart
-from acquisition.session.folder import Session, SessionStep, plan_steps
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep, plan_steps
 from calibration.cli import main
 from calibration.fitting.polynomials import order_of, page_polynomial
 from calibration.pipeline.build import build, check
@@ -138,7 +139,7 @@ def test_the_primaries_correction_can_be_undone(table: Lut, built: BuildResult, 
         plain = np.sum([f[:, None] * white for f, white in zip(fields, paper, strict=True)], axis=0)
         plain /= np.sum(paper, axis=0)
         lit = np.sum(parts, axis=0) > 50
-        factor = built.figures.primaries.beside_paper(table.white[light])
+        factor = built.figures.primaries.field_ratio(table.white[light])
         assert (cell / plain)[lit] == pytest.approx(factor[lit], abs=1e-4)
 
 

@@ -17,11 +17,13 @@ import numpy as np
 import pytest
 
 import calibration.pipeline.build as building
-from acquisition.session.folder import Session, SessionStep
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep
 from calibration.pipeline.build import TableProgress, append, build
 from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, unfinished_table
 from calibration.pipeline.frames import lost_frames
-from calibration.table.lut import damage, open_lut
+from calibration.table.lut import open_lut
+from calibration.table.verification import find_faults
 from calibration.verdict.result import BuildResult
 from foundation.errors import FormatError, InputError
 from sim.world.world import Room
@@ -234,7 +236,7 @@ def test_a_checkpoint_of_another_form_is_not_gone_on_from(tmp_path: Path) -> Non
 def test_the_frames_of_a_table_are_found_again(session: Session, session_under_way: Session, tmp_path: Path) -> None:
     build(session, tmp_path / "lut")
     lut = open_lut(tmp_path / "lut")
-    assert damage(lut) == []
+    assert find_faults(lut) == []
     assert lost_frames(lut, session_under_way) == []
     first, second = (session_under_way.folder / frame.file for frame in lut.frames[1:3])
     first.unlink()

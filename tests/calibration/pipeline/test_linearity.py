@@ -16,7 +16,8 @@ from calibration.pipeline.build import build, check
 from calibration.pipeline.linearity import deviations
 from calibration.report.report import write_report
 from calibration.report.summary import summary
-from calibration.table.lut import damage, open_lut
+from calibration.table.lut import open_lut
+from calibration.table.verification import find_faults
 from calibration.verdict.result import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
@@ -172,11 +173,11 @@ def test_a_chart_that_stands_elsewhere_is_refused(session: Session, tmp_path: Pa
 def test_references_are_under_the_table_s_hashes(session: Session, tmp_path: Path) -> None:
     build(session, tmp_path / "lut")
     path = tmp_path / "lut" / "references.csv"
-    assert damage(open_lut(tmp_path / "lut")) == []
+    assert find_faults(open_lut(tmp_path / "lut")) == []
     path.write_text(path.read_text().replace("white", "wight", 1))
-    assert damage(open_lut(tmp_path / "lut")) == ["references.csv is not as it was built, or is gone"]
+    assert find_faults(open_lut(tmp_path / "lut")) == ["references.csv is not as it was built, or is gone"]
     path.unlink()
-    assert damage(open_lut(tmp_path / "lut")) == ["references.csv is not as it was built, or is gone"]
+    assert find_faults(open_lut(tmp_path / "lut")) == ["references.csv is not as it was built, or is gone"]
 
 
 def test_a_dark_frame_is_under_the_table_s_hashes(session: Session, tmp_path: Path) -> None:
@@ -186,4 +187,4 @@ def test_a_dark_frame_is_under_the_table_s_hashes(session: Session, tmp_path: Pa
     frames = tmp_path / "lut" / "frames.csv"
     lines = frames.read_text().splitlines(keepends=True)
     frames.write_text("".join(line for line in lines if not line.startswith("dark")))
-    assert damage(open_lut(tmp_path / "lut")) == ["frames.csv does not list the frames that lut.json was made of"]
+    assert find_faults(open_lut(tmp_path / "lut")) == ["frames.csv does not list the frames that lut.json was made of"]

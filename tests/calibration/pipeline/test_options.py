@@ -14,7 +14,9 @@ from calibration.pipeline.build import build, check
 from calibration.pipeline.options import BuildOptions
 from calibration.report.report import write_report
 from calibration.report.summary import summary as report_summary
-from calibration.table.lut import damage, open_lut, summary
+from calibration.table.description import describe
+from calibration.table.lut import open_lut
+from calibration.table.verification import find_faults
 from calibration.verdict.values import judged_values
 from foundation.errors import InputError
 
@@ -30,8 +32,8 @@ def test_three_by_three_are_the_inner_samples_of_five_by_five(session: Session, 
     small = build(session, tmp_path / "3", report=write_report, options=BuildOptions(3))
     five, three = open_lut(tmp_path / "5"), open_lut(tmp_path / "3")
     assert three.samples.shape == (*five.samples.shape[:2], 9, 3)
-    assert "9 samples each" in dict(summary(three))["Colours"]
-    assert damage(three) == []
+    assert "9 samples each" in dict(describe(three))["Colours"]
+    assert find_faults(three) == []
     inner = five.samples.reshape(*five.samples.shape[:2], 5, 5, 3)[:, :, 1:4, 1:4].reshape(three.samples.shape)
     # The same photosites; the field differs, since the references are sampled by the same window.
     off = inner.astype(np.float64) - three.samples

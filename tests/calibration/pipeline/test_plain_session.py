@@ -12,7 +12,8 @@ import pytest
 from acquisition.chart.layout import A_SERIES_MM, design_chart, paper_chart
 from acquisition.framing.tagless_field import field_mm
 from acquisition.lights.illuminations import Illumination
-from acquisition.session.folder import ACCEPTED, SessionStep
+from acquisition.session.journal import ACCEPTED
+from acquisition.session.plan import SessionStep
 from calibration.cli import main
 from calibration.pipeline.build import build
 from calibration.report.report import write_report
@@ -94,7 +95,7 @@ def test_nothing_is_registered_anew_where_nothing_moves(plain: Lab, tmp_path: Pa
         result = build(session, tmp_path / "lut")
     assert not any(figures.reregistered for figures in result.figures.frames)
     assert result.figures.largest_shift_px < 0.05
-    assert min(figures.shift.tags for figures in result.figures.frames) >= 16
+    assert min(figures.shift.gauges for figures in result.figures.frames) >= 16
     assert worst_error(plain, tmp_path / "lut") < 0.05
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.session.folder import FrameRecord, Session
+from acquisition.session.folder import Session
+from acquisition.session.journal import FrameRecord
 from calibration.pipeline import prefetching
 from calibration.pipeline.build import build
 from calibration.pipeline.prefetching import prefetched

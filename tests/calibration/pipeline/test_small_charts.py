@@ -44,5 +44,5 @@ def test_cells_of_a_hundred_pixels_are_found_well_enough(tmp_path: Path) -> None
     found = register(mosaic, lab.chart)
     error = found.to_pixels(lab.chart.centres_mm) - lab.truth_px(lab.chart.centres_mm, mosaic)
     assert found.cell_px > 100
-    assert found.room > 20
+    assert found.clearance > 20
     assert np.linalg.norm(error, axis=1).max() < 0.05 * found.cell_px

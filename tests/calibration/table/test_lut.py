@@ -12,15 +12,19 @@ import numpy as np
 import pytest
 
 from acquisition.lights.illuminations import plan_illuminations
-from calibration.table.lut import Frame, Lut, LutWriter, Provenance, damage, frames_sha256, open_lut, require_match
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.source_frames import SourceFrame, frames_sha256
+from calibration.table.verification import find_faults, require_match
+from calibration.table.writer import LutWriter
 from foundation.errors import FormatError, InputError, StorageError
 
 VERSION_1 = Path(__file__).parent / "table_v1"
 """Written by the first release of the format; never to be written again."""
 
 LIGHTS = plan_illuminations(1, (2500, 6500))
-FRAMES = [Frame("white", None, "frames/0000_white.dng", "00" * 32)] + [
-    Frame("light", light.index, f"frames/{light.index + 2:04d}_light.dng", f"{light.index:02x}" * 32)
+FRAMES = [SourceFrame("white", None, "frames/0000_white.dng", "00" * 32)] + [
+    SourceFrame("light", light.index, f"frames/{light.index + 2:04d}_light.dng", f"{light.index:02x}" * 32)
     for light in LIGHTS
 ]
 
@@ -59,7 +63,7 @@ def test_a_table_of_version_1_is_read_for_ever() -> None:
     assert [cell.colour for cell in lut.provenance.unfit] == [5]
     assert lut.frames == ()
     with pytest.raises(InputError, match="records no hashes"):
-        damage(lut)
+        find_faults(lut)
 
 
 def test_the_name_of_a_table_of_version_1_stays() -> None:
@@ -75,7 +79,7 @@ def test_the_hashes_are_those_of_the_files(tmp_path: Path) -> None:
     assert told["illuminations_sha256"] == hashlib.sha256((lut.folder / "illuminations.csv").read_bytes()).hexdigest()
     assert told["lights_sha256"] == [hashlib.sha256(slab.tobytes()).hexdigest() for slab in lut.samples]
     assert list(lut.frames) == FRAMES
-    assert damage(lut) == []
+    assert find_faults(lut) == []
 
 
 def test_a_table_s_name_changes_with_its_samples(tmp_path: Path) -> None:
@@ -116,7 +120,7 @@ def test_damage_is_found_and_told_where(tmp_path: Path, change: Callable[[Path],
     lut = write(tmp_path / "lut")
     change(lut.folder)
     seen: list[tuple[int, int]] = []
-    faults = damage(open_lut(lut.folder), lambda done, total: seen.append((done, total)))
+    faults = find_faults(open_lut(lut.folder), lambda done, total: seen.append((done, total)))
     assert len(faults) == 1
     assert told in faults[0]
     assert seen[-1] == (len(LIGHTS), len(LIGHTS))

@@ -1,4 +1,4 @@
-"""Samples are the sensor's own counts at the right places, and patches that are not of one colour are found."""
+"""Samples are the sensor's own counts at the right places."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.report.half_size import half_size
-from calibration.sampling.samples import gather, gather_values, noise_of, patch_means, sites_at, table_values, uneven
+from calibration.sampling.samples import gather, gather_values, sites_at, table_values
 from tests.calibration.lab import Lab
 
 
@@ -67,56 +67,3 @@ def test_one_pass_and_two_give_the_same_values(lab: Lab, tmp_path: Path, window:
     # By NumPy alone, in double precision: equal but where a value lies on the edge between two counts.
     plain = np.rint((samples[inside].astype(np.float64) - dark[inside, None]) / field[inside, None])
     assert np.abs(values[inside] - np.clip(plain, 0, None)).max() <= 1
-
-
-def patches(level: float, sigma: float, count: int = 3000) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    return np.random.default_rng(2).normal(level, sigma, (count, 25, 3))
-
-
-def test_noise_alone_is_even() -> None:
-    samples = patches(800, 30)
-    assert not uneven(samples, np.full((len(samples), 3), 30.0)).any()
-
-
-def test_a_rim_of_another_colour_is_found() -> None:
-    samples = patches(8000, 60)
-    rim = np.ones((5, 5), dtype=bool)
-    rim[1:-1, 1:-1] = False
-    samples[7, rim.ravel(), 1] += 400
-    found = uneven(samples, np.full((len(samples), 3), 60.0))
-    assert np.flatnonzero(found).tolist() == [7]
-    assert found[7] == pytest.approx(400 / (8000 + 400 * 16 / 25), rel=0.15)
-
-
-def test_less_than_a_percent_is_let_be() -> None:
-    samples = patches(8000, 1)
-    rim = np.ones((5, 5), dtype=bool)
-    rim[1:-1, 1:-1] = False
-    samples[:, rim.ravel()] += 70
-    assert not uneven(samples, np.full((len(samples), 3), 1.0)).any()
-
-
-@pytest.mark.parametrize("window", [3, 7, 9])
-def test_a_rim_is_found_in_other_windows(window: int) -> None:
-    """Noise of 0.4 %, a rim 8 % brighter: beyond 5 σ even of the single inner pixel of 3×3."""
-    samples = np.random.default_rng(6).normal(8000, 30, (3000, window**2, 3))
-    rim = np.ones((window, window), dtype=bool)
-    rim[1:-1, 1:-1] = False
-    samples[7, rim.ravel(), 1] += 640
-    assert np.flatnonzero(uneven(samples, noise_of(samples))).tolist() == [7]
-
-
-def test_noise_is_known_as_a_function_of_the_level() -> None:
-    random = np.random.default_rng(5)
-    level = random.uniform(50, 8000, 4000)
-    sigma = np.sqrt(36 + level / 1.8)
-    samples = level[:, None, None] + sigma[:, None, None] * random.standard_normal((4000, 25, 3))
-    ratio = noise_of(samples) / sigma[:, None]
-    assert np.median(ratio) == pytest.approx(1, abs=0.02)
-    assert np.abs(ratio[level > 500] - 1).max() < 0.15
-
-
-def test_patch_means_are_numpys() -> None:
-    values = np.random.default_rng(4).integers(0, 65536, (50, 25, 3)).astype(np.uint16)
-    np.testing.assert_allclose(patch_means(values), values.mean(axis=1), rtol=1e-14)
-    np.testing.assert_allclose(patch_means(values[::3]), values[::3].mean(axis=1), rtol=1e-14)

@@ -22,7 +22,7 @@ from foundation.errors import RegistrationError
 from sim.world.world import Room
 from tests.calibration.lab import Lab, hang
 
-RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw"
+RAW = Path(__file__).parents[3].parent / "shared" / "data" / "raw"
 
 
 def miss(lab: Lab, mosaic: Mosaic) -> npt.NDArray[np.float64]:

@@ -11,7 +11,8 @@ import pytest
 
 from acquisition.lights.illuminations import plan_illuminations
 from calibration.pipeline.build import build
-from calibration.radiometry.paper import FlatField, Paper, PaperReader
+from calibration.radiometry.flat_field import FlatField
+from calibration.radiometry.paper import Paper, PaperReader
 from calibration.radiometry.primaries import Primaries, pure_lights
 from calibration.table.lut import open_lut
 from sim.world.world import Room
@@ -47,7 +48,7 @@ def test_a_cells_field_is_what_it_reflects() -> None:
     true = np.einsum("p,ip,pic->ic", amounts, fields, cells) / np.einsum("p,pic->ic", amounts, cells)
     of_paper = np.einsum("p,ip,pc->ic", amounts, fields, paper) / white
     assert np.abs(true / of_paper - 1).max() > 0.01
-    assert known.beside_paper(white) == pytest.approx(true / of_paper, abs=3e-3)
+    assert known.field_ratio(white) == pytest.approx(true / of_paper, abs=3e-3)
     # Undone by what `lut.json` tells.
     told = known.correction(white[None])
     assert told["lights"] == [0, 1, 2]
@@ -63,7 +64,7 @@ def test_one_primary_has_papers_field() -> None:
         (0, 1, 2), [replace(p, white=np.eye(3)[n] * 1000) for n, p in enumerate(alone)], [*known.cells], CENTRES
     )
     assert pure is not None
-    assert pure.beside_paper(np.array([0, 800.0, 0])) == pytest.approx(1, abs=1e-12)
+    assert pure.field_ratio(np.array([0, 800.0, 0])) == pytest.approx(1, abs=1e-12)
 
 
 def test_a_dim_primary_tells_nothing() -> None:
@@ -103,7 +104,7 @@ def test_a_session_of_unlike_primaries_is_told_true(tmp_path: Path) -> None:
         true = lab.world.reflected(codes, light.colour, SETTINGS) / white * lut.white[light.index]
         off = lut.samples[light.index].mean(axis=1) / true - 1
         lit = fit[:, None] & (true > 1500)
-        undone = (1 + off) * result.figures.primaries.beside_paper(lut.white[light.index]) - 1
+        undone = (1 + off) * result.figures.primaries.field_ratio(lut.white[light.index]) - 1
         corrected.append(off[lit])
         plain.append(undone[lit])
     one, other = (float(np.sqrt((np.concatenate(values) ** 2).mean())) for values in (corrected, plain))

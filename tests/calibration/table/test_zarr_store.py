@@ -12,7 +12,10 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from acquisition.lights.illuminations import Illumination
-from calibration.table.lut import Frame, Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.source_frames import SourceFrame
+from calibration.table.writer import LutWriter
 from calibration.table.zarr_store import SHARD_LIGHTS, fetch, publish
 from drivers.presenter import Colour
 from foundation.errors import FormatError, InputError, StorageError
@@ -34,7 +37,7 @@ def lut(tmp_path: Path) -> Lut:
     known = Provenance(
         camera="Šestica", bits=2, white_level=8000, session_sha256="1", chart_sha256="2", software="test 1"
     )
-    writer.finish(lights, white, known, [Frame("light", 0, "a.CR2", "3" * 64)])
+    writer.finish(lights, white, known, [SourceFrame("light", 0, "a.CR2", "3" * 64)])
     return open_lut(folder)
 
 

@@ -12,8 +12,8 @@ import pytest
 from scipy import ndimage
 
 from acquisition.chart.layout import paper_chart
+from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.planes import Plane, plane_of, strongest_plane
-from acquisition.framing.tags import Framing, find_chart
 from calibration.registration.movement import gauge_boxes, shift_between
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic
@@ -48,7 +48,7 @@ def moved(plane: Plane, dx: float, dy: float) -> Plane:
 def test_a_still_field_does_not_move(white: Mosaic, framing: Framing, tmp_path: Path, colour: Colour) -> None:
     later = strongest_plane(lab_of(FILL).mosaic(tmp_path, colour, key=2))
     shift = shift_between(plane_of(white, later.channel), framing, later)
-    assert shift.tags >= 16
+    assert shift.gauges >= 16
     assert shift.largest_px < 0.03
 
 
@@ -75,7 +75,7 @@ def test_a_leap_is_not_measured_as_a_step(white: Mosaic, framing: Framing, by: t
     plane = plane_of(white, "G")
     shift = shift_between(plane, framing, moved(plane, *by))
     # Not seen, or at least known to be no small step.
-    assert shift.tags == 0 or shift.largest_px > 0.6
+    assert shift.gauges == 0 or shift.largest_px > 0.6
 
 
 def test_a_hand_over_a_fifth_of_the_field_does_not_move_it(white: Mosaic, framing: Framing) -> None:
@@ -84,14 +84,14 @@ def test_a_hand_over_a_fifth_of_the_field_does_not_move_it(white: Mosaic, framin
     height, width = values.shape
     values[: height // 3, : width // 3] = 200
     shift = shift_between(plane, framing, replace(plane, values=values))
-    assert shift.tags >= 16
+    assert shift.gauges >= 16
     assert shift.largest_px < 0.05
 
 
 def test_no_field_is_seen_in_the_dark(white: Mosaic, framing: Framing) -> None:
     plane = plane_of(white, "G")
     noise = np.random.default_rng(0).normal(0, 6, plane.values.shape).astype(np.float32)
-    assert shift_between(plane, framing, replace(plane, values=noise)).tags == 0
+    assert shift_between(plane, framing, replace(plane, values=noise)).gauges == 0
 
 
 def test_only_the_boxes_are_looked_at(white: Mosaic, framing: Framing) -> None:
@@ -104,7 +104,7 @@ def test_only_the_boxes_are_looked_at(white: Mosaic, framing: Framing) -> None:
             values[top:bottom, left:right] = whole.values[top:bottom, left:right]
         parts.append(replace(whole, values=values))
     one, other = shift_between(parts[0], framing, parts[1]), shift_between(plane, framing, later)
-    assert (one.dx, one.dy, one.largest_px, one.tags) == (other.dx, other.dy, other.largest_px, other.tags)
+    assert (one.dx, one.dy, one.largest_px, one.gauges) == (other.dx, other.dy, other.largest_px, other.gauges)
 
 
 @pytest.mark.parametrize("colour", [WHITE, Colour(0, 0, 255)])

@@ -1,8 +1,6 @@
-"""Black, saturation, the field and the ground truth."""
+"""The flat field and the ground truth, read from bare paper."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -10,19 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.radiometry.paper import (
-    AROUND,
-    FlatField,
-    Paper,
-    PaperReader,
-    black_drift,
-    corrections,
-    saturation,
-)
-from drivers.camera import ExposureSettings
-from drivers.presenter import WHITE
+from calibration.radiometry.corrections import corrections
+from calibration.radiometry.flat_field import FlatField
+from calibration.radiometry.paper import MAX_ORDER_AROUND, Paper, PaperReader
 from foundation.errors import QualityError
-from tests.calibration.lab import Lab
 
 PAGE = (400.0, 300.0)
 RANDOM = np.random.default_rng(3)
@@ -111,25 +100,6 @@ def test_an_even_field_is_one() -> None:
     assert isinstance(FlatField.uniform(PAGE), FlatField)
 
 
-def test_saturation_is_what_the_frame_shows(lab: Lab, tmp_path: Path) -> None:
-    normal = lab.mosaic(tmp_path)
-    assert saturation(normal) == normal.white_level == lab.world.body.saturation
-    # A sensor that saturates below what its file states, as LibRaw's tables have it for the EOS 550D.
-    plateau = 12_800
-
-    def saturate(counts: npt.NDArray[np.uint16]) -> None:
-        np.minimum(counts, plateau, out=counts)
-
-    bright = lab.mosaic(tmp_path, WHITE, settings=ExposureSettings(100, 8.0, 2.0), paint=saturate)
-    assert bright.white_level > plateau
-    assert saturation(bright) == plateau
-
-
-def test_black_drift_is_the_worst_position() -> None:
-    assert black_drift([]) == 0
-    assert black_drift([np.zeros((2, 2)), np.array([[0, 0.2], [-0.3, 0.1]])]) == pytest.approx(0.3)
-
-
 def test_a_stain_is_ignored_by_the_white_and_told_by_the_spread() -> None:
     random = np.random.default_rng(8)
     seen = falloff(PLACES) * 6000 + random.normal(0, 12, (len(PLACES), 3))
@@ -155,6 +125,6 @@ def test_references_in_the_margin_tell_no_shape_that_vanishes_there() -> None:
     u, v = (2 * CENTRES / PAGE - 1).T
     true = falloff(CENTRES) * (1 + 0.02 * u - 0.01 * v * v)[:, None]
     true /= true.mean(axis=0)
-    field = PaperReader(side, CENTRES, PAGE, base, AROUND).read(seen)[0].field
-    assert max(field.orders()) <= AROUND
+    field = PaperReader(side, CENTRES, PAGE, base, MAX_ORDER_AROUND).read(seen)[0].field
+    assert max(field.orders()) <= MAX_ORDER_AROUND
     assert np.abs(field.at(CENTRES) / true - 1).max() < 0.01

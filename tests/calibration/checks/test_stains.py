@@ -44,7 +44,7 @@ def test_a_clean_print_has_none(seed: int, tmp_path: Path) -> None:
     assert not stains.stained.any()
     assert not stains.doubtful.any()
     assert (np.isfinite(stains.deviation)).mean() > 0.95
-    assert (stains.largest() == 0).mean() < 0.05
+    assert (stains.largest_deviation() == 0).mean() < 0.05
 
 
 @pytest.mark.parametrize(("depth", "seed"), [(0.15, 0), (0.5, 2)])
@@ -60,7 +60,7 @@ def test_a_thumb_s_stain_is_found_cell_by_cell(depth: float, seed: int, tmp_path
     assert not stains.stained[outside].any()
     # So few cells fit that every neighbourhood reaches beyond the rim.
     assert -1.15 * depth < stains.deviation[inside, 2].min() < -0.6 * depth
-    assert (stains.largest()[inside] < 0).all()
+    assert (stains.largest_deviation()[inside] < 0).all()
 
 
 def drawn(bits: int, seed: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
@@ -95,7 +95,7 @@ def test_a_stain_is_found_to_its_rim() -> None:
     assert stains.stained[under].mean() > 0.95
     assert not stains.stained[away > 12.5 + 15].any()
     assert stains.stained[~under].sum() <= 3
-    assert (np.sign(stains.largest()[under]) == -1).all()
+    assert (np.sign(stains.largest_deviation()[under]) == -1).all()
 
 
 def test_cells_that_cannot_be_used_are_no_evidence() -> None:
@@ -112,4 +112,4 @@ def test_what_is_dark_says_nothing() -> None:
     stains = find_stains(level / 9000 * 20, places, 3)
     assert np.isnan(stains.deviation).all()
     assert not stains.stained.any()
-    assert not stains.largest().any()
+    assert not stains.largest_deviation().any()
