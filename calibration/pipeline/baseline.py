@@ -1,6 +1,6 @@
 """What the frame that is registered first settles for all frames of a session.
 
-Its light's shape is the base of all others', its cells tell what every frame's should look like, and the primaries'
+Its light's shape is the base of all others', its cells what every frame's are expected to look like, and the primaries'
 frames how the field of a coloured cell differs from that of paper. A baseline does not change, so threads share it.
 """
 

@@ -1,4 +1,4 @@
-"""Accept, accept with remarks, or refuse: values held against `calibration.verdict.thresholds`.
+"""Accept, accept with remarks, or refuse: values compared with `calibration.verdict.thresholds`.
 
 Laws that hold inside:
 

@@ -196,18 +196,18 @@ def test_a_hand_in_the_light_is_refused(
 def test_a_frame_that_is_spoilt_is_named_with_the_place(lab: Lab, tmp_path: Path) -> None:
     with session_of(lab, tmp_path, shaded(lab, 0.8, once)) as session, pytest.raises(QualityError) as refused:
         build(session, tmp_path / "lut")
-    assert "frames/0002_light_000.dng about " in str(refused.value)
+    assert "frames/0002_light_000.dng, about " in str(refused.value)
     assert "a hand, a shadow or a reflection" in str(refused.value)
 
 
-def test_a_faint_shadow_is_told(lab: Lab, tmp_path: Path) -> None:
+def test_a_faint_shadow_is_remarked_on(lab: Lab, tmp_path: Path) -> None:
     """6 % less light on a hand's breadth is no reason to refuse a table, but to look at it."""
     with session_of(lab, tmp_path, shaded(lab, 0.94, once)) as session:
         result = build(session, tmp_path / "lut")
     assert "unlike_block" in {row.threshold.name for row in result.verdict.remarks}
 
 
-def test_a_lamp_that_flickers_is_told_and_harms_no_colour(lab: Lab, tmp_path: Path) -> None:
+def test_a_lamp_that_flickers_is_reported_and_harms_no_colour(lab: Lab, tmp_path: Path) -> None:
     """Every frame has its own brightness; each light's ground truth is of its own frame."""
     bright = {step: ExposureSettings(100, 8.0, 0.5 * (0.94 if step % 2 else 1.0)) for step in range(20)}
     frame = exposed(lab, lambda step: bright[step.number])

@@ -106,9 +106,9 @@ def test_nothing_is_unfit_in_a_healthy_session(built: BuildResult) -> None:
 
 def test_the_field_can_be_undone(table: Lut, built: BuildResult, session: Session, lab: Lab) -> None:
     """Multiplied by the field of `lut.json`, the table gives the counts of the frame again."""
-    told = {correction["name"]: correction for correction in table.provenance.corrections}
-    assert list(told) == ["black", "half size", "saturation", "field", "rounding", "drift", "primaries"]
-    assert len(told["field"]["per_light"]) == len(told["black"]["per_light"]) == len(LIGHTS)
+    done = {correction["name"]: correction for correction in table.provenance.corrections}
+    assert list(done) == ["black", "half size", "saturation", "field", "rounding", "drift", "primaries"]
+    assert len(done["field"]["per_light"]) == len(done["black"]["per_light"]) == len(LIGHTS)
     figures = next(f for f in built.figures.frames if f.record.illumination == 5)
     field = figures.paper.field.at(lab.chart.centres_mm[lab.chart.cell_of_colour])
     assert field.mean(axis=0) == pytest.approx(1, abs=1e-6)
@@ -121,18 +121,18 @@ def test_the_field_can_be_undone(table: Lut, built: BuildResult, session: Sessio
 
 
 def test_the_primaries_correction_can_be_undone(table: Lut, built: BuildResult, lab: Lab) -> None:
-    """What `lut.json` tells of it, and the table's own samples of the primaries, give the factor of every cell."""
-    told = next(done for done in table.provenance.corrections if done["name"] == "primaries")
+    """What `lut.json` records of it, and the table's own samples of the primaries, give the factor of every cell."""
+    recorded = next(done for done in table.provenance.corrections if done["name"] == "primaries")
     assert built.figures.primaries is not None
     places = lab.chart.centres_mm[lab.chart.cell_of_colour]
     fields = [
         np.prod([page_polynomial(places, lab.chart.page_mm, order_of(len(f))) @ np.array(f) for f in factors], axis=0)
-        for factors in told["field"]
+        for factors in recorded["field"]
     ]
-    alone = [table.samples[light].mean(axis=1) for light in told["lights"]]
-    for light, amounts in enumerate(told["per_light"]):
+    alone = [table.samples[light].mean(axis=1) for light in recorded["lights"]]
+    for light, amounts in enumerate(recorded["per_light"]):
         parts = [amount * cells for amount, cells in zip(amounts, alone, strict=True)]
-        paper = [amount * np.array(white) for amount, white in zip(amounts, told["paper"], strict=True)]
+        paper = [amount * np.array(white) for amount, white in zip(amounts, recorded["paper"], strict=True)]
         cell = np.sum([f[:, None] * part for f, part in zip(fields, parts, strict=True)], axis=0) / np.sum(
             parts, axis=0
         )
@@ -143,7 +143,7 @@ def test_the_primaries_correction_can_be_undone(table: Lut, built: BuildResult, 
         assert (cell / plain)[lit] == pytest.approx(factor[lit], abs=1e-4)
 
 
-def test_dark_frames_tell_the_projector_s_black(built: BuildResult, lab: Lab) -> None:
+def test_dark_frames_show_the_projector_s_black(built: BuildResult, lab: Lab) -> None:
     true = lab.world.white(BLACK, SETTINGS) / lab.world.white(WHITE, SETTINGS)
     white = next(figures.paper.white for figures in built.figures.frames if figures.record.kind == "white")
     dark = built.figures.dark_frames
@@ -200,7 +200,7 @@ def test_a_hot_and_a_dead_photosite_are_named(lab: Lab, tmp_path: Path) -> None:
     assert len(unfit) <= 4
 
 
-def test_a_lamp_that_fades_is_told_and_not_corrected(lab: Lab, tmp_path: Path) -> None:
+def test_a_lamp_that_fades_is_reported_and_not_corrected(lab: Lab, tmp_path: Path) -> None:
     """3 % over the session: each light keeps its own ground truth, and the gain brings them to one lamp."""
     lights = LIGHTS[:6]
     steps = len(plan_steps(lights, 2))

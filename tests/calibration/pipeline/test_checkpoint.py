@@ -31,16 +31,16 @@ from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
 
 KILLER = """
 import os, signal, sys
-import calibration.pipeline.build, calibration.pipeline.checkpoint, calibration.table.lut, calibration.report.report
+import calibration.pipeline.build, calibration.pipeline.checkpoint, calibration.table.writer, calibration.report.report
 from calibration.cli import main
 
 place, count = sys.argv[1], int(sys.argv[2])
 calibration.pipeline.build.CHECKPOINT_EVERY = 3
 calibration.report.report.write_report = lambda *_: None
 owner, name = {
-    "putting": (calibration.table.lut.LutWriter, "put"),
+    "putting": (calibration.table.writer.LutWriter, "put"),
     "saving": (calibration.pipeline.checkpoint.UnfinishedTable, "save"),
-    "finishing": (calibration.table.lut, "write_whole"),
+    "finishing": (calibration.table.writer, "write_whole"),
     "publishing": (calibration.pipeline.checkpoint.Path, "replace"),
 }[place]
 real = getattr(owner, name)

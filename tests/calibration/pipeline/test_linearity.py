@@ -1,4 +1,4 @@
-"""A series of exposures tells a sensor that bends from one that does not."""
+"""A series of exposures shows whether a sensor is linear."""
 
 from __future__ import annotations
 
@@ -86,12 +86,12 @@ def test_rounded_times_are_read_as_the_stops_they_stand_for() -> None:
     assert np.nanmax(np.abs(found)) < 0.003
 
 
-def test_what_no_patch_tells_is_left_open() -> None:
+def test_levels_without_patches_are_left_open() -> None:
     reflectance = np.full((1, 300, 3), 1.0)
     _, found = deviations(np.array([0.4, 0.5, 0.6])[:, None, None] * reflectance, np.array([0.4, 0.5, 0.6]))
-    told = np.isfinite(found[0])
-    assert 2 <= told.sum() < 6
-    assert np.abs(found[:, told]).max() < 1e-5
+    measured = np.isfinite(found[0])
+    assert 2 <= measured.sum() < 6
+    assert np.abs(found[:, measured]).max() < 1e-5
     assert np.isnan(deviations(0.001 * reflectance.repeat(4, axis=0), np.arange(1.0, 5))[1]).all()
 
 
@@ -126,9 +126,9 @@ def shown(result: BuildResult) -> tuple[str, str]:
 def test_the_table_says_how_linear_its_camera_is(session: Session, lab: Lab, tmp_path: Path) -> None:
     folder = write_series(lab, tmp_path / "series")
     result = build(session, tmp_path / "lut", report=write_report, linearity=folder)
-    told = json.loads((tmp_path / "lut" / "report.json").read_text())
-    assert told["figures"]["linearity"] < 0.005
-    assert len(told["channels"]["linearity"]) == 10
+    written = json.loads((tmp_path / "lut" / "report.json").read_text())
+    assert written["figures"]["linearity"] < 0.005
+    assert len(written["channels"]["linearity"]) == 10
     assert shown(result)[0].endswith("from a straight line at most")
     assert "8 exposures" in shown(result)[1]
     # The series says nothing of the samples, so it changes none of the table's bytes.

@@ -55,7 +55,7 @@ def worst_error(lab: Lab, folder: Path) -> float:
 
 
 @pytest.mark.parametrize(("by", "anew"), [((0.3, -0.2), []), ((4.0, -2.5), [2])])
-def test_a_bump_is_followed_and_told(plain: Lab, tmp_path: Path, by: tuple[float, float], anew: list[int]) -> None:
+def test_a_bump_is_followed_and_reported(plain: Lab, tmp_path: Path, by: tuple[float, float], anew: list[int]) -> None:
     bumped = moved_by(*by)
     lights = renumbered([*LIGHTS[4:8], RED])
 
@@ -112,7 +112,7 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
     return run
 
 
-def test_corners_by_hand_tell_what_the_light_does_not(plain: Lab, tmp_path: Path, command: Command) -> None:
+def test_corners_by_hand_stand_in_for_light_that_shows_nothing(plain: Lab, tmp_path: Path, command: Command) -> None:
     """Of red light alone nobody can say which way up the chart hangs; white frames are all refused here."""
     lights = renumbered([RED])
     with take(
