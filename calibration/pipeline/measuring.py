@@ -32,7 +32,8 @@ from calibration.radiometry.paper import MAX_ORDER, MAX_ORDER_AROUND, Paper, Pap
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.movement import Shift, gauge_boxes, shift_between
-from calibration.registration.register import Registration, register
+from calibration.registration.register import register
+from calibration.registration.registration import Registration
 from calibration.sampling.patch_statistics import patch_means, sample_noise
 from calibration.sampling.samples import WINDOW, Sites, gather, gather_values, sites_at, table_values
 from drivers.raw.rawfile import Mosaic

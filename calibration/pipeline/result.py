@@ -15,7 +15,7 @@ from calibration.radiometry.dark_frames import DarkSummary
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
 from calibration.radiometry.sensor_range import black_drift
-from calibration.registration.register import Registration
+from calibration.registration.registration import Registration
 from calibration.sampling.samples import WINDOW
 from calibration.table.provenance import Unfit
 from calibration.verdict.verdict import Verdict, figures_of, judge

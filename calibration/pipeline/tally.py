@@ -21,7 +21,6 @@ from calibration.checks.stains import Stains, find_stains
 from calibration.pipeline.measuring import Measured, MeasuredDark, Stretch
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
 from calibration.radiometry.flat_field import FlatField
-from calibration.registration.matching import MIN_BLOCK_SCORE
 from calibration.sampling.patch_statistics import has_dead_photosite, unevenness
 from calibration.table.provenance import Unfit
 
@@ -154,4 +153,4 @@ def _covered_cells(chart: Chart, stretch: Stretch) -> npt.NDArray[np.bool_]:
     """Return the cells that do not look like the chart's, alone or with their neighbourhood."""
     blocks, cells = stretch.registration.blocks, chart.cell_of_colour
     nearest = np.asarray(cKDTree(blocks.centres_mm).query(chart.centres_mm[cells])[1])
-    return stretch.registration.mismatched_cells[cells] | np.asarray(blocks.score[nearest] < MIN_BLOCK_SCORE)
+    return stretch.registration.mismatched_cells[cells] | ~blocks.good[nearest]

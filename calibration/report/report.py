@@ -27,7 +27,7 @@ from calibration.checks.frame_consistency import has_enough_cells
 from calibration.checks.stains import Stains
 from calibration.pipeline.result import BuildResult
 from calibration.radiometry.sensor_range import MAX_BLACK_DRIFT
-from calibration.registration.register import Registration
+from calibration.registration.registration import Registration
 from calibration.report.mosaic import half_size
 from calibration.sampling.patch_statistics import rim_difference, sample_noise
 from calibration.sampling.samples import sites_at

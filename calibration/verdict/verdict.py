@@ -28,7 +28,7 @@ from foundation.errors import first_of
 
 if TYPE_CHECKING:
     from calibration.pipeline.result import BuildResult
-    from calibration.registration.register import Registration
+    from calibration.registration.registration import Registration
 
 SAFE_BLEED = 0.002
 """Share of a sample's light from beyond its cell that is taken for none."""
