@@ -14,18 +14,18 @@ Laws that hold inside:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.planes import CLIPPING_SHARE, frame_black
+from calibration.figures.linearity_figures import LinearityFigures
 from calibration.fitting.least_squares import least_squares
+from calibration.pipeline.baseline import Baseline
 from calibration.pipeline.frames import strongest_channel
-from calibration.pipeline.measuring import STILL_PX, Measurement
 from calibration.radiometry.sensor_range import saturation
-from calibration.registration.movement import Shift
+from calibration.registration.movement import STILL_PX, Shift
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import FormatError, InputError
 
@@ -42,49 +42,16 @@ _HARD, _SOFT = 1e2, 0.1
 _Array = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Linearity:
-    """How counts follow the light.
-
-    Attributes
-    ----------
-    files
-        The frames, by rising exposure.
-    exposure_s
-        (K,) float64, as the files state them.
-    level
-        (B,) float64, shares of saturation.
-    deviation
-        (3, B) float64, relative, of the counts from the line that fits best; NaN where no patch tells.
-    """
-
-    files: tuple[str, ...]
-    exposure_s: _Array
-    level: _Array
-    deviation: _Array
-
-    @property
-    def worst(self) -> float:
-        """The largest deviation, a share."""
-        return float(np.nanmax(np.abs(self.deviation)))
-
-    @property
-    def covered(self) -> tuple[float, float]:
-        """The lowest and the highest share of saturation that a patch of any channel told of."""
-        told = np.flatnonzero(np.isfinite(self.deviation).any(axis=0))
-        return float(self.level[told[0]]), float(self.level[told[-1]])
-
-
-def read_linearity(folder: Path, work: Measurement) -> Linearity:
-    """Return what a series of exposures says.
+def read_linearity(folder: Path, baseline: Baseline) -> LinearityFigures:
+    """Return what a series of exposures shows.
 
     Parameters
     ----------
     folder
         Raw files of the chart where the session's first registered frame has it, under one steady light, with one ISO
         speed and aperture, from dim to the brink of saturation; eight are usual. Hidden files are passed over.
-    work
-        The measurement of the session, which knows where the patches are.
+    baseline
+        The session's, by which the patches are found.
 
     Raises
     ------
@@ -119,8 +86,8 @@ def read_linearity(folder: Path, work: Measurement) -> Linearity:
             )
         black = frame_black(mosaic)
         limit = saturation(mosaic)
-        _require_in_place(work.movement(mosaic, black, strongest_channel(mosaic, black), str(path)), path)
-        means, highest = work.patches(mosaic, black)
+        _require_in_place(baseline.movement(mosaic, black, strongest_channel(mosaic, black), str(path)), path)
+        means, highest = baseline.patches(mosaic, black)
         means[highest >= CLIPPING_SHARE * limit] = np.nan
         seen.append(means)
         limits.append(limit - float(black.mean()))
@@ -136,7 +103,7 @@ def read_linearity(folder: Path, work: Measurement) -> Linearity:
             f"{folder}: no patch is between {LOWEST:.0%} and {HIGHEST:.0%} of saturation in two frames; "
             "take the series with times less far apart, from dim to nearly saturated"
         )
-    return Linearity(tuple(paths[number].name for number in order), np.array(times)[order], level, deviation)
+    return LinearityFigures(tuple(paths[number].name for number in order), np.array(times)[order], level, deviation)
 
 
 def _exposure_s(mosaic: Mosaic, path: Path) -> float:
@@ -224,13 +191,3 @@ def _hat(level: _Array, nodes: _Array) -> _Array:
     """Return the weights (N, B) of nodes for linear interpolation in the logarithm of a level."""
     at = (np.log(level) - np.log(nodes[0])) / (np.log(nodes[1]) - np.log(nodes[0]))
     return np.asarray(np.maximum(1 - np.abs(at[:, None] - np.arange(len(nodes))), 0), dtype=np.float64)
-
-
-def curve(linearity: Linearity) -> list[tuple[float, list[float | None]]]:
-    """Return each level with the deviations of R, G and B there, None where no patch tells; for `report.json`."""
-
-    def told(values: _Array) -> list[float | None]:
-        return [float(f"{value:.4g}") if np.isfinite(value) else None for value in values.tolist()]
-
-    levels = linearity.level.tolist()
-    return [(float(f"{level:.4g}"), told(linearity.deviation[:, number])) for number, level in enumerate(levels)]

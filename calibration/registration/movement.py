@@ -20,6 +20,12 @@ from foundation.robust import huber_weights, sigma_of
 
 MAX_SHIFT_PX = 3.0
 
+STILL_PX = 0.1
+"""Half-size px that the chart may move before the sampling grid follows: a fifth of the rounding of samples' places."""
+
+BUMP_PX = 0.5
+"""Half-size px from which on the chart is registered again: camera or print was knocked, and may have turned too."""
+
 _GAUGE_TAGS = 8
 _STEPS = 5
 _AROUND_TAG_PX = 12

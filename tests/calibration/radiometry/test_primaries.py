@@ -96,7 +96,7 @@ def test_a_session_of_unlike_primaries_is_told_true(tmp_path: Path) -> None:
     codes = lab.chart.rgb[lab.chart.cell_of_colour]
     fit = np.ones(len(codes), dtype=bool)
     fit[[cell.colour for cell in lut.provenance.unfit]] = False
-    assert result.primaries is not None
+    assert result.figures.primaries is not None
     corrected: list[_Array] = []
     plain: list[_Array] = []
     for light in lights:
@@ -104,7 +104,7 @@ def test_a_session_of_unlike_primaries_is_told_true(tmp_path: Path) -> None:
         true = lab.world.reflected(codes, light.colour, SETTINGS) / white * lut.white[light.index]
         off = lut.samples[light.index].mean(axis=1) / true - 1
         lit = fit[:, None] & (true > 1500)
-        undone = (1 + off) * result.primaries.field_ratio(lut.white[light.index]) - 1
+        undone = (1 + off) * result.figures.primaries.field_ratio(lut.white[light.index]) - 1
         corrected.append(off[lit])
         plain.append(undone[lit])
     one, other = (float(np.sqrt((np.concatenate(values) ** 2).mean())) for values in (corrected, plain))

@@ -1,4 +1,4 @@
-"""`build-lut` on tables that are there: told, verified, compared; and what it says of a table in the making."""
+"""`build-lut` on tables that are there: described, verified, compared; and what it says of an unfinished one."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ Command = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
     def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["build-lut", *map(str, arguments)])
-        code = main()
+        code = main([*map(str, arguments)])
         said = capsys.readouterr()
         return code, said.out, said.err
 
@@ -57,8 +56,8 @@ def test_a_check_tells_nothing_that_one_frame_cannot(session: Session, command: 
     code, out, _ = command("--check", session.folder)
     assert code == 0
     assert "remark: Frames" not in out
-    assert "Chart moved" not in out
-    assert "White drift" not in out
+    assert "Movement of the chart" not in out
+    assert "Drift of white" not in out
     assert "Tags found" in out
 
 

@@ -1,4 +1,4 @@
-"""Sessions of a chart without tags: what moves between frames is followed, and told."""
+"""Sessions of a chart without tags: what moves between frames is followed, and reported."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ def test_a_bump_is_followed_and_told(plain: Lab, tmp_path: Path, by: tuple[float
 
     with take(plain, tmp_path / "session", lights, frame=frame) as session:
         result = build(session, tmp_path / "lut", report=write_report)
-    assert [figures.record.illumination for figures in result.frames if figures.registered] == anew
-    first = next(figures for figures in result.frames if figures.record.illumination == 2)
+    assert [figures.record.illumination for figures in result.figures.frames if figures.reregistered] == anew
+    first = next(figures for figures in result.figures.frames if figures.record.illumination == 2)
     assert (first.shift.dx, first.shift.dy) == pytest.approx(by, abs=0.05)
-    assert result.largest_shift_px == pytest.approx(np.hypot(*by), abs=0.07)
+    assert result.figures.largest_shift_px == pytest.approx(np.hypot(*by), abs=0.07)
     # A grid left behind by 4 px reads the next cell: 0.15 of white here.
     assert worst_error(plain, tmp_path / "lut") < 0.05
     page = (tmp_path / "lut" / "report.html").read_text()
-    assert f"{len(anew)} frames registered anew" in page
+    assert f"{len(anew)} frames registered again" in page
     remarks = [row.threshold.name for row in result.verdict.remarks]
     assert ("moved_anew" in remarks) == bool(anew)
 
@@ -85,7 +85,7 @@ def test_a_turn_is_registered_anew(plain: Lab, tmp_path: Path) -> None:
 
     with take(plain, tmp_path / "session", lights, frame=frame) as session:
         result = build(session, tmp_path / "lut")
-    assert [figures.record.illumination for figures in result.frames if figures.registered] == [1]
+    assert [figures.record.illumination for figures in result.figures.frames if figures.reregistered] == [1]
     assert worst_error(plain, tmp_path / "lut") < 0.05
 
 
@@ -93,9 +93,9 @@ def test_nothing_is_registered_anew_where_nothing_moves(plain: Lab, tmp_path: Pa
     lights = renumbered([*LIGHTS[::3], RED])
     with take(plain, tmp_path / "session", lights) as session:
         result = build(session, tmp_path / "lut")
-    assert not any(figures.registered for figures in result.frames)
-    assert result.largest_shift_px < 0.05
-    assert min(figures.shift.gauges for figures in result.frames) >= 16
+    assert not any(figures.reregistered for figures in result.figures.frames)
+    assert result.figures.largest_shift_px < 0.05
+    assert min(figures.shift.gauges for figures in result.figures.frames) >= 16
     assert worst_error(plain, tmp_path / "lut") < 0.05
 
 
@@ -103,10 +103,9 @@ Command = Callable[..., tuple[int, str]]
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
     def run(*arguments: object) -> tuple[int, str]:
-        monkeypatch.setattr("sys.argv", ["build-lut", *map(str, arguments)])
-        code = main()
+        code = main([*map(str, arguments)])
         said = capsys.readouterr()
         return code, said.out + said.err
 

@@ -19,12 +19,12 @@ import pytest
 import calibration.pipeline.build as building
 from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep
-from calibration.pipeline.build import append, build
-from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, growing
+from calibration.pipeline.build import TableProgress, append, build
+from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, unfinished_table
 from calibration.pipeline.frames import lost_frames
-from calibration.pipeline.result import BuildResult, Growth
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
+from calibration.verdict.result import BuildResult
 from foundation.errors import FormatError, InputError
 from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
@@ -35,12 +35,11 @@ import calibration.pipeline.build, calibration.pipeline.checkpoint, calibration.
 from calibration.cli import main
 
 place, count = sys.argv[1], int(sys.argv[2])
-del sys.argv[1:3]
 calibration.pipeline.build.CHECKPOINT_EVERY = 3
 calibration.report.report.write_report = lambda *_: None
 owner, name = {
     "putting": (calibration.table.lut.LutWriter, "put"),
-    "saving": (calibration.pipeline.checkpoint.Growing, "save"),
+    "saving": (calibration.pipeline.checkpoint.UnfinishedTable, "save"),
     "finishing": (calibration.table.lut, "write_whole"),
     "publishing": (calibration.pipeline.checkpoint.Path, "replace"),
 }[place]
@@ -56,7 +55,7 @@ def deadly(*args, **kwargs):
     return real(*args, **kwargs)
 
 setattr(owner, name, deadly)
-sys.exit(main())
+sys.exit(main(sys.argv[3:]))
 """
 
 
@@ -86,12 +85,12 @@ def undisturbed(session: Session, tmp_path_factory: pytest.TempPathFactory) -> d
 
 
 def interrupted_at(session: Session, out: Path, frame: int) -> None:
-    def told(done: int, total: int, what: str) -> None:
+    def progress(done: int, total: int, what: str) -> None:
         if done == frame:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        build(session, out, told)
+        build(session, out, progress)
 
 
 @pytest.mark.parametrize(("place", "count"), [("putting", 2), ("saving", 2), ("finishing", 3), ("publishing", 1)])
@@ -143,12 +142,12 @@ def test_a_bump_before_the_interruption_is_remembered(lab: Lab, tmp_path: Path) 
         build(session, tmp_path / "whole")
         interrupted_at(session, tmp_path / "lut", 5)
         result = build(session, tmp_path / "lut")
-    assert [figures.registered for figures in result.frames].count(True) == 1
+    assert [figures.reregistered for figures in result.figures.frames].count(True) == 1
     assert files(tmp_path / "lut") == files(tmp_path / "whole")
 
 
 @pytest.fixture
-def growing_session(session: Session, tmp_path: Path) -> Generator[Session]:
+def session_under_way(session: Session, tmp_path: Path) -> Generator[Session]:
     """Lend a copy of the session, in which frames can be made to have come, or not yet."""
     shutil.copytree(session.folder, tmp_path / "session")
     with Session.open(tmp_path / "session") as copy:
@@ -169,15 +168,15 @@ def alter(session: Session, change: str, rows: list[tuple[str, ...]]) -> None:
         journal.executemany(change, rows)
 
 
-def test_a_table_follows_its_session(growing_session: Session, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
-    session, out = growing_session, tmp_path / "lut"
+def test_a_table_follows_its_session(session_under_way: Session, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
+    session, out = session_under_way, tmp_path / "lut"
     every = len(session.frames())
     lights = len(session.illuminations)
     seen: list[tuple[int, int]] = []
     for frames in (1, 5, 5, every - 3):
         show(session, frames)
         grown = append(session, out)
-        assert isinstance(grown, Growth)
+        assert isinstance(grown, TableProgress)
         seen.append((grown.lights, grown.new_frames))
         assert not out.exists()
         with pytest.raises(FormatError, match="in the making"):
@@ -191,10 +190,10 @@ def test_a_table_follows_its_session(growing_session: Session, undisturbed: dict
 
 
 def test_a_light_taken_again_is_taken_in_again(
-    growing_session: Session, undisturbed: dict[str, bytes], tmp_path: Path
+    session_under_way: Session, undisturbed: dict[str, bytes], tmp_path: Path
 ) -> None:
     """What had been taken in of it before must not stay."""
-    session = growing_session
+    session = session_under_way
     one, other = (next(r for r in session.frames() if r.illumination == light) for light in (2, 3))
     show(session, 6)
     append(session, tmp_path / "lut")
@@ -208,35 +207,43 @@ def test_a_light_taken_again_is_taken_in_again(
 
 
 def test_two_programs_do_not_make_one_table(session: Session, tmp_path: Path) -> None:
-    with growing(tmp_path / "lut"), pytest.raises(InputError, match="made by another program"):
+    with unfinished_table(tmp_path / "lut"), pytest.raises(InputError, match="made by another program"):
         build(session, tmp_path / "lut")
 
 
 def test_a_checkpoint_comes_back_to_the_last_bit(tmp_path: Path) -> None:
-    told = {"value": 0.1 + 0.2, "tiny": 5e-324, "nothing": None}
-    with growing(tmp_path / "lut") as making:
-        making.save(Checkpoint({"a": "b"}, ["x"], told, {"sum": np.array([0.1, np.inf], np.float32)}))
+    values = {"value": 0.1 + 0.2, "tiny": 5e-324, "nothing": None}
+    with unfinished_table(tmp_path / "lut") as unfinished:
+        unfinished.save(Checkpoint({"a": "b"}, ["x"], values, {"sum": np.array([0.1, np.inf], np.float32)}))
     assert (tmp_path / ".lut.partial").is_dir()
-    with growing(tmp_path / "lut") as making:
-        back = making.load()
-        making.discard()
+    with unfinished_table(tmp_path / "lut") as unfinished:
+        back = unfinished.load()
+        unfinished.discard()
     assert back is not None
-    assert (back.identity, back.frames, back.told) == ({"a": "b"}, ["x"], told)
+    assert (back.identity, back.frames, back.values) == ({"a": "b"}, ["x"], values)
     assert back.arrays["sum"].tobytes() == np.array([0.1, np.inf], np.float32).tobytes()
     assert not list(tmp_path.iterdir())
 
 
-def test_the_frames_of_a_table_are_found_again(session: Session, growing_session: Session, tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_form_is_not_gone_on_from(tmp_path: Path) -> None:
+    """Versions before this one stored other keys."""
+    text = np.frombuffer(b'{"identity": {"a": "b"}, "frames": ["x"], "told": {}}', dtype=np.uint8)
+    with unfinished_table(tmp_path / "lut") as unfinished:
+        np.savez(unfinished.folder / CHECKPOINT, text=text)
+        assert unfinished.load() is None
+
+
+def test_the_frames_of_a_table_are_found_again(session: Session, session_under_way: Session, tmp_path: Path) -> None:
     build(session, tmp_path / "lut")
     lut = open_lut(tmp_path / "lut")
     assert find_faults(lut) == []
-    assert lost_frames(lut, growing_session) == []
-    first, second = (growing_session.folder / frame.file for frame in lut.frames[1:3])
+    assert lost_frames(lut, session_under_way) == []
+    first, second = (session_under_way.folder / frame.file for frame in lut.frames[1:3])
     first.unlink()
     data = bytearray(second.read_bytes())
     data[-1] ^= 1
     second.write_bytes(data)
-    gone, changed = lost_frames(lut, growing_session)
+    gone, changed = lost_frames(lut, session_under_way)
     assert f"{first} cannot be read" in gone
     assert f"{second} has changed" in changed
     os.truncate(tmp_path / "lut" / "samples.npy", 1000)

@@ -12,7 +12,7 @@ from calibration.pipeline.build import build
 from calibration.registration.register import register
 from calibration.report.report import write_report
 from calibration.table.lut import open_lut
-from calibration.verdict.verdict import figures_of
+from calibration.verdict.values import judged_values
 from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, hang_chart, renumbered, take
 
@@ -26,8 +26,8 @@ def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> 
         result = build(session, tmp_path / "lut")
         write_report(result, session, tmp_path)
     assert result.verdict.outcome == "accept"
-    assert not result.unfit
-    assert figures_of(result).keys().isdisjoint({"unlike_scatter", "unlike_block", "doubtful_share"})
+    assert not result.figures.cells.unfit
+    assert judged_values(result.figures).keys().isdisjoint({"unlike_scatter", "unlike_block", "doubtful_share"})
     # What is not judged is not shown as clean.
     report = (tmp_path / "report.html").read_text()
     assert "The course of the session" in report

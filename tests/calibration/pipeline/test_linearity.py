@@ -14,10 +14,11 @@ from acquisition.session.folder import Session
 from calibration.cli import main
 from calibration.pipeline.build import build, check
 from calibration.pipeline.linearity import deviations
-from calibration.pipeline.result import BuildResult
-from calibration.report.report import summary, write_report
+from calibration.report.report import write_report
+from calibration.report.summary import summary
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
+from calibration.verdict.result import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
 from foundation.errors import FormatError, InputError
@@ -119,7 +120,7 @@ def write_series(lab: Lab, folder: Path, bend: Bend = straight, times: tuple[flo
 
 
 def shown(result: BuildResult) -> tuple[str, str]:
-    return next((value, note) for name, value, note in summary(result) if name == "Linearity")
+    return next((row.value, row.note) for row in summary(result.figures) if row.name == "Linearity")
 
 
 def test_the_table_says_how_linear_its_camera_is(session: Session, lab: Lab, tmp_path: Path) -> None:
@@ -128,11 +129,11 @@ def test_the_table_says_how_linear_its_camera_is(session: Session, lab: Lab, tmp
     told = json.loads((tmp_path / "lut" / "report.json").read_text())
     assert told["figures"]["linearity"] < 0.005
     assert len(told["channels"]["linearity"]) == 10
-    assert shown(result)[0].endswith("off a line at most")
+    assert shown(result)[0].endswith("from a straight line at most")
     assert "8 exposures" in shown(result)[1]
     # The series says nothing of the samples, so it changes none of the table's bytes.
     plain = build(session, tmp_path / "plain")
-    assert shown(plain) == ("not measured", "a series of exposures of the chart, given with --linearity, tells")
+    assert shown(plain) == ("not measured", "give a series of exposures of the chart with --linearity")
     for name in ("samples.npy", "illuminations.csv", "lut.json"):
         assert (tmp_path / "lut" / name).read_bytes() == (tmp_path / "plain" / name).read_bytes()
 
@@ -145,7 +146,7 @@ def test_a_sensor_that_bends_is_remarked_on(session: Session, lab: Lab, tmp_path
 
 
 def test_what_is_no_series_is_refused(
-    session: Session, lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    session: Session, lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(InputError, match="No such file"):
         check(session, linearity=tmp_path / "nowhere")
@@ -159,8 +160,7 @@ def test_what_is_no_series_is_refused(
     with pytest.raises(FormatError, match=r"3\.dng was taken with ISO 200"):
         check(session, linearity=one)
     (one / "0.dng").write_text("notes")
-    monkeypatch.setattr("sys.argv", ["build-lut", "--check", "--linearity", str(one), str(session.folder)])
-    assert main() == 2
+    assert main(["--check", "--linearity", str(one), str(session.folder)]) == 2
     assert "0.dng cannot be read as a raw file" in capsys.readouterr().err
 
 
