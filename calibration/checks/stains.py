@@ -37,7 +37,7 @@ SIGNIFICANT = 6.0
 """Standard errors that it must be, too; by chance one neighbourhood in 5·10⁸."""
 
 RIM_SIGMA = 4.0
-"""Usual log_ratios of single cells that a cell next to a stain must deviate by to belong to it."""
+"""Usual deviations of single cells that a cell next to a stain must deviate by to belong to it."""
 
 LEAST_COUNTS = 30.0
 """Darker cells are not judged: a count of stray light is 3 % of them."""

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from calibration.registration.raster import Raster, tiles
 
 _LEAST_SCORE = 0.3
-"""Correlation below which a block is not believed; other cells than the chart's give about 0."""
+"""Correlation below which a block does not count; other cells than the chart's give about 0."""
 
 _NEIGHBOUR_BLOCKS = 1.6
 """Blocks that are nearer, in units of their spacing, are neighbours: the eight around."""
@@ -40,7 +40,7 @@ class FoundBlocks:
     centres_mm
         (B, 2) float64, where the map has them, on the print.
     moves_mm
-        (B, 2) float64, how far they lie beside it, on the print.
+        (B, 2) float64, how far from there they were found, on the print.
     score
         (B,) float64, correlation with the print, −1 … 1.
     """

@@ -12,7 +12,7 @@ from calibration.registration.raster import Raster
 from calibration.registration.tile_comparison import MIN_SCORE, TileComparison
 
 _LEAST_INFORMATION = 4.0
-"""px⁻²: a block that knows its place no better than half a pixel does not count as compared."""
+"""px⁻²: a block whose place has a standard error of half a pixel or more does not count as compared."""
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
@@ -58,7 +58,7 @@ def fit_blocks(
     block_cells
         Cells along a block's side, about.
     all_known
-        Whether the score of a block is kept that hardly knows its place; else it is 0.
+        Whether the score of a block whose place is hardly determined is kept; else it is 0.
     """
     rows, columns = raster.tiles(per_cell)
     across, down = (max(1, count // block_cells) for count in (columns, rows))

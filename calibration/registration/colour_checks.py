@@ -28,10 +28,10 @@ _MISMATCH_NEIGHBOURS = 0.35
 """Share of mismatched neighbours from which on a cell is taken for covered with them (judgement)."""
 
 _SLIP_CELLS = 16
-"""Cells along a part of the field that is looked at for a slip, at most."""
+"""Cells along a part of the field that is tested for a slip, at most."""
 
 _SLIP = 0.5
-"""Cells by which a part must seem to lie beside its place: half the way to the next."""
+"""Cells by which a part must seem to be displaced: half the way to the next."""
 
 _SLIP_SIGMAS = 6.0
 """Standard errors that a slip must have, too."""
@@ -40,7 +40,7 @@ _PART_WORTH = 8
 """Independent measurements that a part counts for: the misfit of the colours is alike over many cells."""
 
 _COLOUR_MISFIT, _MOST_NOISE = 0.003, 0.01
-"""Of paper white: what the model of the colours leaves, and what noise may count for beside it."""
+"""Of paper white: what the model of the colours leaves, and what noise may add to it at most."""
 
 _MOST_MISFIT = 20.0
 """Usual errors beyond which a cell's error counts no more."""
@@ -110,10 +110,10 @@ def slipped_parts(
     place: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]],
     shape: tuple[int, int],
 ) -> tuple[_Array, int]:
-    """Return which parts of a grid of cells look like their neighbours, and how many parts could be looked at.
+    """Return which parts of a grid of cells have the colours of their neighbours, and how many parts were compared.
 
-    By the colours' own level, which steps and correlations do not look at: what is seen less what is expected is
-    explained, part by part and by least squares, by what the next cell would change.
+    By the level of the colours, which the matching leaves free: seen less expected colours are fitted, part by part and
+    by least squares, by what a displacement to the next cell would change.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def slipped_parts(
     )
     error = np.clip(error / usual, -_MOST_MISFIT, _MOST_MISFIT)
     places: list[_Array] = []
-    looked_at = 0
+    compared = 0
     size = int(np.clip(min(rows, columns) // 2, 4, _SLIP_CELLS))
     for top in range(0, rows, size):
         for left in range(0, columns, size):
@@ -158,11 +158,11 @@ def slipped_parts(
             known = np.isfinite(values).all(axis=0)
             if known.sum() < size**2:
                 continue
-            looked_at += 1
+            compared += 1
             design = np.stack([one[known] for one in values[:2]], axis=1)
             gram = design.T @ design
             slip = np.linalg.solve(gram + 1e-9 * np.eye(2), design.T @ values[2][known])
             sure = np.sqrt(np.diag(gram) * _PART_WORTH / known.sum())
             if ((np.abs(slip) > _SLIP) & (np.abs(slip) * sure > _SLIP_SIGMAS)).any():
                 places.append(np.array([left, top]) + size / 2)
-    return np.array(places).reshape(-1, 2), looked_at
+    return np.array(places).reshape(-1, 2), compared

@@ -60,14 +60,14 @@ _RIM_SIGMAS = 3.0
 _COLOURS_REPEAT = 10
 """How many neighbouring elements the misfit of the colours is alike over, where steps of colour are all there is."""
 
-_LOOK_CELLS = 0.6
+_BLURRED_CELLS = 0.6
 """Blur in cells at which blocks of a smooth order are compared with the chart's."""
 
 _LEAST_BLOCK_SCORE = 0.3
 """Median correlation of the blocks that are searched for; blocks of another chart give about 0."""
 
 _COLOUR_PATCHES = 5000
-"""Patches that the colour model is fitted on: some thousand say of a polynomial all that more would."""
+"""Patches that the colour model is fitted on: more do not improve a polynomial of some dozen terms."""
 
 _INTERPOLATION_PX = 0.28
 """σ that cubic interpolation adds to a frame's edges: measured on edges of σ 0.4 to 0.7 px, less where they are softer.
@@ -80,7 +80,7 @@ _Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
-    """Places found otherwise that hold the map where no cells are.
+    """Places found by other means, which fix the map where no cells are.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ class Matcher:
     lens
         The map that tags or outline give.
     anchors
-        The same tags or outline, which hold the map where no cells are.
+        The same tags or outline, which fix the map where no cells are.
     blur_px
         σ of printed edges in the frame.
     cell_px
@@ -259,7 +259,7 @@ class Matcher:
         for _ in range(2):
             template = self._template(raster, cover, self._elements(raster, max(self.blur_px, 0.7)))
             image, there = self._rectified(raster)
-            # What is printed in the margin is no cell's business.
+            # What is printed in the margin must not move cells.
             bare = ~raster.near(cover, _COARSE_PER_CELL)
             image[bare] = template[bare]
             found = find_blocks(raster, template, image, there, block * _COARSE_PER_CELL, reach)
@@ -319,13 +319,13 @@ class Matcher:
         comparison = self._left
         if self._smooth_order:
             # The steps of dark cells drown in noise; whether these are the chart's colours shows over many cells.
-            comparison = replace(comparison, score=self._compared_softly(_LOOK_CELLS).score)
+            comparison = replace(comparison, score=self._compared_softly(_BLURRED_CELLS).score)
         return fit_blocks(
             comparison, self._raster, self._per_cell, self._chart, self._block_cells, all_known=self._smooth_order
         )
 
     def slipped(self, mismatched_cells: _Mask) -> tuple[_Array, int]:
-        """Return the middles (B, 2) mm of parts of the field that look like their neighbours, and of how many parts.
+        """Return the middles (B, 2) mm of parts of the field with their neighbours' colours, and of how many parts.
 
         `mismatched_cells` (C,) bool are left out.
         """

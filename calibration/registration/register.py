@@ -8,7 +8,7 @@ Laws that hold inside:
 - A chart without tags has the outline of its field for that, and is then followed from coarse to fine: a map that has
   slipped by a cell is looked for, and refused.
 - All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres.
-- The result judges itself. A registration that cannot be trusted is a `RegistrationError`, never a value.
+- A registration that cannot be trusted is a `RegistrationError`, never a value.
 
 Places are half-size pixels, pixel centres at integers; millimetres on the print.
 """
@@ -104,7 +104,7 @@ def register(
         For a chart without tags: (4, 2) half-size px, the corners of the field of cells, clockwise from the printed
         top-left, to some 20 px; found by themselves if not given.
     near
-        An earlier registration of the same session: a chart without tags then hangs the same way up.
+        An earlier registration of the same session: a chart without tags is then taken to hang the same way up.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
 
 
 def _outline(field: FoundField) -> Anchors:
-    """Return the field's outline, whose places are known across alone."""
+    """Return the field's outline, whose places are known across it and not along it."""
     known = np.einsum("ni,nj->nij", field.normals, field.normals) / _OUTLINE_SIGMA_PX**2
     return Anchors(field.outline_mm, field.outline_px, known)
 
@@ -184,7 +184,7 @@ def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple
 
 
 def _require_own_cells(matcher: Matcher, mismatched_cells: _Mask, what: str) -> None:
-    """Refuse a map on which parts of the field show the colours of the cells beside them."""
+    """Refuse a map on which parts of the field show the colours of the neighbouring cells."""
     places, parts = matcher.slipped(mismatched_cells)
     if len(places) >= max(_FEW_SLIPPED, _SLIPPED_SHARE * parts):
         x, y = places[0]
@@ -220,7 +220,7 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
 
 
 def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors, lens_rms: float) -> Registration:
-    """Return the map with everything that says how good it is."""
+    """Return the map with all figures of its quality."""
     seen, expected, paper = matcher.patches()
     there = np.asarray(np.isfinite(seen).all(axis=1))
     residual = marks.places_px - matcher.to_pixels(marks.points_mm)

@@ -1,4 +1,4 @@
-"""A rectified frame compared with the print as it should be seen: what each tile of the raster asks the map to do.
+"""A rectified frame compared with the print as it should be seen: how each tile of the raster would move the map.
 
 One step of Lucas and Kanade's method, with gain and offset local and free, as the light and the lens's shading are, and
 residuals weighted by Huber's function. Source: B. D. Lucas and T. Kanade, "An iterative image registration technique",
@@ -27,7 +27,7 @@ _Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class TileComparison:
-    """What tiles of a raster say about the map.
+    """Displacements that the tiles of a raster measure.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class TileComparison:
         return TileComparison(self.points_mm, self.information, left, self.score)
 
     def weakened(self, times: float) -> TileComparison:
-        """Return the same with the weight of fewer measurements: of so many that repeat each other one counts."""
+        """Return the same with the weight of fewer measurements: one for each `times` that repeat each other."""
         return TileComparison(self.points_mm, self.information / times, self.pull / times, self.score)
 
 
@@ -67,7 +67,7 @@ def compare_tiles(
     cell_px: float,
     without_gradient: bool = False,
 ) -> TileComparison:
-    """Return what tiles of size × size elements say about the map by which a frame was rectified.
+    """Return how tiles of size × size elements would move the map by which a frame was rectified.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def compare_tiles(
     cell_px
         Half-size pixels along a cell's side; a tile is taken to be as large, or finer.
     without_gradient
-        Whether what an even gradient of the colours could say is left out, as an offset explains it as well as a
+        Whether an even gradient of the colours is left out of the slopes, since an offset explains it as well as a
         movement does.
     """
     mean = _LocalMean(weight, window, without_gradient)
