@@ -20,7 +20,7 @@ from calibration.radiometry.greys import tint_deg
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
 from calibration.radiometry.sensor_range import black_drift
-from calibration.registration.register import Registration
+from calibration.registration.registration import Registration
 from calibration.table.provenance import Unfit
 
 _Array = npt.NDArray[np.float64]

@@ -26,7 +26,6 @@ from calibration.pipeline.measuring import MeasuredDarkFrame, MeasuredFrame
 from calibration.pipeline.registered_frame import RegisteredFrame
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
 from calibration.radiometry.flat_field import FlatField
-from calibration.registration.matching import MIN_BLOCK_SCORE
 from calibration.sampling.patch_statistics import has_dead_photosite, unevenness
 from calibration.table.provenance import Unfit
 
@@ -227,4 +226,4 @@ def _covered_cells(chart: Chart, registered: RegisteredFrame) -> _Mask:
     """Return the cells (C,) that do not look like the chart's, alone or with their neighbourhood."""
     blocks, cells = registered.registration.blocks, chart.cell_of_colour
     nearest = np.asarray(cKDTree(blocks.centres_mm).query(chart.centres_mm[cells])[1])
-    return registered.registration.mismatched_cells[cells] | np.asarray(blocks.score[nearest] < MIN_BLOCK_SCORE)
+    return registered.registration.mismatched_cells[cells] | ~blocks.good[nearest]

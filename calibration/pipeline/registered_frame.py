@@ -22,7 +22,8 @@ from calibration.pipeline.frames import DecodedFrame
 from calibration.pipeline.options import BuildOptions
 from calibration.radiometry.greys import GreyLevels
 from calibration.registration.movement import gauge_boxes
-from calibration.registration.register import Registration, register
+from calibration.registration.register import register
+from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites, sites_at
 from drivers.raw.rawfile import Mosaic
 

@@ -32,7 +32,7 @@ def corrections(
     page_mm
         Width and height of the page.
     black
-        (L, 2, 2) black level of each light's frame.
+        (L, 2, 2) float64 counts, black level of each light's frame.
     saturation_counts
         Raw count of saturation.
     fields
@@ -40,9 +40,9 @@ def corrections(
     measured
         Whether saturation was seen, rather than stated by the raw file.
     gains
-        (L, 3) the lamp's drift at each light; None where no white frame tells.
+        (L, 3) the lamp's drift at each light; None without white frames.
     subtracted
-        (L, 3) dark light of bare paper that was subtracted; None where none was to be.
+        (L, 3) counts, dark light of bare paper that was subtracted; None where none was to be.
     at_zero
         (L,) share of each light's samples that are 0; None where it was not counted.
     """

@@ -43,7 +43,7 @@ class FlatField:
         return cls(page_mm, ((), (), ()))
 
     def at(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the field (N, 3) at points (N, 2) mm, > 0."""
+        """Return the field (N, 3) float64 at points (N, 2) mm, > 0; 1 is its mean over the cells."""
         points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
         shape = np.ones((len(points), 3))
         for channel, factors in enumerate(self.coefficients):
@@ -52,7 +52,7 @@ class FlatField:
         return np.maximum(shape, LEAST_FIELD)
 
     def orders(self) -> tuple[int, ...]:
-        """Return the total order of each channel's last factor: what the frame itself could tell."""
+        """Return the total order of each channel's last factor, which was fitted on the frame itself."""
         return tuple(order_of(len(factors[-1])) if factors else 0 for factors in self.coefficients)
 
     def parameters(self) -> list[list[list[float]]]:

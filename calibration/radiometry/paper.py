@@ -37,7 +37,7 @@ _Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Paper:
-    """What the white references of a frame say.
+    """What the white references of a frame show.
 
     Attributes
     ----------
@@ -72,10 +72,10 @@ class PaperReader:
     page_mm
         Width and height of the page.
     base
-        The shape of a brighter frame, to which other frames add what they can tell; none for the brightest itself.
+        The flat field of a brighter frame, on which others are fitted; none for the brightest itself.
     order
-        The highest order that a frame may tell by itself. References that lie around the cells and not among them
-        tell no more than `MAX_ORDER_AROUND`.
+        The highest order that is fitted on a frame itself: `MAX_ORDER_AROUND` where references lie around the cells and
+        not among them.
     """
 
     def __init__(
@@ -94,12 +94,12 @@ class PaperReader:
         self._at_centres = np.ascontiguousarray(page_polynomial(centres_mm, page_mm, MAX_ORDER).T)
 
     def read(self, seen: _Array, what: str = "the frame") -> tuple[Paper, _Array]:
-        """Return what a frame's paper says, and the frame's field (C, 3) at the cells' centres.
+        """Return what a frame's paper shows, and the frame's field (C, 3) float64 at the cells' centres.
 
         Parameters
         ----------
         seen
-            (N, 3) the references' mean counts above black; NaN where one cannot be used.
+            (N, 3) float64, the references' mean counts above black; NaN where one cannot be used.
         what
             The frame's name for messages.
 
@@ -126,7 +126,7 @@ class PaperReader:
         for channel, (solution, weights) in enumerate(fits):
             base = self.base.coefficients[channel]
             level = float((local[channel] * self._base_at_centres[:, channel]).mean())
-            # Light too weak to have a shape of its own, or none at all.
+            # Light too weak to show a shape of its own, or none at all.
             own = solution / level if level > 0 and local[channel].min() > 0.05 * level else np.ones(1)
             if len(own) > 1:
                 shape[:, channel] *= local[channel] / level
@@ -143,7 +143,7 @@ class PaperReader:
 
 
 def _best_fit(basis: _Array, known: _Array, values: _Array, highest: int) -> tuple[_Array, _Array]:
-    """Return solution (terms,) and weights (N,) of the order that says most with least (BIC), shape `known` given."""
+    """Return solution (terms,) and weights (N,) of the order with the least BIC; `known` (N,) is the base's shape."""
     best: tuple[float, _Array, _Array] | None = None
     for order in range(highest + 1):
         count = len(page_powers(order))

@@ -23,7 +23,7 @@ _PLATEAU = 64
 
 
 def saturation(mosaic: Mosaic) -> int:
-    """Return the count at which the sensor saturates, as far as this frame tells.
+    """Return the raw count at which the sensor saturates, as far as this frame shows it.
 
     What the metadata state, or what the frame shows if that is lower: a plateau of at least 64 photosites at the
     frame's highest count. LibRaw's tables state 15 831 for an EOS 550D that saturates at 13 584 (ISO 100), so a
@@ -38,7 +38,10 @@ def saturation(mosaic: Mosaic) -> int:
 
 
 def black_drift(blacks: Sequence[_Array]) -> float:
-    """Return how far the black level of any position of the block drifted over frames (each (2, 2)), counts."""
+    """Return the largest drift of the black level of any position of the block over frames, counts.
+
+    `blacks` are (2, 2) float64 counts each.
+    """
     if not blacks:
         return 0.0
     return float(np.ptp(np.stack(blacks), axis=0).max())

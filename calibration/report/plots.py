@@ -18,7 +18,7 @@ from calibration.checks.stains import Stains
 from calibration.figures.table_figures import TableFigures
 from calibration.radiometry.flat_field import FlatField
 from calibration.registration.movement import STILL_PX
-from calibration.registration.register import Registration
+from calibration.registration.registration import Registration
 from calibration.sampling.patch_statistics import rim_difference, sample_noise
 from calibration.sampling.samples import sites_at
 from foundation.srgb import decode_srgb

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.figures.table_figures import TableFigures
-from calibration.registration.register import Registration
+from calibration.registration.registration import Registration
 from calibration.sampling.windows import bleed
 from foundation.angles import angles_deg
 

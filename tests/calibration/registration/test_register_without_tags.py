@@ -87,7 +87,7 @@ def test_cells_that_stand_one_aside_are_refused(plain: Lab, tmp_path: Path) -> N
     columns = len(np.unique(plain.chart.centres_mm[:, 0].round(3)))
     grid = plain.chart.colours.reshape(-1, columns)
     other = replace(plain.chart, colours=np.roll(grid, 1, axis=1).reshape(-1))
-    with pytest.raises(RegistrationError, match="one cell aside"):
+    with pytest.raises(RegistrationError, match="have the colours of the cells beside them"):
         register(plain.mosaic(tmp_path), other)
 
 

@@ -8,13 +8,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from acquisition.chart.layout import A_SERIES_MM, design_chart
 from benchmarks import rooms
-from calibration.registration.displacement import Displacement
-from calibration.registration.lens import fit_lens
 from calibration.registration.register import register
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
@@ -150,29 +146,6 @@ def test_a_real_photograph_without_the_chart_is_refused(lab: Lab) -> None:
     with pytest.raises(RegistrationError, match="looked for, none found") as caught:
         register(read_raw(path), lab.chart, path.name)
     assert "\n" not in str(caught.value)
-
-
-def test_the_lens_is_found_exactly_without_noise() -> None:
-    points = np.stack(np.meshgrid(np.linspace(0, 1189, 8), np.linspace(0, 841, 6)), axis=-1).reshape(-1, 2)
-    x, y = ((points - (594, 420)) / 1500 * 2).T
-    r2 = x * x + y * y
-    radial = 1 - 0.04 * r2 + 0.02 * r2**2
-    bent = np.stack([x * radial + 3e-4 * x * y, y * radial + 1.5e-4 * (r2 + 2 * y * y)], axis=-1)
-    places = bent * 1500 + (1300, 866)
-    lens, residual = fit_lens(points, places, (2601, 1733))
-    assert np.abs(residual).max() < 0.02
-    assert lens.to_pixels(points) == pytest.approx(places, abs=0.02)
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.floats(-3, 3), st.floats(-0.05, 0.05), st.floats(-0.05, 0.05))
-def test_a_displacement_without_bend_is_followed_exactly(level: float, slope_x: float, slope_y: float) -> None:
-    low, high = np.array([10.0, 20.0]), np.array([110.0, 90.0])
-    points = low + np.random.default_rng(1).random((300, 2)) * (high - low)
-    moved = np.stack([level + slope_x * points[:, 0], level + slope_y * points[:, 1]], axis=-1)
-    information = np.broadcast_to(np.eye(2) * 1e4, (300, 2, 2))
-    found = Displacement.over(low, high, 12.0).fitted(points, information, 1e4 * moved)
-    assert found.at(points) == pytest.approx(moved, abs=1e-3)
 
 
 def test_a_mirrored_frame_is_called_mirrored(lab: Lab, tmp_path: Path) -> None:
