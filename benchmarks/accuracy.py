@@ -189,7 +189,8 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
     world = World(sheet(chart), simulated_body(settings), simulated_room(settings))
     exposure, cells = settings.camera.exposure, chart.centres_mm[chart.cell_of_colour]
 
-    offset = np.linalg.norm(result.registration.to_pixels(chart.centres_mm) - world.project(chart.centres_mm), axis=1)
+    found = result.figures.registration.to_pixels(chart.centres_mm)
+    offset = np.linalg.norm(found - world.project(chart.centres_mm), axis=1)
     report(f"{case}: cell centres, RMS", float(np.sqrt((offset**2).mean())), "px", "World.project")
     report(f"{case}: cell centres, worst of {len(offset)}", float(offset.max()), "px", "World.project")
 
@@ -203,7 +204,7 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
     )
     report(f"{case}: ground truth, worst angle", float(degrees.max()), "degrees", f"World.white, {len(lights)} lights")
 
-    frames = {frame.record.illumination: frame for frame in result.frames if frame.record.kind == "light"}
+    frames = {frame.record.illumination: frame for frame in result.figures.frames if frame.record.kind == "light"}
     fields = [frames[number].paper.field.at(cells) for number in range(len(lights))]
     held = hold(lut, world, chart, fields, exposure)
     against = "World.reflected over World.white, noise by EMVA 1288 taken out"

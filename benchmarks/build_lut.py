@@ -34,7 +34,7 @@ from acquisition.session.folder import Session
 from acquisition.session.journal import ACCEPTED
 from acquisition.session.plan import plan_steps
 from calibration.pipeline.build import build
-from calibration.pipeline.frames import threads
+from calibration.pipeline.prefetching import threads
 from calibration.registration.register import register
 from calibration.sampling.samples import gather_values, sites_at
 from drivers.raw.rawfile import read_raw

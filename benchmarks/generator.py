@@ -30,7 +30,9 @@ import numpy as np
 import numpy.typing as npt
 import skimage.data
 
-from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from foundation.compiled import compiled
 from generator.kernels.choice import SCRATCH, choose_group, row_keys

@@ -21,7 +21,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from foundation.console import run
 from foundation.errors import DeviceError

@@ -26,9 +26,11 @@ from acquisition.chart.model import Chart
 from acquisition.chart.printing import drawing
 from acquisition.framing.planes import frame_black
 from benchmarks.accuracy import WELL_LIT_DN, sample_variance
-from calibration.registration.register import Registration, register
+from calibration.registration.register import register
+from calibration.registration.registration import Registration
 from calibration.sampling.samples import gather, sites_at
-from calibration.verdict.verdict import bleed, judge
+from calibration.sampling.windows import bleed
+from calibration.verdict.verdict import judge
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw

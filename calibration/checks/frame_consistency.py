@@ -1,15 +1,16 @@
 """Whether a frame shows the same print as the frame that was registered: a hand, a lost focus, another poster.
 
-White frames are looked at cell by cell, but only every so often. A light's own frame may be spoilt between two of them,
-and its table slice with it, while tags stand where they stood. So every frame is held against the registered one. Each
-channel of a cell, over the same under the first light, is a smooth function of the printed code, for any two lights
-and any inks that are. A polynomial in the code says which, fitted on the frame itself; what is left are noise, the
-polynomial's own error, strewn over the sheet as the codes are, and what ought not to be there:
+White frames are compared cell by cell, but taken only every so often. A light's own frame may be spoilt between two of
+them, and its part of the table with it, while the tags are where they were. So every frame is compared with the
+registered one. The ratio of a cell's channel to the same under the first light is a smooth function of the printed
+code, for any two lights and whatever the inks. It is estimated by a polynomial in the code, fitted on the frame itself.
+What is left is noise, the polynomial's own error, which is spread over the sheet at random as the codes are, and what
+is wrong with the frame:
 
-- `scatter`, over all cells: blur mixes neighbours, another order of cells fits nothing;
-- `block`, the mean over neighbouring cells: a hand, a shadow, a reflection lies in one place.
+- `scatter`, over all cells: blur mixes neighbours, and another order of cells fits nothing;
+- `block`, the mean over neighbouring cells: a hand, a shadow or a reflection lies in one place.
 
-Charts of 8 and 64 cells have no more cells than the polynomial has terms, or twice as many: they tell nothing.
+Charts of 8 and 64 cells have no more cells than the polynomial has terms, or twice as many, and cannot be checked.
 """
 
 from __future__ import annotations
@@ -24,21 +25,35 @@ from calibration.fitting.polynomials import code_polynomial, code_powers
 from foundation.robust import huber_weights, sigma_of
 
 DEGREE = 4
+"""Of the polynomial in the code: 35 terms."""
+
 LEAST_COUNTS = 60.0
 """Mean of 25 samples that a cell is expected to have for it to be compared: good to 3 %."""
 
 CELLS = 8192
-"""Cells that are compared, at most: every frame is, and a quarter of a full chart tells enough."""
+"""Cells that are compared, at most: a quarter of a full chart, for every frame is compared."""
 
 FIT_CELLS = 1500
+"""Cells that the polynomial is fitted on, about: forty for each of its terms."""
+
 BLOCK_CELLS = 32
+"""Compared cells of a block: four times as many cells of a full chart, a square of six centimetres on A0."""
+
 LEAST_CELLS = 12
+"""Compared cells that a block must have for its mean to count."""
+
 CELLS_A_TERM = 2
 """With fewer cells for each term, what is wrong would be fitted, or what is right not."""
 
 _ROUNDS = 3
+"""Reweighted solutions in a row, after a first with equal weights."""
+
 _CERTAIN = 4.0
-"""Standard errors that are taken off a block's mean before it counts."""
+"""Standard errors that are taken off a block's mean before it counts: among a full chart's 256 blocks noise alone
+exceeds them in one of sixty frames."""
+
+_MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0
+"""Standard error of a cell's prediction: a share of its level, and counts."""
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
@@ -46,7 +61,7 @@ _Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class FrameConsistency:
-    """How a frame differs from what the print should look like under its light.
+    """How a frame differs from the registered print under its light; zeros where nothing can be compared.
 
     Attributes
     ----------
@@ -65,7 +80,7 @@ class FrameConsistency:
 
 @dataclass(frozen=True, eq=False)
 class _Channel:
-    """What is known of one channel before any frame is held against it.
+    """One channel of the reference, prepared for comparisons.
 
     `terms` (N, K) and `level` (N,) of the compared cells, those `there` that are bright enough, `some` of them to fit
     on, and the fit's `design` (F, K).
@@ -85,12 +100,12 @@ class _Channel:
 
 
 def has_enough_cells(cells: int) -> bool:
-    """Return whether a chart of so many cells can be held against its codes at all."""
+    """Return whether a chart of so many cells can be checked by its codes at all."""
     return cells >= CELLS_A_TERM * len(code_powers(DEGREE))
 
 
 class ConsistencyCheck:
-    """What cells should look like under any light, from one frame of the print.
+    """Compares frames with one reference frame of the print, whatever their lights.
 
     Parameters
     ----------
@@ -101,7 +116,7 @@ class ConsistencyCheck:
     level
         (C, 3) float64 mean counts above black in that frame, field divided out.
     usable
-        (C,) bool, cells that are themselves there.
+        (C,) bool, cells that are inside the frame and not covered.
 
     Attributes
     ----------
@@ -117,7 +132,7 @@ class ConsistencyCheck:
         self._block, self._middles = _blocks(cells_mm[self.cells])
 
     def compare(self, mean: _Array, variance: _Array) -> FrameConsistency:
-        """Return how like the print a frame is.
+        """Return how far a frame is consistent with the reference.
 
         Parameters
         ----------
@@ -138,8 +153,8 @@ class ConsistencyCheck:
         if len(known.there) < CELLS_A_TERM * known.terms.shape[1]:
             return FrameConsistency()
         design, level, seen = known.design, known.level[known.some], mean[known.some]
-        # Each cell counts by what it should tell, not by what it does: what is covered would count most.
-        sigma = 0.02 * float(np.median(seen / level)) * level + 3
+        # Weights are those of the expected levels, not of the levels seen: covered cells would count most.
+        sigma = _MODEL_ERROR * float(np.median(seen / level)) * level + _LEAST_ERROR
         if not sigma.min() > 0:
             return FrameConsistency()
         weights = 1 / sigma**2
@@ -152,12 +167,12 @@ class ConsistencyCheck:
         there = there[expected[there] > LEAST_COUNTS]
         if len(there) < LEAST_CELLS:
             return FrameConsistency()
-        aside = np.clip(mean[there] / expected[there] - 1, -1, 1)
-        spread2 = sigma_of(aside - np.median(aside)) ** 2
+        deviation = np.clip(mean[there] / expected[there] - 1, -1, 1)
+        spread2 = sigma_of(deviation - np.median(deviation)) ** 2
         noise2 = float(np.median(variance[there] / expected[there] ** 2))
         block = self._block[there]
         count = np.bincount(block, minlength=len(self._middles))
-        total = np.bincount(block, aside, len(self._middles))
+        total = np.bincount(block, deviation, len(self._middles))
         full = np.flatnonzero(count >= LEAST_CELLS)
         scatter = float(np.sqrt(max(spread2 - noise2, 0)))
         if not len(full):

@@ -1,14 +1,15 @@
 """Whether each light's white is what its codes give: a frame that bears another light's name.
 
-The ground truth is measured and holds whatever a light is called; its codes and temperature are not. So whites are held
-against codes, with nothing assumed of the projector but smoothness: the light is a sum of functions of the red, the
-green and the blue code, and of the lesser of two and of three codes, for a wheel with white, yellow, cyan or magenta
-segments adds light where the primaries overlap. The functions are polynomials, fitted on all lights, robustly, so that
-a few that do not fit stand out; if most bear wrong names, no such functions exist, and many stand out.
+The ground truth is measured and stays true whatever a light is called; its codes and temperature do not. So whites are
+compared with codes, with nothing assumed of the projector but smoothness: the light is a sum of functions of the red,
+the green and the blue code, and of the lesser of two and of three codes, for a wheel with white, yellow, cyan or
+magenta segments adds light where the primaries overlap. The functions are polynomials, fitted on all lights, robustly,
+so that a few that do not fit are outliers; if most bear wrong names, no such functions exist, and there are many.
 
-What cannot be told: exchanged neighbours, and names that are exchanged alike for all lights, red for green. The
-primaries' own frames are not asked for (`calibration.radiometry.primaries`): they may be the ones that bear wrong
-names.
+Not detected are exchanged neighbours, and codes that are exchanged alike for all lights, red for green. The frames of
+the primaries (`calibration.radiometry.primaries`) are not used as a basis: they may be the ones that bear wrong names.
+
+Why so: `docs/decisions/0015-lights-are-held-against-their-codes.md`.
 """
 
 from __future__ import annotations
@@ -30,32 +31,39 @@ LIGHTS_A_TERM = 3
 """With fewer lights for each coefficient, what is wrong would be fitted."""
 
 _ROUNDS = 15
+"""Reweighted solutions in a row: many, as the brightness of each light is estimated anew in each."""
+
 _LEAST_OTHERS = 0.1
+"""Least share of a light's fit that is taken to come from the other lights, so that its residual stays finite."""
+
 _FLICKER = 1.25
 """Factor by which the lamp may make a light brighter or darker than another of its codes."""
 
 _CERTAIN = 4.0
-"""Standard errors of a ground truth that are taken off its angle."""
+"""Standard errors of a ground truth that are taken off its angle, so that noise is not taken for a wrong name."""
 
 _Array = npt.NDArray[np.float64]
 
 
 def angles_off_codes_deg(lights: Sequence[Illumination], white: _Array, errors_deg: _Array) -> _Array | None:
-    """Return how far each white's direction is off what its codes give (L,), degrees, beyond four standard errors.
+    """Return the angle between each white and the one that its codes give, beyond four standard errors.
+
+    Iteratively reweighted least squares with Huber's weights squared; residuals are those of a light as predicted
+    from the others (divided by 1 − its leverage).
 
     Parameters
     ----------
     lights
         L lights.
     white
-        (L, 3) > 0, their ground truths, the lamp's drift taken out, all exposed alike.
+        (L, 3) > 0, their ground truths, linear camera RGB, the lamp's drift taken out, all exposed alike.
     errors_deg
-        (L,) standard error of each white's direction.
+        (L,) standard error of each white's direction, degrees.
 
     Returns
     -------
     ndarray or None
-        None where the lights are too few to tell.
+        (L,) float64 degrees, ≥ 0; None where there are fewer than `LIGHTS_A_TERM` lights for each coefficient.
     """
     terms = _terms(np.array([(light.colour.red, light.colour.green, light.colour.blue) for light in lights]))
     if len(lights) < LIGHTS_A_TERM * terms.shape[1]:
@@ -64,20 +72,20 @@ def angles_off_codes_deg(lights: Sequence[Illumination], white: _Array, errors_d
     # Each light counts alike, however bright.
     design, seen = terms / length[:, None], white / length[:, None]
     weights = np.ones(len(lights))
-    given, aims = seen, seen
+    given, targets = seen, seen
     for _ in range(_ROUNDS):
         root = np.sqrt(weights)[:, None]
         rooted = design * root
         inverse: _Array = np.asarray(np.linalg.pinv(rooted), dtype=np.float64)
-        given = product(design, inverse @ (aims * root))
-        # As seen from the other lights: a primary alone in its corner draws the fit to itself, whatever it shows.
-        own = np.einsum("lt,tl->l", rooted, inverse)
-        residual = np.linalg.norm(aims - given, axis=1) / np.maximum(1 - own, _LEAST_OTHERS)
+        given = product(design, inverse @ (targets * root))
+        # As predicted from the other lights: a primary, alone in its corner, draws the fit to itself.
+        leverage = np.einsum("lt,tl->l", rooted, inverse)
+        residual = np.linalg.norm(targets - given, axis=1) / np.maximum(1 - leverage, _LEAST_OTHERS)
         usual = max(sigma_of(residual), 1e-9)
         weights = huber_weights(residual, usual) ** 2
-        # A light's brightness is its own: a lamp that flickers by a hundredth would else look like wrong names.
+        # Each light's brightness is free: else a lamp that flickers by a hundredth would look like wrong names.
         brightness = (given * seen).sum(axis=1, keepdims=True)
-        aims = seen * np.clip(brightness, 1 / _FLICKER, _FLICKER)
+        targets = seen * np.clip(brightness, 1 / _FLICKER, _FLICKER)
     return np.maximum(angles_deg(given, seen) - _CERTAIN * errors_deg, 0)
 
 

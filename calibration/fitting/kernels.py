@@ -13,15 +13,25 @@ import numpy.typing as npt
 from foundation.compiled import compiled
 from foundation.robust import MAD_TO_SIGMA
 
+_POINTS_AT_A_TIME = 2048
+"""Points that the terms are added up for at a time: three channels of them, and a line of the basis, stay in the
+processor's second cache."""
+
+_RIDGE = 1e-10
+"""Share of the normal matrix's mean diagonal that is added to it: keeps equal columns solvable."""
+
+_CUT = 6.0
+"""Robust standard deviations from which on a residual has no weight (J. W. Tukey's biweight)."""
+
 _Array = npt.NDArray[np.float64]
 
 
 @compiled
 def linear_combinations(basis: _Array, factors: _Array, out: _Array) -> None:
-    """Fill out (3, N) with the sums over k of factors[c, k] · basis[k, n]."""
+    """Fill out (3, N) with the sums over k of factors[c, k] · basis[k, n]; basis (K, N), factors (3, K)."""
     out[:] = 0
-    for start in range(0, basis.shape[1], 2048):
-        end = min(start + 2048, basis.shape[1])
+    for start in range(0, basis.shape[1], _POINTS_AT_A_TIME):
+        end = min(start + _POINTS_AT_A_TIME, basis.shape[1])
         for term in range(basis.shape[0]):
             line = basis[term, start:end]
             for channel in range(3):
@@ -34,7 +44,7 @@ def linear_combinations(basis: _Array, factors: _Array, out: _Array) -> None:
 
 @compiled
 def weighted_fit(design: _Array, values: _Array, weights: _Array) -> _Array:
-    """Return the x (K,) that minimises Σ w (values − design x)²."""
+    """Return the x (K,) that minimises Σ w (values − design x)²; design (N, K), values and weights (N,)."""
     count, unknowns = design.shape
     gram, solution = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
     for point in range(count):
@@ -48,18 +58,16 @@ def weighted_fit(design: _Array, values: _Array, weights: _Array) -> _Array:
     for i in range(unknowns):
         trace += gram[i, i]
     for i in range(unknowns):
-        gram[i, i] += 1e-10 * max(trace / unknowns, 1e-30)
+        gram[i, i] += _RIDGE * max(trace / unknowns, 1e-30)
     _solve_positive_definite(gram, solution)
     return solution
 
 
 @compiled
 def robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Array, _Array]:
-    """Return solution (K,), weights (N,) and residuals (N,) of a fit without what lies far off.
+    """Return solution (K,), weights (N,) and residuals (N,) of a fit that outliers do not move.
 
-    Least squares by the normal equations, reweighted by Tukey's biweight at six robust standard deviations. The
-    design's condition is squared: fit for orthogonal-like bases of order unity. A ridge of 1e-10 keeps equal columns
-    solvable.
+    Least squares by the normal equations, reweighted by Tukey's biweight.
 
     Parameters
     ----------
@@ -82,7 +90,7 @@ def robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Ar
             residual[point] = values[point] - predicted
         scale = MAD_TO_SIGMA * np.median(np.abs(residual)) + 1e-9
         for point in range(count):
-            inside = max(1 - (residual[point] / (6 * scale)) ** 2, 0.0)
+            inside = max(1 - (residual[point] / (_CUT * scale)) ** 2, 0.0)
             weights[point] = inside * inside
     return solution, weights, residual
 

@@ -19,12 +19,20 @@ _Array = npt.NDArray[np.float64]
 
 
 def page_powers(order: int) -> list[tuple[int, int]]:
-    """Return the degrees (i, j) in x and y of a polynomial of total order `order`, lower totals first."""
+    """Return the degrees (i, j) in x and y of the terms of a polynomial of total order `order`, lower totals first.
+
+    >>> page_powers(2)
+    [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)]
+    """
     return [(total - j, j) for total in range(order + 1) for j in range(total + 1)]
 
 
 def order_of(count: int) -> int:
-    """Return the total order of a polynomial of `count` terms: the inverse of the number of `page_powers`."""
+    """Return the total order of a polynomial of `count` terms: the inverse of the number of `page_powers`.
+
+    >>> order_of(6)
+    2
+    """
     return round((np.sqrt(8 * count + 1) - 3) / 2)
 
 
@@ -61,7 +69,11 @@ def _page_basis(points: bytes, page_mm: tuple[float, float], order: int) -> _Arr
 
 
 def code_powers(degree: int) -> list[tuple[int, int, int]]:
-    """Return the degrees in red, green and blue of each term of a polynomial in codes of total degree `degree`."""
+    """Return the degrees in red, green and blue of each term of a polynomial in codes of total degree `degree`.
+
+    >>> code_powers(1)
+    [(0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)]
+    """
     return [(i, j, k) for i in range(degree + 1) for j in range(degree + 1 - i) for k in range(degree + 1 - i - j)]
 
 

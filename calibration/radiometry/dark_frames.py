@@ -1,11 +1,11 @@
-"""What is there when the projector shows black: its leak, the room's light, hot photosites; and whether light adds.
+"""Dark frames: the light that is there while the projector shows black, read noise, and hot photosites.
 
 Laws that hold inside:
 
-- Leak and ambient light cannot be told apart and are one figure, read on bare paper in the dark frames.
-- They are part of every light: samples and ground truth hold them alike, so nothing is subtracted unless asked for
-  (`calibration.radiometry.dark_subtraction`).
-- A photosite is hot when it stands out in every dark frame; what stands out once is a cosmic ray.
+- The projector's leak and ambient light cannot be separated and are one figure, read on bare paper.
+- They are part of every light: samples and ground truth contain them alike, so nothing is subtracted unless the user
+  wishes it (`calibration.radiometry.dark_subtraction`).
+- A photosite is hot when it is an outlier in every dark frame; an outlier in a single one is a cosmic ray.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class DarkSummary:
-    """What the dark frames say.
+    """What the dark frames of a session show together.
 
     Attributes
     ----------
@@ -47,7 +47,8 @@ class DarkSummary:
     noise
         (3,) float64 counts, standard deviation of a sample: read noise, of green that of the mean of two photosites.
     hottest
-        (C,) float64 counts, how far the hottest sample of each cell stands out in every frame; 0 where it does not.
+        (C,) float64 counts, by how much the hottest sample of each cell exceeds its median in every frame; 0 where none
+        does.
     lights
         (3,) float64 counts on bare paper, of each frame.
     """
@@ -100,7 +101,7 @@ def measure_dark_frame(
     paper: npt.NDArray[np.float32],
     shape: _Array,
 ) -> tuple[DarkFrameFigures, npt.NDArray[np.int16]]:
-    """Return what a dark frame says, and how far each sample (C, S, 3) stands above its cell, whole counts.
+    """Return the figures of a dark frame, and how far each sample is above the median of its cell.
 
     Parameters
     ----------
@@ -114,21 +115,28 @@ def measure_dark_frame(
         (N, S, 3) float32 samples of the white references that lie in the frame.
     shape
         (N, 3) field at these references.
+
+    Returns
+    -------
+    figures
+        Of the frame.
+    excess
+        (C, S, 3) int16, whole counts above the cell's median.
     """
     flat: _Array = paper.mean(axis=1, dtype=np.float64) / shape
     count = max(len(flat), 1)
     middle: _Array = np.asarray(np.median(flat, axis=0), dtype=np.float64)
     # The median of normal values has a standard error 1.25 times that of the mean.
     spread: _Array = MAD_TO_SIGMA * np.median(np.abs(flat - middle), axis=0)
-    aside: npt.NDArray[np.float32] = cells - np.median(cells, axis=1, keepdims=True)
-    # A seventh of the cells tells the noise well enough; about the median of 25 it is read 2 % low.
-    noise: _Array = (1 + 0.5 / cells.shape[1]) * MAD_TO_SIGMA * np.median(np.abs(aside[::7]), axis=(0, 1))
+    excess: npt.NDArray[np.float32] = cells - np.median(cells, axis=1, keepdims=True)
+    # A seventh of the cells gives the noise well enough; about the median of 25 it is read 2 % low.
+    noise: _Array = (1 + 0.5 / cells.shape[1]) * MAD_TO_SIGMA * np.median(np.abs(excess[::7]), axis=(0, 1))
     figures = DarkFrameFigures(record, black, middle, MEDIAN_ERROR * spread / np.sqrt(count), noise)
-    return figures, np.clip(np.rint(aside), -32768, 32767).astype(np.int16)
+    return figures, np.clip(np.rint(excess), -32768, 32767).astype(np.int16)
 
 
 class HotPixels:
-    """Remembers, over dark frames, which samples stand out of their cells in every one of them.
+    """Accumulates, over dark frames, which samples exceed their cells' medians in every one of them.
 
     Parameters
     ----------
@@ -141,26 +149,29 @@ class HotPixels:
         self._least: npt.NDArray[np.int16] = np.full(self._shape, 32767, dtype=np.int16)
         self._past = np.zeros(cells)
 
-    def add(self, aside: npt.NDArray[np.int16]) -> None:
-        """Take a frame in; `aside` as `measure_dark_frame` returned it."""
-        np.minimum(self._least, aside, out=self._least)
+    def add(self, excess: npt.NDArray[np.int16]) -> None:
+        """Take in a frame; `excess` (C, S, 3) counts, as `measure_dark_frame` returned it."""
+        np.minimum(self._least, excess, out=self._least)
 
     def restart(self, noise: _Array) -> None:
-        """Begin anew, since cells lie on other photosites from now on; what was hot so far stays hot."""
+        """Begin again, since cells lie on other photosites from now on; cells that were hot so far stay so.
+
+        `noise` (3,) counts is the standard deviation of a sample.
+        """
         self._past = self.hottest(noise)
         self._least = np.full(self._shape, 32767, dtype=np.int16)
 
     def hottest(self, noise: _Array) -> _Array:
-        """Return how far the hottest sample of each cell (C,) stands out in every frame, 0 where it does not.
+        """Return how far the hottest sample of each cell (C,) float64 exceeds its median in every frame, counts.
 
-        `noise` (3,) is a sample's.
+        0 where none does. `noise` (3,) counts is the standard deviation of a sample.
         """
         hot = np.maximum(HOT_COUNTS, HOT_SIGMA * noise)
         seen = (self._least > hot) & (self._least < 32767)
         return np.maximum(np.where(seen, self._least, 0).max(axis=(1, 2)).astype(np.float64), self._past)
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return all that is remembered."""
+        """Return all that is needed to go on: int16 (C, S, 3) and float64 (C,) arrays by name."""
         return {"dark_least": self._least, "dark_past": self._past}
 
     def restore(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
@@ -169,12 +180,12 @@ class HotPixels:
 
 
 def median_noise(frames: Sequence[DarkFrameFigures]) -> _Array:
-    """Return the noise (3,) of a sample, the median of dark frames; NaN without one."""
+    """Return the noise (3,) float64 counts of a sample, the median of dark frames; NaN without one."""
     return np.asarray(np.median([dark.noise for dark in frames], axis=0)) if frames else np.full(3, np.nan)
 
 
 def dark_summary(frames: Sequence[DarkFrameFigures], hot: HotPixels) -> DarkSummary:
-    """Return what dark frames say together."""
+    """Return what dark frames show together."""
     if not frames:
         return DarkSummary()
     noise = median_noise(frames)

@@ -1,14 +1,16 @@
 """The light of the dark frames at every patch, to be subtracted: the projector's leak and the room's light.
 
-A cell's own dark frames say it, but with the noise of a few samples: 1.2 counts of a single frame, as much as the light
-itself often is. So it is predicted, dark paper × field × the cell's reflectance, and what cells show beyond the
+A dark frame shows it at each cell, but with the noise of a few samples: 1.2 counts in a single frame, as much as the
+light itself often is. So it is predicted, dark paper × field × the cell's reflectance, and what cells show beyond the
 prediction is added as far as it is more than noise: the share w = 1 − noise² / variance of what is left over, one for
-each channel (empirical Bayes; Efron and Morris, JASA 1973). `docs/decisions/0009-dark-light-is-predicted.md` says why.
+each channel (empirical Bayes; B. Efron and C. Morris, Journal of the American Statistical Association 68, 1973).
+
+Why so: `docs/decisions/0009-dark-light-is-predicted.md`.
 
 Laws that hold inside:
 
 - A frame's dark light is that of the last dark frame taken before it, or of the first, for frames before that.
-- What is learnt from a dark frame depends on those before it alone, so that a table may grow.
+- The estimate after a dark frame depends on those before it alone, so that a table may grow.
 """
 
 from __future__ import annotations
@@ -24,8 +26,13 @@ from foundation.robust import MAD_TO_SIGMA
 
 _LEAST_WHITE = 50.0
 """Counts that paper must have in a channel for a cell's reflectance to be read there."""
+
 _MOST_REFLECTANCE = 1.5
+"""Of bare paper's: no print reflects more, but noise in a dim channel may seem to."""
+
 _FAR_SIGMA = 6.0
+"""Standard deviations from its patch's median up to which a sample is light: read noise alone passes 6 σ once in 2.5
+million samples, a chart's."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -41,7 +48,7 @@ class DarkLight:
     patches
         (P, 3) float32 counts, of each patch as the camera sees it, field and all.
     share
-        (3,) float64, how much of what cells show beyond the prediction was believed.
+        (3,) float64, 0 … 1, how much of what cells show beyond the prediction was added.
     """
 
     paper: _Array
@@ -50,9 +57,19 @@ class DarkLight:
 
 
 def winsorised_means(samples: npt.NDArray[np.float32], noise: _Array) -> _Array:
-    """Return the means (P, 3) of dark samples (P, S, 3), those beyond 6 σ of their patch's median brought back to it.
+    """Return the winsorised means of dark samples, since a hot photosite or a cosmic ray is no light.
 
-    A hot photosite, or a cosmic ray, is no light.
+    Parameters
+    ----------
+    samples
+        (P, S, 3) float32 counts above black; those beyond 6 σ of their patch's median count as if they were there.
+    noise
+        (3,) float64 counts, σ of one sample.
+
+    Returns
+    -------
+    ndarray
+        (P, 3) float64 counts.
     """
     middle = np.median(samples, axis=1, keepdims=True)
     far = (_FAR_SIGMA * noise).astype(np.float32)
@@ -60,16 +77,16 @@ def winsorised_means(samples: npt.NDArray[np.float32], noise: _Array) -> _Array:
 
 
 def reflectances(seen: _Array, field: _Array, white: _Array) -> _Array:
-    """Return the reflectance (P, 3) of patches, of bare paper's.
+    """Return the reflectance (P, 3) float64 of patches, 1 = bare paper.
 
     Parameters
     ----------
     seen
-        (P, 3) mean counts of a frame of even light.
+        (P, 3) mean counts above black in a frame of even light.
     field
-        (P, 3) its field.
+        (P, 3) its flat field at the patches.
     white
-        (3,) bare paper in it. A channel without light has the reflectances of the brightest one.
+        (3,) counts of bare paper in it. A channel without light has the reflectances of the brightest one.
     """
     found = np.clip(seen / (field * np.maximum(white, _LEAST_WHITE)), 0, _MOST_REFLECTANCE)
     found[:, white < _LEAST_WHITE] = found[:, [int(np.argmax(white))]]
@@ -77,7 +94,7 @@ def reflectances(seen: _Array, field: _Array, white: _Array) -> _Array:
 
 
 class DarkLightEstimator:
-    """Learns the dark light from dark frames, one after another.
+    """Estimates the dark light from dark frames, one after another.
 
     Parameters
     ----------
@@ -102,7 +119,7 @@ class DarkLightEstimator:
         return self._current
 
     def restart(self) -> None:
-        """Forget what cells showed beyond the prediction: they lie on other photosites from now on."""
+        """Drop what cells showed beyond the prediction: they lie on other photosites from now on."""
         self._left[:] = 0
         self._noise[:] = 0
         self._frames = 0
@@ -117,7 +134,7 @@ class DarkLightEstimator:
         noise
             (3,) standard deviation of one sample.
         paper
-            What its white references say.
+            What its white references show.
         field
             (P, 3) its field at the patches.
         """
@@ -133,7 +150,7 @@ class DarkLightEstimator:
         return self._current
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return all that was learnt."""
+        """Return all that is needed to go on: float arrays by name; none before the first frame."""
         if self._current is None:
             return {}
         return {

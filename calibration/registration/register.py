@@ -8,14 +8,14 @@ Laws that hold inside:
 - A chart without tags has the outline of its field for that, and is then followed from coarse to fine: a map that has
   slipped by a cell is looked for, and refused.
 - All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres.
-- The result judges itself. A registration that cannot be trusted is a `RegistrationError`, never a value.
+- A registration that cannot be trusted is a `RegistrationError`, never a value.
 
 Places are half-size pixels, pixel centres at integers; millimetres on the print.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -29,19 +29,14 @@ from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
 from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
 from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.visibility import MIN_CELL_PX
-from calibration.registration.colour_model import ColourModel
-from calibration.registration.displacement import Displacement
+from calibration.registration.blocks import Blocks
+from calibration.registration.colour_checks import agreement, mismatched
 from calibration.registration.lens import Lens, fit_lens
-from calibration.registration.matching import Anchors, Blocks, Matcher, not_this_chart
+from calibration.registration.matching import Anchors, Matcher, not_this_chart
+from calibration.registration.registration import SAMPLE_REACH_PX, Registration
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import RegistrationError
-from foundation.robust import MAD_TO_SIGMA, sigma_of
-
-SAMPLE_REACH_PX = 3.25
-"""From a cell's true centre to the outer edge of its 25 pixels: 2.5, rounding 0.5, registration 0.25."""
-
-ROOM_PX = 1.75
-"""From there to the edge of a cell of 10 px, for which the limits of places were found."""
+from foundation.robust import sigma_of
 
 MAX_TAG_RESIDUAL_PX = 8.0
 """RMS of the tags against homography and distortion; 2.3 is a sheet that waves by 6 mm and curls by 10."""
@@ -53,11 +48,24 @@ MIN_PLAIN_AGREEMENT = 0.95
 """The same for a chart without tags, whose smooth order a model of colours can follow into a cover; 0.99 is usual."""
 
 MIN_GOOD_BLOCKS = 0.75
+"""Least share of the blocks of cells that look as the chart has them (judgement)."""
+
 MAX_BLOCK_RESIDUAL_PX = 0.5
+"""RMS displacement that blocks may still need, for cells of 10 px: twice what the samples' reach allows for, and more
+than ten times what a sheet that waves by 3 mm leaves in simulated frames."""
 
 _GAUSS_NEWTON_STEPS = 5
+"""Steps at most; each is the cost of a comparison of all cells."""
+
+_SETTLED_PX = 0.01
+"""RMS movement of a step below which there is none to follow: a third of the map's own error."""
+
 _TAG_SIGMA_PX = 0.15
+"""Standard error of a tag's corner: 0.085 px measured in white light, .20 in a weak one."""
+
 _OUTLINE_SIGMA_PX = 0.1
+"""Standard error of a point of the outline, across it (judgement)."""
+
 _APART, _APART_PX = 5.0, 1.0
 """Points of an outline further from the lens than five of their standard deviations, and a pixel, are not of it."""
 
@@ -66,91 +74,11 @@ _FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
 
 _FEW_SLIPPED = 2
 _SLIPPED_SHARE = 0.015
-"""Parts of a field from which on it is refused; none looks slipped in any simulated room that is registered well."""
-
-_LEAST_COLOURS = 64
-"""A model fitted on fewer colours is no judge of one of them."""
-
-_MISMATCH_SIGMA = 10.0
-_NEIGHBOURS = 13
-"""A cell and the twelve within two cells of it."""
-
-_MISMATCH_NEIGHBOURS = 0.35
-_MISMATCH_SHARE = 0.08
-"""Of paper white: the model's own errors at the gamut's corners stay below."""
+"""Number and share of a field's parts from which on it is refused: none looks slipped in any simulated room that is
+registered well."""
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class Registration:
-    """The chart's place in a frame.
-
-    Attributes
-    ----------
-    framing
-        The tags, or the field's outline, as found.
-    lens, displacement
-        The two parts of the map.
-    marks_residual_px
-        (N, 2) float64, the tags' corners against the final map; of a chart without tags the field's outline, across.
-    lens_residual_px
-        RMS of the same against the lens alone: what the paper's waviness leaves.
-    blocks
-        Fit of the cells.
-    colours
-        The colour model of the frame.
-    mismatched_cells
-        (N,) bool, cells in the chart's order whose colour is not nearly the model's: covered, damaged, misprinted.
-    agreement
-        Correlation of the cells' colours with the model's, the mean of the channels that carry light.
-    blur_px
-        σ of the tags' edges, or of the field's.
-    cell_px
-        Half-size pixels per cell, the shorter side of the smallest.
-    shift_px
-        Movement since the frame that was registered, (dx, dy).
-    """
-
-    framing: Framing
-    lens: Lens
-    displacement: Displacement
-    marks_residual_px: _Array
-    lens_residual_px: float
-    blocks: Blocks
-    colours: ColourModel
-    mismatched_cells: _Mask
-    agreement: float
-    blur_px: float
-    cell_px: float
-    shift_px: tuple[float, float] = (0.0, 0.0)
-
-    def to_pixels(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the half-size pixels (N, 2) float64, x then y, of points (N, 2) on the print."""
-        return self.lens.to_pixels(points_mm) + self.displacement.at(points_mm) + self.shift_px
-
-    def shifted(self, dx: float, dy: float) -> Registration:
-        """Return this registration for a frame in which the chart lies (dx, dy) px further."""
-        return replace(self, shift_px=(self.shift_px[0] + dx, self.shift_px[1] + dy))
-
-    @property
-    def marks_rms_px(self) -> float:
-        """RMS distance of the tags' corners, or the field's outline, from the final map."""
-        return rms(self.marks_residual_px)
-
-    @property
-    def block_rms_px(self) -> float:
-        """RMS of what the good blocks would still ask for: the registration's own estimate of its error."""
-        return rms(self.blocks.residual_px[self.blocks.good])
-
-    @property
-    def room(self) -> float:
-        """How much further samples are from their cells' edges than in cells of 10 px, ≥ 1: places matter less by it.
-
-        Cells of a hundred pixels are found to a pixel, which is nothing to them.
-        """
-        return max(1.0, (self.cell_px / 2 - SAMPLE_REACH_PX) / ROOM_PX)
 
 
 def register(
@@ -176,7 +104,7 @@ def register(
         For a chart without tags: (4, 2) half-size px, the corners of the field of cells, clockwise from the printed
         top-left, to some 20 px; found by themselves if not given.
     near
-        An earlier registration of the same session: a chart without tags then hangs the same way up.
+        An earlier registration of the same session: a chart without tags is then taken to hang the same way up.
 
     Raises
     ------
@@ -211,7 +139,7 @@ def register(
         for softness in _FOLLOWED_SOFTLY:
             matcher.follow(softness)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        if matcher.step() < 0.01:
+        if matcher.step() < _SETTLED_PX:
             break
     registration = _registered(chart, framing, matcher, marks, lens_rms)
     _judge(registration, MIN_AGREEMENT if chart.tags else MIN_PLAIN_AGREEMENT, what)
@@ -228,7 +156,7 @@ def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
 
 
 def _outline(field: FoundField) -> Anchors:
-    """Return the field's outline, whose places are known across alone."""
+    """Return the field's outline, whose places are known across it and not along it."""
     known = np.einsum("ni,nj->nij", field.normals, field.normals) / _OUTLINE_SIGMA_PX**2
     return Anchors(field.outline_mm, field.outline_px, known)
 
@@ -240,7 +168,7 @@ def _clear_edges(field: FoundField, planes: list[Plane], blur: float) -> FoundFi
 
 
 def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple[FoundField, Lens, _Array]:
-    """Return the field without points of its outline that stand apart, which are marks; its lens; and residuals."""
+    """Return the field without outlying points of its outline, which are marks in the margin; its lens; residuals."""
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
     for _ in range(2):
         size = np.linalg.norm(residual, axis=1)
@@ -256,14 +184,14 @@ def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple
 
 
 def _require_own_cells(matcher: Matcher, mismatched_cells: _Mask, what: str) -> None:
-    """Refuse a map on which parts of the field show the colours of the cells beside them."""
+    """Refuse a map on which parts of the field show the colours of the neighbouring cells."""
     places, parts = matcher.slipped(mismatched_cells)
     if len(places) >= max(_FEW_SLIPPED, _SLIPPED_SHARE * parts):
         x, y = places[0]
         raise RegistrationError(
-            f"{what}: {len(places)} of {parts} parts of the field look as if they lay one cell aside, the first about "
-            f"{x:.0f}, {y:.0f} mm from the sheet's top-left corner; uncover the print, hang it flatter, and see that "
-            "chart.json has its cells where they are printed"
+            f"{what}: {len(places)} of {parts} parts of the field have the colours of the cells beside them, the "
+            f"first at about {x:.0f}, {y:.0f} mm from the sheet's top-left corner; uncover the print, hang it flatter, "
+            "and see that chart.json has its cells where they are printed"
         )
 
 
@@ -292,17 +220,13 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
 
 
 def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors, lens_rms: float) -> Registration:
-    """Return the map with everything that tells how good it is."""
-    seen, wanted, paper = matcher.patches()
+    """Return the map with all figures of its quality."""
+    seen, expected, paper = matcher.patches()
     there = np.asarray(np.isfinite(seen).all(axis=1))
     residual = marks.places_px - matcher.to_pixels(marks.points_mm)
     if framing.field is not None:
         residual = (residual * framing.field.normals).sum(axis=1, keepdims=True) * framing.field.normals
-    mismatched_cells = np.zeros(chart.colour_count, dtype=np.bool_)
-    if chart.colour_count >= _LEAST_COLOURS:
-        mismatched_cells = _with_neighbours(
-            _mismatched_cells(seen, wanted, paper)[: chart.colour_count], chart.centres_mm / np.array(chart.cell_mm)
-        )
+    mismatched_cells = mismatched(seen, expected, paper, chart)
     blocks = matcher.blocks()
     if not chart.tags:
         there[: chart.colour_count] &= ~mismatched_cells
@@ -316,7 +240,7 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
         blocks=blocks,
         colours=matcher.colours,
         mismatched_cells=mismatched_cells,
-        agreement=_agreement(seen[there], wanted[there]),
+        agreement=agreement(seen[there], expected[there]),
         blur_px=matcher.blur_px,
         cell_px=matcher.cell_px,
     )
@@ -333,30 +257,6 @@ def _without_mismatched_cells(blocks: Blocks, mismatched_cells: _Mask, chart: Ch
     return replace(blocks, score=blocks.score * (1 - share))
 
 
-def _mismatched_cells(seen: _Array, wanted: _Array, paper: _Array) -> _Mask:
-    """Return which patches (N,) differ from their model far more than is usual, and by a visible share of white."""
-    residual = np.abs(seen - wanted)
-    usual = MAD_TO_SIGMA * np.nanmedian(residual, axis=0)
-    return np.asarray(((residual > _MISMATCH_SIGMA * usual) & (residual > _MISMATCH_SHARE * paper)).any(axis=1))
-
-
-def _with_neighbours(mismatched_cells: _Mask, centres: _Array) -> _Mask:
-    """Return the mismatched cells (N,) and the cells amid them, which a cover of their own colour would hide.
-
-    `centres` (N, 2) in cells.
-    """
-    near = cKDTree(centres).query(centres, k=min(_NEIGHBOURS, len(centres)))[1]
-    share = mismatched_cells[np.asarray(near).reshape(len(centres), -1)].mean(axis=1)
-    return np.asarray(mismatched_cells | (share > _MISMATCH_NEIGHBOURS))
-
-
-def _agreement(seen: _Array, wanted: _Array) -> float:
-    """Return the correlation of colours with those wanted, the mean of the channels that carry most light."""
-    light = np.median(seen, axis=0)
-    used = np.flatnonzero(light >= 0.3 * light.max())
-    return float(np.mean([np.corrcoef(seen[:, channel], wanted[:, channel])[0, 1] for channel in used]))
-
-
 def _judge(registration: Registration, least_agreement: float, what: str) -> None:
     """Refuse a registration that would build a wrong table."""
     blocks = registration.blocks
@@ -370,9 +270,9 @@ def _judge(registration: Registration, least_agreement: float, what: str) -> Non
             what,
             f"{share:.0%} of the blocks of cells look as the chart has them, at least {MIN_GOOD_BLOCKS:.0%} needed",
         )
-    allowed = MAX_BLOCK_RESIDUAL_PX * registration.room
+    allowed = MAX_BLOCK_RESIDUAL_PX * registration.clearance
     if registration.block_rms_px > allowed:
         raise RegistrationError(
-            f"{what}: blocks of cells still ask for movements of {registration.block_rms_px:.2f} px RMS, "
+            f"{what}: the residual of the blocks of cells is {registration.block_rms_px:.2f} px RMS, at most "
             f"{allowed:.2g} allowed; hang the print flatter"
         )

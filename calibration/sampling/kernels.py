@@ -43,7 +43,7 @@ def sample(
     samples: _Float,
     peak: _Count,
 ) -> None:
-    """Fill samples (N, window², 3) and their highest counts (N,); patches that are not inside are left at 0.
+    """Fill samples (N, window², 3) float32 and their highest counts `peak` (N,); patches that are not inside get 0.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def sample(
     window
         Pixels along a patch's side.
     black
-        (3,) float32.
+        (3,) float32 counts, of red, green and blue.
     """
     red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
     for patch in order:
@@ -90,7 +90,7 @@ def sample(
 
 @compiled
 def tabulate(samples: _Float, dark: _Float, field: _Float, values: _Count) -> None:
-    """Fill values (N, S, 3) from samples, less `dark` (N, 3), over `field` (N, 3)."""
+    """Fill values (N, S, 3) uint16 from samples (N, S, 3) float32, less `dark` (N, 3), over `field` (N, 3)."""
     for patch in range(samples.shape[0]):
         for number in range(samples.shape[1]):
             for channel in range(3):
@@ -113,7 +113,7 @@ def sample_to_table(
     values: _Count,
     peak: _Count,
 ) -> None:
-    """Do `sample` and `tabulate` in one go, without the samples between them."""
+    """Do `sample` and `tabulate` in one pass, without the samples between them."""
     red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
     for patch in order:
         highest = np.int32(0)
@@ -142,7 +142,7 @@ def sample_to_table(
 
 @compiled
 def patch_means(values: _Count, means: _Array) -> None:
-    """Fill means (N, 3) of values (N, S, 3)."""
+    """Fill means (N, 3) float64 of values (N, S, 3) uint16."""
     samples = values.shape[1]
     for patch in range(values.shape[0]):
         red, green, blue = np.int64(0), np.int64(0), np.int64(0)

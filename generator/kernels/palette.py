@@ -20,7 +20,7 @@ from generator.kernels.choice import EDGE, OFFSETS, group_of
 from generator.kernels.vector import GROUP, copy1, name_colours, offset_at
 
 if TYPE_CHECKING:
-    from calibration.table.lut import Provenance
+    from calibration.table.provenance import Provenance
 
 
 def bits_of(colours: int) -> int:

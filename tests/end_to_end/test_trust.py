@@ -18,8 +18,9 @@ from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep
 from benchmarks.accuracy import Held, beyond_noise, hold, repeated_variance
 from benchmarks.rooms import random_case
-from calibration.pipeline.build import BuildResult, build
+from calibration.pipeline.build import build
 from calibration.table.lut import open_lut
+from calibration.verdict.result import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from foundation.angles import angles_deg
@@ -42,7 +43,7 @@ def held_against(lab: Lab, session: Session, folder: Path) -> tuple[BuildResult,
     result = build(session, folder / "lut")
     table = open_lut(folder / "lut")
     cells = lab.chart.centres_mm[lab.chart.cell_of_colour]
-    frames = {frame.record.illumination: frame for frame in result.frames if frame.record.kind == "light"}
+    frames = {frame.record.illumination: frame for frame in result.figures.frames if frame.record.kind == "light"}
     fields = [frames[number].paper.field.at(cells) for number in range(len(table.illuminations))]
     return result, hold(table, lab.world, lab.chart, fields, SETTINGS)
 
@@ -147,7 +148,7 @@ def test_a_random_room_is_refused_or_right(seed: int, tmp_path: Path) -> None:
             result, held = held_against(hung, session, tmp_path)
         except QualityError:
             return
-    offset = result.registration.to_pixels(hung.chart.centres_mm) - hung.world.project(hung.chart.centres_mm)
+    offset = result.figures.registration.to_pixels(hung.chart.centres_mm) - hung.world.project(hung.chart.centres_mm)
     assert np.linalg.norm(offset, axis=1).max() < 0.7
     assert wrong(held) < WRONG
 
@@ -178,7 +179,7 @@ def test_a_chart_moved_by_a_cell_is_followed(lab: Lab, tmp_path: Path) -> None:
 
     with session_of(lab, tmp_path, frame) as session:
         result, held = held_against(lab, session, tmp_path)
-    assert sum(figures.registered for figures in result.frames) == 1
+    assert sum(figures.reregistered for figures in result.figures.frames) == 1
     assert "moved_anew" in {row.threshold.name for row in result.verdict.remarks}
     # The light moves with the picture here, so its field fits the moved frames less well.
     assert wrong(held) < 0.05
@@ -195,18 +196,18 @@ def test_a_hand_in_the_light_is_refused(
 def test_a_frame_that_is_spoilt_is_named_with_the_place(lab: Lab, tmp_path: Path) -> None:
     with session_of(lab, tmp_path, shaded(lab, 0.8, once)) as session, pytest.raises(QualityError) as refused:
         build(session, tmp_path / "lut")
-    assert "frames/0002_light_000.dng about " in str(refused.value)
+    assert "frames/0002_light_000.dng, about " in str(refused.value)
     assert "a hand, a shadow or a reflection" in str(refused.value)
 
 
-def test_a_faint_shadow_is_told(lab: Lab, tmp_path: Path) -> None:
+def test_a_faint_shadow_is_remarked_on(lab: Lab, tmp_path: Path) -> None:
     """6 % less light on a hand's breadth is no reason to refuse a table, but to look at it."""
     with session_of(lab, tmp_path, shaded(lab, 0.94, once)) as session:
         result = build(session, tmp_path / "lut")
     assert "unlike_block" in {row.threshold.name for row in result.verdict.remarks}
 
 
-def test_a_lamp_that_flickers_is_told_and_harms_no_colour(lab: Lab, tmp_path: Path) -> None:
+def test_a_lamp_that_flickers_is_reported_and_harms_no_colour(lab: Lab, tmp_path: Path) -> None:
     """Every frame has its own brightness; each light's ground truth is of its own frame."""
     bright = {step: ExposureSettings(100, 8.0, 0.5 * (0.94 if step % 2 else 1.0)) for step in range(20)}
     frame = exposed(lab, lambda step: bright[step.number])
@@ -258,7 +259,7 @@ def test_frames_that_clip_list_their_cells(lab: Lab, tmp_path: Path) -> None:
             return
     table = open_lut(tmp_path / "lut")
     fit = table.samples[:, held.clean]
-    assert fit.max() < 1.2 * result.white_level
+    assert fit.max() < 1.2 * result.figures.sensor.white_level
     assert wrong(held) < WRONG
 
 
@@ -267,6 +268,6 @@ def test_a_softer_picture_is_registered_as_well(tmp_path: Path) -> None:
     soft = hang(room=Room(waviness_mm=0.5, blur_px=0.8))
     with take(soft, tmp_path / "session", FEW) as session:
         result, held = held_against(soft, session, tmp_path)
-    offset = result.registration.to_pixels(soft.chart.centres_mm) - soft.world.project(soft.chart.centres_mm)
+    offset = result.figures.registration.to_pixels(soft.chart.centres_mm) - soft.world.project(soft.chart.centres_mm)
     assert np.sqrt((offset**2).sum(axis=1).mean()) < 0.05
     assert wrong(held) < WRONG

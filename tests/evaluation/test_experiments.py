@@ -15,7 +15,9 @@ import pytest
 from fsspec.core import url_to_fs
 
 from acquisition.lights.illuminations import Illumination
-from calibration.table.lut import LutWriter, Provenance, open_lut
+from calibration.table.lut import open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from evaluation import experiments
 from evaluation.cli import main

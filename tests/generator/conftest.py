@@ -10,7 +10,9 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.lights.illuminations import Illumination
-from calibration.table.lut import Lut, LutWriter, Provenance, Unfit, open_lut
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance, Unfit
+from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from generator.kernels import philox
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.table.lut import Provenance, Unfit
+from calibration.table.provenance import Provenance, Unfit
 from foundation.errors import InputError
 from generator.kernels import streaming
 from generator.kernels.palette import bits_of, channels_of, colours_in, fit_picture, stand_ins

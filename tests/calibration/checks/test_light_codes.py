@@ -16,7 +16,6 @@ from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep
 from calibration.checks.light_codes import DEGREE, LIGHTS_A_TERM, angles_off_codes_deg
 from calibration.pipeline.build import build
-from calibration.pipeline.measuring import FrameFigures
 from calibration.report.report import write_report
 from calibration.verdict.thresholds import THRESHOLDS
 from calibration.verdict.verdict import judge
@@ -140,8 +139,8 @@ def test_lights_off_their_codes_make_no_table_and_are_named(
         held.extend([white, errors_deg])
         return np.where(np.isin(np.arange(len(lights)), (3, 7)), 5.0 + np.arange(len(lights)), 0.1)
 
-    monkeypatch.setattr("calibration.pipeline.build.angles_off_codes_deg", told)
-    with pytest.raises(QualityError, match=r"what its codes give: 12°.*, 2 lights: 7, 3; correct the list of frames"):
+    monkeypatch.setattr("calibration.pipeline.collecting.angles_off_codes_deg", told)
+    with pytest.raises(QualityError, match=r"codes predict: 12°.*, 2 lights: 7, 3; correct the list of frames"):
         build(session, tmp_path / "lut", report=write_report)
     report = json.loads((tmp_path / "lut.refused" / "report.json").read_text())
     assert report["off_codes_deg"][2:4] == [0.1, 8.0]
@@ -160,16 +159,13 @@ def test_lights_exposed_otherwise_are_not_held_against_their_codes(
         exposed = replace(SETTINGS, shutter_s=0.6) if step.illumination == 1 else SETTINGS
         return lab.dng(step.colour, step.number, exposed)
 
-    monkeypatch.setattr("calibration.pipeline.build.angles_off_codes_deg", told)
+    monkeypatch.setattr("calibration.pipeline.collecting.angles_off_codes_deg", told)
     with take(lab, tmp_path / "alike", LIGHTS[:3]) as session:
         result = build(session, tmp_path / "lut")
-        assert result.off_codes_deg is not None
-        assert result.frames[0].exposure == pytest.approx(0.5 * 100 / 8**2)
-        # A checkpoint of before it was noted.
-        earlier = {name: value for name, value in result.frames[0].to_json().items() if name != "exposure"}
-        assert FrameFigures.from_json(result.frames[0].record, lab.chart.page_mm, earlier).exposure == 0
+        assert result.figures.lights.off_codes_deg is not None
+        assert result.figures.frames[0].exposure == pytest.approx(0.5 * 100 / 8**2)
     with take(lab, tmp_path / "longer", LIGHTS[:3], frame=longer) as session:
-        assert build(session, tmp_path / "other").off_codes_deg is None
+        assert build(session, tmp_path / "other").figures.lights.off_codes_deg is None
 
 
 def test_two_lights_of_one_file_make_no_table(lab: Lab, tmp_path: Path) -> None:

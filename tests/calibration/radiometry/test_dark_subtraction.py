@@ -13,13 +13,14 @@ import pytest
 from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep
 from calibration.cli import main
-from calibration.pipeline.build import append, build, check
-from calibration.pipeline.options import Choices
-from calibration.pipeline.result import BuildResult, Growth
+from calibration.pipeline.build import TableProgress, append, build, check
+from calibration.pipeline.options import BuildOptions
 from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances, winsorised_means
-from calibration.radiometry.paper import FlatField, Paper
-from calibration.report.report import summary
+from calibration.radiometry.flat_field import FlatField
+from calibration.radiometry.paper import Paper
+from calibration.report.summary import summary
 from calibration.table.lut import open_lut
+from calibration.verdict.result import BuildResult
 from drivers.presenter import BLACK
 from foundation.errors import FormatError
 from sim.world.room import Room
@@ -27,7 +28,7 @@ from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
 
 PATCHES = 4000
 NOISE = np.array([6.0, 4.2, 6.0])
-SUBTRACTED = Choices(subtract_dark=True)
+SUBTRACTED = BuildOptions(subtract_dark=True)
 _Array = npt.NDArray[np.float64]
 
 
@@ -118,7 +119,7 @@ def session(room: Lab, tmp_path_factory: pytest.TempPathFactory) -> Generator[Se
 
 @pytest.fixture(scope="module")
 def subtracted(session: Session, tmp_path_factory: pytest.TempPathFactory) -> BuildResult:
-    return build(session, tmp_path_factory.mktemp("table") / "lut", choices=SUBTRACTED)
+    return build(session, tmp_path_factory.mktemp("table") / "lut", options=SUBTRACTED)
 
 
 def test_table_and_ground_truth_are_those_of_a_dark_room(room: Lab, subtracted: BuildResult) -> None:
@@ -133,7 +134,7 @@ def test_table_and_ground_truth_are_those_of_a_dark_room(room: Lab, subtracted: 
         seen = table.white[light.index]
         assert seen[shown] / seen[shown].max() == pytest.approx(white[shown] / white[shown].max(), rel=0.01)
         # A channel that the light lacks is left with nothing, to the noise of its references.
-        assert (seen[~shown] < white[~shown] + 4 * subtracted.white_error[light.index][~shown]).all()
+        assert (seen[~shown] < white[~shown] + 4 * subtracted.figures.lights.white_error[light.index][~shown]).all()
         true = room.world.reflected(codes, light.colour, SETTINGS) - room.world.reflected(codes, BLACK, SETTINGS)
         scale = (seen[shown] / white[shown]).mean()
         mean, true = table.samples[light.index].mean(axis=1)[:, shown], true[:, shown] * scale
@@ -144,10 +145,10 @@ def test_table_and_ground_truth_are_those_of_a_dark_room(room: Lab, subtracted: 
 
 
 def test_light_adds_when_the_dark_is_out(room: Lab, subtracted: BuildResult) -> None:
-    assert subtracted.added is not None
-    assert np.abs(subtracted.added).max() < 0.006
+    assert subtracted.figures.lights.additivity is not None
+    assert np.abs(subtracted.figures.lights.additivity).max() < 0.006
     assert "leak_share" not in {row.threshold.name for row in subtracted.verdict.rows}
-    note = next(note for name, _, note in summary(subtracted) if name == "Light while black is shown")
+    note = next(row.note for row in summary(subtracted.figures) if row.name.startswith("Light while"))
     assert note.endswith("; subtracted from samples and ground truth")
 
 
@@ -187,10 +188,10 @@ def test_a_growing_table_ends_in_the_same_bytes(session: Session, subtracted: Bu
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        build(session, tmp_path / "lut", told, choices=SUBTRACTED)
+        build(session, tmp_path / "lut", told, options=SUBTRACTED)
     done: list[int] = []
-    grown = append(session, tmp_path / "lut", lambda number, total, what: done.append(number), choices=SUBTRACTED)
-    assert not isinstance(grown, Growth)
+    grown = append(session, tmp_path / "lut", lambda number, total, what: done.append(number), options=SUBTRACTED)
+    assert not isinstance(grown, TableProgress)
     assert done[1] == 17
     for path in subtracted.lut.iterdir():
         assert path.read_bytes() == (tmp_path / "lut" / path.name).read_bytes()
@@ -202,29 +203,25 @@ def test_a_checkpoint_of_another_choice_is_not_gone_on_from(session: Session, tm
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        build(session, tmp_path / "lut", told, choices=SUBTRACTED)
+        build(session, tmp_path / "lut", told, options=SUBTRACTED)
     with pytest.raises(KeyboardInterrupt):
         build(session, tmp_path / "lut", told)
     done: list[int] = []
-    build(session, tmp_path / "lut", lambda number, total, what: done.append(number), choices=SUBTRACTED)
+    build(session, tmp_path / "lut", lambda number, total, what: done.append(number), options=SUBTRACTED)
     assert done[:2] == [0, 1]
 
 
-def test_without_dark_frames_it_is_refused(
-    lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_dark_frames_it_is_refused(lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def refuse_darks(step: SessionStep) -> str:
         return "refused" if step.kind == "dark" else "accepted"
 
     with take(lab, tmp_path / "session", LIGHTS[:2], verdict=refuse_darks) as session:
         for make in (build, append):
             with pytest.raises(FormatError, match=r"no accepted dark frame.*build the table without --subtract-dark"):
-                make(session, tmp_path / "lut", choices=SUBTRACTED)
+                make(session, tmp_path / "lut", options=SUBTRACTED)
         with pytest.raises(FormatError, match="no accepted dark frame"):
             check(session, SUBTRACTED)
-    arguments = ["build-lut", "--subtract-dark", str(tmp_path / "session"), str(tmp_path / "lut")]
-    monkeypatch.setattr("sys.argv", arguments)
-    assert main() == 2
+    assert main(["--subtract-dark", str(tmp_path / "session"), str(tmp_path / "lut")]) == 2
     assert "take the session with acquire run" in capsys.readouterr().err
     assert not (tmp_path / "lut").exists()
 
@@ -236,7 +233,7 @@ def test_lights_before_the_first_dark_frame_take_the_first(room: Lab, tmp_path: 
         return "refused" if step.kind == "dark" and step.number < 3 else "accepted"
 
     with take(room, tmp_path / "session", renumbered(LIGHTS[5:8]), verdict=refuse_first) as session:
-        result = build(session, tmp_path / "lut", choices=SUBTRACTED)
-    assert result.subtracted is not None
-    assert (result.subtracted == result.subtracted[0]).all()
-    assert (result.subtracted > 40).all()
+        result = build(session, tmp_path / "lut", options=SUBTRACTED)
+    assert result.figures.lights.subtracted is not None
+    assert (result.figures.lights.subtracted == result.figures.lights.subtracted[0]).all()
+    assert (result.figures.lights.subtracted > 40).all()
