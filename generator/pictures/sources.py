@@ -35,7 +35,7 @@ _OF_THE_MACHINE: Final = frozenset(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Scene:
+class SourcePicture:
     """A source picture as it was read.
 
     Attributes
@@ -61,7 +61,7 @@ class Source(Protocol):
         """What the dataset calls it."""
         ...
 
-    def read(self) -> Scene:
+    def read(self) -> SourcePicture:
         """Return the picture; a FormatError says why it cannot be had."""
         ...
 
@@ -105,7 +105,7 @@ class PictureFile:
         """The file's path or URL."""
         return f"{self.root.rstrip('/')}/{self.below}" if self.below else self.root
 
-    def read(self) -> Scene:
+    def read(self) -> SourcePicture:
         """Return the picture; see `picture.open_picture`.
 
         Raises
@@ -133,7 +133,7 @@ class PictureFile:
                 raise InputError(
                     f"there is not enough memory to read {self.location}; use fewer workers, or leave it out"
                 ) from error
-        return Scene(reading.picture, digest.hexdigest(), reading.profile)
+        return SourcePicture(reading.picture, digest.hexdigest(), reading.profile)
 
 
 @contextmanager
@@ -211,14 +211,14 @@ class RandomScene:
         """Return its number, size and seed."""
         return {"random": self.number, "size": [self.width, self.height], "seed": self.seed}
 
-    def read(self) -> Scene:
+    def read(self) -> SourcePicture:
         """Return the picture."""
         places = np.arange((self.width + 3) // 4)
         rows = np.arange(self.height)[:, None]
         four = philox.words(self.seed, places, rows, self.number, philox.SCENES)
         words = np.stack(four, axis=-1).reshape(self.height, -1)[:, : self.width]
         codes = np.stack([words >> np.uint32(24), words >> np.uint32(16), words >> np.uint32(8)], axis=-1)
-        return Scene(codes.astype(np.uint8))
+        return SourcePicture(codes.astype(np.uint8))
 
 
 def random_scenes(count: int, width: int, height: int, seed: int = 0) -> tuple[RandomScene, ...]:

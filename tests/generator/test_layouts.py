@@ -26,7 +26,7 @@ from generator.dataset.production.records import Layout
 from generator.dataset.reader import Dataset, generate_dataset, open_dataset
 from generator.lights.choices import ListedLights, TogetherLights
 from generator.masks.making import parse_masks
-from generator.pictures.sources import Scene, random_scenes
+from generator.pictures.sources import SourcePicture, random_scenes
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -149,7 +149,7 @@ class Gone:
 
     name: str = "gone"
 
-    def read(self) -> Scene:
+    def read(self) -> SourcePicture:
         raise StorageError("the disk is gone")
 
     def told(self) -> dict[str, Any]:
