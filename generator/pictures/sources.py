@@ -65,7 +65,7 @@ class Source(Protocol):
         """Return the picture; a FormatError says why it cannot be had."""
         ...
 
-    def told(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return how it is made or read, as JSON holds it, but not where a file lies."""
         ...
 
@@ -96,7 +96,7 @@ class PictureFile:
         # Many readers of CSV take a carriage return for the end of a line, quoted or not.
         return text.replace("\r", "\\r")
 
-    def told(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return its name and its preparation."""
         return {"picture": self.name, **self.preparation.describe()}
 
@@ -207,7 +207,7 @@ class RandomScene:
         """What the dataset calls it."""
         return f"random-{self.number:06d}"
 
-    def told(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return its number, size and seed."""
         return {"random": self.number, "size": [self.width, self.height], "seed": self.seed}
 

@@ -152,7 +152,7 @@ class Gone:
     def read(self) -> SourcePicture:
         raise StorageError("the disk is gone")
 
-    def told(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         return {}
 
 

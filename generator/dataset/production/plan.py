@@ -283,7 +283,7 @@ def sources_sha256(sources: Sequence[Source]) -> str:
     """
     digest = hashlib.sha256()
     for source in sources:
-        digest.update(json.dumps(source.told(), sort_keys=True).encode() + b"\n")
+        digest.update(json.dumps(source.to_json(), sort_keys=True).encode() + b"\n")
     return digest.hexdigest()
 
 
