@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from foundation.errors import InputError
 from generator.kernels.palette import bits_of
-from generator.kernels.philox import key_of
+from generator.philox import key_of
 
 Samples = npt.NDArray[np.uint16]
 Picture = npt.NDArray[np.uint8]

@@ -26,8 +26,8 @@ import numba
 import numpy as np
 from numba import uint32, uint64
 
-from generator.kernels.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES
 from generator.kernels.vector import GROUP, LANES, LINE, choose, copy1, prefetch_once
+from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES
 
 AHEAD: Final = 2
 """Groups of pixels whose offsets are chosen before the first one's samples are fetched."""

@@ -27,7 +27,8 @@ from numba import uint32
 
 from foundation.compiled import compiled
 from foundation.errors import InputError
-from generator.kernels import philox, streaming
+from generator import philox
+from generator.kernels import streaming
 from generator.kernels.arguments import (
     Picture,
     Samples,

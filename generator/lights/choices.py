@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
-from generator.kernels import philox
+from generator import philox
 from generator.lights.distributions import Distribution
 from generator.lights.gamut import Gamut, Match, Outside, OutsideGamutError, black_body, rgb_of
 from generator.lights.ground_truths import load_ground_truths

@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
 from foundation.srgb import srgb_codes
-from generator.kernels import philox
+from generator import philox
 from generator.pictures.profiles import ADOBE_RGB, ASSUMED, from_adobe_rgb, to_srgb
 
 Picture = npt.NDArray[np.uint8]

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from foundation.errors import FormatError, InputError, StorageError
+from generator import philox
 from generator.dataset.store import DESCRIPTION, filesystem, is_remote, local_path
-from generator.kernels import philox
 from generator.pictures.picture import AS_THEY_ARE, LARGEST_SIDE, Picture, Preparation, open_picture
 
 if TYPE_CHECKING:

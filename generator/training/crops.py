@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
-from generator.kernels import philox
+from generator import philox
 from generator.kernels.palette import fit_picture
 from generator.kernels.planar import draw_batch
 from generator.lights.lighting import Mixture

@@ -12,7 +12,7 @@ import pytest
 from acquisition.lights.illuminations import Illumination
 from calibration.table.lut import Lut, LutWriter, Provenance, Unfit, open_lut
 from drivers.presenter import Colour
-from generator.kernels import philox
+from generator import philox
 
 SAMPLES = 25
 MakeLut = Callable[..., Lut]

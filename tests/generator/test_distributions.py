@@ -11,11 +11,11 @@ import pytest
 from scipy.stats import chisquare, kstest
 
 from foundation.errors import FormatError, InputError
-from generator.kernels.philox import CHROMATICITIES, words
 from generator.lights.choices import DrawnLights
 from generator.lights.distributions import Distribution, Fitted, Gaussian, Uniform, parse_distribution
 from generator.lights.gamut import Gamut, rb_of
 from generator.lights.lighting import LightChoice
+from generator.philox import CHROMATICITIES, words
 
 CORNERS = np.array([[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]])
 GAMUT = Gamut(np.array([*CORNERS, [0.3, 0.4, 0.3]]))

@@ -115,7 +115,7 @@ class Plan:
     options: Options
 
     def __post_init__(self) -> None:
-        from generator.kernels.philox import key_of
+        from generator.philox import key_of
 
         key_of(self.seed)
         if not self.sources or not self.choice.lights_each:
