@@ -44,7 +44,7 @@ def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
     return np.stack([colours >> 2 * bits & mask, colours >> bits & mask, colours & mask], axis=-1)
 
 
-def stand_ins(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
+def nearest_fit_colours(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
     """Return for each unfit colour the nearest fit one.
 
     Nearest by Euclidean distance of the codes; of several equally near the lowest index.
@@ -79,7 +79,7 @@ def stand_ins(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
     return np.array(nearest, dtype=np.int64).reshape(unfit.shape)
 
 
-def fit_picture(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple[npt.NDArray[np.uint8], int]:
+def replace_unfit_colours(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple[npt.NDArray[np.uint8], int]:
     """Return `picture` with unfit colours replaced, and the number of pixels replaced.
 
     Parameters
@@ -108,7 +108,7 @@ def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.boo
     """Return which of a table's colours are unfit, and the codes (8**bits, 3) to stand in for those."""
     is_unfit, instead = np.zeros(8**bits, np.bool_), np.zeros((8**bits, 3), np.uint8)
     is_unfit[list(unfit)] = True
-    instead[list(unfit)] = channels_of(stand_ins(unfit, bits), bits) << (8 - bits)
+    instead[list(unfit)] = channels_of(nearest_fit_colours(unfit, bits), bits) << (8 - bits)
     return is_unfit, instead
 
 

@@ -36,7 +36,7 @@ from generator.kernels.arguments import (
 )
 from generator.kernels.choice import AHEAD, SCRATCH, ask_group, choose_group, row_keys, slot
 from generator.kernels.drawing import choose_first, draw_groups
-from generator.kernels.palette import fit_picture
+from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.streaming import line_at, line_room, pass_on
 from generator.kernels.vector import (
     GROUP,
@@ -52,7 +52,7 @@ from generator.kernels.vector import (
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
-WHOLE_LIGHT: Final = 1 << 20
+WHOLE_LIGHT_PIXELS: Final = 1 << 20
 """Pixels from which reading a light's samples in one go is cheaper than touching their pages at random."""
 
 _STRETCH: Final = 16
@@ -287,7 +287,7 @@ def draw_mosaic(
     return delivered(work, target)
 
 
-def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT) -> npt.NDArray[np.uint16]:
+def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.NDArray[np.uint16]:
     """Return the samples (8**bits, S, 3) uint16 of light number `light`, in memory if `pixels` are worth the copy.
 
     Raises
@@ -302,7 +302,7 @@ def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT) -> npt.NDArray[n
     if not 0 <= number < len(lut.samples):
         raise InputError(f"there is no light {number}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
     mapped = lut.samples[number]
-    return np.array(mapped) if pixels >= WHOLE_LIGHT else mapped
+    return np.array(mapped) if pixels >= WHOLE_LIGHT_PIXELS else mapped
 
 
 def render(
@@ -310,7 +310,7 @@ def render(
 ) -> npt.NDArray[np.uint16]:
     """Return the raw linear image of `picture` printed, lit by the table's light `light` and photographed.
 
-    Colours that the table lists as unfit are replaced by the nearest fit one; see `kernels.palette.fit_picture`.
+    Colours that the table lists as unfit are replaced by the nearest fit one; see `kernels.palette.replace_unfit_colours`.
 
     Parameters
     ----------
@@ -335,5 +335,5 @@ def render(
     """
     check_picture(picture)
     samples = read_light(lut, light, picture.shape[0] * picture.shape[1])
-    fit, _ = fit_picture(picture, lut.provenance)
+    fit, _ = replace_unfit_colours(picture, lut.provenance)
     return draw_samples(samples, fit, seed=seed, image=image, threads=threads)

@@ -43,7 +43,7 @@ def _chromaticities(weights: Any, whites: Any, out: Any) -> None:
 
 
 @compiled
-def _whole_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> None:
+def _quantise_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> None:
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1]):
             red, green, blue = _light_at(weights, whites, y, x)
@@ -51,7 +51,7 @@ def _whole_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> Non
 
 
 @compiled
-def _whole_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: Any) -> None:
+def _quantise_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: Any) -> None:
     """Do the same for weights (H, 2 W) and `out` (H, 3 W), in a loop of which the compiler makes vectors."""
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1] // 2):
@@ -64,7 +64,7 @@ def _whole_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: Any)
 
 
 @compiled
-def _whole_weights(weights: Any, full: Any, out: Any) -> None:
+def _quantise_weights(weights: Any, full: Any, out: Any) -> None:
     for y in range(weights.shape[0]):
         for light in range(weights.shape[2]):
             for x in range(weights.shape[1]):
@@ -101,7 +101,7 @@ def chromaticities(weights: npt.NDArray[np.float32], whites: npt.NDArray[np.floa
     return out
 
 
-def whole_chromaticities(
+def quantised_chromaticities(
     weights: npt.NDArray[np.float32], whites: npt.NDArray[np.float64], full: int
 ) -> npt.NDArray[np.uint16]:
     """Return `chromaticities` as whole parts of `full` ≤ 65535, rounded; green takes what is left: (H, W, 3) uint16."""
@@ -109,17 +109,17 @@ def whole_chromaticities(
     out = np.empty((height, width, 3), np.uint16)
     numbers = whites.astype(np.float32), np.float32(full)
     if lights == 2:
-        _whole_chromaticities_of_two(weights.reshape(height, -1), *numbers, out.reshape(height, -1))
+        _quantise_chromaticities_of_two(weights.reshape(height, -1), *numbers, out.reshape(height, -1))
     else:
-        _whole_chromaticities(weights, *numbers, out)
+        _quantise_chromaticities(weights, *numbers, out)
     return out
 
 
-def whole_weights(weights: npt.NDArray[np.float32], full: int) -> npt.NDArray[np.uint16]:
+def quantised_weights(weights: npt.NDArray[np.float32], full: int) -> npt.NDArray[np.uint16]:
     """Return weights (H, W, K) float32 from 0 to 1 as whole parts of `full` ≤ 65535, rounded: (K, H, W) uint16."""
     height, width, lights = weights.shape
     out = np.empty((lights, height, width), np.uint16)
-    _whole_weights(weights, np.float32(full), out)
+    _quantise_weights(weights, np.float32(full), out)
     return out
 
 

@@ -102,14 +102,14 @@ class Mixture:
         """
         from generator.kernels.mixing import mixed_table
         from generator.kernels.palette import colours_in
-        from generator.kernels.rendering import WHOLE_LIGHT, read_light
+        from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, read_light
 
         self._require(lut)
-        pixels = WHOLE_LIGHT if picture is None else picture.shape[0] * picture.shape[1]
+        pixels = WHOLE_LIGHT_PIXELS if picture is None else picture.shape[0] * picture.shape[1]
         if len(self.lights) == 1:
             return read_light(lut, self.lights[0], pixels)
         colours = None
-        if picture is not None and pixels < WHOLE_LIGHT:
+        if picture is not None and pixels < WHOLE_LIGHT_PIXELS:
             # To find the colours of a large picture takes as long as to mix all.
             colours = colours_in(picture, lut.provenance.bits)
         tables = [lut.samples[light] for light in self.lights]

@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from foundation.errors import FormatError
 from generator.files.maps import encode_map
-from generator.kernels.whites import whole_chromaticities, whole_weights
+from generator.kernels.whites import quantised_chromaticities, quantised_weights
 from generator.lights.lighting import FULL, Lighting, MaskMaker
 from generator.masks.making import whole_parts
 
@@ -154,9 +154,9 @@ def encode_maps(lut: Lut, lighting: Lighting, weights: _Array) -> list[tuple[str
     weights
         (H, W, lights) float32 in whole 65535ths, what the image was made with.
     """
-    shares = whole_weights(weights, FULL)
+    shares = quantised_weights(weights, FULL)
     maps = [("masks", f"_{light}.png", encode_map(share)) for light, share in enumerate(shares)]
-    truth = whole_chromaticities(weights, lighting.whites(lut), FULL)
+    truth = quantised_chromaticities(weights, lighting.whites(lut), FULL)
     return [*maps, ("ground_truth", ".png", encode_map(truth))]
 
 

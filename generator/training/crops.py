@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from foundation.errors import InputError
 from generator import philox
-from generator.kernels.palette import fit_picture
+from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.planar import draw_batch
 from generator.lights.lighting import Mixture
 from generator.training.recycling import Recycled
@@ -155,7 +155,7 @@ class Crops:
             self._tables = np.stack([mixture.samples(self.lut, self.seed) for mixture in self.lights])
             self._rows = np.arange(len(self.lights))
         self._pictures = [
-            fit_picture(self.gallery.picture(number), self.lut.provenance)[0] for number in range(len(self.gallery))
+            replace_unfit_colours(self.gallery.picture(number), self.lut.provenance)[0] for number in range(len(self.gallery))
         ]
 
     def __getstate__(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from calibration.table.lut import Provenance, Unfit
 from foundation.errors import InputError
 from generator.kernels import streaming
-from generator.kernels.palette import bits_of, channels_of, colours_in, fit_picture, stand_ins
+from generator.kernels.palette import bits_of, channels_of, colours_in, replace_unfit_colours, nearest_fit_colours
 from generator.kernels.rendering import PATTERNS, draw_mosaic, draw_samples, render
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ def test_every_unfit_colour_and_no_other_is_replaced(bits: int, height: int, wid
         unfit=[Unfit(colour=int(colour), cause="stain") for colour in unfit],
     )
     before = picture.copy()
-    fit, count = fit_picture(picture, told)
+    fit, count = replace_unfit_colours(picture, told)
     np.testing.assert_array_equal(picture, before)
     upper = (picture >> (8 - bits)).astype(np.int64)
     colour = (upper[..., 0] << 2 * bits) | (upper[..., 1] << bits) | upper[..., 2]
@@ -213,7 +213,7 @@ def test_every_unfit_colour_and_no_other_is_replaced(bits: int, height: int, wid
     hit = np.isin(colour, unfit)
     assert count == np.count_nonzero(hit)
     np.testing.assert_array_equal(fit[~hit], picture[~hit])
-    instead = dict(zip(unfit.tolist(), stand_ins(unfit, bits).tolist(), strict=True))
+    instead = dict(zip(unfit.tolist(), nearest_fit_colours(unfit, bits).tolist(), strict=True))
     codes = channels_of([instead[index] for index in colour[hit].tolist()], bits) << (8 - bits)
     np.testing.assert_array_equal(fit[hit], codes.reshape(-1, 3))
 

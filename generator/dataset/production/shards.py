@@ -216,11 +216,11 @@ def _wanted(job: ShardJob, position: int) -> list[tuple[int, Lighting]]:
 
 def _read(job: ShardJob, lut: Lut, place: int) -> _Read:
     from generator.files.formats import smallest_side
-    from generator.kernels.palette import fit_picture
+    from generator.kernels.palette import replace_unfit_colours
 
     source: Source = job.sources[place]
     scene = source.read()
-    picture, replaced = fit_picture(scene.picture, lut.provenance)
+    picture, replaced = replace_unfit_colours(scene.picture, lut.provenance)
     height, width = picture.shape[:2]
     least = smallest_side(job.options.form)
     if min(height, width) < least:
