@@ -21,7 +21,7 @@ from drivers.raw.camera_matrix import Matrix, camera_matrix
 from drivers.tiff.reading import CFA
 from drivers.tiff.writing import Kind, Tags, head, rationals, text
 from foundation.errors import InputError
-from generator.files.shot import Shot
+from generator.files.metadata import ImageMetadata
 
 SMALLEST_SIDE = 22
 """Photosites along a side below which LibRaw takes a file for no raw file."""
@@ -31,13 +31,13 @@ _SRGB: Matrix = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557,
 """From XYZ to linear sRGB, IEC 61966-2-1."""
 
 
-def encode_dng(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
+def encode_dng(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
     """Return the file of `image` (H, W, 3) uint16, uncompressed.
 
     Raises
     ------
     InputError
-        The image is smaller than raw programs open or larger than the format holds, or the shot's white level or
+        The image is smaller than raw programs open or larger than the format holds, or the metadata's white level or
         white cannot be written.
     """
     height, width, _ = image.shape
@@ -46,9 +46,9 @@ def encode_dng(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
             f"an image of {width}x{height} px is too small for DNG: raw programs open none below "
             f"{SMALLEST_SIDE}x{SMALLEST_SIDE}; choose png or tiff"
         )
-    neutral = _neutral(shot)
-    matrix = camera_matrix(shot.camera) or _SRGB
-    model = f"{shot.camera} generated".strip()
+    neutral = _neutral(metadata)
+    matrix = camera_matrix(metadata.camera) or _SRGB
+    model = f"{metadata.camera} generated".strip()
     tags: Tags = {
         254: (Kind.LONG, [0]),  # NewSubfileType: the picture itself
         256: (Kind.LONG, [width]),
@@ -56,7 +56,7 @@ def encode_dng(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
         258: (Kind.SHORT, [16]),  # BitsPerSample
         259: (Kind.SHORT, [1]),  # Compression: none
         262: (Kind.SHORT, [CFA]),
-        270: text(shot.note()),  # ImageDescription
+        270: text(metadata.to_json()),  # ImageDescription
         271: text("CroP"),  # Make
         272: text(model),
         274: (Kind.SHORT, [1]),  # Orientation: as it lies
@@ -71,7 +71,7 @@ def encode_dng(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
         50710: (Kind.BYTE, [0, 1, 2]),  # CFAPlaneColor
         50711: (Kind.SHORT, [1]),  # CFALayout: rectangular
         50714: (Kind.SHORT, [0]),  # BlackLevel
-        50717: (Kind.SHORT, [shot.white_level]),  # WhiteLevel
+        50717: (Kind.SHORT, [metadata.white_level]),  # WhiteLevel
         50721: (Kind.SRATIONAL, [part for row in matrix for entry in row for part in (round(10000 * entry), 10000)]),
         50728: rationals(*neutral),  # AsShotNeutral
         50778: (Kind.SHORT, [_D65]),  # CalibrationIlluminant1
@@ -106,14 +106,14 @@ def half_size(counts: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
     return image
 
 
-def _neutral(shot: Shot) -> tuple[float, float, float]:
+def _neutral(metadata: ImageMetadata) -> tuple[float, float, float]:
     """Return the light's white over its largest channel."""
-    if not 1 <= shot.white_level <= 65535:
-        raise InputError(f"the white level is {shot.white_level}; DNG expects 1 to 65535")
-    largest = max(shot.white)
-    if not all(math.isfinite(part) and part > largest * 1e-5 for part in shot.white):
+    if not 1 <= metadata.white_level <= 65535:
+        raise InputError(f"the white level is {metadata.white_level}; DNG expects 1 to 65535")
+    largest = max(metadata.white)
+    if not all(math.isfinite(part) and part > largest * 1e-5 for part in metadata.white):
         raise InputError(
-            f"the light's white is {shot.white}, DNG expects every channel above 0; choose png, tiff, exr or jxl"
+            f"the light's white is {metadata.white}, DNG expects every channel above 0; choose png, tiff, exr or jxl"
         )
-    red, green, blue = (part / largest for part in shot.white)
+    red, green, blue = (part / largest for part in metadata.white)
     return red, green, blue

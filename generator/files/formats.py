@@ -8,6 +8,8 @@
 
 Every encoder lets go of the interpreter's lock while it computes (not while it copies uncompressed pixels into the
 file), and no byte depends on the number of threads. Beside image and file a PNG takes some megabytes, however large.
+
+This is the room's door: code of other rooms imports this file and no other of `generator.files`.
 """
 
 from __future__ import annotations
@@ -20,14 +22,15 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
-from generator.files.shot import Shot
+from generator.files.metadata import ImageMetadata
 
 __all__ = [
     "FORMATS",
     "Format",
-    "Shot",
+    "ImageMetadata",
     "decode_image",
     "encode_image",
+    "encode_map",
     "encode_pieces",
     "encode_preview",
     "libraries_of",
@@ -66,7 +69,7 @@ def smallest_side(form: Format) -> int:
     return SMALLEST_SIDE
 
 
-def encode_image(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> bytes:
+def encode_image(image: npt.NDArray[np.uint16], form: Format, metadata: ImageMetadata) -> bytes:
     """Return `image` as the bytes of a file.
 
     Parameters
@@ -75,37 +78,37 @@ def encode_image(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> byt
         (H, W, 3) uint16, linear camera RGB.
     form
         The format; `dng` keeps one channel of each pixel, the others every bit.
-    shot
+    metadata
         What is known of the image; written wherever the format has a place for it (not `jxl`), needed by `dng`.
 
     Raises
     ------
     InputError
-        The image is not of that shape and type, or its size or the shot does not fit the format.
+        The image is not of that shape and type, or its size or the metadata does not fit the format.
     """
     _check(image)
     if form == "png":
         from generator.files.png import encode_png
 
-        return encode_png(image, shot)
+        return encode_png(image, metadata)
     if form == "tiff":
         from generator.files.tiff import encode_tiff
 
-        return encode_tiff(image, shot)
+        return encode_tiff(image, metadata)
     if form == "exr":
         from generator.files.exr import encode_exr
 
-        return encode_exr(image, shot)
+        return encode_exr(image, metadata)
     if form == "jxl":
         from generator.files.jxl import encode_jxl
 
         return encode_jxl(image)
     from generator.files.dng import encode_dng
 
-    return encode_dng(image, shot)
+    return encode_dng(image, metadata)
 
 
-def encode_pieces(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> Iterable[bytes | memoryview]:
+def encode_pieces(image: npt.NDArray[np.uint16], form: Format, metadata: ImageMetadata) -> Iterable[bytes | memoryview]:
     """Return the file of `encode_image` in pieces, whose memory may be used again for the next one.
 
     Of a PNG they are encoded when they are asked for, so that a file of any size is written out of a cache's memory.
@@ -119,8 +122,8 @@ def encode_pieces(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> It
     if form == "png":
         from generator.files.png import png_pieces
 
-        return png_pieces(image, shot)
-    return (encode_image(image, form, shot),)
+        return png_pieces(image, metadata)
+    return (encode_image(image, form, metadata),)
 
 
 def _check(image: npt.NDArray[np.uint16]) -> None:
@@ -178,6 +181,13 @@ def _decoded(data: bytes, form: Format) -> npt.NDArray[np.uint16]:
     from generator.files.exr import decode_exr
 
     return decode_exr(data)
+
+
+def encode_map(values: npt.NDArray[np.uint16]) -> bytes:
+    """Return `values` (H, W) or (H, W, 3) uint16, smooth ones such as a mask of weights, as the bytes of a 16-bit PNG."""
+    from generator.files import maps
+
+    return maps.encode_map(values)
 
 
 def encode_preview(picture: npt.NDArray[np.uint8]) -> bytes:

@@ -21,7 +21,7 @@ from isal import isal_zlib
 
 from foundation.errors import InputError
 from generator.files.deflate import WIDEST, Packer
-from generator.files.shot import Shot
+from generator.files.metadata import ImageMetadata
 
 SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 """The first bytes of every PNG file (clause 5.2)."""
@@ -37,7 +37,7 @@ _ADLER: Final = 65521
 _threads = threading.local()
 
 
-def encode_png(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> bytes:
+def encode_png(image: npt.NDArray[np.uint16], metadata: ImageMetadata, threads: int = 1) -> bytes:
     """Return the file of `image` (H, W, 3) uint16; no byte depends on the number of threads.
 
     Raises
@@ -45,10 +45,12 @@ def encode_png(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> b
     InputError
         The image is wider or higher than a PNG may be.
     """
-    return b"".join([bytes(piece) for piece in png_pieces(image, shot, threads)])
+    return b"".join([bytes(piece) for piece in png_pieces(image, metadata, threads)])
 
 
-def png_pieces(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> Iterator[bytes | memoryview]:
+def png_pieces(
+    image: npt.NDArray[np.uint16], metadata: ImageMetadata, threads: int = 1
+) -> Iterator[bytes | memoryview]:
     """Yield the file of `encode_png` piece by piece; the memory of each is used again for the next."""
     height, width, _ = image.shape
     if width > WIDEST or height > TALLEST:
@@ -58,7 +60,7 @@ def png_pieces(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> I
         )
     yield SIGNATURE
     yield from chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0))
-    yield from chunk(b"tEXt", b"Description\0" + shot.note().encode("ascii"))
+    yield from chunk(b"tEXt", b"Description\0" + metadata.to_json().encode("ascii"))
     rows = max(1, BAND // width)
     tops = range(0, height, rows)
     total = 1

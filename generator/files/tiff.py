@@ -1,6 +1,6 @@
 """TIFF 6.0 as every reader can read it: 16-bit RGB in one uncompressed strip; the fastest of the formats.
 
-The shot is told in ImageDescription. Nothing is compressed: the zstd codec is missing from widespread readers, and
+ImageDescription holds the metadata. Nothing is compressed: the zstd codec is missing from widespread readers, and
 deflate, at the speed of their TIFF writers, costs more time than it saves room.
 """
 
@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from drivers.tiff.writing import Kind, Tags, head, text
 from foundation.errors import InputError
-from generator.files.shot import Shot
+from generator.files.metadata import ImageMetadata
 
 _RGB = 2
 
 
-def encode_tiff(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
+def encode_tiff(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
     """Return the file of `image` (H, W, 3) uint16.
 
     Raises
@@ -32,7 +32,7 @@ def encode_tiff(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
         258: (Kind.SHORT, [16] * channels),  # BitsPerSample
         259: (Kind.SHORT, [1]),  # Compression: none
         262: (Kind.SHORT, [_RGB]),  # PhotometricInterpretation
-        270: text(shot.note()),  # ImageDescription
+        270: text(metadata.to_json()),  # ImageDescription
         277: (Kind.SHORT, [channels]),  # SamplesPerPixel
         278: (Kind.LONG, [height]),  # RowsPerStrip
         284: (Kind.SHORT, [1]),  # PlanarConfiguration: pixel by pixel

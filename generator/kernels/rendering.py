@@ -310,7 +310,7 @@ def render(
 ) -> npt.NDArray[np.uint16]:
     """Return the raw linear image of `picture` printed, lit by the table's light `light` and photographed.
 
-    Colours that the table lists as unfit are replaced by the nearest fit one; see `kernels.palette.replace_unfit_colours`.
+    Colours that the table lists as unfit are replaced by the nearest fit one; see `palette.replace_unfit_colours`.
 
     Parameters
     ----------

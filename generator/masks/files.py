@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError
-from generator.files.maps import encode_map
+from generator.files.formats import encode_map
 from generator.kernels.whites import quantised_chromaticities, quantised_weights
 from generator.lights.lighting import FULL, Lighting, MaskMaker
 from generator.masks.making import whole_parts

@@ -155,7 +155,8 @@ class Crops:
             self._tables = np.stack([mixture.samples(self.lut, self.seed) for mixture in self.lights])
             self._rows = np.arange(len(self.lights))
         self._pictures = [
-            replace_unfit_colours(self.gallery.picture(number), self.lut.provenance)[0] for number in range(len(self.gallery))
+            replace_unfit_colours(self.gallery.picture(number), self.lut.provenance)[0]
+            for number in range(len(self.gallery))
         ]
 
     def __getstate__(self) -> dict[str, Any]:

@@ -20,11 +20,11 @@ from isal import isal_zlib
 from foundation.errors import InputError
 from generator.files import png
 from generator.files.deflate import Packer, find_repeats
-from generator.files.formats import Shot
+from generator.files.formats import ImageMetadata
 from generator.files.huffman import LONGEST, code_lengths, codes_of
 from generator.files.png import encode_png
 
-SHOT = Shot(12000, (1.0, 1.0, 1.0), "Benchmark")
+METADATA = ImageMetadata(12000, (1.0, 1.0, 1.0), "Benchmark")
 
 Image16 = npt.NDArray[np.uint16]
 
@@ -157,8 +157,8 @@ def test_what_is_found_is_equal(seed: int, height: int, width: int, colours: int
 def test_bands_and_threads_make_one_stream(monkeypatch: pytest.MonkeyPatch, band: int, threads: int) -> None:
     monkeypatch.setattr(png, "BAND", band)
     image = drawn(37, 400, 60)
-    data = encode_png(image, SHOT, threads)
-    assert data == encode_png(image, SHOT)
+    data = encode_png(image, METADATA, threads)
+    assert data == encode_png(image, METADATA)
     assert data.count(b"IDAT") == -(-37 // max(1, band // 400))
     np.testing.assert_array_equal(imagecodecs.png_decode(data), image)
 
@@ -166,16 +166,16 @@ def test_bands_and_threads_make_one_stream(monkeypatch: pytest.MonkeyPatch, band
 @pytest.mark.parametrize("image", [drawn(512, 512, 2000), smooth(512, 512), np.full((512, 512, 3), 300, np.uint16)])
 def test_files_are_no_larger_than_those_of_opencv(image: Image16) -> None:
     usual = cv2.imencode(".png", image[..., ::-1])[1]
-    assert len(encode_png(image, SHOT)) <= len(usual)
+    assert len(encode_png(image, METADATA)) <= len(usual)
 
 
 def test_images_that_no_png_holds_are_refused() -> None:
     wide = np.broadcast_to(np.zeros(1, np.uint16), (1, (1 << 28) + 1, 3))
     with pytest.raises(InputError, match="268435457x1 px is too large for PNG"):
-        encode_png(wide, SHOT)
+        encode_png(wide, METADATA)
     tall = np.broadcast_to(np.zeros(1, np.uint16), (1 << 31, 1, 3))
     with pytest.raises(InputError, match="1x2147483648 px is too large for PNG"):
-        encode_png(tall, SHOT)
+        encode_png(tall, METADATA)
 
 
 frequencies = st.lists(st.integers(0, 1 << 40) | st.just(0), min_size=1, max_size=286)
@@ -233,4 +233,4 @@ def test_the_bytes_of_a_file_stay_the_same_for_ever(height: int, width: int, sha
     picture = (index * index // 97 % 40).reshape(height, width)
     sample = ((index * 2654435761 >> 7) % 25).reshape(height, width)
     image = np.stack([picture * gain + sample * gain // 9 for gain in (31, 97, 55)], axis=-1)
-    assert hashlib.sha256(encode_png(image.astype(np.uint16), SHOT)).hexdigest() == sha256
+    assert hashlib.sha256(encode_png(image.astype(np.uint16), METADATA)).hexdigest() == sha256

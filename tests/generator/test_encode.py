@@ -24,7 +24,7 @@ from foundation.errors import FormatError, InputError
 from generator.files.formats import (
     FORMATS,
     Format,
-    Shot,
+    ImageMetadata,
     decode_image,
     encode_image,
     encode_preview,
@@ -32,7 +32,7 @@ from generator.files.formats import (
     suffix_of,
 )
 
-SHOT = Shot(white_level=11536, white=(2046.0, 1579.5, 4520.0), camera="Canon EOS 550D")
+METADATA = ImageMetadata(white_level=11536, white=(2046.0, 1579.5, 4520.0), camera="Canon EOS 550D")
 WHOLE: tuple[Format, ...] = ("png", "tiff", "exr", "jxl")
 """The formats that keep all three channels."""
 
@@ -65,7 +65,7 @@ def by_openimageio(path: Path) -> Image16:
 def test_every_bit_comes_back_in_place(tmp_path: Path, form: Format) -> None:
     image = noisy(31, 45)
     path = tmp_path / f"image{suffix_of(form)}"
-    path.write_bytes(encode_image(image, form, SHOT))
+    path.write_bytes(encode_image(image, form, METADATA))
     stream = oiio.ImageInput.open(str(path))
     assert stream is not None
     assert str(stream.spec().format) == ("float" if form == "exr" else "uint16")
@@ -76,7 +76,7 @@ def test_every_bit_comes_back_in_place(tmp_path: Path, form: Format) -> None:
 @pytest.mark.parametrize("form", ["png", "tiff"])
 def test_opencv_reads_the_same(form: Format) -> None:
     image = noisy(31, 45)
-    data = np.frombuffer(encode_image(image, form, SHOT), np.uint8)
+    data = np.frombuffer(encode_image(image, form, METADATA), np.uint8)
     read = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     assert read is not None
     np.testing.assert_array_equal(read[..., ::-1], image)
@@ -86,14 +86,14 @@ def test_opencv_reads_the_same(form: Format) -> None:
 @settings(max_examples=60, deadline=None)
 @given(image=images)
 def test_any_image_comes_back(form: Format, image: Image16) -> None:
-    np.testing.assert_array_equal(decode_image(encode_image(image, form, SHOT), form, "image"), image)
+    np.testing.assert_array_equal(decode_image(encode_image(image, form, METADATA), form, "image"), image)
 
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_an_image_need_not_be_contiguous(form: Format) -> None:
     image = noisy(48, 60)
     turned = image[::-1, ::-1]
-    assert encode_image(turned, form, SHOT) == encode_image(turned.copy(), form, SHOT)
+    assert encode_image(turned, form, METADATA) == encode_image(turned.copy(), form, METADATA)
 
 
 def chunks_of(data: bytes) -> list[tuple[bytes, bytes]]:
@@ -111,7 +111,7 @@ def chunks_of(data: bytes) -> list[tuple[bytes, bytes]]:
 
 
 def test_png_is_sixteen_bit_rgb_and_tells_its_shot() -> None:
-    chunks = chunks_of(encode_image(noisy(20, 30), "png", SHOT))
+    chunks = chunks_of(encode_image(noisy(20, 30), "png", METADATA))
     assert [name for name, _ in chunks] == [b"IHDR", b"tEXt", b"IDAT", b"IEND"]
     # 11.2.2: width, height, bit depth, colour type, compression, filter and interlace methods.
     assert struct.unpack(">IIBBBBB", chunks[0][1]) == (30, 20, 16, 2, 0, 0, 0)
@@ -125,7 +125,7 @@ def test_png_is_sixteen_bit_rgb_and_tells_its_shot() -> None:
 def test_pillow_shows_the_upper_bytes() -> None:
     """Pillow has no 16-bit RGB; what it shows is the image all the same, not one changed by a profile or gamma."""
     image = noisy(20, 30)
-    with Image.open(io.BytesIO(encode_image(image, "png", SHOT))) as read:
+    with Image.open(io.BytesIO(encode_image(image, "png", METADATA))) as read:
         assert read.size == (30, 20)
         assert "gamma" not in read.info
         np.testing.assert_array_equal(np.asarray(read.convert("RGB")), image >> 8)
@@ -133,7 +133,7 @@ def test_pillow_shows_the_upper_bytes() -> None:
 
 def test_tiff_is_uncompressed_and_plain() -> None:
     image = noisy(4, 5)
-    with tifffile.TiffFile(io.BytesIO(encode_image(image, "tiff", SHOT))) as file:
+    with tifffile.TiffFile(io.BytesIO(encode_image(image, "tiff", METADATA))) as file:
         page = file.pages.first
         assert (page.compression, page.photometric, page.bitspersample, page.samplesperpixel) == (1, 2, 16, 3)
         assert page.dataoffsets[0] % 16 == 0
@@ -144,7 +144,7 @@ def test_tiff_is_uncompressed_and_plain() -> None:
 def test_exr_is_float_under_zip_and_tells_its_shot(tmp_path: Path) -> None:
     image = noisy(40, 30)
     path = tmp_path / "image.exr"
-    path.write_bytes(encode_image(image, "exr", SHOT))
+    path.write_bytes(encode_image(image, "exr", METADATA))
     stream = oiio.ImageInput.open(str(path))
     assert stream is not None
     spec = stream.spec()
@@ -158,7 +158,7 @@ def test_exr_is_float_under_zip_and_tells_its_shot(tmp_path: Path) -> None:
 
 def test_jpeg_xl_is_one_lossless_codestream() -> None:
     image = noisy(20, 30)
-    data = encode_image(image, "jxl", SHOT)
+    data = encode_image(image, "jxl", METADATA)
     # ISO/IEC 18181-2, 5: the signature box; 16-bit lossless wants level 10, which only a container can tell.
     assert data[:12] == bytes.fromhex("0000000c 4a584c20 0d0a870a")
     np.testing.assert_array_equal(imagecodecs.jpegxl_decode(data), image)
@@ -167,9 +167,9 @@ def test_jpeg_xl_is_one_lossless_codestream() -> None:
 @pytest.mark.parametrize("form", FORMATS)
 def test_other_arrays_are_refused(form: Format) -> None:
     with pytest.raises(InputError, match=r"the image is uint16 \(4, 4\)"):
-        encode_image(np.zeros((4, 4), np.uint16), form, SHOT)
+        encode_image(np.zeros((4, 4), np.uint16), form, METADATA)
     with pytest.raises(InputError, match=r"the image is uint16 \(0, 4, 3\)"):
-        encode_image(np.zeros((0, 4, 3), np.uint16), form, SHOT)
+        encode_image(np.zeros((0, 4, 3), np.uint16), form, METADATA)
 
 
 @pytest.mark.parametrize(("form", "width", "height"), [("tiff", 30000, 24000), ("dng", 60000, 36000)])
@@ -179,13 +179,13 @@ def test_what_a_format_of_32_bit_offsets_cannot_hold_is_refused_unwritten(
     # One count seen everywhere: an image of 4 GiB that takes no memory.
     image = np.broadcast_to(np.uint16(7), (height, width, 3))
     with pytest.raises(InputError, match=rf"an image of {width}x{height} px is too large for {form.upper()}: .* 4 GiB"):
-        encode_image(image, form, SHOT)
+        encode_image(image, form, METADATA)
 
 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("keep", [0, 10, 1000])
 def test_damaged_files_are_refused_by_name(form: Format, keep: int) -> None:
-    data = encode_image(noisy(40, 40), form, SHOT)
+    data = encode_image(noisy(40, 40), form, METADATA)
     with pytest.raises(FormatError, match=r"images/000007"):
         decode_image(data[:keep], form, "images/000007")
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from drivers.raw.camera_matrix import camera_matrix
 from drivers.raw.rawfile import decode_raw
 from foundation.errors import InputError
-from generator.files.formats import Shot, decode_image, encode_image
+from generator.files.formats import ImageMetadata, decode_image, encode_image
 
 WHITES = {
     "candle": (1945.3, 492.3, 105.1),
@@ -40,8 +40,8 @@ def grey_scene(white: tuple[float, float, float]) -> npt.NDArray[np.uint16]:
 def test_what_libraw_shows_is_neutral_where_the_scene_is(light: str, camera: str) -> None:
     white = WHITES[light]
     # Saturation far enough above the white that no channel clips when LibRaw multiplies it by its balance.
-    shot = Shot(white_level=12000, white=white, camera=camera)
-    with rawpy.imread(io.BytesIO(encode_image(grey_scene(white), "dng", shot))) as raw:
+    metadata = ImageMetadata(white_level=12000, white=white, camera=camera)
+    with rawpy.imread(io.BytesIO(encode_image(grey_scene(white), "dng", metadata))) as raw:
         shown = raw.postprocess(
             use_camera_wb=True, output_bps=16, no_auto_bright=True, gamma=(1, 1), highlight_mode=rawpy.HighlightMode(1)
         )
@@ -52,8 +52,8 @@ def test_what_libraw_shows_is_neutral_where_the_scene_is(light: str, camera: str
 
 def test_without_the_ground_truth_it_is_not_neutral() -> None:
     """So that the test above can fail: the same scene, the balance of another light."""
-    shot = Shot(white_level=12000, white=WHITES["daylight"], camera="Canon EOS 550D")
-    with rawpy.imread(io.BytesIO(encode_image(grey_scene(WHITES["candle"]), "dng", shot))) as raw:
+    metadata = ImageMetadata(white_level=12000, white=WHITES["daylight"], camera="Canon EOS 550D")
+    with rawpy.imread(io.BytesIO(encode_image(grey_scene(WHITES["candle"]), "dng", metadata))) as raw:
         shown = raw.postprocess(use_camera_wb=True, output_bps=16, no_auto_bright=True, gamma=(1, 1))
     means = shown.reshape(-1, 3).mean(axis=0, dtype=np.float64)
     assert abs(means[0] / means[1] - 1) > 0.5
@@ -63,7 +63,7 @@ def test_without_the_ground_truth_it_is_not_neutral() -> None:
 @given(height=st.integers(22, 41), width=st.integers(22, 41), seed=st.integers(0, 99))
 def test_each_photosite_is_its_own_channel_of_its_pixel(height: int, width: int, seed: int) -> None:
     image = np.random.default_rng(seed).integers(0, 65536, (height, width, 3)).astype(np.uint16)
-    data = encode_image(image, "dng", Shot(65535, (1.0, 1.0, 1.0), "Canon EOS 550D"))
+    data = encode_image(image, "dng", ImageMetadata(65535, (1.0, 1.0, 1.0), "Canon EOS 550D"))
     mosaic = decode_raw(data, Path("image.dng"))
     assert (mosaic.pattern, mosaic.white_level, mosaic.black.tolist()) == ("RGGB", 65535, [[0, 0], [0, 0]])
     rows, columns = np.indices((height, width)) % 2
@@ -82,7 +82,7 @@ def test_dcraw_sees_the_same_counts_and_balance(tmp_path: Path) -> None:
     white = WHITES["candle"]
     image = grey_scene(white)
     path = tmp_path / "image.dng"
-    path.write_bytes(encode_image(image, "dng", Shot(12000, white, "Canon EOS 550D")))
+    path.write_bytes(encode_image(image, "dng", ImageMetadata(12000, white, "Canon EOS 550D")))
     subprocess.run([dcraw, "-D", "-4", "-T", str(path)], check=True, timeout=60)
     counts = decode_raw(path.read_bytes(), path).counts
     np.testing.assert_array_equal(tifffile.imread(path.with_suffix(".tiff")), counts)
@@ -93,8 +93,8 @@ def test_dcraw_sees_the_same_counts_and_balance(tmp_path: Path) -> None:
 
 def test_the_tags_are_those_of_the_standard() -> None:
     image = np.zeros((30, 40, 3), np.uint16)
-    shot = Shot(11536, (500.0, 2000.0, 1000.0), "Canon EOS 550D")
-    with tifffile.TiffFile(io.BytesIO(encode_image(image, "dng", shot))) as file:
+    metadata = ImageMetadata(11536, (500.0, 2000.0, 1000.0), "Canon EOS 550D")
+    with tifffile.TiffFile(io.BytesIO(encode_image(image, "dng", metadata))) as file:
         tags = {tag.code: tag.value for tag in file.pages.first.tags}
     assert (tags[256], tags[257], tags[258], tags[259], tags[262], tags[277]) == (40, 30, 16, 1, 32803, 1)
     assert (tags[33421], tags[33422]) == ((2, 2), bytes([0, 1, 1, 2]))
@@ -125,11 +125,11 @@ def test_a_known_camera_has_its_matrix_and_another_none() -> None:
 @pytest.mark.parametrize("white", [(0.0, 1.0, 1.0), (float("nan"), 1.0, 1.0), (1.0, -1.0, 1.0), (0.0, 0.0, 0.0)])
 def test_a_light_without_a_channel_is_refused(white: tuple[float, float, float]) -> None:
     with pytest.raises(InputError, match="DNG expects every channel above 0; choose png"):
-        encode_image(np.zeros((30, 30, 3), np.uint16), "dng", Shot(12000, white, "Canon EOS 550D"))
+        encode_image(np.zeros((30, 30, 3), np.uint16), "dng", ImageMetadata(12000, white, "Canon EOS 550D"))
 
 
 def test_sizes_that_raw_programs_do_not_open_are_refused() -> None:
     with pytest.raises(InputError, match="40x21 px is too small for DNG"):
-        encode_image(np.zeros((21, 40, 3), np.uint16), "dng", Shot(12000, (1.0, 1.0, 1.0), "Canon EOS 550D"))
+        encode_image(np.zeros((21, 40, 3), np.uint16), "dng", ImageMetadata(12000, (1.0, 1.0, 1.0), "Canon EOS 550D"))
     with pytest.raises(InputError, match="white level is 0"):
-        encode_image(np.zeros((30, 40, 3), np.uint16), "dng", Shot(0, (1.0, 1.0, 1.0), "Canon EOS 550D"))
+        encode_image(np.zeros((30, 40, 3), np.uint16), "dng", ImageMetadata(0, (1.0, 1.0, 1.0), "Canon EOS 550D"))

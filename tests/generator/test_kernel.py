@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from calibration.table.lut import Provenance, Unfit
 from foundation.errors import InputError
 from generator.kernels import streaming
-from generator.kernels.palette import bits_of, channels_of, colours_in, replace_unfit_colours, nearest_fit_colours
+from generator.kernels.palette import bits_of, channels_of, colours_in, nearest_fit_colours, replace_unfit_colours
 from generator.kernels.rendering import PATTERNS, draw_mosaic, draw_samples, render
 
 if TYPE_CHECKING:

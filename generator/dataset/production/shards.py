@@ -242,15 +242,15 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _Read:
 
 
 def _make(job: ShardJob, lut: Lut, writer: ShardWriter, number: int, got: _Read, lighting: Lighting) -> Sample:
-    from generator.files.formats import Shot, encode_pieces, encode_preview, suffix_of
+    from generator.files.formats import ImageMetadata, encode_pieces, encode_preview, suffix_of
     from generator.pictures.preview import preview_of
 
     height, width = got.picture.shape[:2]
     white_level = lut.provenance.white_level
     image, truth, maps = _photograph(lut, got.picture, lighting, job.seed, number)
-    shot = Shot(white_level, truth, lut.provenance.camera)
+    metadata = ImageMetadata(white_level, truth, lut.provenance.camera)
     files: list[tuple[str, str, Pieces]] = [
-        ("images", suffix_of(job.options.form), encode_pieces(image, job.options.form, shot)),
+        ("images", suffix_of(job.options.form), encode_pieces(image, job.options.form, metadata)),
         *((kind, ending, (data,)) for kind, ending, data in maps),
     ]
     if job.options.previews:

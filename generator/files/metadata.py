@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Shot:
+class ImageMetadata:
     """One image's light and camera.
 
     Attributes
@@ -24,7 +24,7 @@ class Shot:
     white: tuple[float, float, float]
     camera: str
 
-    def note(self) -> str:
+    def to_json(self) -> str:
         """Return one line of JSON in ASCII, for formats with a place for a text."""
         known = {"white_level": self.white_level, "white": self.white, "camera": self.camera}
         return json.dumps({"format": "crop.image", "values": "linear camera RGB, black 0", **known})
