@@ -60,10 +60,11 @@ from generator.dataset.production.records import (
 )
 from generator.dataset.production.shards import OnImage, OnSkip
 from generator.dataset.production.workplace import Workplace, finished, stored_identity, workplace
-from generator.dataset.store import DESCRIPTION, Store, open_store
 from generator.files.formats import Format, decode_image
 from generator.lights.choices import ListedLights
 from generator.lights.lighting import LightChoice, parse_mixture
+from generator.stores.places import DESCRIPTION
+from generator.stores.store import Store, open_store
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

@@ -20,11 +20,11 @@ import tifffile
 from PIL import Image
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.store import filesystem
 from generator.pictures import picture
 from generator.pictures import sources as scene
 from generator.pictures.picture import Preparation, read_picture
 from generator.pictures.sources import RandomScene, find_pictures, random_scenes
+from generator.stores.places import filesystem
 
 
 def write(path: Path, pixels: npt.NDArray[np.generic], form: str, **attributes: object) -> Path:

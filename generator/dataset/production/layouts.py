@@ -11,7 +11,7 @@ from typing import Final, Protocol, Self
 
 from generator.dataset.production.plan import ShardJob
 from generator.dataset.production.records import FileSum, ImageRecord, Split, image_key
-from generator.dataset.store import Pieces, Store, gathered
+from generator.stores.store import Pieces, Store, joined
 
 _SETTLED_IMAGES: Final = 32
 _SETTLED_PIXELS: Final = 1 << 23
@@ -85,7 +85,7 @@ class ShardWriter(Protocol):
 
 def hold(sample: Sample) -> Sample:
     """Return a sample with all its bytes in memory of their own."""
-    return replace(sample, files=tuple((kind, ending, (gathered(data),)) for kind, ending, data in sample.files))
+    return replace(sample, files=tuple((kind, ending, (joined(data),)) for kind, ending, data in sample.files))
 
 
 class FolderWriter:
@@ -123,7 +123,7 @@ class FolderWriter:
             self._settle()
 
     def _settle(self) -> None:
-        self._settling.append(self._thread.submit(self._store.settle, self._written))
+        self._settling.append(self._thread.submit(self._store.sync, self._written))
         self._written, self._images, self._pixels = [], 0, 0
 
     def close(self) -> list[FileSum]:

@@ -24,7 +24,7 @@ from generator.dataset.production.layouts import Fault, Sample, hold
 from generator.dataset.production.plan import ShardJob
 from generator.dataset.production.records import FileSum, shard_key
 from generator.dataset.production.webdataset import about
-from generator.dataset.store import Store
+from generator.stores.store import Store
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -159,7 +159,7 @@ class ParquetWriter:
         for part in self._parts.values():
             part.close()
         self._stack.close()
-        self._store.settle(self._parts)
+        self._store.sync(self._parts)
         return [FileSum(name=name, sha256=self._parts[name].hashed.sha256) for name in sorted(self._parts)]
 
     def __enter__(self) -> Self:

@@ -36,10 +36,10 @@ from generator.dataset.production.records import (
     Triple,
 )
 from generator.dataset.production.workplace import Workplace
-from generator.dataset.store import Pieces
 from generator.lights.lighting import Lighting
 from generator.pictures.picture import Picture
 from generator.pictures.sources import Source
+from generator.stores.store import Pieces
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

@@ -22,7 +22,7 @@ from foundation.hashing import HashingWriter
 from generator.dataset.production.layouts import Fault, Sample, hold, member_name
 from generator.dataset.production.plan import ShardJob
 from generator.dataset.production.records import FileSum, shard_key
-from generator.dataset.store import Store
+from generator.stores.store import Store
 
 
 def about(sample: Sample) -> dict[str, Any]:
@@ -73,7 +73,7 @@ class TarWriter:
         for tar, _ in self._open.values():
             tar.close()
         self._stack.close()
-        self._store.settle(self._open)
+        self._store.sync(self._open)
         return [FileSum(name=name, sha256=self._open[name][1].sha256) for name in sorted(self._open)]
 
     def __enter__(self) -> Self:
