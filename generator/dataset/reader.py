@@ -1,7 +1,7 @@
 """A dataset: its reader, and the call that makes one.
 
     images/NNNNNN.png    linear camera RGB in the units of the table; the number is the one that was planned
-    masks/, ground_truth/  where several lights fall on an image; see `masks.files`
+    masks/, ground_truth/  where several lights fall on an image; see `masks.maps`
     previews/NNNNNN.jpg  the same, tone mapped, at most 512 px: the look of the raw, no white balance
     ground_truth.csv     image,source,illumination,r,g,b with r + g + b = 1, one row a light
     gt.txt               r g b a line in image order: the mean of the lights over the image
@@ -133,7 +133,7 @@ class Dataset:
         FormatError
             A file is missing or damaged.
         """
-        from generator.masks.files import decode_weights
+        from generator.masks.maps import decode_weights
 
         masks = [self._map(entry, "masks", f"_{light}.png") for light in range(len(entry.lights))]
         return decode_weights(masks, self._of(entry, "masks"))
@@ -148,7 +148,7 @@ class Dataset:
         FormatError
             The file is missing or damaged.
         """
-        from generator.masks.files import decode_ground_truth
+        from generator.masks.maps import decode_ground_truth
 
         return decode_ground_truth(self._map(entry, "ground_truth", ".png"), self._of(entry, "ground truth"))
 

@@ -25,7 +25,7 @@ from generator.dataset.production.assembly import damage
 from generator.dataset.production.records import Layout
 from generator.dataset.reader import Dataset, generate_dataset, open_dataset
 from generator.lights.choices import ListedLights, TogetherLights
-from generator.masks.making import parse_masks
+from generator.masks.request import parse_masks
 from generator.pictures.sources import SourcePicture, random_scenes
 
 if TYPE_CHECKING:

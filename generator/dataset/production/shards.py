@@ -268,7 +268,7 @@ def _photograph(
     """Return the raw image, the mean of its lights, and the files that say where each of several lights falls."""
     from generator.kernels.mixing import mix_samples
     from generator.kernels.rendering import draw_samples
-    from generator.masks.files import encode_maps
+    from generator.masks.maps import encode_maps
 
     # The hash of the table stands for its samples in the dataset's description.
     for mixture in lighting.mixtures:
@@ -281,7 +281,7 @@ def _photograph(
     weights = lighting.weights_of(*picture.shape[:2])
     white_level = lut.provenance.white_level
     image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
-    return image, chromaticity(lighting.overall(lut, weights)), encode_maps(lut, lighting, weights)
+    return image, chromaticity(lighting.overall(lut, weights)), encode_maps(weights, lighting.whites(lut))
 
 
 def _room(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
