@@ -44,7 +44,8 @@ from generator.dataset.production.assembly import (
     assemble,
 )
 from generator.dataset.production.engines import OnWait, check_workers, make_shards
-from generator.dataset.production.layouts import member_name, read_member
+from generator.dataset.production.layouts.by_name import read_member
+from generator.dataset.production.layouts.samples import member_name
 from generator.dataset.production.plan import SHARD_IMAGES, Options, Plan
 from generator.dataset.production.records import (
     FORMAT,

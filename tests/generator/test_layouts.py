@@ -267,7 +267,7 @@ def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.M
     def find_spec(name: str) -> None:
         del name
 
-    monkeypatch.setattr("generator.dataset.production.parquet.find_spec", find_spec)
+    monkeypatch.setattr("generator.dataset.production.layouts.parquet.find_spec", find_spec)
     with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install croplab\[parquet\]"):
         make("parquet")
 

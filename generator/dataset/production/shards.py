@@ -25,7 +25,8 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
-from generator.dataset.production.layouts import Sample, ShardWriter, open_writer
+from generator.dataset.production.layouts.by_name import open_writer
+from generator.dataset.production.layouts.samples import Sample, ShardWriter
 from generator.dataset.production.plan import ShardJob, light_of, split_of, versions
 from generator.dataset.production.records import (
     ImageRecord,
@@ -109,7 +110,7 @@ def make_shard(
         if on_image:
             on_image()
 
-    with open_writer(job, place.files) as writer, _cancelling(pending, ahead):
+    with _writer_of(job, place) as writer, _cancelling(pending, ahead):
         for row, source in enumerate(job.sources):
             while len(ahead) <= workers and row + len(ahead) < len(job.sources):
                 ahead.append(pool.submit(_read, job, lut, row + len(ahead)))
@@ -141,6 +142,11 @@ def make_shard(
     )
     place.commit(record)
     return record
+
+
+def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
+    maps = any(lighting.masks is not None for lighting in job.choice.lightings_of(job.position))
+    return open_writer(job.options.layout, place.files, job.shard, previews=job.options.previews, maps=maps)
 
 
 @contextmanager
