@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from isal import isal_zlib
 
-from benchmarks.encode import SHOT, at_once, photograph
+from benchmarks.encode import METADATA, at_once, photograph
 from benchmarks.generator import SAMPLES, noisy_table, report
 from calibration.table.lut import Lut
 from foundation.processors import processor_count
@@ -86,7 +86,7 @@ def by_isal(image: npt.NDArray[np.uint16]) -> int:
 
 def encode_away(image: npt.NDArray[np.uint16]) -> None:
     """Encode an image and keep nothing."""
-    for _ in encode_pieces(image, "png", SHOT):
+    for _ in encode_pieces(image, "png", METADATA):
         pass
 
 
@@ -124,7 +124,7 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
             at_once(
                 pool,
                 [
-                    lambda number=number, image=image: put(f"{number:04d}.png", encode_pieces(image, "png", SHOT))
+                    lambda number=number, image=image: put(f"{number:04d}.png", encode_pieces(image, "png", METADATA))
                     for number, image in enumerate(images)
                 ],
             )

@@ -33,7 +33,7 @@ import skimage.data
 from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
 from foundation.compiled import compiled
-from generator.kernels.choice import SCRATCH, choose_group, row_keys
+from generator.kernels.choice import SCRATCH_BYTES, choose_group, row_keys
 from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_planar
 from generator.kernels.rendering import draw_mosaic, draw_samples
@@ -140,7 +140,7 @@ def fetching(tables: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> 
     """Return a call that loads the samples of a picture's pixels from each table; the width must be whole groups."""
     height, width = picture.shape[:2]
     places = np.zeros((len(tables), height, width), np.uint32)
-    scratch = np.empty(SCRATCH, np.uint8)
+    scratch = np.empty(SCRATCH_BYTES, np.uint8)
     numbers = np.uint32(SAMPLES), np.uint32(5)
     for light, its in enumerate(places):
         _choose_all(picture.ctypes.data, width, height, light, *numbers, its.ctypes.data, scratch.ctypes.data)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.encode import SHOT, photograph
+from benchmarks.encode import METADATA, photograph
 from benchmarks.generator import SAMPLES, WHITE, in_turns, mask_weights, noisy_table, report
 from calibration.table.lut import Lut
 from generator.files.formats import encode_pieces
@@ -61,7 +61,7 @@ def measure(name: str, lut: Lut, picture: npt.NDArray[np.uint8], repeats: int) -
         calls[f"{kind}, masks"] = lambda lighting=lighting: lighting.weights_of(height, width)
         calls[f"{kind}, mixing"] = lambda its=its: mix_samples(lut.samples, picture, its, white_level=WHITE)
         calls[f"{kind}, maps"] = lambda its=its, lighting=lighting: encode_maps(its, lighting.whites(lut))
-    calls["image"] = lambda: sum(len(piece) for piece in encode_pieces(image, "png", SHOT))
+    calls["image"] = lambda: sum(len(piece) for piece in encode_pieces(image, "png", METADATA))
     seconds = in_turns(calls, time.thread_time, repeats)
     for kind in KINDS:
         steps = {step: seconds[f"{kind}, {step}"] for step in ("masks", "mixing", "maps")} | {"image": seconds["image"]}

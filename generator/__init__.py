@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from generator.dataset.reader import generate_dataset, open_dataset
-    from generator.kernels.mixing import mix_samples, mixed_table
+    from generator.kernels.mixed_table import mixed_table
+    from generator.kernels.mixing import mix_samples
     from generator.kernels.planar import draw_batch, draw_planar
     from generator.kernels.rendering import draw_mosaic, draw_samples, render
     from generator.pictures.picture import read_picture
@@ -51,7 +52,7 @@ _HOMES = {
     "flash": "generator.pictures.tonemap",
     "generate_dataset": "generator.dataset.reader",
     "mix_samples": "generator.kernels.mixing",
-    "mixed_table": "generator.kernels.mixing",
+    "mixed_table": "generator.kernels.mixed_table",
     "open_dataset": "generator.dataset.reader",
     "read_picture": "generator.pictures.picture",
     "render": "generator.kernels.rendering",

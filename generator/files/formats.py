@@ -184,7 +184,7 @@ def _decoded(data: bytes, form: Format) -> npt.NDArray[np.uint16]:
 
 
 def encode_map(values: npt.NDArray[np.uint16]) -> bytes:
-    """Return `values` (H, W) or (H, W, 3) uint16, smooth ones such as a mask of weights, as the bytes of a 16-bit PNG."""
+    """Return smooth `values` (H, W) or (H, W, 3) uint16, such as a mask of weights, as the bytes of a 16-bit PNG."""
     from generator.files import maps
 
     return maps.encode_map(values)

@@ -67,7 +67,7 @@ def check_picture(picture: Picture) -> None:
         raise InputError(f"the picture is {picture.dtype} {picture.shape}, expected uint8 (height, width, 3)")
 
 
-def check_target(
+def check_out(
     out: npt.NDArray[Any] | None, shape: tuple[int, ...], dtype: type[np.uint16] | type[np.float32]
 ) -> npt.NDArray[Any]:
     """Return `out`, or a new array if it is None.
@@ -86,7 +86,7 @@ def check_target(
     return out
 
 
-def check_place(seed: int, image: int) -> np.uint64:
+def check_seed(seed: int, image: int) -> np.uint64:
     """Return the seed as compiled code takes it.
 
     Raises
@@ -100,7 +100,7 @@ def check_place(seed: int, image: int) -> np.uint64:
     return np.uint64(seed)
 
 
-def check_white(white_level: int) -> None:
+def check_white_level(white_level: int) -> None:
     """Check that `white_level` is 1 … 65535.
 
     Raises
@@ -112,7 +112,21 @@ def check_white(white_level: int) -> None:
         raise InputError(f"the white level is {white_level}, expected 1 to 65535")
 
 
-def packed(picture: Picture) -> Picture:
+def check_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float64]:
+    """Return the weights of `lights` lights as (K,) float64.
+
+    Raises
+    ------
+    InputError
+        They are not one finite number ≥ 0 a light.
+    """
+    checked = np.asarray(weights, dtype=np.float64)
+    if checked.shape != (lights,) or not np.isfinite(checked).all() or (checked < 0).any():
+        raise InputError(f"the weights are {np.asarray(weights).tolist()}, expected {lights} finite numbers from 0")
+    return checked
+
+
+def packed_rows(picture: Picture) -> Picture:
     """Return `picture` with the bytes of each row in one piece, itself where they are."""
     return picture if picture.strides[1:] == (3, 1) else np.ascontiguousarray(picture)
 
@@ -132,19 +146,19 @@ def readable(samples: Samples) -> Samples:
 
 
 def writable(target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
-    """Return `target` if its rows are pieces at even addresses, else an array of its shape to be `delivered`."""
+    """Return `target` if its rows are pieces at even addresses, else an array of its shape to be `copied_back`."""
     piece = (6, 2) if target.ndim == 3 else (2,)
     return target if target.strides[1:] == piece and target.flags.aligned else np.empty(target.shape, target.dtype)
 
 
-def delivered(work: npt.NDArray[np.uint16], target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
+def copied_back(work: npt.NDArray[np.uint16], target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
     """Return `target` with the content of `work`, which is itself or came from `writable`."""
     if work is not target:
         target[...] = work
     return target
 
 
-def share(fill: Callable[[int, int], object], count: int, threads: int) -> None:
+def run_in_threads(fill: Callable[[int, int], object], count: int, threads: int) -> None:
     """Call `fill(first, end)` for parts of 0 … count − 1, in as many threads."""
     threads = min(threads, count)
     if threads <= 1:

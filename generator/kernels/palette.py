@@ -16,8 +16,8 @@ from numba import uint32
 
 from foundation.compiled import compiled
 from foundation.errors import InputError, QualityError
-from generator.kernels.choice import EDGE, OFFSETS, group_of
-from generator.kernels.vector import GROUP, copy1, name_colours, offset_at
+from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, group_address
+from generator.kernels.vector import GROUP, copy1, offset_at, write_colours
 
 if TYPE_CHECKING:
     from calibration.table.lut import Provenance
@@ -116,7 +116,7 @@ def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool
     """Return which of the (8**bits,) colours of a table are in a picture (H, W, 3) uint8."""
     found = np.zeros(8**bits, np.bool_)
     pixels = np.ascontiguousarray(picture)
-    scratch = np.ones(EDGE + 2 * OFFSETS + 1, np.uint8)
+    scratch = np.ones(EDGE_BYTES + 2 * OFFSETS_BYTES + 1, np.uint8)
     _find(pixels.ctypes.data, pixels.size // 3, np.uint32(bits), found.ctypes.data, scratch.ctypes.data)
     return found
 
@@ -124,11 +124,11 @@ def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool
 @compiled
 def _find(pixels: int, count: int, bits: Any, found: int, scratch: int) -> None:
     """Set the byte of each colour that is among the pixels to the last one of scratch memory."""
-    places, others = scratch + EDGE, scratch + EDGE + OFFSETS
-    one = others + OFFSETS
+    places, others = scratch + EDGE_BYTES, scratch + EDGE_BYTES + OFFSETS_BYTES
+    one = others + OFFSETS_BYTES
     for group in range((count + GROUP - 1) // GROUP):
-        source = group_of(pixels, count, group, scratch)
-        name_colours(source, bits, uint32(1), places, uint32(0), others)
+        source = group_address(pixels, count, group, scratch)
+        write_colours(source, bits, uint32(1), places, uint32(0), others)
         for i in range(min(GROUP, count - GROUP * group)):
             copy1(one, found + offset_at(places + 4 * i))
 

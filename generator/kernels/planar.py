@@ -20,16 +20,16 @@ import numpy.typing as npt
 from foundation.compiled import compiled
 from foundation.errors import InputError
 from generator.kernels.arguments import (
+    check_out,
     check_picture,
     check_samples,
-    check_target,
-    check_white,
-    packed,
+    check_white_level,
+    packed_rows,
     readable,
-    share,
+    run_in_threads,
 )
-from generator.kernels.choice import EDGE, OFFSETS, choose_group, row_keys
-from generator.kernels.vector import EIGHT, GROUP, mirrored8, offset_at, plane1, planes8, prefetch
+from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, choose_group, row_keys
+from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, planes8_mirrored, prefetch
 
 Window = tuple[int, int, int, int]
 
@@ -57,7 +57,7 @@ def _crop(
     The offsets of a row are chosen, and their samples asked for, before the row above is fetched: the samples may lie
     in memory nobody has touched for long. `last` stands in for the table's last light; `arguments.readable`.
     """
-    row_bytes = OFFSETS * (width // GROUP + 2)
+    row_bytes = OFFSETS_BYTES * (width // GROUP + 2)
     for item in range(first, end):
         light, picture, pitch, picture_width, x0, y0, flip, image, lights = plan[item]
         samples = last if light == lights - 1 else tables + light * light_bytes
@@ -66,15 +66,15 @@ def _crop(
         for y in range(height + 1):
             if y < height:
                 keys = row_keys(y0 + y, 0, image, seeds[item])
-                chosen = scratch + EDGE + row_bytes * (y & 1)
+                chosen = scratch + EDGE_BYTES + row_bytes * (y & 1)
                 for group in range(low, high + 1):
-                    to = chosen + OFFSETS * (group - low)
+                    to = chosen + OFFSETS_BYTES * (group - low)
                     choose_group(picture + y * pitch, picture_width, group, keys, count, bits, scratch, to)
                     for i in range(GROUP):
                         prefetch(samples + offset_at(to + 4 * i))
             if y == 0:
                 continue
-            offsets = scratch + EDGE + row_bytes * ((y - 1) & 1) + 4 * (x0 - GROUP * low)
+            offsets = scratch + EDGE_BYTES + row_bytes * ((y - 1) & 1) + 4 * (x0 - GROUP * low)
             if flip:
                 offsets += 4 * (width - 1)
             red = target + item * pitches[0] + (y - 1) * pitches[2]
@@ -90,7 +90,7 @@ def _crop(
                     # The last eight may be some of the ones before again.
                     x = min(start, width - EIGHT)
                     if flip:
-                        mirrored8(samples, offsets - 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
+                        planes8_mirrored(samples, offsets - 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
                     else:
                         planes8(samples, offsets + 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
 
@@ -155,7 +155,7 @@ def draw_planar(
     check_picture(picture)
     whole = (0, 0, picture.shape[1], picture.shape[0])
     x0, y0, width, height = whole if window is None else _checked_window(window, picture)
-    target = check_target(out, (3, height, width), np.float32)
+    target = check_out(out, (3, height, width), np.float32)
     parts = max(1, min(threads, height))
     edges = [height * part // parts for part in range(parts + 1)]
     pieces = [target[:, top:bottom] for top, bottom in pairwise(edges)]
@@ -175,7 +175,7 @@ def draw_planar(
                 out=piece[None],
             )
 
-    share(fill, parts, parts)
+    run_in_threads(fill, parts, parts)
     return target
 
 
@@ -230,7 +230,7 @@ def draw_batch(
     if tables.ndim != 4 or not len(tables):
         raise InputError(f"the tables are {tables.shape}, expected (lights, 8**bits, samples, 3)")
     bits = check_samples(tables[0])
-    check_white(white_level)
+    check_white_level(white_level)
     count = len(pictures)
     frames = np.asarray(windows, dtype=np.int64)
     if frames.shape != (count, 4) or not count:
@@ -244,8 +244,8 @@ def draw_batch(
     gained = np.broadcast_to(np.asarray(gains, dtype=np.float64), count)
     if not (np.isfinite(gained) & (gained >= 0)).all():
         raise InputError(f"the gain is {gained.min()}, expected a finite number from 0")
-    seeded, imaged = _whole(seeds, count, 64, "seed"), _whole(images, count, 32, "image number")
-    target = check_target(out, (count, 3, height, width), np.float32)
+    seeded, imaged = _whole_numbers(seeds, count, 64, "seed"), _whole_numbers(images, count, 32, "image number")
+    target = check_out(out, (count, 3, height, width), np.float32)
     work = target if target.strides[3] == 4 or width == 1 else np.empty(target.shape, np.float32)
     if not tables[0].flags.c_contiguous:
         tables = np.ascontiguousarray(tables)
@@ -254,7 +254,7 @@ def draw_batch(
     distinct = {id(picture): picture for picture in pictures}
     for picture in distinct.values():
         check_picture(picture)
-    sources = [packed(picture) for picture in distinct.values()]
+    sources = [packed_rows(picture) for picture in distinct.values()]
     facts = np.array([(one.ctypes.data, one.strides[0], one.shape[1], one.shape[0]) for one in sources], np.int64)
     places = {identity: place for place, identity in enumerate(distinct)}
     shown = facts[[places[id(picture)] for picture in pictures]]
@@ -268,7 +268,7 @@ def draw_batch(
     scales = (gained / white_level).astype(np.float32)
 
     def fill(first: int, end: int) -> None:
-        scratch = np.empty(EDGE + 2 * OFFSETS * (width // GROUP + 2), np.uint8)
+        scratch = np.empty(EDGE_BYTES + 2 * OFFSETS_BYTES * (width // GROUP + 2), np.uint8)
         _crop(
             plan,
             seeded,
@@ -287,13 +287,13 @@ def draw_batch(
             scratch.ctypes.data,
         )
 
-    share(fill, count, threads)
+    run_in_threads(fill, count, threads)
     if work is not target:
         target[...] = work
     return target
 
 
-def _whole(numbers: npt.ArrayLike, count: int, bits: int, name: str) -> npt.NDArray[np.uint64]:
+def _whole_numbers(numbers: npt.ArrayLike, count: int, bits: int, name: str) -> npt.NDArray[np.uint64]:
     """Return `count` whole numbers 0 … 2**bits − 1, one for all repeated."""
     given = np.asarray(numbers)
     if given.dtype.kind not in "iu":

@@ -26,7 +26,7 @@ def _light_at(weights: Any, whites: Any, y: int, x: int) -> Any:
 
 
 @numba.njit(inline="always")
-def _whole(red: Any, green: Any, blue: Any, full: Any) -> Any:
+def _quantised(red: Any, green: Any, blue: Any, full: Any) -> Any:
     """Return r, g and b as whole parts of `full`; green takes what rounding leaves."""
     total = red + green + blue
     first, last = np.int32(np.rint(red / total * full)), np.int32(np.rint(blue / total * full))
@@ -47,7 +47,7 @@ def _quantise_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> 
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1]):
             red, green, blue = _light_at(weights, whites, y, x)
-            out[y, x, 0], out[y, x, 1], out[y, x, 2] = _whole(red, green, blue, full)
+            out[y, x, 0], out[y, x, 1], out[y, x, 2] = _quantised(red, green, blue, full)
 
 
 @compiled
@@ -60,7 +60,7 @@ def _quantise_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: A
             red = _ZERO + one * whites[0, 0] + other * whites[1, 0]
             green = _ZERO + one * whites[0, 1] + other * whites[1, 1]
             blue = _ZERO + one * whites[0, 2] + other * whites[1, 2]
-            out[y, 3 * x], out[y, 3 * x + 1], out[y, 3 * x + 2] = _whole(red, green, blue, full)
+            out[y, 3 * x], out[y, 3 * x + 1], out[y, 3 * x + 2] = _quantised(red, green, blue, full)
 
 
 @compiled

@@ -98,7 +98,7 @@ class Mixture:
         InputError
             The table has no such light.
         """
-        from generator.kernels.mixing import mixed_table
+        from generator.kernels.mixed_table import mixed_table
         from generator.kernels.palette import colours_in
         from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, read_light
 

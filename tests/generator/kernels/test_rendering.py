@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.table.lut import Provenance, Unfit
 from foundation.errors import InputError
 from generator.kernels import streaming
-from generator.kernels.palette import bits_of, channels_of, colours_in, nearest_fit_colours, replace_unfit_colours
+from generator.kernels.palette import bits_of
 from generator.kernels.rendering import PATTERNS, draw_mosaic, draw_samples, render
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ Rule = Callable[..., npt.NDArray[np.int64]]
 def expected(
     rule: Rule, samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8], seed: int, image: int, **place: int
 ) -> npt.NDArray[np.uint16]:
-    """Return `draw_samples` by the rules at the heads of `kernel.py` and `choice.py`, in numpy."""
+    """Return `draw_samples` by the rules at the heads of `rendering.py` and `choice.py`, in numpy."""
     bits = {8: 1, 64: 2, 512: 3, 4096: 4, 32768: 5}[len(samples)]
     upper = (picture >> (8 - bits)).astype(np.int64)
     colour = (upper[..., 0] << (2 * bits)) | (upper[..., 1] << bits) | upper[..., 2]
@@ -187,35 +186,6 @@ def test_render_replaces_unfit_colours_by_the_nearest(make_lut: Callable[..., Lu
     # Colour 0 is (0, 0, 0) and 1 (0, 0, 1), both unfit; at distance 1 of black remain 4 (0, 1, 0) and 16 (1, 0, 0).
     green = render(lut, np.zeros((4, 8, 3), np.uint8) + np.array([0, 64, 0], np.uint8), 0, seed=1)
     np.testing.assert_array_equal(black, green)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(1, 5), st.integers(1, 30), st.integers(1, 30), st.integers(0, 2**32 - 1), st.booleans())
-def test_every_unfit_colour_and_no_other_is_replaced(bits: int, height: int, width: int, seed: int, few: bool) -> None:
-    rng = np.random.default_rng(seed)
-    picture = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
-    unfit = rng.choice(8**bits, 1 if few else min(8**bits - 1, 40), replace=False)
-    told = Provenance(
-        camera="Test",
-        bits=bits,
-        white_level=9,
-        session_sha256="1" * 64,
-        chart_sha256="2" * 64,
-        software="test",
-        unfit=[Unfit(colour=int(colour), cause="stain") for colour in unfit],
-    )
-    before = picture.copy()
-    fit, count = replace_unfit_colours(picture, told)
-    np.testing.assert_array_equal(picture, before)
-    upper = (picture >> (8 - bits)).astype(np.int64)
-    colour = (upper[..., 0] << 2 * bits) | (upper[..., 1] << bits) | upper[..., 2]
-    np.testing.assert_array_equal(np.flatnonzero(colours_in(picture, bits)), np.unique(colour))
-    hit = np.isin(colour, unfit)
-    assert count == np.count_nonzero(hit)
-    np.testing.assert_array_equal(fit[~hit], picture[~hit])
-    instead = dict(zip(unfit.tolist(), nearest_fit_colours(unfit, bits).tolist(), strict=True))
-    codes = channels_of([instead[index] for index in colour[hit].tolist()], bits) << (8 - bits)
-    np.testing.assert_array_equal(fit[hit], codes.reshape(-1, 3))
 
 
 def test_a_picture_of_another_type_is_refused_before_anything_is_drawn(make_lut: Callable[..., Lut]) -> None:

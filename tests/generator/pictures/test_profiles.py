@@ -16,7 +16,7 @@ from PIL import Image, ImageCms
 from foundation.errors import FormatError, InputError
 from generator.pictures.picture import Preparation, open_picture
 from generator.pictures.profiles import to_srgb
-from tests.generator.icc import gamma_profile
+from tests.generator.pictures.icc import gamma_profile
 
 Codes = npt.NDArray[np.uint8]
 

@@ -11,7 +11,8 @@ import pytest
 
 from foundation.errors import InputError
 from generator.kernels import streaming
-from generator.kernels.mixing import mix_samples, mixed_table
+from generator.kernels.mixed_table import mixed_table
+from generator.kernels.mixing import mix_samples
 from generator.kernels.rendering import draw_samples
 
 if TYPE_CHECKING:
