@@ -30,7 +30,7 @@ from benchmarks.encode import METADATA, at_once, photograph
 from benchmarks.generator import SAMPLES, noisy_table, report
 from calibration.table.lut import Lut
 from foundation.processors import processor_count
-from generator.dataset.reader import generate_dataset
+from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.files.formats import encode_pieces
 from generator.pictures.sources import find_pictures
 from generator.stores.store import LocalStore
@@ -103,7 +103,9 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
 
     def by_suite(previews: bool = False) -> None:
         shutil.rmtree(ours, ignore_errors=True)
-        generate_dataset(lut, ours, find_pictures([sources]), [0], previews=previews, workers=workers)
+        generate_dataset(
+            lut, ours, find_pictures([sources]), [0], options=DatasetOptions(previews=previews), workers=workers
+        )
 
     by_suite()
     images = images_of(ours)

@@ -23,7 +23,7 @@ from evaluation.datasets import open_scenes
 from evaluation.experiments import evaluate, images_csv, table_csv
 from evaluation.methods import GrayEdge, standard_methods
 from foundation.errors import InputError
-from generator.dataset.reader import generate_dataset
+from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.pictures.sources import random_scenes
 
 LIGHTS = np.array([[2000.0, 3000, 1000], [1500, 3000, 2500]])
@@ -51,7 +51,7 @@ def make_dataset(tmp_path: Path) -> Callable[[int, int], Path]:
 
     def make(width: int, height: int) -> Path:
         scenes = random_scenes(8, width, height)
-        generate_dataset(open_lut(folder), tmp_path / "made", scenes, [0, 1], previews=False)
+        generate_dataset(open_lut(folder), tmp_path / "made", scenes, [0, 1], options=DatasetOptions(previews=False))
         return tmp_path / "made"
 
     return make

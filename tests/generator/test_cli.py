@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,8 +35,7 @@ def generate(monkeypatch: pytest.MonkeyPatch, make_lut: Callable[..., Lut], tmp_
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments: str) -> int:
-        monkeypatch.setattr(sys, "argv", ["generate", *arguments])
-        return main()
+        return main(arguments)
 
     return call
 
@@ -50,7 +48,7 @@ def test_a_dataset_with_its_contact_sheet(generate: Generate, capsys: pytest.Cap
     assert "out: 6 images of 2 pictures under 3 lights" in printed.out
     assert "1 of 3 pictures could not be read" in printed.out
     assert "lists as unfit; they took the nearest fit colour" in printed.out
-    assert "passed over bad.png" in printed.err
+    assert "left out bad.png" in printed.err
     assert "6/6" in printed.err
     assert cv2.imread("sheet.png") is not None
     described = json.loads(Path("out/dataset.json").read_text())
@@ -120,8 +118,8 @@ def test_a_sheet_that_could_not_be_written_is_made_alone(
         patched.setattr(contact, "write_whole", full)
         assert generate("lut", "out", *wish) == 5
     assert (
-        "error: out is whole, but its contact sheet sheet.png cannot be written: No space left on device; have it made "
-        "alone by generate --verify out --contact-sheet"
+        "error: out is complete, but its contact sheet sheet.png cannot be written: No space left on device; free space "
+        "or choose another place, then make the sheet with generate --verify out --contact-sheet PATH"
     ) in capsys.readouterr().err
     assert generate("--verify", "out", "--contact-sheet", "sheet.png") == 0
     assert cv2.imread("sheet.png") is not None
@@ -132,7 +130,7 @@ def test_shares_are_finished_and_verified(generate: Generate, capsys: pytest.Cap
     assert generate("lut", "whole", *wish) == 0
     capsys.readouterr()
     assert generate("lut", "out", *wish, "--shard", "1/2") == 0
-    assert "1 of 3 shards of out are done; others are to be made yet" in capsys.readouterr().out
+    assert "1 of 3 shards of out are done; others are still to be made" in capsys.readouterr().out
     assert generate("--finish", "out") == 2
     assert "2 of 3 shards of out are not made yet: 0, 2; run their shares" in capsys.readouterr().err
     assert generate("lut", "out", *wish, "--shard", "0/2") == 0
@@ -146,7 +144,7 @@ def test_shares_are_finished_and_verified(generate: Generate, capsys: pytest.Cap
     assert generate("--verify", "out") == 4
     printed = capsys.readouterr()
     assert printed.out == "images/000005.png has changed\n"
-    assert "out is not as it was made, see above (1 faults)" in printed.err
+    assert "out is not as it was made: 1 fault, listed above" in printed.err
     truths = Path("out/gt.txt").read_text().splitlines()
     Path("out/gt.txt").write_text("\n".join(reversed(truths)))
     assert generate("--verify", "out") == 4
@@ -159,7 +157,7 @@ def test_a_share_is_gone_on_with_by_the_whole(generate: Generate, capsys: pytest
     assert generate("lut", "out", *wish, "--seed", "1") == 2
     assert "out was begun with another plan (seed 0, now 1)" in " ".join(capsys.readouterr().err.split())
     assert generate("lut", "out", *wish) == 0
-    assert "5 images were there already" in capsys.readouterr().err
+    assert "5 images were made by an earlier run" in capsys.readouterr().err
     assert [path.name for path in Path().iterdir() if path.name.startswith(".")] == []
 
 

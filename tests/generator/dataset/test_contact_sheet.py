@@ -10,7 +10,8 @@ import numpy.typing as npt
 import pytest
 
 from generator.dataset.contact_sheet import contact_sheet
-from generator.dataset.reader import Dataset, Entry, generate_dataset
+from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.reader import Dataset, Entry
 from generator.pictures.sources import random_scenes
 
 if TYPE_CHECKING:
@@ -30,7 +31,9 @@ def test_a_contact_sheet_shows_rows_of_sources(
         return load(self, entry)
 
     monkeypatch.setattr(Dataset, "read_image", read)
-    made = generate_dataset(make_lut(), tmp_path / "out", random_scenes(5, 24, 16), [0, 1, 2, 3], previews=False)
+    made = generate_dataset(
+        make_lut(), tmp_path / "out", random_scenes(5, 24, 16), [0, 1, 2, 3], options=DatasetOptions(previews=False)
+    )
     whole = contact_sheet(made)
     assert len(shown) == 20
     assert whole.dtype == np.uint8

@@ -8,14 +8,15 @@ import json
 import os
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import cv2
 import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError
-from generator.dataset.reader import generate_dataset, open_dataset
+from generator.dataset.making import Callbacks, DatasetOptions, generate_dataset
+from generator.dataset.reader import open_dataset
 from generator.kernels.rendering import render
 from generator.lights.choices import ListedLights, RandomLights
 from generator.lights.lighting import mixture_of
@@ -65,8 +66,10 @@ def test_what_is_in_the_folder(make_lut: Callable[..., Lut], pictures: Path, tmp
         [2, 1],
         seed=77,
         workers=2,
-        on_image=lambda: images.append(1),
-        on_skip=lambda name, reason, missed: skipped.append((name, f"{reason} ({missed} images)")),
+        callbacks=Callbacks(
+            on_image=lambda: images.append(1),
+            on_skip=lambda name, reason, missed: skipped.append((name, f"{reason} ({missed} images)")),
+        ),
     )
     assert len(images) == 8
     assert [name for name, _ in skipped] == ["broken.jpg"]
@@ -137,7 +140,7 @@ def test_workers_change_no_byte(make_lut: Callable[..., Lut], pictures: Path, tm
 def test_replaced_pixels_are_counted(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
     lut = make_lut(unfit=(0, 21))
     (source,) = find_pictures([pictures / "a.png"])
-    made = generate_dataset(lut, tmp_path / "out", [source], [0], previews=False)
+    made = generate_dataset(lut, tmp_path / "out", [source], [0], options=DatasetOptions(previews=False))
     top = source.read().picture >> 6
     count = int(((top == 0).all(axis=2) | (top == 1).all(axis=2)).sum())  # colour 21 is (1, 1, 1)
     assert count > 0
@@ -170,8 +173,8 @@ def test_pictures_too_small_for_the_format_are_passed_over(make_lut: Callable[..
         tmp_path / "out",
         sources,
         [0],
-        form="dng",
-        on_skip=lambda name, reason, missed: skipped.append(reason),
+        options=DatasetOptions(form="dng"),
+        callbacks=Callbacks(on_skip=lambda name, reason, missed: skipped.append(reason)),
     )
     assert [entry.image for entry in made.entries] == ["000001.dng"]
     (reason,) = skipped
@@ -189,14 +192,16 @@ def test_nothing_is_left_of_a_dataset_that_cannot_be(
     with pytest.raises(FormatError, match="none of the 1 pictures can be read"):
         generate_dataset(lut, tmp_path / "out", find_pictures([pictures / "broken.jpg"]), [0])
     unlike: Any = (1, 2)
-    with pytest.raises(InputError, match=r"split\.2 of a dataset is .*Field required"):
-        generate_dataset(lut, tmp_path / "out", sources, [0], split=unlike)
+    with pytest.raises(InputError, match="the split 1,2 is to be three shares from 0 that sum to 1"):
+        generate_dataset(lut, tmp_path / "out", sources, [0], options=DatasetOptions(split=unlike))
+    with pytest.raises(InputError, match="'bmp' is no format of a dataset; use one of png, tiff, exr, jxl, dng"):
+        DatasetOptions(form=cast("Any", "bmp"))
     assert contents(tmp_path) == before
     assert not list(tmp_path.glob(".out*"))
     assert threading.active_count() == threads
 
 
-def test_a_taken_folder_and_empty_wishes_are_refused(
+def test_a_taken_folder_and_empty_lists_are_refused(
     make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path
 ) -> None:
     lut = make_lut()

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from foundation.errors import FormatError
-from generator.dataset.reader import generate_dataset, open_dataset
+from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.reader import open_dataset
 from generator.lights.choices import ListedLights, TogetherLights
 from generator.masks.request import parse_masks
 from generator.pictures.sources import random_scenes
@@ -18,11 +19,19 @@ if TYPE_CHECKING:
 
     from calibration.table.lut import Lut
 
+BARE = DatasetOptions(previews=False)
+
 
 @pytest.fixture
 def small(make_lut: Callable[..., Lut], tmp_path: Path) -> Path:
     """Return a dataset of two random scenes under one light, without previews."""
-    generate_dataset(make_lut(), tmp_path / "small", random_scenes(2, 24, 16), [1], form="tiff", previews=False)
+    generate_dataset(
+        make_lut(),
+        tmp_path / "small",
+        random_scenes(2, 24, 16),
+        [1],
+        options=DatasetOptions(form="tiff", previews=False),
+    )
     return tmp_path / "small"
 
 
@@ -72,7 +81,7 @@ def test_ground_truths_that_disagree_are_named(
     make_lut: Callable[..., Lut], tmp_path: Path, written: tuple[int | str, ...], message: str
 ) -> None:
     out = tmp_path / "out"
-    made = generate_dataset(make_lut(), out, random_scenes(1, 24, 16), [0, 1, 2, 3], previews=False)
+    made = generate_dataset(make_lut(), out, random_scenes(1, 24, 16), [0, 1, 2, 3], options=BARE)
     truths = lines_of(out / "gt.txt")
     (out / "gt.txt").write_text("\n".join([*truths, "", ""]))
     assert open_dataset(out) == made
@@ -101,7 +110,7 @@ def test_a_table_that_is_no_csv_is_named(small: Path) -> None:
 def test_the_mean_of_several_lights_lies_between_them(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
     choice = TogetherLights(ListedLights((0, 3)), 2, parse_masks("half-plane", 2, 5))
     out = tmp_path / "out"
-    generate_dataset(make_lut(), out, random_scenes(2, 24, 16), choice, previews=False)
+    generate_dataset(make_lut(), out, random_scenes(2, 24, 16), choice, options=BARE)
     assert all(entry.truth not in entry.truths for entry in open_dataset(out).entries)
     first, _ = lines_of(out / "gt.txt")
     (out / "gt.txt").write_text(f"{first}\n0.1 0.1 0.8\n")

@@ -16,14 +16,22 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.production.assembly import damage
-from generator.dataset.production.plan import Options, Plan
+from generator.dataset.making import (
+    DatasetOptions,
+    Plan,
+    finish_dataset,
+    generate_dataset,
+    make_dataset,
+    make_share,
+)
 from generator.dataset.production.shards import make_elsewhere
 from generator.dataset.production.workplace import workplace
-from generator.dataset.reader import finish_dataset, generate_dataset, make_dataset, make_share, open_dataset
+from generator.dataset.reader import open_dataset
+from generator.dataset.verification import file_faults
 from generator.lights.choices import ListedLights
 from generator.pictures.sources import find_pictures, random_scenes
 from generator.stores.store import LocalStore, RemoteStore, open_store
+from tests.generator.groups import grouped
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -73,7 +81,7 @@ def contents(place: str | Path) -> dict[str, str]:
 
 def make(lut: Lut, out: str | Path, **options: Any) -> None:
     wishes: dict[str, Any] = {"seed": 3, "shard_images": 3, "split": (0.5, 0.0, 0.5), **options}
-    generate_dataset(lut, out, SCENES, [2, 0], **wishes)
+    generate_dataset(lut, out, SCENES, [2, 0], **grouped(**wishes))
 
 
 @pytest.mark.parametrize("layout", ["folder", "webdataset", "parquet"])
@@ -87,7 +95,7 @@ def test_a_dataset_in_a_store_is_the_one_on_the_disk(make_lut: Callable[..., Lut
     assert there.sources == here.sources
     for entry in here.entries[::3]:
         np.testing.assert_array_equal(there.read_image(entry), here.read_image(entry))
-    assert list(damage("memory://bucket/out")) == []
+    assert list(file_faults("memory://bucket/out")) == []
     with pytest.raises(InputError, match="memory://bucket/out already holds a dataset; name another place"):
         make(lut, "memory://bucket/out", layout=layout)
 
@@ -122,7 +130,7 @@ def test_a_store_that_fails_at_any_write_is_gone_on_with(
 
 def test_shares_in_a_store(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
     lut = make_lut()
-    plan = Plan(lut, SCENES, ListedLights((2, 0)), 3, Options(shard_images=3, split=(0.5, 0.0, 0.5)))
+    plan = Plan(lut, SCENES, ListedLights((2, 0)), 3, DatasetOptions(shard_images=3, split=(0.5, 0.0, 0.5)))
     make(lut, tmp_path / "out")
     assert make_share(plan, "memory://out", (1, 2)) == (1, 3)
     with pytest.raises(InputError, match=r"memory://out was begun with another plan \(seed 3, now 4\)"):
@@ -154,7 +162,7 @@ def test_a_late_worker_of_a_plan_that_was_removed_is_not_believed(
 ) -> None:
     lut = make_lut()
     out = "memory://bucket/out" if remote else str(tmp_path / "out")
-    old, new = (Plan(lut, SCENES, ListedLights((0, 2)), seed, Options(shard_images=3)) for seed in (3, 4))
+    old, new = (Plan(lut, SCENES, ListedLights((0, 2)), seed, DatasetOptions(shard_images=3)) for seed in (3, 4))
     with workplace(out, old.identity()) as late:
         pass
     RemoteStore(out).remove("") if remote else shutil.rmtree(tmp_path / ".out.partial")

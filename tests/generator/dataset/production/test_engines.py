@@ -14,8 +14,8 @@ import psutil
 import pytest
 
 from foundation.errors import InputError
-from generator.dataset.production.engines import parse_engine
-from generator.dataset.reader import generate_dataset
+from generator.dataset.making import Callbacks, DatasetOptions, Workers, generate_dataset
+from generator.dataset.production.workers import SILENT, parse_engine
 from generator.lights.choices import RandomLights
 from generator.pictures.sources import find_pictures, random_scenes
 
@@ -46,12 +46,9 @@ def make(lut: Lut, out: Path, engine: str, workers: int, on_image: Callable[[], 
         scenes,
         lights,
         seed=4,
-        previews=False,
-        shard_images=SHARD,
-        split=(0.8, 0.1, 0.1),
-        engine=engine,
-        workers=workers,
-        on_image=on_image,
+        options=DatasetOptions(previews=False, shard_images=SHARD, split=(0.8, 0.1, 0.1)),
+        workers=Workers(engine, workers),
+        callbacks=SILENT if on_image is None else Callbacks(on_image=on_image),
     )
 
 
@@ -154,24 +151,26 @@ def test_a_cluster_by_its_address(
     path = other.folder / "lut.json"
     path.write_text(path.read_text().replace("Test camera", "Another"))
     with pytest.raises(InputError, match="of a worker is not that of the plan; give every machine the same table"):
-        generate_dataset(other, tmp_path / "refused", random_scenes(2, 24, 16), [0], engine=address)
+        generate_dataset(other, tmp_path / "refused", random_scenes(2, 24, 16), [0], workers=Workers(address))
 
 
 @pytest.mark.parametrize("cluster", [0], indirect=True)
-def test_a_scheduler_without_workers_is_told_of_and_waited_for(
+def test_a_scheduler_without_workers_is_named_and_waited_for(
     make_lut: Callable[..., Lut], tmp_path: Path, cluster: LocalCluster
 ) -> None:
     address = cluster.scheduler_address.replace("tcp://", "dask://")
-    told: list[str] = []
+    said: list[str] = []
 
     def start_one(sentence: str) -> None:
-        told.append(sentence)
+        said.append(sentence)
         cluster.scale(1)
 
     scenes = random_scenes(2, 24, 16)
-    made = generate_dataset(make_lut(), tmp_path / "out", scenes, [0], engine=address, on_wait=start_one)
+    made = generate_dataset(
+        make_lut(), tmp_path / "out", scenes, [0], workers=Workers(address), callbacks=Callbacks(on_wait=start_one)
+    )
     assert made.description.images == 2
-    assert told == [f"the Dask scheduler has no worker yet; start some with: dask worker {cluster.scheduler_address}"]
+    assert said == [f"the Dask scheduler has no worker yet; start some with: dask worker {cluster.scheduler_address}"]
 
 
 def test_workers_that_were_started_in_another_folder(
@@ -181,7 +180,7 @@ def test_workers_that_were_started_in_another_folder(
     Path("pictures").mkdir()
     Path("pictures/a.pgm").write_bytes(b"P5 2 2 255 abcd")
     address = cluster.scheduler_address.replace("tcp://", "dask://")
-    made = generate_dataset(make_lut(), Path("out"), find_pictures(["pictures"]), [0], engine=address)
+    made = generate_dataset(make_lut(), Path("out"), find_pictures(["pictures"]), [0], workers=Workers(address))
     assert made.description.images == 1
 
 
@@ -203,5 +202,7 @@ def test_a_scheduler_that_does_not_answer(
 ) -> None:
     monkeypatch.setattr("generator.dataset.production.engines.CONNECT_S", 0.2)
     with pytest.raises(InputError, match=r"no Dask scheduler answers at 127\.0\.0\.1:1: .*; start one with dask"):
-        generate_dataset(make_lut(), tmp_path / "out", random_scenes(2, 24, 16), [0], engine="dask://127.0.0.1:1")
+        generate_dataset(
+            make_lut(), tmp_path / "out", random_scenes(2, 24, 16), [0], workers=Workers("dask://127.0.0.1:1")
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["lut"]

@@ -21,12 +21,14 @@ import numpy.typing as npt
 import pytest
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.production.assembly import damage
+from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.production.records import Layout
-from generator.dataset.reader import Dataset, generate_dataset, open_dataset
+from generator.dataset.reader import Dataset, open_dataset
+from generator.dataset.verification import file_faults
 from generator.lights.choices import ListedLights, TogetherLights
 from generator.masks.request import parse_masks
 from generator.pictures.sources import SourcePicture, random_scenes
+from tests.generator.groups import grouped
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -45,7 +47,7 @@ def make(make_lut: Callable[..., Lut], tmp_path: Path) -> Make:
     def call(layout: Layout, lights: Any = (2, 0), **options: Any) -> Dataset:
         out = tmp_path / f"{layout}-{len(list(tmp_path.iterdir()))}"
         wishes: dict[str, Any] = {"seed": 3, "layout": layout, "shard_images": 5, **options}
-        return generate_dataset(lut, out, SCENES, lights, **wishes)
+        return generate_dataset(lut, out, SCENES, lights, **grouped(**wishes))
 
     return call
 
@@ -92,11 +94,11 @@ def test_the_webdataset_package_reads_the_shards(make: Make) -> None:
         urls = sorted((place_of(made) / part).glob("*.tar"))
         # In a program of its own, because the package leaves files open.
         read = subprocess.run([sys.executable, "-c", READER, *urls], capture_output=True, text=True, check=True)
-        for key, told, digests in map(json.loads, read.stdout.splitlines()):
+        for key, metadata, digests in map(json.loads, read.stdout.splitlines()):
             entry = entries.pop(f"{key}.png")
             assert digests == {"png": sums[f"images/{key}.png"], "preview.jpg": sums[f"previews/{key}.jpg"]}
-            assert told["truth"] == pytest.approx(entry.truth, abs=1e-9)
-            assert (told["source"], told["split"], told["width"]) == (entry.source, part, 28)
+            assert metadata["truth"] == pytest.approx(entry.truth, abs=1e-9)
+            assert (metadata["source"], metadata["split"], metadata["width"]) == (entry.source, part, 28)
             assert entry.split == part
     assert not entries
 
@@ -162,7 +164,7 @@ def test_a_shard_that_cannot_be_ended_is_given_up_quietly(
 ) -> None:
     """A writer that ends its file when it is thrown away finds the file closed; pytest fails for that."""
     with pytest.raises(StorageError, match="the disk is gone"):
-        generate_dataset(make_lut(), tmp_path / "out", (*SCENES, Gone()), [0], layout=layout)
+        generate_dataset(make_lut(), tmp_path / "out", (*SCENES, Gone()), [0], options=DatasetOptions(layout=layout))
     gc.collect()
     assert capfd.readouterr() == ("", "")
 
@@ -228,18 +230,18 @@ def grey(data: bytes) -> npt.NDArray[np.uint16]:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_verifying_names_what_is_not_as_it_was_made(make: Make, layout: Layout) -> None:
     folder = place_of(make(layout, split=(0.5, 0.2, 0.3)))
-    looked_at: list[tuple[int, int]] = []
-    assert list(damage(folder, lambda done, total: looked_at.append((done, total)), workers=3)) == []
+    verified: list[tuple[int, int]] = []
+    assert list(file_faults(folder, lambda done, total: verified.append((done, total)), workers=3)) == []
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     files = len(names) - 1  # every one but the list of hashes itself
-    assert looked_at == [(done + 1, files) for done in range(files)]
+    assert verified == [(done + 1, files) for done in range(files)]
     victim = sorted(path for path in folder.rglob("00000*") if path.suffix in (".png", ".tar", ".parquet"))[0]
     data = bytearray(victim.read_bytes())
     data[len(data) // 2] ^= 1
     victim.write_bytes(bytes(data))
     (folder / "gt.txt").unlink()
     (folder / "notes.txt").write_text("mine")
-    assert sorted(damage(folder)) == sorted(
+    assert sorted(file_faults(folder)) == sorted(
         [
             f"{victim.relative_to(folder).as_posix()} has changed",
             "gt.txt is missing or cannot be read",
@@ -247,7 +249,7 @@ def test_verifying_names_what_is_not_as_it_was_made(make: Make, layout: Layout) 
         ]
     )
     with pytest.raises(FormatError, match=r"is no dataset: it has no dataset\.json"):
-        list(damage(folder.parent))
+        list(file_faults(folder.parent))
 
 
 @pytest.mark.parametrize("layout", ["webdataset", "parquet"])
@@ -275,13 +277,13 @@ def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.M
 def test_a_dataset_of_version_1_is_read(make: Make) -> None:
     made = make("folder", split=None)
     folder = place_of(made)
-    told = json.loads((folder / "dataset.json").read_text())
+    content = json.loads((folder / "dataset.json").read_text())
     sources = [source.model_dump(exclude={"split", "profile"}) for source in made.sources]
     for key in ("planned", "pixels", "replaced_pixels", "splits"):
-        del told[key]
-    told |= {"version": 1, "sources": sources}
-    told["options"] = {key: told["options"][key] for key in ("format", "lights", "previews")} | {"max_side": None}
-    (folder / "dataset.json").write_text(json.dumps(told))
+        del content[key]
+    content |= {"version": 1, "sources": sources}
+    content["options"] = {key: content["options"][key] for key in ("format", "lights", "previews")} | {"max_side": None}
+    (folder / "dataset.json").write_text(json.dumps(content))
     (folder / "sources.csv").unlink()
     old = open_dataset(folder)
     assert old.entries == made.entries

@@ -15,8 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.errors import InputError
-from generator.dataset.production.plan import parse_share, parse_split, split_of
-from generator.dataset.reader import generate_dataset
+from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.production.options import parse_split
+from generator.dataset.production.plan import split_of
+from generator.dataset.production.workers import parse_share
 from generator.pictures.sources import find_pictures
 
 if TYPE_CHECKING:
@@ -59,7 +61,8 @@ def test_parts_are_of_sources_and_stay_when_others_come(make_lut: Callable[..., 
     for number in range(12):
         write(folder / f"{number:02d}.png", number)
         write(folder / "copies" / f"copy of {number}.png", number)
-    made = generate_dataset(lut, tmp_path / "out", find_pictures([folder]), [0, 1, 2], seed=6, split=(0.5, 0.2, 0.3))
+    options = DatasetOptions(split=(0.5, 0.2, 0.3))
+    made = generate_dataset(lut, tmp_path / "out", find_pictures([folder]), [0, 1, 2], seed=6, options=options)
     parts: dict[str, set[str | None]] = {}
     for entry in made.entries:
         parts.setdefault(entry.source, set()).add(entry.split)
@@ -73,7 +76,7 @@ def test_parts_are_of_sources_and_stay_when_others_come(make_lut: Callable[..., 
     assert {source.name: {source.split} for source in made.sources} == parts
     for number in range(12, 20):
         write(folder / f"0{number}.png", number)
-    more = generate_dataset(lut, tmp_path / "more", find_pictures([folder]), [3], seed=6, split=(0.5, 0.2, 0.3))
+    more = generate_dataset(lut, tmp_path / "more", find_pictures([folder]), [3], seed=6, options=options)
     now = {entry.source: {entry.split} for entry in more.entries}
     assert {name: now[name] for name in parts} == parts
 

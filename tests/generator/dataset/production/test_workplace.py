@@ -15,13 +15,22 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from foundation.errors import FormatError, InputError
+from generator.dataset.making import (
+    DatasetOptions,
+    Plan,
+    Workers,
+    finish_dataset,
+    generate_dataset,
+    make_dataset,
+    make_share,
+)
 from generator.dataset.production.layouts import plain_files
-from generator.dataset.production.plan import Options, Plan
 from generator.dataset.production.records import ShardRecord
 from generator.dataset.production.workplace import Workplace, workplace
-from generator.dataset.reader import Dataset, finish_dataset, generate_dataset, make_dataset, make_share
+from generator.dataset.reader import Dataset
 from generator.lights.choices import ListedLights, RandomLights
 from generator.pictures.sources import random_scenes
+from tests.generator.groups import grouped
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -40,7 +49,7 @@ def contents(folder: Path) -> dict[str, str]:
 
 def make(lut: Lut, out: Path, scenes: int = 4, **options: Any) -> Dataset:
     wishes: dict[str, Any] = {"seed": 3, "shard_images": 2, "split": (0.5, 0.0, 0.5), "previews": False}
-    return generate_dataset(lut, out, SCENES[:scenes], [2, 0], **(wishes | options))
+    return generate_dataset(lut, out, SCENES[:scenes], [2, 0], **grouped(**(wishes | options)))
 
 
 class StopIt(Exception):
@@ -162,7 +171,7 @@ def test_another_plan_in_the_same_place_is_refused(make_lut: Callable[..., Lut],
 
 def test_one_program_makes_a_dataset_at_a_time(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
     lut, out = make_lut(), tmp_path / "out"
-    plan = Plan(lut, SCENES, ListedLights((0,)), 0, Options())
+    plan = Plan(lut, SCENES, ListedLights((0,)), 0, DatasetOptions())
     with (
         workplace(out, plan.identity()),
         pytest.raises(InputError, match="is being made by another program; wait for it"),
@@ -171,13 +180,13 @@ def test_one_program_makes_a_dataset_at_a_time(make_lut: Callable[..., Lut], tmp
 
 
 def plan_of(lut: Lut) -> Plan:
-    return Plan(lut, SCENES, RandomLights(3, 4, 9), 9, Options(shard_images=2, split=(0.4, 0.3, 0.3)))
+    return Plan(lut, SCENES, RandomLights(3, 4, 9), 9, DatasetOptions(shard_images=2, split=(0.4, 0.3, 0.3)))
 
 
 def test_shares_make_the_whole(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
     lut, out = make_lut(), tmp_path / "out"
     make_dataset(plan_of(lut), tmp_path / "whole")
-    assert make_share(plan_of(lut), out, (1, 3), workers=2) == (2, 6)
+    assert make_share(plan_of(lut), out, (1, 3), Workers(count=2)) == (2, 6)
     assert make_share(plan_of(lut), out, (0, 3)) == (4, 6)
     with pytest.raises(InputError, match=r"2 of 6 shards of .* are not made yet: 2, 5; run their shares"):
         finish_dataset(out)
@@ -201,7 +210,7 @@ def test_shares_are_made_beside_each_other(make_lut: Callable[..., Lut], tmp_pat
             finish_dataset(tmp_path / "out")
 
 
-def test_a_damaged_record_and_a_changed_source_are_told(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+def test_a_damaged_record_and_a_changed_source_are_reported(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
     lut, out = make_lut(), tmp_path / "out"
     make_share(plan_of(lut), out, (0, 1))
     (record,) = (tmp_path / ".out.partial" / "plan" / "shards").glob("000001.*.json")
