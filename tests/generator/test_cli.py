@@ -118,8 +118,8 @@ def test_a_sheet_that_could_not_be_written_is_made_alone(
         patched.setattr(contact, "write_whole", full)
         assert generate("lut", "out", *wish) == 5
     assert (
-        "error: out is complete, but its contact sheet sheet.png cannot be written: No space left on device; free space "
-        "or choose another place, then make the sheet with generate --verify out --contact-sheet PATH"
+        "error: out is complete, but its contact sheet sheet.png cannot be written: No space left on device; free "
+        "space or choose another place, then make the sheet with generate --verify out --contact-sheet PATH"
     ) in capsys.readouterr().err
     assert generate("--verify", "out", "--contact-sheet", "sheet.png") == 0
     assert cv2.imread("sheet.png") is not None

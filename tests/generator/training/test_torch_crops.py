@@ -76,6 +76,6 @@ def test_single_items_and_their_bounds(crops: Crops) -> None:
 
 
 def test_nothing_else_imports_pytorch() -> None:
-    modules = "generator.training.crops, generator.dataset.reader, generator.kernels.rendering"
+    modules = "generator, generator.training, generator.dataset.making, generator.kernels.rendering"
     code = f"import sys, {modules}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
