@@ -31,9 +31,9 @@ from benchmarks.generator import SAMPLES, noisy_table, report
 from calibration.table.lut import Lut
 from foundation.processors import processor_count
 from generator.dataset.reader import generate_dataset
-from generator.dataset.store import LocalStore
 from generator.files.formats import encode_pieces
 from generator.pictures.sources import find_pictures
+from generator.stores.store import LocalStore
 
 LARGE_REPEATS = 3
 SMALL_REPEATS = 5

@@ -38,7 +38,7 @@ from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_planar
 from generator.kernels.rendering import draw_mosaic, draw_samples
 from generator.kernels.vector import GROUP, LINE, copy8, offset_at, prefetch_once
-from generator.masks.making import parse_masks
+from generator.masks.request import parse_masks
 
 SAMPLES = 25
 REPEATS = 7

@@ -22,8 +22,8 @@ from calibration.table.lut import Lut
 from generator.files.formats import encode_pieces
 from generator.kernels.mixing import mix_samples
 from generator.lights.lighting import Lighting, plain
-from generator.masks.files import encode_maps
-from generator.masks.making import parse_masks
+from generator.masks.maps import encode_maps
+from generator.masks.request import parse_masks
 
 KINDS = ("half-plane", "soft-edge", "spots", "smooth", "window")
 FULL = 65535
@@ -60,7 +60,7 @@ def measure(name: str, lut: Lut, picture: npt.NDArray[np.uint8], repeats: int) -
         its = lighting.weights_of(height, width)
         calls[f"{kind}, masks"] = lambda lighting=lighting: lighting.weights_of(height, width)
         calls[f"{kind}, mixing"] = lambda its=its: mix_samples(lut.samples, picture, its, white_level=WHITE)
-        calls[f"{kind}, maps"] = lambda its=its, lighting=lighting: encode_maps(lut, lighting, its)
+        calls[f"{kind}, maps"] = lambda its=its, lighting=lighting: encode_maps(its, lighting.whites(lut))
     calls["image"] = lambda: sum(len(piece) for piece in encode_pieces(image, "png", METADATA))
     seconds = in_turns(calls, time.thread_time, repeats)
     for kind in KINDS:

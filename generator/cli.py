@@ -445,7 +445,7 @@ def _verify(out: str, workers: int | None) -> Dataset:
     from generator.dataset.production.assembly import damage
     from generator.dataset.production.engines import check_workers
     from generator.dataset.reader import open_dataset
-    from generator.dataset.store import is_remote
+    from generator.stores.places import is_remote
 
     # Whoever reads from a store waits for it most of the time.
     at_once = max(processor_count(), _STORE_READERS if is_remote(out) else 1) if workers is None else workers
@@ -482,7 +482,7 @@ def _draw_sheet(dataset: Dataset, out: str, contact_sheet: Path | None) -> None:
 
 def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None) -> None:
     from foundation.errors import InputError
-    from generator.dataset.store import is_remote, local_path
+    from generator.stores.places import is_remote, local_path
 
     if shard is not None:
         raise InputError(

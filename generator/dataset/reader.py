@@ -1,7 +1,7 @@
 """A dataset: its reader, and the call that makes one.
 
     images/NNNNNN.png    linear camera RGB in the units of the table; the number is the one that was planned
-    masks/, ground_truth/  where several lights fall on an image; see `masks.files`
+    masks/, ground_truth/  where several lights fall on an image; see `masks.maps`
     previews/NNNNNN.jpg  the same, tone mapped, at most 512 px: the look of the raw, no white balance
     ground_truth.csv     image,source,illumination,r,g,b with r + g + b = 1, one row a light
     gt.txt               r g b a line in image order: the mean of the lights over the image
@@ -44,7 +44,8 @@ from generator.dataset.production.assembly import (
     assemble,
 )
 from generator.dataset.production.engines import OnWait, check_workers, make_shards
-from generator.dataset.production.layouts import member_name, read_member
+from generator.dataset.production.layouts.by_name import read_member
+from generator.dataset.production.layouts.samples import member_name
 from generator.dataset.production.plan import SHARD_IMAGES, Options, Plan
 from generator.dataset.production.records import (
     FORMAT,
@@ -60,10 +61,11 @@ from generator.dataset.production.records import (
 )
 from generator.dataset.production.shards import OnImage, OnSkip
 from generator.dataset.production.workplace import Workplace, finished, stored_identity, workplace
-from generator.dataset.store import DESCRIPTION, Store, open_store
 from generator.files.formats import Format, decode_image
 from generator.lights.choices import ListedLights
 from generator.lights.lighting import LightChoice, parse_mixture
+from generator.stores.places import DESCRIPTION
+from generator.stores.store import Store, open_store
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -132,7 +134,7 @@ class Dataset:
         FormatError
             A file is missing or damaged.
         """
-        from generator.masks.files import decode_weights
+        from generator.masks.maps import decode_weights
 
         masks = [self._map(entry, "masks", f"_{light}.png") for light in range(len(entry.lights))]
         return decode_weights(masks, self._of(entry, "masks"))
@@ -147,7 +149,7 @@ class Dataset:
         FormatError
             The file is missing or damaged.
         """
-        from generator.masks.files import decode_ground_truth
+        from generator.masks.maps import decode_ground_truth
 
         return decode_ground_truth(self._map(entry, "ground_truth", ".png"), self._of(entry, "ground truth"))
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from foundation.errors import FormatError, InputError, StorageError
 from generator import philox
-from generator.dataset.store import DESCRIPTION, filesystem, is_remote, local_path
 from generator.pictures.picture import AS_THEY_ARE, LARGEST_SIDE, Picture, Preparation, open_picture
+from generator.stores.places import DESCRIPTION, filesystem, is_remote, local_path
 
 if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem

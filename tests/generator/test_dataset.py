@@ -21,7 +21,7 @@ from generator.dataset.reader import Dataset, Entry, generate_dataset, open_data
 from generator.kernels.rendering import render
 from generator.lights.choices import ListedLights, RandomLights, TogetherLights
 from generator.lights.lighting import mixture_of
-from generator.masks.making import parse_masks
+from generator.masks.request import parse_masks
 from generator.pictures.picture import read_picture
 from generator.pictures.sources import find_pictures, random_scenes
 

@@ -25,7 +25,7 @@ from generator.dataset.production.assembly import damage
 from generator.dataset.production.records import Layout
 from generator.dataset.reader import Dataset, generate_dataset, open_dataset
 from generator.lights.choices import ListedLights, TogetherLights
-from generator.masks.making import parse_masks
+from generator.masks.request import parse_masks
 from generator.pictures.sources import SourcePicture, random_scenes
 
 if TYPE_CHECKING:
@@ -267,7 +267,7 @@ def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.M
     def find_spec(name: str) -> None:
         del name
 
-    monkeypatch.setattr("generator.dataset.production.parquet.find_spec", find_spec)
+    monkeypatch.setattr("generator.dataset.production.layouts.parquet.find_spec", find_spec)
     with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install croplab\[parquet\]"):
         make("parquet")
 

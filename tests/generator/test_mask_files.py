@@ -19,9 +19,11 @@ from hypothesis.extra import numpy as hnp
 from foundation.angles import angles_deg
 from foundation.errors import FormatError
 from generator.files.formats import encode_map
-from generator.lights.lighting import FULL, Lighting, plain
-from generator.masks.files import decode_ground_truth, decode_weights, encode_maps, find_masks
-from generator.masks.making import parse_masks
+from generator.lights.lighting import Lighting, plain
+from generator.masks.given import find_masks
+from generator.masks.maps import decode_ground_truth, decode_weights, encode_maps
+from generator.masks.request import parse_masks
+from generator.masks.weights import FULL
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -131,7 +133,7 @@ def test_maps_are_read_back_as_the_image_was_made(tmp_path: Path, make_lut: Call
     lighting = Lighting(tuple(plain(light) for light in shining), parse_masks("smooth", lights, 1).maker(0))
     weights = lighting.weights_of(40, 60)
     names: list[str] = []
-    for folder, suffix, data in encode_maps(lut, lighting, weights):
+    for folder, suffix, data in encode_maps(weights, lighting.whites(lut)):
         (tmp_path / folder).mkdir(exist_ok=True)
         (tmp_path / folder / f"000004{suffix}").write_bytes(data)
         names.append(f"{folder}/000004{suffix}")

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from foundation.errors import InputError
-from generator.lights.lighting import FULL, MaskMaker
-from generator.masks.making import MadeMaskPlan, parse_masks, whole_parts
+from generator.masks.making import MadeMaskPlan
+from generator.masks.request import parse_masks
 from generator.masks.shapes import HalfPlanes, SmoothFields, Spots, Windows
+from generator.masks.weights import FULL, MaskMaker, quantise_shares
 
 KINDS = ("half-plane", "soft-edge", "spots", "smooth", "window")
 Map = npt.NDArray[np.float32]
@@ -163,7 +164,7 @@ def test_windows_have_their_panes() -> None:
 
 def test_whole_parts_give_what_is_left_to_the_largest() -> None:
     out = np.empty((1, 1, 3), np.float32)
-    whole_parts(np.array([1, 1, 1.0001], np.float32).reshape(3, 1, 1), out)
+    quantise_shares(np.array([1, 1, 1.0001], np.float32).reshape(3, 1, 1), out)
     assert np.rint(out * FULL).ravel().tolist() == [21844, 21844, 21847]
 
 
@@ -171,8 +172,8 @@ def test_whole_parts_give_what_is_left_to_the_largest() -> None:
 def test_whole_parts_of_two_are_those_of_three_one_of_which_is_dark(shares: npt.NDArray[np.float32]) -> None:
     shares[0] += np.float32(2**-20) * (shares.sum(axis=0) == 0)
     two, three = np.empty((3, 37, 2), np.float32), np.empty((3, 37, 3), np.float32)
-    whole_parts(shares, two)
-    whole_parts(np.concatenate([shares, np.zeros_like(shares[:1])]), three)
+    quantise_shares(shares, two)
+    quantise_shares(np.concatenate([shares, np.zeros_like(shares[:1])]), three)
     np.testing.assert_array_equal(three, np.dstack([two, np.zeros((3, 37))]))
 
 

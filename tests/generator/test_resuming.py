@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from foundation.errors import FormatError, InputError
-from generator.dataset.production import layouts
+from generator.dataset.production.layouts import plain_files
 from generator.dataset.production.plan import Options, Plan
 from generator.dataset.production.records import ShardRecord
 from generator.dataset.production.workplace import Workplace, workplace
@@ -120,22 +120,22 @@ def test_a_kill_at_any_file_operation_is_gone_on_from(make_lut: Callable[..., Lu
 def test_a_record_is_written_when_its_files_are_on_the_disk(
     make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str
 ) -> None:
-    settled: set[int] = set()
+    synced: set[int] = set()
     checked: list[str] = []
     fsync, commit = os.fsync, Workplace.commit
 
     def noted(handle: int) -> None:
         fsync(handle)
-        settled.add(os.fstat(handle).st_ino)
+        synced.add(os.fstat(handle).st_ino)
 
     def checking(place: Workplace, record: ShardRecord) -> None:
         for file in record.files:
             path = Path(place.files.place) / file.name
-            assert {path.stat().st_ino, path.parent.stat().st_ino} <= settled, f"{file.name} is only in memory"
+            assert {path.stat().st_ino, path.parent.stat().st_ino} <= synced, f"{file.name} is only in memory"
             checked.append(file.name)
         commit(place, record)
 
-    monkeypatch.setattr(layouts, "_SETTLED_IMAGES", 2)
+    monkeypatch.setattr(plain_files, "_SYNCED_IMAGES", 2)
     monkeypatch.setattr(os, "fsync", noted)
     monkeypatch.setattr(Workplace, "commit", checking)
     make(make_lut(), tmp_path / "out", layout=layout, workers=2, shard_images=5)

@@ -21,9 +21,9 @@ from generator.dataset.production.plan import Options, Plan
 from generator.dataset.production.shards import make_elsewhere
 from generator.dataset.production.workplace import workplace
 from generator.dataset.reader import finish_dataset, generate_dataset, make_dataset, make_share, open_dataset
-from generator.dataset.store import LocalStore, RemoteStore, open_store
 from generator.lights.choices import ListedLights
 from generator.pictures.sources import find_pictures, random_scenes
+from generator.stores.store import LocalStore, RemoteStore, open_store
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut

@@ -31,8 +31,9 @@ from generator.dataset.production.records import (
     image_key,
 )
 from generator.dataset.production.workplace import Workplace
-from generator.dataset.store import DESCRIPTION, Store, open_store
 from generator.files.formats import suffix_of
+from generator.stores.places import DESCRIPTION
+from generator.stores.store import Store, open_store
 
 GROUND_TRUTH = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS = ("image", "source", "illumination", "r", "g", "b")
@@ -151,10 +152,10 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
             sums.write(file.sum.encode())
         sums.write(f"{hashlib.sha256(text).hexdigest()}  {DESCRIPTION}\n".encode())
     names = [file.name for file in written]
-    place.files.settle([*names, SUMS])
+    place.files.sync([*names, SUMS])
     # In an object store this makes it a dataset, so everything else is there.
     place.files.put(DESCRIPTION, text)
-    place.files.settle([DESCRIPTION])
+    place.files.sync([DESCRIPTION])
     place.publish()
 
 

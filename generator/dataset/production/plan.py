@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict
 
 from foundation.errors import InputError
 from foundation.version import software
+from generator.dataset.production.layouts.by_name import require_libraries
 from generator.dataset.production.records import SPLITS, Layout, Light, Split, Table
 from generator.files.formats import Format, libraries_of
 
@@ -126,10 +127,7 @@ class Plan:
             raise InputError(f"{self.total} images are more than a dataset holds, 2^32; make several, each with a seed")
         if self.options.shard_images < 1:
             raise InputError(f"shards of {self.options.shard_images} images were asked for, expected 1 or more")
-        if self.options.layout == "parquet":
-            from generator.dataset.production.parquet import require_pyarrow
-
-            require_pyarrow()
+        require_libraries(self.options.layout)
         check_shares(self.options.split)
 
     @property

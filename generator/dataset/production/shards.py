@@ -25,7 +25,8 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
-from generator.dataset.production.layouts import Sample, ShardWriter, open_writer
+from generator.dataset.production.layouts.by_name import open_writer
+from generator.dataset.production.layouts.samples import Sample, ShardWriter
 from generator.dataset.production.plan import ShardJob, light_of, split_of, versions
 from generator.dataset.production.records import (
     ImageRecord,
@@ -36,10 +37,10 @@ from generator.dataset.production.records import (
     Triple,
 )
 from generator.dataset.production.workplace import Workplace
-from generator.dataset.store import Pieces
 from generator.lights.lighting import Lighting
 from generator.pictures.picture import Picture
 from generator.pictures.sources import Source
+from generator.stores.store import Pieces
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -109,7 +110,7 @@ def make_shard(
         if on_image:
             on_image()
 
-    with open_writer(job, place.files) as writer, _cancelling(pending, ahead):
+    with _writer_of(job, place) as writer, _cancelling(pending, ahead):
         for row, source in enumerate(job.sources):
             while len(ahead) <= workers and row + len(ahead) < len(job.sources):
                 ahead.append(pool.submit(_read, job, lut, row + len(ahead)))
@@ -141,6 +142,11 @@ def make_shard(
     )
     place.commit(record)
     return record
+
+
+def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
+    maps = any(lighting.masks is not None for lighting in job.choice.lightings_of(job.position))
+    return open_writer(job.options.layout, place.files, job.shard, previews=job.options.previews, maps=maps)
 
 
 @contextmanager
@@ -268,7 +274,7 @@ def _photograph(
     """Return the raw image, the mean of its lights, and the files that say where each of several lights falls."""
     from generator.kernels.mixing import mix_samples
     from generator.kernels.rendering import draw_samples
-    from generator.masks.files import encode_maps
+    from generator.masks.maps import encode_maps
 
     # The hash of the table stands for its samples in the dataset's description.
     for mixture in lighting.mixtures:
@@ -281,7 +287,7 @@ def _photograph(
     weights = lighting.weights_of(*picture.shape[:2])
     white_level = lut.provenance.white_level
     image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
-    return image, chromaticity(lighting.overall(lut, weights)), encode_maps(lut, lighting, weights)
+    return image, chromaticity(lighting.overall(lut, weights)), encode_maps(weights, lighting.whites(lut))
 
 
 def _room(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:

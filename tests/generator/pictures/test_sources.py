@@ -14,10 +14,10 @@ import numpy.typing as npt
 import pytest
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.store import filesystem
 from generator.pictures import sources as scene
 from generator.pictures.picture import Preparation
 from generator.pictures.sources import RandomScene, find_pictures, random_scenes
+from generator.stores.places import filesystem
 from tests.generator.pictures.oiio_files import write
 
 

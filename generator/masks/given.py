@@ -1,4 +1,4 @@
-"""Masks and per-pixel ground truths as image files: those a user gives, and those written beside the images.
+"""Masks that a user gives as image files.
 
 A folder of masks holds one set for each image, in the order of the names, starting over when they end:
 
@@ -11,32 +11,26 @@ A folder of masks holds one set for each image, in the order of the names, start
 Full scale is weight 1; 8 or 16 bits, or float from 0 to 1; transparency does not count. A set of any size is made to
 fit the image. Weights are divided by their sum. Where K masks leave a pixel dark, the first light falls.
 
-Beside the images of a dataset lie `masks/NNNNNN_k.png`, the weight of light k = 0 … K − 1 in 16-bit grey, 65535 = 1,
-sum 65535, and `ground_truth/NNNNNN.png`, r, g, b in 16 bits with r + g + b = 65535. These masks can be given again: in
-a folder of such names alone a set belongs to the image of its number, since a picture that was passed over leaves its
-numbers out. An image whose number has no set takes one in turn.
+The masks of a dataset (`masks.maps`) can be given again: in a folder of such names alone a set belongs to the image of
+its number, since a picture that was passed over leaves its numbers out. An image whose number has no set takes one in
+turn.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError
-from generator.files.formats import encode_map
-from generator.kernels.whites import quantised_chromaticities, quantised_weights
-from generator.lights.lighting import FULL, Lighting, MaskMaker
-from generator.masks.making import whole_parts
-
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
+from generator.masks.decoding import decode_values
+from generator.masks.weights import MaskMaker, Weights, quantise_shares
 
 SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".webp", ".pgm", ".ppm")
 """Endings of what is taken for a mask."""
@@ -50,7 +44,7 @@ class GivenMasks:
 
     files: tuple[Path, ...]
 
-    def weights(self, height: int, width: int, lights: int) -> _Array:
+    def weights(self, height: int, width: int, lights: int) -> Weights:
         """Return (height, width, lights) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel.
 
         Raises
@@ -73,7 +67,7 @@ class GivenMasks:
             over = np.maximum(total, 1)
             shares = np.stack([np.maximum(1 - total, 0), *(mask / over for mask in masks)])
         out = np.empty((height, width, lights), np.float32)
-        whole_parts(shares, out)
+        quantise_shares(shares, out)
         return out
 
 
@@ -108,7 +102,7 @@ class GivenMaskPlan:
 
 
 def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
-    """Return the sets of masks in a folder; the rules stand at the head of this file.
+    """Return the sets of masks in a folder; the head of this file has the rules.
 
     Raises
     ------
@@ -142,56 +136,6 @@ def find_masks(folder: Path, lights: int) -> GivenMaskPlan:
     return GivenMaskPlan(folder.name, tuple(sets), digest.hexdigest(), places if len(places) == len(sets) else {})
 
 
-def encode_maps(lut: Lut, lighting: Lighting, weights: _Array) -> list[tuple[str, str, bytes]]:
-    """Return what goes beside an image of several lights: folder, what follows the image's number, PNG file.
-
-    Parameters
-    ----------
-    lut
-        The table.
-    lighting
-        The image's light.
-    weights
-        (H, W, lights) float32 in whole 65535ths, what the image was made with.
-    """
-    shares = quantised_weights(weights, FULL)
-    maps = [("masks", f"_{light}.png", encode_map(share)) for light, share in enumerate(shares)]
-    truth = quantised_chromaticities(weights, lighting.whites(lut), FULL)
-    return [*maps, ("ground_truth", ".png", encode_map(truth))]
-
-
-def decode_weights(files: Sequence[bytes], what: str) -> _Array:
-    """Return the weights (H, W, K) float32, sum 1, of the K mask files of an image of a dataset.
-
-    Raises
-    ------
-    FormatError
-        A file is damaged, or not of one size with the others.
-    """
-    masks = [_from_16_bits(data, 2, what) for data in files]
-    if len({mask.shape for mask in masks}) != 1:
-        raise FormatError(f"the masks of {what} differ in size; make the dataset again")
-    return np.stack(masks, axis=-1)
-
-
-def decode_ground_truth(data: bytes, what: str) -> _Array:
-    """Return the ground truth (H, W, 3) float32, r + g + b = 1, of every pixel of an image of a dataset.
-
-    Raises
-    ------
-    FormatError
-        The file is damaged.
-    """
-    return _from_16_bits(data, 3, what)
-
-
-def _from_16_bits(data: bytes, dimensions: int, what: str) -> _Array:
-    image = _decoded(data, what)
-    if image.dtype != np.uint16 or image.ndim != dimensions:
-        raise FormatError(f"{what} is no map of 16 bits; make the dataset again")
-    return np.asarray(image / np.float32(FULL), dtype=np.float32)
-
-
 def _bytes_of(path: Path) -> bytes:
     try:
         return path.read_bytes()
@@ -199,22 +143,9 @@ def _bytes_of(path: Path) -> bytes:
         raise FormatError(f"cannot read {path}: {error.strerror}") from error
 
 
-def _decoded(file: bytes, what: Path | str) -> npt.NDArray[Any]:
-    """Return a picture (H, W) or (H, W, 3), RGB, of the type that the file has; transparency is left out."""
-    import cv2
-
-    data = np.frombuffer(file, np.uint8)
-    image = cast("npt.NDArray[Any] | None", cv2.imdecode(data, cv2.IMREAD_UNCHANGED)) if data.size else None
-    if image is None or image.ndim not in (2, 3):
-        raise FormatError(f"{what} is no picture that can be read, or damaged; give masks as PNG or TIFF")
-    if image.ndim == 2:
-        return image
-    return image[..., 0] if image.shape[2] < 3 else image[..., 2::-1]
-
-
 def _read(path: Path) -> list[_Array]:
-    """Return the masks of a file: one if it is grey, also if its three channels are alike, else three."""
-    image = _decoded(_bytes_of(path), path)
+    """Return the masks of a file, (H, W) float32, 0 … 1: one if it is grey or its channels are equal, else three."""
+    image = decode_values(_bytes_of(path), path)
     if image.dtype.kind == "u" and image.dtype.itemsize <= 2:
         scaled = np.asarray(image / np.float32(np.iinfo(image.dtype).max), dtype=np.float32)
     elif image.dtype.kind == "f" and np.isfinite(image).all():
@@ -228,11 +159,11 @@ def _read(path: Path) -> list[_Array]:
 
 
 def _fitted(mask: _Array, height: int, width: int) -> _Array:
-    """Return a mask at the size of the image: areas averaged where it shrinks, interpolated where it grows."""
+    """Return a mask (H, W) float32 at the size of the image: averaged over areas to shrink it, else interpolated."""
     import cv2
 
     if mask.shape == (height, width):
         return mask
     smaller = height <= mask.shape[0] and width <= mask.shape[1]
-    way = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(mask, (width, height), interpolation=way), dtype=np.float32)
+    interpolation = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(mask, (width, height), interpolation=interpolation), dtype=np.float32)

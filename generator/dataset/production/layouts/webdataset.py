@@ -19,38 +19,23 @@ from typing import Any, Self, cast
 
 from foundation.errors import FormatError
 from foundation.hashing import HashingWriter
-from generator.dataset.production.layouts import Fault, Sample, hold, member_name
-from generator.dataset.production.plan import ShardJob
+from generator.dataset.production.layouts.samples import ExitReason, Sample, in_memory, member_name, metadata_of
 from generator.dataset.production.records import FileSum, shard_key
-from generator.dataset.store import Store
-
-
-def about(sample: Sample) -> dict[str, Any]:
-    """Return what is told about an image beside its pixels, as JSON holds it."""
-    record = sample.record
-    return {
-        "image": record.number,
-        "source": sample.source,
-        "split": sample.split,
-        "width": sample.width,
-        "height": sample.height,
-        "truth": list(record.truth),
-        "lights": [{"illumination": light.illumination, "truth": list(light.truth)} for light in record.lights],
-    }
+from generator.stores.store import Store
 
 
 class TarWriter:
     """Writes the images of a shard to `data/000003.tar`, or to one file for each part of the dataset."""
 
-    def __init__(self, store: Store, job: ShardJob) -> None:
+    def __init__(self, store: Store, shard: int) -> None:
         self._store = store
-        self._shard = shard_key(job.shard)
+        self._shard = shard_key(shard)
         self._stack = ExitStack()
         self._open: dict[str, tuple[tarfile.TarFile, HashingWriter]] = {}
 
     def store(self, sample: Sample) -> Sample:
-        """Return the sample, encoded: the files of a shard are written one after the other."""
-        return hold(sample)
+        """Return the sample encoded: a tar file takes its members one after the other."""
+        return in_memory(sample)
 
     def append(self, sample: Sample) -> None:
         """Write an image and what belongs to it."""
@@ -60,7 +45,7 @@ class TarWriter:
             tar = tarfile.open(fileobj=cast("Any", hashed), mode="w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
             self._open[name] = (tar, hashed)
         tar = self._open[name][0]
-        text = json.dumps(about(sample), ensure_ascii=False) + "\n"
+        text = json.dumps(metadata_of(sample), ensure_ascii=False) + "\n"
         for kind, ending, pieces in (*sample.files, ("images", ".json", (text.encode(),))):
             data = b"".join(pieces)
             header = tarfile.TarInfo(member_name(kind, sample.key, ending))
@@ -73,13 +58,13 @@ class TarWriter:
         for tar, _ in self._open.values():
             tar.close()
         self._stack.close()
-        self._store.settle(self._open)
+        self._store.sync(self._open)
         return [FileSum(name=name, sha256=self._open[name][1].sha256) for name in sorted(self._open)]
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *error: *Fault) -> None:
+    def __exit__(self, *error: *ExitReason) -> None:
         self._stack.__exit__(*error)
 
 

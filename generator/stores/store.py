@@ -1,9 +1,10 @@
-"""Where a dataset lies: a folder of this machine, or any object store that fsspec reaches.
+"""Files below one place: a folder of this machine, or any object store that fsspec reaches.
 
-Laws that hold inside:
+Rules that hold inside:
 
-- A file is there whole or not at all. Two programs may write one name at once; with equal bytes nobody can tell.
-- Only what was settled is sure to outlast a loss of power. Settling many files at once costs one wait, not many.
+- A file is there whole or not at all. Two programs may write one name at once: the later file replaces the earlier.
+- Only files that were synchronised (`Store.sync`) are sure to survive a loss of power. To synchronise many at once
+  costs one wait, not many.
 - An object store has no rename and needs none: an object appears when its last byte has arrived.
 
 A name is a path below the store's place, with forward slashes.
@@ -23,16 +24,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
 
-from foundation.errors import CropError, FormatError, InputError, StorageError
+from foundation.errors import CropError, FormatError, StorageError
 from foundation.files import is_partial, partial_path, storage_error, sync_folder
+from generator.stores.places import filesystem, is_remote, local_path
 
 Pieces = Iterable[bytes | memoryview]
-"""A file's bytes in order; the memory of one piece may be that of the next."""
+"""A file's bytes in order; a piece is valid until the next is asked for."""
 
-DESCRIPTION: Final = "dataset.json"
-"""The file that is there where a data set is complete, and nowhere else."""
-
-_WAITING: Final = 16
+_SYNC_THREADS: Final = 16
+"""Files synchronised at a time: a file system commits its journal once for all that wait, so that sixteen waits cost
+little more than one."""
 
 if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
@@ -43,7 +44,7 @@ class Store(Protocol):
 
     @property
     def place(self) -> str:
-        """The place as a person would write it."""
+        """The path or URL, as a user writes it."""
         ...
 
     def put(self, name: str, data: bytes | Pieces) -> None:
@@ -54,12 +55,12 @@ class Store(Protocol):
         """Open a file to be written in order; it appears when the block ends well."""
         ...
 
-    def settle(self, names: Iterable[str]) -> None:
-        """Wait until these files would outlast a loss of power."""
+    def sync(self, names: Iterable[str]) -> None:
+        """Wait until these files would survive a loss of power."""
         ...
 
     def get(self, name: str) -> bytes:
-        """Return a file's bytes; a FormatError says why they cannot be had."""
+        """Return a file's bytes; a FormatError says why they cannot be read."""
         ...
 
     def open(self, name: str) -> contextlib.AbstractContextManager[BinaryIO]:
@@ -98,7 +99,7 @@ class LocalStore:
 
     @contextmanager
     def create(self, name: str) -> Generator[BinaryIO]:
-        """Open a file to be written; it appears when the block ends well, and is on the disk once settled."""
+        """Open a file to be written; it appears when the block ends well, and is on the disk once synchronised."""
         path = self.root / name
         # Named by chance, because two programs may be at the same shard; see `foundation.files.is_partial`.
         hidden = partial_path(path.with_name(f"{path.name}.{secrets.token_hex(8)}"))
@@ -123,12 +124,11 @@ class LocalStore:
             raise StorageError(f"{self.root} is gone: the dataset was finished or removed meanwhile")
         folder.mkdir(parents=True, exist_ok=True)
 
-    def settle(self, names: Iterable[str]) -> None:
+    def sync(self, names: Iterable[str]) -> None:
         """Wait until these files and their names are on the disk."""
         paths = [self.root / name for name in names]
-        # A file system writes its journal once for all that wait together: sixteen waits cost little more than one.
-        with ThreadPoolExecutor(_WAITING) as pool:
-            list(pool.map(_settle_file, paths))
+        with ThreadPoolExecutor(_SYNC_THREADS) as pool:
+            list(pool.map(_sync_file, paths))
         for folder in {path.parent for path in paths}:
             sync_folder(folder)
 
@@ -169,7 +169,7 @@ class LocalStore:
                     (Path(path) / file).unlink(missing_ok=True)
 
 
-def _settle_file(path: Path) -> None:
+def _sync_file(path: Path) -> None:
     try:
         handle = os.open(path, os.O_RDONLY)
         try:
@@ -211,8 +211,8 @@ class RemoteStore:
 
     def put(self, name: str, data: bytes | Pieces) -> None:
         """Write an object."""
-        whole = data if isinstance(data, bytes) else gathered(data)
-        with self._said(name):
+        whole = data if isinstance(data, bytes) else joined(data)
+        with self._translated_errors(name):
             self._files.pipe_file(self._path(name), whole)
 
     @contextmanager
@@ -222,40 +222,40 @@ class RemoteStore:
         with tempfile.NamedTemporaryFile(prefix="crop-") as stream:
             yield cast("BinaryIO", stream)
             stream.flush()
-            with self._said(name):
+            with self._translated_errors(name):
                 self._files.put_file(stream.name, self._path(name))
 
-    def settle(self, names: Iterable[str]) -> None:
-        """Return at once: an object that has been taken is the store's to keep."""
+    def sync(self, names: Iterable[str]) -> None:
+        """Return at once: a store that accepted an object keeps it."""
         del names
 
     def get(self, name: str) -> bytes:
         """Return an object's bytes."""
-        with self._said(name, reading=True):
+        with self._translated_errors(name, reading=True):
             return self._files.cat_file(self._path(name))
 
     @contextmanager
     def open(self, name: str) -> Generator[BinaryIO]:
         """Open an object to be read."""
-        with self._said(name, reading=True):
+        with self._translated_errors(name, reading=True):
             stream = self._files.open(self._path(name), "rb")
         with stream:
             yield stream
 
     def has(self, name: str) -> bool:
         """Return whether there is such an object."""
-        with self._said(name, reading=True):
+        with self._translated_errors(name, reading=True):
             return self._files.exists(self._path(name))
 
     def names(self, folder: str = "") -> Iterator[str]:
         """Return the names of all objects below `folder`."""
-        with self._said(folder, reading=True):
+        with self._translated_errors(folder, reading=True):
             found = self._files.find(self._path(folder))
         return (path[len(self._root) :].lstrip("/") for path in found)
 
     def remove(self, folder: str) -> None:
         """Remove all objects below `folder`."""
-        with self._said(folder):
+        with self._translated_errors(folder):
             if self._files.exists(self._path(folder)):
                 self._files.rm(self._path(folder), recursive=True)
 
@@ -263,8 +263,8 @@ class RemoteStore:
         return f"{self._root}/{name}" if name else self._root
 
     @contextmanager
-    def _said(self, name: str, reading: bool = False) -> Generator[None]:
-        """Translate what the library of a store may raise, whichever it is, into one sentence of ours."""
+    def _translated_errors(self, name: str, reading: bool = False) -> Generator[None]:
+        """Raise any error of a store's library as a FormatError or StorageError that names the object and a remedy."""
         try:
             yield
         except (CropError, MemoryError):
@@ -281,54 +281,9 @@ class RemoteStore:
             ) from error
 
 
-def gathered(pieces: Pieces) -> bytes:
-    """Return pieces as one."""
+def joined(pieces: Pieces) -> bytes:
+    """Return pieces of a file as one."""
     return b"".join([bytes(piece) for piece in pieces])
-
-
-def is_remote(place: str) -> bool:
-    """Return whether `place` is a URL of a store and not a path of this machine (file:// is a path)."""
-    scheme, found, _ = place.partition("://")
-    return bool(found) and scheme not in ("file", "local")
-
-
-def local_path(place: str | Path) -> Path:
-    """Return the path of a place of this machine, of which file:// may be the first part; it ends in a name.
-
-    Raises
-    ------
-    InputError
-        The place is empty, or the root of all folders.
-    """
-    text = str(place)
-    for scheme in ("file://", "local://"):
-        text = text.removeprefix(scheme)
-    path = Path(text)
-    if text and path.name in ("", ".."):
-        path = path.resolve()
-    if not path.name:
-        raise InputError(f"{str(place)!r} names no place; name a folder, such as dataset")
-    return path
-
-
-def filesystem(url: str) -> tuple[AbstractFileSystem, str]:
-    """Return the store of a URL, by fsspec, and the path in it.
-
-    Raises
-    ------
-    InputError
-        No such kind of store is known, or its library is not installed; the message has fsspec's reason.
-    """
-    from fsspec.core import url_to_fs
-
-    try:
-        return url_to_fs(url)
-    except (ImportError, ValueError, OSError) as error:
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise InputError(
-            f"cannot reach {url}: {reason}; name a store that fsspec knows, and install its library (s3://: s3fs, "
-            "gs://: gcsfs, az://: adlfs)"
-        ) from error
 
 
 def open_store(place: str | Path) -> Store:

@@ -20,11 +20,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 
 from foundation.errors import FormatError, InputError
 from foundation.hashing import HashingWriter
-from generator.dataset.production.layouts import Fault, Sample, hold
-from generator.dataset.production.plan import ShardJob
+from generator.dataset.production.layouts.samples import ExitReason, Sample, in_memory, metadata_of
 from generator.dataset.production.records import FileSum, shard_key
-from generator.dataset.production.webdataset import about
-from generator.dataset.store import Store
+from generator.stores.store import Store
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -80,8 +78,8 @@ def schema(previews: bool, maps: bool) -> pa.Schema:
     left_out = {"preview": not previews, "masks": not maps, "ground_truth": not maps}
     kept = [column for column in columns if not left_out.get(column[0])]
     features = {name: feature for name, _, feature in kept}
-    told = json.dumps({"info": {"features": features}})
-    return pa.schema([(name, kind) for name, kind, _ in kept]).with_metadata({"huggingface": told})
+    info = json.dumps({"info": {"features": features}})
+    return pa.schema([(name, kind) for name, kind, _ in kept]).with_metadata({"huggingface": info})
 
 
 class _Part:
@@ -124,25 +122,24 @@ class _Part:
 class ParquetWriter:
     """Writes the images of a shard to `data/000003.parquet`, or to one file for each part of the dataset."""
 
-    def __init__(self, store: Store, job: ShardJob) -> None:
+    def __init__(self, store: Store, shard: int, previews: bool, maps: bool) -> None:
         self._store = store
-        self._shard = shard_key(job.shard)
-        maps = any(lighting.masks is not None for lighting in job.choice.lightings_of(job.position))
-        self._schema = schema(job.options.previews, maps)
+        self._shard = shard_key(shard)
+        self._schema = schema(previews, maps)
         self._stack = ExitStack()
         self._parts: dict[str, _Part] = {}
 
     def store(self, sample: Sample) -> Sample:
-        """Return the sample, encoded: the rows of a shard are written one after the other."""
-        return hold(sample)
+        """Return the sample encoded: a Parquet file takes its rows one after the other."""
+        return in_memory(sample)
 
     def append(self, sample: Sample) -> None:
         """Write the row of an image."""
         name = f"{sample.split or 'data'}/{self._shard}.parquet"
         if name not in self._parts:
             self._parts[name] = _Part(self._stack.enter_context(self._store.create(name)), self._schema)
-        told = about(sample)
-        row: dict[str, Any] = {"number": told.pop("image"), **told, "masks": []}
+        metadata = metadata_of(sample)
+        row: dict[str, Any] = {"number": metadata.pop("image"), **metadata, "masks": []}
         size = 0
         for kind, ending, pieces in sample.files:
             data = b"".join(pieces)
@@ -159,13 +156,13 @@ class ParquetWriter:
         for part in self._parts.values():
             part.close()
         self._stack.close()
-        self._store.settle(self._parts)
+        self._store.sync(self._parts)
         return [FileSum(name=name, sha256=self._parts[name].hashed.sha256) for name in sorted(self._parts)]
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *error: *Fault) -> None:
+    def __exit__(self, *error: *ExitReason) -> None:
         """Leave no half file behind."""
         for part in self._parts.values():
             part.give_up()
