@@ -102,7 +102,7 @@ class Summary:
 
 
 def summarise(errors: npt.ArrayLike) -> Summary:
-    """Return the summary of errors (N,), N ≥ 1, degrees.
+    """Return the summary of errors (N,) float, N ≥ 1, degrees.
 
     Raises
     ------

@@ -1,11 +1,10 @@
 """Adobe DNG: the image as the Bayer mosaic of a raw file, which raw programs open with the right white balance.
 
 Each photosite of the RGGB pattern takes its own channel of its pixel; two thirds of the values are left out, as by a
-sensor. Black is 0, white the table's saturation, AsShotNeutral the ground truth: what a raw program shows is neutral
-where the scene is. The colour matrix is the one that LibRaw holds for the table's camera, or, for a camera that it
-does not know, that of linear sRGB: neutral things stay neutral with either, colours are only the camera's with the
-first. The file names CroP as its maker, so that no program applies to it what it knows of the camera's own files, such
-as their black level.
+sensor. Black is 0, white the table's saturation, AsShotNeutral the ground truth, so that a raw program shows neutral
+things as neutral. The colour matrix is the one that LibRaw holds for the table's camera or, for a camera unknown to it,
+that of linear sRGB: neutral things stay neutral with both, other colours are right with the first only. The file names
+CroP as its maker, so that no program applies facts of the camera's own files to it, such as their black level.
 
 Source: DNG 1.7.1, chapters 2 and 4.
 """
@@ -88,7 +87,14 @@ def encode_dng(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
 
 
 def mosaic_of(image: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
-    """Return what an RGGB sensor keeps of `image` (H, W, 3): (H, W) uint16, little-endian."""
+    """Return the RGGB mosaic (H, W) uint16, little-endian, of `image` (H, W, 3) uint16.
+
+    Examples
+    --------
+    >>> mosaic_of(np.full((2, 4, 3), (10, 20, 30), np.uint16))
+    array([[10, 20, 10, 20],
+           [20, 30, 20, 30]], dtype=uint16)
+    """
     counts = np.empty(image.shape[:2], "<u2")
     counts[0::2, 0::2] = image[0::2, 0::2, 0]
     counts[0::2, 1::2] = image[0::2, 1::2, 1]
@@ -98,7 +104,15 @@ def mosaic_of(image: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
 
 
 def half_size(counts: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
-    """Return linear RGB (H // 2, W // 2, 3) uint16 of an RGGB mosaic: red, mean of both greens rounded up, blue."""
+    """Return linear RGB (H // 2, W // 2, 3) uint16 of an RGGB mosaic (H, W) uint16.
+
+    Each 2×2 block becomes a pixel: red, the mean of both greens rounded up, blue.
+
+    Examples
+    --------
+    >>> half_size(np.array([[10, 20], [25, 30]], np.uint16))
+    array([[[10, 23, 30]]], dtype=uint16)
+    """
     height, width = (size // 2 * 2 for size in counts.shape)
     image = np.empty((height // 2, width // 2, 3), np.uint16)
     image[..., 0] = counts[0:height:2, 0:width:2]
@@ -109,7 +123,7 @@ def half_size(counts: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
 
 
 def _neutral(metadata: ImageMetadata) -> tuple[float, float, float]:
-    """Return the light's white over its largest channel."""
+    """Return the light's white over its largest channel, as AsShotNeutral has it."""
     if not 1 <= metadata.white_level <= 65535:
         raise InputError(f"the white level is {metadata.white_level}; DNG expects 1 to 65535")
     largest = max(metadata.white)
