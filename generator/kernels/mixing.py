@@ -430,7 +430,7 @@ def mix_samples(
 
     run_in_threads(fill, len(picture), threads)
     if any(faults):
-        raise InputError("a weight is negative, infinite or no number; expected finite numbers from 0")
+        raise InputError("a weight is negative, infinite or NaN; expected finite numbers from 0")
     if work is not target:
         target[...] = work[:, : target.shape[1]]
     return target

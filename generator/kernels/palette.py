@@ -133,7 +133,7 @@ def replace_unfit_colours(picture: npt.NDArray[np.uint8], provenance: Provenance
 
 @lru_cache(maxsize=4)
 def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.uint8]]:
-    """Return which of a table's colours are unfit, (8**bits,) bool, and their replacements, codes (8**bits, 3) uint8."""
+    """Return which colours of a table are unfit, (8**bits,) bool, and their replacements, (8**bits, 3) uint8."""
     is_unfit, instead = np.zeros(8**bits, np.bool_), np.zeros((8**bits, 3), np.uint8)
     is_unfit[list(unfit)] = True
     instead[list(unfit)] = channels_of(nearest_fit_colours(unfit, bits), bits) << (8 - bits)

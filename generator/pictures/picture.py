@@ -84,7 +84,7 @@ class Preparation:
                 f"a crop of {self.crop[0]}x{self.crop[1]} was asked for, expected sides of 1 to {LARGEST_SIDE} px"
             )
         if self.crop is None and (self.cover or self.crop_at == "random"):
-            raise InputError("covering a crop, or a crop at random, wants the crop's size, such as 512x512")
+            raise InputError("no crop was given to cover or to cut at random; give its size, such as 512x512")
 
     def describe(self) -> dict[str, Any]:
         """Return the options that are set, as a JSON object."""

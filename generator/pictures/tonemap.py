@@ -89,7 +89,7 @@ def fit_flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2
     """
     if not linear.size or a <= 0 or gamma <= 0:
         raise InputError(
-            f"tone mapping wants an image and parameters above 0; got {linear.shape}, a={a}, gamma={gamma}"
+            f"tone mapping got an image {linear.shape}, a={a} and gamma={gamma}, expected pixels and numbers above 0"
         )
     brightness = _brightness(np.asarray(linear))
     return flash_from_brightness(float(np.log(brightness).mean(dtype=np.float64)), float(brightness.max()), a, gamma)
