@@ -10,7 +10,7 @@ import pytest
 from foundation.errors import FormatError
 from generator.lights.ground_truths import load_ground_truths
 
-GT = Path(__file__).parents[2].parent / "shared" / "data" / "gt"
+GT = Path(__file__).parents[3].parent / "shared" / "data" / "gt"
 
 
 @pytest.mark.parametrize(
