@@ -57,8 +57,8 @@ class GrayEdge:
     def __post_init__(self) -> None:
         if self.order not in (0, 1, 2) or self.p < 1 or self.sigma < 0 or (self.order and not self.sigma):
             raise ValueError(
-                f"order {self.order}, p {self.p}, sigma {self.sigma} make no method of the framework; expected order 0, "
-                "1 or 2, p from 1, and sigma from 0, above 0 for a derivative"
+                f"order {self.order}, p {self.p}, sigma {self.sigma} make no method of the framework; expected order 0 "
+                "to 2, p from 1, and sigma from 0, above 0 for a derivative"
             )
 
     def estimate(
