@@ -4,7 +4,7 @@ Against the program that first comes to mind (OpenCV reads and writes, numpy dra
 encoder alone on the finished images with as many threads: once with the writing of its files, which is what a folder
 takes however its images came about, and once in memory, where what is encoded is thrown away. Neither of the two
 hashes, nor waits for the disk, as a dataset does. Where every processor is busy, nothing but waiting can be hidden
-behind an encoder, so its share of the processor time is told too: no arrangement of the same work goes beyond. The
+behind an encoder, so its share of the processor time is reported too: no arrangement of the same work goes beyond. The
 faster the encoder, the less there is to hide behind, so the fastest in our libraries, ISA-L's deflate at level 1 of the
 same bytes unfiltered, is measured beside it.
 

@@ -107,7 +107,7 @@ def photograph(width: int, height: int) -> npt.NDArray[np.uint8]:
 
 
 def by_numpy(samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16]:
-    """Return a raw image in the way that first comes to mind."""
+    """Return a raw image in the most obvious manner."""
     colour = (picture >> 3).astype(np.int64) @ np.array([1024, 32, 1])
     choice = np.random.default_rng(0).integers(0, SAMPLES, colour.shape)
     return np.take(samples.reshape(-1, 3), colour * SAMPLES + choice, axis=0)

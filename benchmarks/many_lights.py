@@ -1,8 +1,8 @@
-"""An image under two lights, with the maps that tell where each falls: `python -m benchmarks.many_lights`.
+"""An image under two lights, with the maps of where each falls: `python -m benchmarks.many_lights`.
 
 Prints one JSON object a line. The usual program makes the same of the same picture: a soft edge, samples of both lights
 mixed with their noise, the light of each pixel, and four PNG files in memory, with numpy and OpenCV. Calls take turns,
-the fastest counts, and the time is the processor's with one thread. What each step takes is told as its share.
+the fastest counts, and the time is the processor's with one thread. The time of each step is reported as its share.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FULL = 65535
 
 
 def usual(lut: Lut, picture: npt.NDArray[np.uint8]) -> None:
-    """Make image and maps in the way that first comes to mind."""
+    """Make image and maps in the most obvious manner."""
     height, width, _ = picture.shape
     y, x = np.mgrid[:height, :width].astype(np.float32)
     along = np.clip((0.8 * (x / width - 0.5) + 0.6 * (y / height - 0.5)) / 0.4 + 0.5, 0, 1)

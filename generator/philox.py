@@ -1,4 +1,4 @@
-"""Random words as a pure function of where they are used: Philox4x32-10.
+"""Random words as a pure function of the place of their use: Philox4x32-10.
 
 Every random choice of the generator is a word of this function, so that a dataset's bytes depend on its seed alone and
 never on tiles, threads, workers or the version of a library. The key is the seed (low word, high word). The counter is
@@ -18,8 +18,11 @@ import numpy.typing as npt
 from foundation.errors import InputError
 
 MULTIPLIERS: Final = (0xD2511F53, 0xCD9E8D57)
+"""Of a round's two products: table 2 of the source."""
 KEY_STEPS: Final = (0x9E3779B9, 0xBB67AE85)
+"""Added to the key words after each round: the golden ratio and √3 − 1 (section 3.3)."""
 ROUNDS: Final = 10
+"""The authors' recommendation: three more than pass every statistical test."""
 
 SAMPLES: Final = 0
 """Purpose of the words that choose one of the table's samples for each pixel."""
@@ -39,6 +42,7 @@ ITEMS: Final = 7
 """Purpose of the words that choose what a training item shows."""
 
 _WORD: Final = 0xFFFFFFFF
+"""Mask of the lower 32 bits, a word."""
 
 Words = npt.NDArray[np.uint32]
 
@@ -50,6 +54,11 @@ def key_of(seed: int) -> tuple[int, int]:
     ------
     InputError
         The seed is outside that range.
+
+    Examples
+    --------
+    >>> key_of(2**32 + 7)
+    (7, 1)
     """
     if not 0 <= seed < 1 << 64:
         raise InputError(f"the seed is {seed}, expected a whole number from 0 to 2^64 - 1")
@@ -73,7 +82,13 @@ def words(
     Returns
     -------
     tuple of four ndarray
-        uint32, of the broadcast shape of `a`, `b` and `number`.
+        uint32, of the broadcast shape of `a`, `b` and `number`, such as (N,).
+
+    Examples
+    --------
+    >>> first, *others = words(seed=0, a=[0, 1], b=0, number=0, purpose=SAMPLES)
+    >>> first.shape, first.dtype, len(others)
+    ((2,), dtype('uint32'), 3)
     """
     keys = list(key_of(seed))
     c0, c1, c2 = np.broadcast_arrays(*(np.asarray(counter, dtype=np.uint64) for counter in (a, b, number)))
@@ -93,6 +108,11 @@ def distinct(seed: int, count: int, total: int, number: int, purpose: int) -> tu
 
     A shuffle of Fisher and Yates stopped after `count` steps. Step i takes the first word w of place (i, 0) and draws
     i + ⌊w (total − i) / 2³²⌋.
+
+    Examples
+    --------
+    >>> sorted(distinct(seed=0, count=5, total=5, number=0, purpose=LIGHTS))
+    [0, 1, 2, 3, 4]
     """
     drawn = [int(word) for word in words(seed, np.arange(count), 0, number, purpose)[0]]
     moved: dict[int, int] = {}

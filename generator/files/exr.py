@@ -22,14 +22,18 @@ from foundation.errors import InputError
 from generator.files.metadata import ImageMetadata
 
 LARGEST_SIDE: Final = (1 << 31) - 1
-"""Windows are of signed 32-bit integers."""
+"""Largest number of a signed 32-bit integer, which counts the columns of a window and the bytes of a chunk."""
 
 _MAGIC_AND_VERSION: Final = struct.pack("<ii", 20000630, 2)
+"""First bytes of every OpenEXR file of version 2 with scan lines in one part."""
 _ZIP: Final = 3
+"""Number of the compression ZIP_COMPRESSION."""
 _LINES: Final = 16
-"""Scan lines that zip compresses together."""
+"""Scan lines that ZIP_COMPRESSION packs together."""
 _FLOAT: Final = 2
+"""Number of the pixel type FLOAT."""
 _LEVEL: Final = 1
+"""Level of ISA-L's compression, of 0 to 3, as for maps."""
 
 
 def encode_exr(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
@@ -102,13 +106,13 @@ def _attribute(name: str, kind: str, value: bytes) -> bytes:
 
 
 def _chunk(image: npt.NDArray[np.uint16], y: int) -> bytes:
-    """Return the scan lines from `y` on, as many as go together: channels B, G, R of a line, then the next line."""
+    """Return the chunk of the scan lines from `y` on: channels B, G, R of a line, then the next line."""
     lines = image[y : y + _LINES, :, ::-1].transpose(0, 2, 1).astype("<f4", order="C")
     raw = lines.reshape(-1).view(np.uint8)
-    # Bytes of even and of odd places apart, then differences: noise and exponents are then each among their like.
+    # Bytes of even and of odd places are parted, then differences taken: so noise and exponents stand apart.
     apart = np.concatenate([raw[0::2], raw[1::2]])
     apart[1:] = apart[1:] - apart[:-1] + np.uint8(128)
     data = isal_zlib.compress(apart.data, _LEVEL)
-    # What does not become smaller is stored as it is, without reordering.
+    # Data that do not become smaller are stored without reordering.
     body = data if len(data) < raw.nbytes else raw.tobytes()
     return struct.pack("<ii", y, len(body)) + body

@@ -1,4 +1,4 @@
-"""What is known of an image beside its pixels, and goes into a file wherever its format has a place for it."""
+"""The metadata of an image, which go into its file wherever the format has a place for them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ImageMetadata:
-    """One image's light and camera.
+    """Light and camera of one image.
 
     Attributes
     ----------
@@ -26,5 +26,5 @@ class ImageMetadata:
 
     def to_json(self) -> str:
         """Return one line of JSON in ASCII, for formats with a place for a text."""
-        known = {"white_level": self.white_level, "white": self.white, "camera": self.camera}
-        return json.dumps({"format": "crop.image", "values": "linear camera RGB, black 0", **known})
+        values = {"white_level": self.white_level, "white": self.white, "camera": self.camera}
+        return json.dumps({"format": "crop.image", "values": "linear camera RGB, black 0", **values})

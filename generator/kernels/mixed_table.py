@@ -95,6 +95,13 @@ def mixed_table(
     ------
     InputError
         A shape, type or number is not as above.
+
+    Examples
+    --------
+    >>> red, blue = np.zeros((2, 8, 25, 3), np.uint16)
+    >>> red[7], blue[7] = (800, 400, 200), (200, 400, 800)
+    >>> mixed_table([red, blue], [0.5, 0.25])[7, 0]
+    array([450, 300, 300], dtype=uint16)
     """
     lights = check_tables(tables)
     checked = check_weights(weights, len(lights))

@@ -71,7 +71,7 @@ from generator.kernels.vector_mixing import (
 SEGMENT_PIXELS: Final = 512
 """Pixels of a row that are mixed together, whole groups: their weights and offsets stay in the second-level cache."""
 _PREFETCH_PIXELS: Final = 4096
-"""Pixels by which prefetching weights leads reading them: eight segments, longer than memory takes to answer."""
+"""Pixels by which prefetching weights leads reading them: eight segments: time for the memory to answer."""
 SEGMENT_BYTES: Final = OFFSETS_BYTES * (SEGMENT_PIXELS // GROUP + 1)
 """Bytes of a segment's offsets, or of one light's weights; a row's last may be longer by up to seven pixels."""
 PAIR_BYTES: Final = 6 * SEGMENT_BYTES
@@ -348,6 +348,17 @@ def mix_samples(
     ------
     InputError
         A shape, type or number is not as above.
+
+    Examples
+    --------
+    Two lights on a white wall, the left half in the first, the right half in both:
+
+    >>> red, blue = np.zeros((2, 8, 25, 3), np.uint16)
+    >>> red[7], blue[7] = (800, 400, 200), (200, 400, 800)
+    >>> weights = np.array([[[1, 0], [0.5, 0.5]]], np.float32)
+    >>> mix_samples([red, blue], np.full((1, 2, 3), 255, np.uint8), weights)
+    array([[[800, 400, 200],
+            [500, 400, 500]]], dtype=uint16)
     """
     lights = check_tables(tables)
     bits = bits_of(lights[0].shape[0])
@@ -419,7 +430,7 @@ def mix_samples(
 
     run_in_threads(fill, len(picture), threads)
     if any(faults):
-        raise InputError("a weight is negative, infinite or no number; expected finite numbers from 0")
+        raise InputError("a weight is negative, infinite or NaN; expected finite numbers from 0")
     if work is not target:
         target[...] = work[:, : target.shape[1]]
     return target

@@ -1,7 +1,7 @@
-"""Colours of a source picture that the table cannot stand for, and what stands in for them.
+"""The colours of a table, and what replaces those of a picture that the table lists as unfit for use.
 
 A table lists the cells whose samples must not be used. A pixel of such a colour takes the nearest fit colour, and the
-number of those pixels is told and recorded with the dataset; nothing is replaced in silence.
+number of those pixels is printed and recorded with the dataset; nothing is replaced in silence.
 """
 
 from __future__ import annotations
@@ -30,6 +30,11 @@ def bits_of(colours: int) -> int:
     ------
     InputError
         No table has that many colours.
+
+    Examples
+    --------
+    >>> bits_of(32768)
+    5
     """
     for bits in range(1, 6):
         if colours == 8**bits:
@@ -38,7 +43,15 @@ def bits_of(colours: int) -> int:
 
 
 def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
-    """Return the codes (..., 3) int64, 0 … 2**bits − 1, of colour indices 0 … 8**bits − 1."""
+    """Return the codes (..., 3) int64, red, green, blue 0 … 2**bits − 1, of colour indices (...) int 0 … 8**bits − 1.
+
+    Examples
+    --------
+    >>> channels_of([0, 1, 32767], bits=5)
+    array([[ 0,  0,  0],
+           [ 0,  0,  1],
+           [31, 31, 31]])
+    """
     colours = np.asarray(colours, dtype=np.int64)
     mask = (1 << bits) - 1
     return np.stack([colours >> 2 * bits & mask, colours >> bits & mask, colours & mask], axis=-1)
@@ -65,6 +78,11 @@ def nearest_fit_colours(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64
     ------
     QualityError
         No colour is fit.
+
+    Examples
+    --------
+    >>> nearest_fit_colours([0, 1], bits=2)
+    array([4, 2])
     """
     unfit = np.asarray(unfit, dtype=np.int64)
     is_fit = np.ones(8**bits, dtype=bool)
@@ -93,6 +111,16 @@ def replace_unfit_colours(picture: npt.NDArray[np.uint8], provenance: Provenance
     -------
     tuple
         (H, W, 3) uint8, the same array if nothing had to be replaced; and the count.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> stained = SimpleNamespace(bits=2, unfit=(SimpleNamespace(colour=0),))
+    >>> picture = np.array([[[0, 10, 20], [255, 255, 255]]], np.uint8)
+    >>> replaced, pixels = replace_unfit_colours(picture, stained)
+    >>> replaced, pixels
+    (array([[[  0,   0,  64],
+            [255, 255, 255]]], dtype=uint8), 1)
     """
     bits = provenance.bits
     unfit = tuple(sorted({cell.colour for cell in provenance.unfit}))
@@ -105,7 +133,7 @@ def replace_unfit_colours(picture: npt.NDArray[np.uint8], provenance: Provenance
 
 @lru_cache(maxsize=4)
 def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.uint8]]:
-    """Return which of a table's colours are unfit, and the codes (8**bits, 3) to stand in for those."""
+    """Return which colours of a table are unfit, (8**bits,) bool, and their replacements, (8**bits, 3) uint8."""
     is_unfit, instead = np.zeros(8**bits, np.bool_), np.zeros((8**bits, 3), np.uint8)
     is_unfit[list(unfit)] = True
     instead[list(unfit)] = channels_of(nearest_fit_colours(unfit, bits), bits) << (8 - bits)
@@ -113,7 +141,13 @@ def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.boo
 
 
 def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool_]:
-    """Return which of the (8**bits,) colours of a table are in a picture (H, W, 3) uint8."""
+    """Return which colours of a table, (8**bits,) bool, are in a picture (H, W, 3) uint8.
+
+    Examples
+    --------
+    >>> np.flatnonzero(colours_in(np.array([[[0, 0, 0], [255, 255, 0]]], np.uint8), bits=5))
+    array([    0, 32736])
+    """
     found = np.zeros(8**bits, np.bool_)
     pixels = np.ascontiguousarray(picture)
     scratch = np.ones(EDGE_BYTES + 2 * OFFSETS_BYTES + 1, np.uint8)
@@ -123,7 +157,7 @@ def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool
 
 @compiled
 def _find(pixels: int, count: int, bits: Any, found: int, scratch: int) -> None:
-    """Set the byte of each colour that is among the pixels to the last one of scratch memory."""
+    """Set the byte at `found` of each colour that is among the pixels to 1, the last byte of scratch memory."""
     places, others = scratch + EDGE_BYTES, scratch + EDGE_BYTES + OFFSETS_BYTES
     one = others + OFFSETS_BYTES
     for group in range((count + GROUP - 1) // GROUP):

@@ -1,7 +1,7 @@
 """Crops for training: float32, one plane a channel, of any window of a picture.
 
-A crop is the window of the image that `kernel.draw_samples` makes of the whole picture, mirrored if asked for, times a
-gain, in units of the sensor's saturation and cut off there:
+A crop is the window of the image that `rendering.draw_samples` makes of the whole picture, mirrored if asked for, times
+a gain, in units of the sensor's saturation and cut off there:
 
     out[c, y, x] = min(float32(sample) · float32(gain / white_level), 1)
 
@@ -32,6 +32,7 @@ from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, choose_group, ro
 from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, planes8_mirrored, prefetch
 
 Window = tuple[int, int, int, int]
+"""x and y of a window's first pixel in the picture, and its width and height, px."""
 
 
 @compiled
@@ -54,8 +55,8 @@ def _crop(
 ) -> None:
     """Fill the items `first` to `end` of a batch.
 
-    The offsets of a row are chosen, and their samples asked for, before the row above is fetched: the samples may lie
-    in memory nobody has touched for long. `last` stands in for the table's last light; `arguments.readable`.
+    The offsets of a row are chosen, and their samples prefetched, before the row above is fetched: the samples may lie
+    in memory that is in no cache. `last` is the table's last light as `arguments.readable` returns it.
     """
     row_bytes = OFFSETS_BYTES * (width // GROUP + 2)
     for item in range(first, end):
@@ -87,7 +88,7 @@ def _crop(
                     plane1(sample + 4, scale, blue + 4 * x)
             else:
                 for start in range(0, width, EIGHT):
-                    # The last eight may be some of the ones before again.
+                    # The last eight may overlap the ones before.
                     x = min(start, width - EIGHT)
                     if flip:
                         planes8_mirrored(samples, offsets - 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
@@ -150,6 +151,14 @@ def draw_planar(
     ------
     InputError
         A shape, type or number is not as above, or the window is not inside the picture.
+
+    Examples
+    --------
+    >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(8, 2, 3)
+    >>> white = np.full((6, 8, 3), 255, np.uint8)
+    >>> planes = draw_planar(samples, white, white_level=50, window=(2, 1, 4, 3), gain=2.0)
+    >>> planes.shape, planes.dtype, float(planes.max())
+    ((3, 3, 4), dtype('float32'), 1.0)
     """
     check_samples(samples)
     check_picture(picture)
@@ -195,8 +204,8 @@ def draw_batch(
 ) -> npt.NDArray[np.float32]:
     """Return N crops, item i being `draw_planar(tables[lights[i]], pictures[i], window=windows[i], ...)`.
 
-    Nothing is copied or prepared, so that `tables` may be gigabytes mapped from disk. All work is done without the
-    interpreter's lock.
+    Tables are not copied, so that they may be gigabytes mapped from disk. All work is done without the interpreter's
+    lock.
 
     Parameters
     ----------
@@ -211,7 +220,7 @@ def draw_batch(
     white_level
         As for `draw_planar`.
     flips, gains, seeds, images
-        (N,) or one for all, as for `draw_planar`.
+        (N,) bool, float, int and int, or one for all, as for `draw_planar`.
     threads
         Threads that share the items; no byte depends on it.
     out
@@ -226,6 +235,14 @@ def draw_batch(
     ------
     InputError
         A shape, type or number is not as above.
+
+    Examples
+    --------
+    >>> tables = np.arange(2 * 8 * 2 * 3, dtype=np.uint16).reshape(2, 8, 2, 3)
+    >>> white = np.full((6, 8, 3), 255, np.uint8)
+    >>> crops = draw_batch(tables, [0, 1], [white, white], [(0, 0, 4, 4), (4, 2, 4, 4)], white_level=100)
+    >>> crops.shape, crops.dtype
+    ((2, 3, 4, 4), dtype('float32'))
     """
     if tables.ndim != 4 or not len(tables):
         raise InputError(f"the tables are {tables.shape}, expected (lights, 8**bits, samples, 3)")
@@ -250,14 +267,14 @@ def draw_batch(
     if not tables[0].flags.c_contiguous:
         tables = np.ascontiguousarray(tables)
     last = readable(tables[-1])
-    # Most batches show a picture more than once: each is looked at once.
+    # Most batches show a picture more than once; each is checked once.
     distinct = {id(picture): picture for picture in pictures}
     for picture in distinct.values():
         check_picture(picture)
     sources = [packed_rows(picture) for picture in distinct.values()]
-    facts = np.array([(one.ctypes.data, one.strides[0], one.shape[1], one.shape[0]) for one in sources], np.int64)
+    layouts = np.array([(one.ctypes.data, one.strides[0], one.shape[1], one.shape[0]) for one in sources], np.int64)
     places = {identity: place for place, identity in enumerate(distinct)}
-    shown = facts[[places[id(picture)] for picture in pictures]]
+    shown = layouts[[places[id(picture)] for picture in pictures]]
     outside = (frames[:, :2] < 0).any(axis=1) | (frames[:, :2] + frames[:, 2:] > shown[:, 2:]).any(axis=1)
     for item in np.flatnonzero(outside | (min(width, height) < 1))[:1]:
         _checked_window(frames[item].tolist(), pictures[int(item)])
@@ -294,7 +311,7 @@ def draw_batch(
 
 
 def _whole_numbers(numbers: npt.ArrayLike, count: int, bits: int, name: str) -> npt.NDArray[np.uint64]:
-    """Return `count` whole numbers 0 … 2**bits − 1, one for all repeated."""
+    """Return `count` whole numbers 0 … 2**bits − 1 as (count,) uint64; a single one is repeated."""
     given = np.asarray(numbers)
     if given.dtype.kind not in "iu":
         given = np.asarray(numbers, dtype=object)

@@ -1,6 +1,6 @@
 """From source codes to linear camera RGB: each pixel becomes one of the table's samples of its colour.
 
-Paper, section 3.4. With n the table's bits (5 in the paper), a pixel R, G, B at (x, y) becomes
+Source: paper, section 3.4. With n the table's bits (5 in the paper), a pixel R, G, B at (x, y) becomes
 
     samples[((R >> (8 - n)) << 2n) | ((G >> (8 - n)) << n) | (B >> (8 - n)), choice(seed, image, x, y)]
 
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 WHOLE_LIGHT_PIXELS: Final = 1 << 20
-"""Pixels from which reading a light's samples in one go is cheaper than touching their pages at random."""
+"""Pixels from which copying all samples of a light (5 MB) is cheaper than reading their pages in random order."""
 
 _SEGMENT_GROUPS: Final = 16
 """Groups of pixels that are put together before they are streamed: 3 KiB, which stay in the first-level cache."""
@@ -192,6 +192,17 @@ def draw_samples(
     ------
     InputError
         A shape, type or number is not as above.
+
+    Examples
+    --------
+    A table of one bit a channel has 8 colours, here with two samples each; the picture is white, the last colour:
+
+    >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(8, 2, 3)
+    >>> draw_samples(samples, np.full((1, 4, 3), 255, np.uint8), seed=0)
+    array([[[45, 46, 47],
+            [45, 46, 47],
+            [42, 43, 44],
+            [45, 46, 47]]], dtype=uint16)
     """
     bits = check_samples(samples)
     check_picture(picture)
@@ -251,12 +262,19 @@ def draw_mosaic(
     Returns
     -------
     ndarray
-        (H, W) uint16, in the units of `samples`.
+        (H, W) uint16, linear camera values in the units of `samples`.
 
     Raises
     ------
     InputError
         A shape, type or number is not as above, or the pattern is none of these.
+
+    Examples
+    --------
+    >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(8, 2, 3)
+    >>> draw_mosaic(samples, np.full((2, 4, 3), 255, np.uint8), pattern="RGGB")
+    array([[45, 46, 42, 46],
+           [43, 47, 46, 44]], dtype=uint16)
     """
     bits = check_samples(samples)
     check_picture(picture)
@@ -291,7 +309,9 @@ def draw_mosaic(
 
 
 def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.NDArray[np.uint16]:
-    """Return the samples (8**bits, S, 3) uint16 of light number `light`, in memory if `pixels` are worth the copy.
+    """Return the samples (8**bits, S, 3) uint16 of light number `light`.
+
+    For a picture of `WHOLE_LIGHT_PIXELS` or more they are copied to memory, else they stay on disk until they are used.
 
     Raises
     ------
@@ -335,6 +355,17 @@ def render(
     ------
     InputError
         The table has no such light, or the picture is not of that shape and type.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(1, 8, 2, 3)
+    >>> lut = SimpleNamespace(samples=samples, provenance=SimpleNamespace(bits=1, white_level=100, unfit=()))
+    >>> render(lut, np.full((1, 2, 3), 255, np.uint8), light=0)
+    array([[[45, 46, 47],
+            [45, 46, 47]]], dtype=uint16)
+
+    Usually the table comes from `generator.open_lut` and the picture from `generator.read_picture`.
     """
     check_picture(picture)
     samples = read_light(lut, light, picture.shape[0] * picture.shape[1])

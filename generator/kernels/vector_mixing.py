@@ -49,7 +49,7 @@ _EIGHT_WORDS: Final = ir.VectorType(I32, BLOCK)
 _PIXEL_PAIRS: Final = ((0, 2), (4, 6), (1, 3), (5, 7))
 """Which two of eight pixels share a vector, so that pixels are packed without crossing its quarters."""
 _ORDER: Final = tuple((_PIXEL_PAIRS[lane % _QUAD][lane // (2 * _QUAD)], lane // _QUAD % 2) for lane in range(LANES))
-"""Pixel and light of each of a block's weights in the order of `arrange_weights`: each pair of pixels in one quarter."""
+"""Pixel and light of each of a block's weights in the order of `arrange_weights`, in the quarters of `_PIXEL_PAIRS`."""
 
 
 @intrinsic

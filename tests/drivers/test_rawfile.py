@@ -320,7 +320,7 @@ def test_what_is_no_raw_file(tmp_path: Path, content: bytes, capfd: pytest.Captu
 LATE_WRITER = """
 import ctypes
 from pathlib import Path
-from drivers import rawfile
+from drivers.raw import rawfile
 
 libc = ctypes.CDLL(None)
 with rawfile._libraw_silenced():

@@ -117,8 +117,12 @@ def test_png_is_sixteen_bit_rgb_and_tells_its_shot() -> None:
     assert struct.unpack(">IIBBBBB", chunks[0][1]) == (30, 20, 16, 2, 0, 0, 0)
     keyword, _, note = chunks[1][1].partition(b"\0")
     assert keyword == b"Description"
-    told = json.loads(note)
-    assert (told["white_level"], told["white"], told["camera"]) == (11536, [2046.0, 1579.5, 4520.0], "Canon EOS 550D")
+    values = json.loads(note)
+    assert (values["white_level"], values["white"], values["camera"]) == (
+        11536,
+        [2046.0, 1579.5, 4520.0],
+        "Canon EOS 550D",
+    )
     assert len(zlib.decompress(chunks[2][1])) == 20 * (1 + 6 * 30)
 
 

@@ -56,7 +56,7 @@ def test_mean_and_variance_are_those_of_one_exposure(
     measured = mixed.var(axis=1, ddof=1).mean(axis=1)
     assert abs((measured / true).mean() - 1) < 5 * 0.0018
     if weights == (0.5, 0.5):
-        # The test can tell: the plain average has half the variance.
+        # The test can distinguish them: the plain average has half the variance.
         plain = (samples * 0.5).sum(axis=0).var(axis=1, ddof=1).mean(axis=1)
         assert abs((plain / true).mean() - 0.5) < 0.02
 
@@ -229,5 +229,5 @@ def test_faults_of_weight_maps_are_named(make_lut: Callable[..., Lut], picture: 
     for wrong in (-0.1, float("nan"), float("inf")):
         faulty = weights.copy()
         faulty[36, 1052, 1] = wrong
-        with pytest.raises(InputError, match="a weight is negative, infinite or no number"):
+        with pytest.raises(InputError, match="a weight is negative, infinite or NaN"):
             mix_samples(tables, picture, faulty)

@@ -1,4 +1,4 @@
-"""Colours unfit for use give way to the nearest fit one, and no other does."""
+"""Every colour that is unfit for use is replaced by the nearest fit one, and no other colour is."""
 
 from __future__ import annotations
 

@@ -48,9 +48,9 @@ def cumulants(samples: npt.NDArray[np.uint16]) -> tuple[_Array, _Array, _Array]:
     """Return mean, variance and fourth cumulant (C, 3) of one draw from samples (C, S, 3)."""
     values = samples.astype(np.float64)
     mean = values.mean(axis=1)
-    aside = values - mean[:, None]
-    variance = (aside**2).mean(axis=1)
-    return mean, variance, (aside**4).mean(axis=1) - 3 * variance**2
+    deviation = values - mean[:, None]
+    variance = (deviation**2).mean(axis=1)
+    return mean, variance, (deviation**4).mean(axis=1) - 3 * variance**2
 
 
 def require_moments(image: npt.NDArray[np.uint16], mean: _Array, variance: _Array, fourth: _Array) -> None:

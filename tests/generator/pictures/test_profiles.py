@@ -144,7 +144,7 @@ def test_a_jpeg_cut_short_is_refused(tmp_path_factory: pytest.TempPathFactory, k
 
 
 def ramp(width: int, height: int) -> Codes:
-    """Return a picture whose codes tell the place: R the column, G the row."""
+    """Return a picture whose codes are the place: R the column, G the row."""
     rows, columns = np.mgrid[:height, :width]
     return np.stack([columns, rows, rows * 0], axis=-1).astype(np.uint8)
 

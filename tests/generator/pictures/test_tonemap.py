@@ -67,7 +67,7 @@ def test_single_precision_moves_no_code_by_more_than_one(gamma: float) -> None:
 
 @pytest.mark.parametrize(("a", "gamma"), [(0, 2.2), (5, 0)])
 def test_impossible_parameters_are_refused(a: float, gamma: float) -> None:
-    with pytest.raises(InputError, match="parameters above 0"):
+    with pytest.raises(InputError, match="expected pixels and numbers above 0"):
         fit_flash(np.ones((1, 1, 3)), a, gamma)
 
 

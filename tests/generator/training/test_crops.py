@@ -194,9 +194,9 @@ def test_a_gallery_on_disk_is_the_pictures(tmp_path: Path) -> None:
 WITHOUT_TORCH = """
 import sys
 sys.modules["torch"] = None
-from generator.training.crops import Crops
+from generator.training import Crops
 try:
-    from generator.training.crops import CropDataset
+    from generator.training.torch_crops import CropDataset
 except ImportError as error:
     print(error)
 """
