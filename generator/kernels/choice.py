@@ -34,7 +34,7 @@ LEAD: Final = 2
 OFFSETS_BYTES: Final = 4 * GROUP
 """Bytes of a group's offsets, uint32 each."""
 _PREFETCH_BYTES: Final = 2048
-"""Bytes by which prefetching the picture leads reading it: some 21 groups: time for the memory to answer."""
+"""Bytes by which prefetching the picture leads reading it, some 21 groups: time for the memory to answer."""
 EDGE_BYTES: Final = 128
 """Bytes of scratch memory for the last pixels of a row: a group's 96, rounded up to whole lines of the cache."""
 SCRATCH_BYTES: Final = EDGE_BYTES + 4 * OFFSETS_BYTES
