@@ -27,7 +27,7 @@ from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from foundation.console import run
 from foundation.errors import DeviceError
-from generator.dataset.reader import generate_dataset
+from generator.dataset.making import DatasetOptions, Workers, generate_dataset
 from generator.lights.choices import RandomLights
 from generator.pictures.sources import random_scenes
 
@@ -66,11 +66,8 @@ def make(lut: Lut, out: Path, images: int, engine: str, workers: int) -> None:
         scenes,
         RandomLights(LIGHTS, 8, 5),
         seed=5,
-        previews=False,
-        split=(0.8, 0.1, 0.1),
-        shard_images=100,
-        engine=engine,
-        workers=workers,
+        options=DatasetOptions(previews=False, split=(0.8, 0.1, 0.1), shard_images=100),
+        workers=Workers(engine, workers),
     )
 
 

@@ -1,6 +1,6 @@
 """TIFF 6.0 as every reader can read it: 16-bit RGB in one uncompressed strip; the fastest of the formats.
 
-The shot is told in ImageDescription. Nothing is compressed: the zstd codec is missing from widespread readers, and
+ImageDescription holds the metadata. Nothing is compressed: the zstd codec is missing from widespread readers, and
 deflate, at the speed of their TIFF writers, costs more time than it saves room.
 """
 
@@ -12,10 +12,10 @@ import numpy.typing as npt
 from drivers.tiff.tags import RGB, TiffTag
 from drivers.tiff.writing import Kind, Tags, head, text
 from foundation.errors import InputError
-from generator.files.shot import Shot
+from generator.files.metadata import ImageMetadata
 
 
-def encode_tiff(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
+def encode_tiff(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
     """Return the file of `image` (H, W, 3) uint16.
 
     Raises
@@ -31,7 +31,7 @@ def encode_tiff(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
         TiffTag.BITS_PER_SAMPLE: (Kind.SHORT, [16] * channels),
         TiffTag.COMPRESSION: (Kind.SHORT, [1]),  # none
         TiffTag.PHOTOMETRIC_INTERPRETATION: (Kind.SHORT, [RGB]),
-        TiffTag.IMAGE_DESCRIPTION: text(shot.note()),
+        TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
         TiffTag.SAMPLES_PER_PIXEL: (Kind.SHORT, [channels]),
         TiffTag.ROWS_PER_STRIP: (Kind.LONG, [height]),
         TiffTag.PLANAR_CONFIGURATION: (Kind.SHORT, [1]),  # pixel by pixel

@@ -16,16 +16,16 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
-from generator.kernels import philox
+from generator import philox
 from generator.lights.distributions import Distribution
 from generator.lights.gamut import Gamut, Match, Outside, OutsideGamutError, black_body, rgb_of
 from generator.lights.ground_truths import load_ground_truths
 from generator.lights.lighting import LightChoice, Lighting, Mixture, parse_mixture, plain
-from generator.lights.options import parse_numbers
+from generator.masks.weights import MaskPlan
+from generator.named_numbers import parse_numbers
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.masks.making import MaskPlan
 
 __all__ = [
     "DrawnLights",

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
-from generator.kernels.philox import Words
 from generator.lights.gamut import rb_of
-from generator.lights.options import parse_numbers
+from generator.named_numbers import parse_numbers
+from generator.philox import Words
 
 _Array = npt.NDArray[np.float64]
 _WORD = float(1 << 32)

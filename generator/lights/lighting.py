@@ -1,7 +1,7 @@
 """What falls on a picture: a mixture of the table's lights, or several mixtures, each in its part of the picture.
 
 Light adds, so a mixture with weights from 0 is a real light, its ground truth the same mixture of the ground truths.
-The laws that hold inside:
+Rules that hold inside:
 
 - The weights of a mixture sum to 1. So it is as bright as its lights are and never brighter than the brightest, the
   stray light that every exposure holds once is in the mixture once, and the noise is that of one exposure (`mixing`).
@@ -20,12 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
+from generator.masks.weights import MaskMaker
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-
-FULL: Final = 65535
-"""A pixel's weight 1 as it is written to a file."""
 
 _BILLION: Final = 10**9
 
@@ -100,16 +98,16 @@ class Mixture:
         InputError
             The table has no such light.
         """
-        from generator.kernels.mixing import mixed_table
+        from generator.kernels.mixed_table import mixed_table
         from generator.kernels.palette import colours_in
-        from generator.kernels.rendering import WHOLE_LIGHT, read_light
+        from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, read_light
 
         self._require(lut)
-        pixels = WHOLE_LIGHT if picture is None else picture.shape[0] * picture.shape[1]
+        pixels = WHOLE_LIGHT_PIXELS if picture is None else picture.shape[0] * picture.shape[1]
         if len(self.lights) == 1:
             return read_light(lut, self.lights[0], pixels)
         colours = None
-        if picture is not None and pixels < WHOLE_LIGHT:
+        if picture is not None and pixels < WHOLE_LIGHT_PIXELS:
             # To find the colours of a large picture takes as long as to mix all.
             colours = colours_in(picture, lut.provenance.bits)
         tables = [lut.samples[light] for light in self.lights]
@@ -151,15 +149,6 @@ def parse_mixture(label: str) -> Mixture:
         raise InputError(f"{label!r} is no mixture of lights; write a light such as 12, or 12:0.25+40:0.75")
     ordered = sorted(parts)
     return Mixture(tuple(ordered), tuple(parts[light] for light in ordered))
-
-
-@runtime_checkable
-class MaskMaker(Protocol):
-    """Where in one picture each of its lights falls."""
-
-    def weights(self, height: int, width: int, lights: int) -> npt.NDArray[np.float32]:
-        """Return (height, width, lights) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from generator.lights.distributions import parse_distribution
 from generator.lights.gamut import Gamut, Outside
 from generator.lights.ground_truths import load_ground_truths
 from generator.lights.lighting import LightChoice
+from generator.masks.request import parse_masks
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -50,7 +51,7 @@ class LightRequest:
     lights_per_image
         Lights that fall on one image: that many, in the order of the lists, share each image.
     masks
-        Where each falls; see `masks.making.parse_masks`.
+        Where each falls; see `masks.request.parse_masks`.
     """
 
     illuminations: str | None = None
@@ -82,8 +83,6 @@ class LightRequest:
         choice = self._lights(lut, seed, together)
         if together == 1:
             return choice
-        from generator.masks.making import parse_masks
-
         return TogetherLights(choice, together, parse_masks(self.masks or MASKS, together, seed))
 
     def _lights(self, lut: Lut, seed: int, together: int) -> LightChoice:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.compiled import compiled
-from generator.kernels import philox
+from generator import philox
 
 Array = npt.NDArray[np.floating[Any]]
 """float32: what is computed from float32 arrays and Python's own numbers stays float32."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,8 +21,8 @@ from foundation.files import storage_error, whole_folder, write_whole
 from generator.pictures.picture import Picture
 from generator.pictures.sources import Source
 
-FORMAT = "crop.gallery"
-VERSION = 1
+FORMAT: Final = "crop.gallery"
+VERSION: Final = 1
 
 
 class _Entry(BaseModel):
@@ -50,15 +50,15 @@ class Gallery:
     Attributes
     ----------
     names
-        What each picture is called, P of them.
+        The pictures' names, P of them.
     codes
-        (N,) uint8, all pictures' codes.
+        (N,) uint8, the sRGB codes of all pictures one after another.
     sizes
         (P, 2) int64, height and width, px.
     offsets
-        (P,) int64, where each picture begins in `codes`.
+        (P,) int64, index in `codes` of each picture's first value.
     folder
-        Where it is kept; None for one in memory.
+        The gallery's folder; None for one in memory.
     """
 
     names: tuple[str, ...]
@@ -72,7 +72,7 @@ class Gallery:
         return len(self.names)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A worker maps the file anew rather than being sent what may be gigabytes.
+        # A worker maps the file again rather than being sent gigabytes.
         if self.folder is not None:
             return open_gallery, (self.folder,)
         return Gallery, (self.names, self.codes, self.sizes, self.offsets)
@@ -92,7 +92,7 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
     pictures
         (H, W, 3) uint8 each, sRGB codes.
     names
-        What they are called; numbers if None.
+        Their names; numbers if None.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
         There is none, one is of another shape or type, or there are not as many names.
     """
     if not pictures:
-        raise InputError("a gallery wants pictures, none were given")
+        raise InputError("a gallery of no pictures was asked for, expected 1 or more")
     if names is not None and len(names) != len(pictures):
         raise InputError(f"{len(pictures)} pictures of a gallery have {len(names)} names, expected one each")
     for picture in pictures:
@@ -124,7 +124,7 @@ def save_gallery(
     Parameters
     ----------
     sources
-        The pictures; see `scene.find_pictures`. One that cannot be read is passed over and listed.
+        The pictures; see `pictures.sources.find_pictures`. One that cannot be read is left out and listed.
     folder
         Where the gallery is to be; must be free. It appears when it is complete.
     on_skip

@@ -11,17 +11,16 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from pydantic import BaseModel, ConfigDict
-
 from foundation.errors import InputError
 from foundation.version import software
+from generator.dataset.production.layouts.by_name import require_libraries
+from generator.dataset.production.options import DatasetOptions
 from generator.dataset.production.records import SPLITS, Layout, Light, Split, Table
 from generator.files.formats import Format, libraries_of
 
@@ -30,39 +29,8 @@ if TYPE_CHECKING:
     from generator.lights.lighting import LightChoice
     from generator.pictures.sources import Source
 
-SHARD_IMAGES: Final = 256
-"""Images of a shard unless said: what a kill costs at most, for each shard that was being made."""
-
 _WORD: Final = 1 << 64
-
-
-class Options(BaseModel):
-    """What a dataset is asked to be, beside its table, sources, lights and seed.
-
-    Attributes
-    ----------
-    form
-        File format of the images; see `encode`.
-    layout
-        How images lie: each in its file, or many in a tar or Parquet file.
-    previews
-        Whether tone-mapped pictures go with them.
-    split
-        Shares of train, validation and test; None leaves the dataset undivided.
-    shard_images
-        Images of one shard.
-    sources
-        How sources were read, as plain values; recorded only.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    form: Format = "png"
-    layout: Layout = "folder"
-    previews: bool = True
-    split: tuple[float, float, float] | None = None
-    shard_images: int = SHARD_IMAGES
-    sources: dict[str, Any] = {}
+"""Values of the eight bytes of a hash that place a source among the parts."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +62,7 @@ class ShardJob:
     sources: tuple[Source, ...]
     choice: LightChoice
     seed: int
-    options: Options
+    options: DatasetOptions
     versions: dict[str, str]
 
 
@@ -112,10 +80,10 @@ class Plan:
     sources: Sequence[Source]
     choice: LightChoice
     seed: int
-    options: Options
+    options: DatasetOptions
 
     def __post_init__(self) -> None:
-        from generator.kernels.philox import key_of
+        from generator.philox import key_of
 
         key_of(self.seed)
         if not self.sources or not self.choice.lights_each:
@@ -124,13 +92,7 @@ class Plan:
             )
         if self.total > 1 << 32:
             raise InputError(f"{self.total} images are more than a dataset holds, 2^32; make several, each with a seed")
-        if self.options.shard_images < 1:
-            raise InputError(f"shards of {self.options.shard_images} images were asked for, expected 1 or more")
-        if self.options.layout == "parquet":
-            from generator.dataset.production.parquet import require_pyarrow
-
-            require_pyarrow()
-        check_shares(self.options.split)
+        require_libraries(self.options.layout)
 
     @property
     def total(self) -> int:
@@ -188,62 +150,13 @@ class Plan:
         recorded = {
             "format": options.form,
             "layout": options.layout,
-            **options.sources,
+            **options.reading,
             "lights": self.choice.describe(),
             "previews": options.previews,
             "split": dict(zip(SPLITS, options.split, strict=True)) if options.split else None,
             "shard_images": options.shard_images,
         }
         return json.loads(json.dumps(recorded))
-
-
-def check_shares(shares: tuple[float, float, float] | None) -> None:
-    """Refuse shares of train, validation and test that are negative or do not sum to 1.
-
-    Raises
-    ------
-    InputError
-        They are so.
-    """
-    if shares is not None and not (min(shares) >= 0 and abs(sum(shares) - 1) < 1e-6):
-        told = ",".join(f"{share:g}" for share in shares)
-        raise InputError(f"the split {told} is to be three shares from 0 that sum to 1, such as 0.8,0.1,0.1")
-
-
-def parse_split(text: str) -> tuple[float, float, float]:
-    """Return the shares of train, validation and test of a text such as `0.8,0.1,0.1` or `80,10,10`.
-
-    Two numbers are train and test.
-
-    Raises
-    ------
-    InputError
-        The text is no such list.
-    """
-    try:
-        parts = [float(part) for part in text.split(",")]
-    except ValueError:
-        parts = []
-    if len(parts) == 2:
-        parts.insert(1, 0.0)
-    if len(parts) != 3 or not min(parts) >= 0 or not 0 < sum(parts) < float("inf"):
-        raise InputError(f"the split {text!r} is to be shares of train, validation and test, such as 0.8,0.1,0.1")
-    total = sum(parts)
-    return parts[0] / total, parts[1] / total, parts[2] / total
-
-
-def parse_share(text: str) -> tuple[int, int]:
-    """Return (i, n) of a text such as `3/16`: share i of n, i from 0.
-
-    Raises
-    ------
-    InputError
-        The text is no such share.
-    """
-    match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip(), re.ASCII)
-    if not match or not int(match[1]) < int(match[2]):
-        raise InputError(f"{text!r} is no share; write I/N with I from 0 to N - 1, such as 0/16")
-    return int(match[1]), int(match[2])
 
 
 def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
@@ -283,7 +196,7 @@ def sources_sha256(sources: Sequence[Source]) -> str:
     """
     digest = hashlib.sha256()
     for source in sources:
-        digest.update(json.dumps(source.told(), sort_keys=True).encode() + b"\n")
+        digest.update(json.dumps(source.to_json(), sort_keys=True).encode() + b"\n")
     return digest.hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""What is written down about a dataset: its description, its lights and sources, and the record of each shard.
+"""Records of a dataset: its description, lights and sources, the record of each shard, and the names of its files.
 
 A shard is a range of planned image numbers that is made by one task. Its record is written when everything else of it
 is on the disk: a shard with a record is done, one without is not.
@@ -7,20 +7,31 @@ is on the disk: a shard with a record is done, one without is not.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-FORMAT = "crop.dataset"
-VERSION = 2
+FORMAT: Final = "crop.dataset"
+VERSION: Final = 2
+"""Version 1 listed the sources in `dataset.json`; they have a table of their own since."""
+
+GROUND_TRUTH: Final = "ground_truth.csv"
+GROUND_TRUTH_COLUMNS: Final = ("image", "source", "illumination", "r", "g", "b")
+SOURCES: Final = "sources.csv"
+SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile")
+TRUTHS: Final = "gt.txt"
+SUMS: Final = "SHA256SUMS"
+CARD: Final = "README.md"
 
 Triple = tuple[float, float, float]
 Layout = Literal["folder", "webdataset", "parquet"]
 Split = Literal["train", "validation", "test"]
-SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
 
 
 class _Record(BaseModel):
+    """A frozen value that is stored as JSON; what a later version adds is ignored."""
+
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 

@@ -31,7 +31,8 @@ from foundation.errors import FormatError, InputError
 from foundation.files import partial_path, publish_folder, require_free, storage_error
 from foundation.held_folders import LOCK_FILE, held_folder
 from generator.dataset.production.records import ShardRecord, shard_key
-from generator.dataset.store import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
+from generator.stores.places import DESCRIPTION, is_remote, local_path
+from generator.stores.store import LocalStore, RemoteStore, Store, open_store
 
 PLAN: Final = "plan.json"
 RECORDS: Final = "shards"
@@ -90,7 +91,7 @@ class Workplace:
         """Bring the record of a shard to the disk whose files are there: from here on it is done."""
         name = self._record_name(record.shard)
         self.notes.put(name, record.model_dump_json().encode())
-        self.notes.settle([name])
+        self.notes.sync([name])
 
     def discard(self) -> None:
         """Forget the shards that are done, since going on would lead to the same end."""
@@ -189,7 +190,7 @@ def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Genera
             if not notes.has(PLAN):
                 _begin(folder, mark)
                 notes.put(PLAN, _text(identity))
-                notes.settle([PLAN])
+                notes.sync([PLAN])
             _require_same(notes, identity, path, f"remove {folder}")
             if not alone:
                 lock.share()
