@@ -255,6 +255,11 @@ def parse_lights(text: str, total: int) -> ListedLights:
     ------
     InputError
         An entry is no number or range, or the table has no such light.
+
+    Examples
+    --------
+    >>> parse_lights("0,5,12-14", total=707).lights
+    (0, 5, 12, 13, 14)
     """
     if text.strip().lower() == "all":
         return ListedLights(tuple(range(total)))

@@ -170,6 +170,11 @@ def parse_distribution(text: str) -> Distribution:
         It names none.
     FormatError
         The file cannot be read or fitted.
+
+    Examples
+    --------
+    >>> parse_distribution("gaussian:r=.3,b=.25,sd=.02")
+    Gaussian(r=0.3, b=0.25, sd_r=0.02, sd_b=0.02, correlation=0.0)
     """
     from generator.lights.ground_truths import load_ground_truths
 

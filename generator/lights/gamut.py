@@ -219,12 +219,24 @@ class Gamut:
 
 
 def rb_of(rgb: _Array) -> _Array:
-    """Return the chromaticities (..., 2) r and b of linear RGB (..., 3)."""
+    """Return the chromaticities (..., 2) float64, r and b, of linear RGB (..., 3) float64 of any length.
+
+    Examples
+    --------
+    >>> rb_of(np.array([1.0, 2.0, 1.0])).tolist()
+    [0.25, 0.25]
+    """
     return rgb[..., [0, 2]] / rgb.sum(axis=-1, keepdims=True)
 
 
 def rgb_of(rb: npt.ArrayLike) -> _Array:
-    """Return (..., 3) float64 of sum 1 for chromaticities (..., 2) r and b."""
+    """Return linear RGB (..., 3) float64 of sum 1 for chromaticities (..., 2), r and b.
+
+    Examples
+    --------
+    >>> rgb_of([0.25, 0.25]).tolist()
+    [0.25, 0.5, 0.25]
+    """
     rb = np.asarray(rb, dtype=np.float64)
     return np.stack([rb[..., 0], 1 - rb[..., 0] - rb[..., 1], rb[..., 1]], axis=-1)
 

@@ -43,6 +43,11 @@ class Mixture:
     ------
     InputError
         The lights do not ascend, or the weights are not above 0 or do not sum to 1 within a millionth.
+
+    Examples
+    --------
+    >>> Mixture((12, 40), (0.25, 0.75)).label
+    '12:0.25+40:0.75'
     """
 
     lights: tuple[int, ...]
@@ -121,12 +126,18 @@ class Mixture:
 
 
 def plain(light: int) -> Mixture:
-    """Return light number `light` alone."""
+    """Return light number `light` alone: a mixture of one."""
     return Mixture((light,), (1.0,))
 
 
 def mixture_of(parts: Mapping[int, float]) -> Mixture:
-    """Return the mixture of lights in the proportion of `parts` ≥ 0 (light to share); shares of 0 are left out."""
+    """Return the mixture of lights in the proportion of `parts` ≥ 0 (light to share); shares of 0 are left out.
+
+    Examples
+    --------
+    >>> mixture_of({40: 3, 12: 1, 7: 0}).label
+    '12:0.25+40:0.75'
+    """
     total = sum(parts.values())
     kept = {light: parts[light] / total for light in sorted(parts) if parts[light] / total * _BILLION >= 0.5}
     total = sum(kept.values())
@@ -140,6 +151,11 @@ def parse_mixture(label: str) -> Mixture:
     ------
     InputError
         The text is no such label.
+
+    Examples
+    --------
+    >>> parse_mixture("12:0.25+40:0.75")
+    Mixture(lights=(12, 40), weights=(0.25, 0.75))
     """
     if re.fullmatch(r"\d{1,9}", label, re.ASCII):
         return plain(int(label))

@@ -59,6 +59,11 @@ class Gallery:
         (P,) int64, index in `codes` of each picture's first value.
     folder
         The gallery's folder; None for one in memory.
+
+    Examples
+    --------
+    >>> Gallery(("grey",), np.full(12, 128, np.uint8), np.array([[2, 2]]), np.array([0])).picture(0).shape
+    (2, 2, 3)
     """
 
     names: tuple[str, ...]
@@ -98,6 +103,12 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
     ------
     InputError
         There is none, one is of another shape or type, or there are not as many names.
+
+    Examples
+    --------
+    >>> gallery = gallery_of([np.zeros((4, 6, 3), np.uint8), np.ones((2, 2, 3), np.uint8)], ["dark", "other"])
+    >>> len(gallery), gallery.codes.shape, gallery.picture(1).shape
+    (2, (84,), (2, 2, 3))
     """
     if not pictures:
         raise InputError("a gallery of no pictures was asked for, expected 1 or more")
@@ -138,6 +149,15 @@ def save_gallery(
         No source can be read.
     StorageError
         The disk is full or gone; nothing is left behind.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from generator import find_pictures
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     gallery = save_gallery(find_pictures("cat.png"), Path(folder) / "gallery")
+    >>> gallery.names, gallery.sizes.tolist()
+    (('cat.png',), [[40, 50]])
     """
     entries: list[_Entry] = []
     skipped: list[str] = []
@@ -172,6 +192,15 @@ def open_gallery(folder: Path | str) -> Gallery:
     ------
     FormatError
         The folder is none, or its files disagree.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from generator import find_pictures
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = save_gallery(find_pictures("cat.png"), Path(folder) / "gallery")
+    ...     open_gallery(Path(folder) / "gallery").picture(0).shape
+    (40, 50, 3)
     """
     folder = Path(folder)
     path = folder / "gallery.json"
