@@ -114,7 +114,7 @@ class Dataset:
 
     @property
     def layout(self) -> str:
-        """How its images lie."""
+        """Its layout: ``folder``, ``webdataset`` or ``parquet``."""
         return str(self.description.options.get("layout", "folder"))
 
     @cached_property
@@ -179,7 +179,7 @@ def open_dataset(place: Path | str) -> Dataset:
     Raises
     ------
     FormatError
-        There is no dataset, it is of a version not known here, or its files disagree.
+        There is no dataset, it is of a version that this software does not read, or its files disagree.
 
     Examples
     --------

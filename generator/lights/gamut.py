@@ -31,14 +31,16 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 TOLERANCE_DEG: Final = 0.01
-"""How far one or two lights may be from what is wanted to be taken instead of three: about a table's own error."""
+"""Angle to a wanted light within which one light, or two, are taken instead of three, degrees: about a table's own
+error."""
 
 Outside = Literal["refuse", "nearest"]
 """What to do about a light that the table cannot make: refuse it, or take the nearest that it can."""
 
 _Array = npt.NDArray[np.float64]
 _THIN: Final = 1e-6
-"""Breadth over length of the lights' chromaticities below which they lie on a line."""
+"""Ratio of the singular values of the lights' chromaticities below which they lie on a line: far above what rounding
+makes of a line, far below the breadth of three lights of a projector."""
 
 
 class OutsideGamutError(InputError):
@@ -47,7 +49,7 @@ class OutsideGamutError(InputError):
     Attributes
     ----------
     angle
-        How far it is from the nearest that can be made, degrees.
+        Angle to the nearest light that can be made, degrees.
     nearest
         The mixture that makes the nearest.
     """
@@ -75,7 +77,7 @@ class Gamut:
     white
         (L, 3) float64 > 0, the ground truths of the lights in linear camera RGB.
     table
-        What to call the table in messages.
+        Name of the table in messages.
     """
 
     white: _Array
@@ -120,7 +122,7 @@ class Gamut:
         return (shares.min(axis=1) >= 0).any(axis=0)
 
     def match(self, wanted: npt.ArrayLike, outside: Outside = "refuse") -> Match:
-        """Return the mixture of the fewest near lights for a wanted light; the rule stands at the head of this file.
+        """Return the mixture of the fewest near lights for a wanted light, by the rule at the head of this file.
 
         Parameters
         ----------

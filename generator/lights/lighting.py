@@ -1,10 +1,10 @@
-"""What falls on a picture: a mixture of the table's lights, or several mixtures, each in its part of the picture.
+"""The light on a picture: a mixture of the table's lights, or several mixtures, each in its part of the picture.
 
 Light adds, so a mixture with weights from 0 is a real light, its ground truth the same mixture of the ground truths.
 Rules that hold inside:
 
 - The weights of a mixture sum to 1. So it is as bright as its lights are and never brighter than the brightest, the
-  stray light that every exposure holds once is in the mixture once, and the noise is that of one exposure (`mixing`).
+  stray light of an exposure is in the mixture once, and the noise is that of one exposure (`kernels.mixed_table`).
 - Weights are whole billionths, so that a label gives back the mixture to the last bit.
 - What masks give for a pixel sums to 1 in whole 65535ths, so that a 16-bit file holds it without loss.
 """
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 _BILLION: Final = 10**9
+"""Parts of a weight: as many decimals as a label has."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,7 @@ def parse_mixture(label: str) -> Mixture:
 
 @dataclass(frozen=True)
 class Lighting:
-    """One image's light.
+    """The light of one image.
 
     Attributes
     ----------
@@ -200,9 +201,9 @@ class Lighting:
         return np.array([mixture.white(lut) for mixture in self.mixtures])
 
     def overall(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Return the light that falls on the picture on the average, (3,) float64, linear camera RGB, not normalised.
+        """Return the mean light of the picture, (3,) float64, linear camera RGB, not normalised.
 
-        The one ground truth of an image of several lights, for methods that know of one only.
+        The one ground truth of an image of several lights, for methods that estimate one.
 
         Parameters
         ----------
@@ -216,7 +217,7 @@ class Lighting:
         return np.asarray(mean_weights(weights) @ self.whites(lut))
 
     def ground_truth_map(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Return the ground truth of each pixel.
+        """Return the ground truth (H, W, 3) float32 of each pixel.
 
         Parameters
         ----------

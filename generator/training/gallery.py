@@ -1,8 +1,8 @@
 """Many pictures unpacked once, so that training can cut crops from them without decoding.
 
 A gallery is a folder of two files: `codes.u8`, the sRGB codes of all pictures one after another, row by row, R, G, B;
-and `gallery.json`, which says where each begins. It is memory-mapped, so workers share one copy and what is not looked
-at costs no memory.
+and `gallery.json`, with the size of each. It is memory-mapped, so workers share one copy, and pictures
+that are not read take no memory.
 """
 
 from __future__ import annotations
