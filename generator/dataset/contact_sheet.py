@@ -52,6 +52,7 @@ def _even(count: int, most: int) -> list[int]:
 
 
 def _load(dataset: Dataset, entry: Entry) -> npt.NDArray[np.uint8]:
+    """Return the preview (H, W, 3) uint8 of an image, sRGB codes."""
     import cv2
 
     preview = dataset.read_preview(entry)

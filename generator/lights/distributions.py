@@ -102,7 +102,7 @@ class Fitted:
 
     @classmethod
     def of(cls, truths: _Array, file: str = "") -> Fitted:
-        """Return the distribution of ground truths (N, 3), linear RGB of the table's camera, of any length.
+        """Return the distribution of ground truths (N, 3) float64, linear RGB of the table's camera, of any length.
 
         Raises
         ------
@@ -143,7 +143,7 @@ class Fitted:
 
 
 def _normal(words: tuple[Words, Words, Words, Words]) -> _Array:
-    """Return (N, 2) standard normal numbers from the first two words (G. E. P. Box and M. E. Muller, 1958)."""
+    """Return standard normal (N, 2) float64 from two words (N,) uint32 (G. E. P. Box and M. E. Muller, 1958)."""
     radius = np.sqrt(-2 * np.log((words[0] + 1.0) / _WORD))
     angle = 2 * np.pi * words[1] / _WORD
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)

@@ -116,7 +116,7 @@ class Gamut:
         return np.unique(np.concatenate([corners[:, [0, 1]], corners[:, [0, 2]], corners[:, [1, 2]]]), axis=0)
 
     def contains(self, wanted: _Array) -> npt.NDArray[np.bool_]:
-        """Return whether three lights make each of (N, 3) or (N, 2) wanted lights: linear RGB, or r and b."""
+        """Return (N,) bool, whether three lights make each light: (N, 3) float64, linear RGB, or (N, 2), r and b."""
         rgb = wanted if wanted.shape[1] == 3 else rgb_of(wanted)
         shares = (self._inverses.reshape(-1, 3) @ rgb.T).reshape(-1, 3, len(rgb))
         return (shares.min(axis=1) >= 0).any(axis=0)
@@ -127,7 +127,7 @@ class Gamut:
         Parameters
         ----------
         wanted
-            (3,) ≥ 0, linear RGB of the table's camera, of any length.
+            (3,) float64 ≥ 0, linear RGB of the table's camera, of any length.
         outside
             What to do if no mixture makes it.
 
@@ -202,7 +202,14 @@ class Gamut:
         return Match(mixture_of({light: 1.0}), float(angles_deg(self.white[light], target)))
 
     def _pairs(self, target: _Array) -> tuple[npt.NDArray[np.int64], _Array, _Array]:
-        """Return the pairs between whose lights the target's foot falls, their shares, and the angles in degrees."""
+        """Return the pairs of neighbours between whose lights the target falls.
+
+        Returns
+        -------
+        tuple
+            Their lights (P, 2) int64, the shares (P, 2) float64 that make the nearest to the target, and its angle to
+            the target (P,) float64, degrees.
+        """
         at_u, at_v = (self.directions @ target)[self.edges.T]
         cosine = self._cosines
         area = np.maximum(1 - cosine**2, 1e-30)
@@ -213,7 +220,7 @@ class Gamut:
         return self.edges[between], shares[between], np.degrees(np.arccos(np.sqrt(np.minimum(common, 1))))
 
     def _found(self, lights: npt.NDArray[np.int64], shares: _Array, target: _Array) -> Match:
-        """Return the match of `shares` of the directions of `lights`."""
+        """Return the match of `shares` (K,) float64 of the directions of `lights` (K,) int64."""
         weights = np.maximum(shares, 0) / np.linalg.norm(self.white[lights], axis=1)
         mixture = mixture_of({int(light): float(weight) for light, weight in zip(lights, weights, strict=True)})
         made = np.asarray(mixture.weights) @ self.white[list(mixture.lights)]
@@ -244,6 +251,7 @@ def rgb_of(rb: npt.ArrayLike) -> _Array:
 
 
 def _unit(rgb: _Array) -> _Array:
+    """Return (..., 3) float64 at length 1."""
     return rgb / np.linalg.norm(rgb, axis=-1, keepdims=True)
 
 

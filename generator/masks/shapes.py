@@ -50,7 +50,7 @@ class Shape(Protocol):
     """A kind of masks: from the dice of an image to where its lights fall."""
 
     def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function that fills a picture's rows.
+        """Return the function from rows v (h, 1) to the lights' shares (K, h, W) float32 of their pixels.
 
         Parameters
         ----------
@@ -63,7 +63,7 @@ class Shape(Protocol):
         pixel
             Size of a pixel, a share of the longer side.
         u
-            (1, W), the columns' distances from the picture's centre, shares of the longer side.
+            (1, W) float32, the columns' distances from the picture's centre, shares of the longer side.
         """
         ...
 
@@ -95,7 +95,7 @@ class HalfPlanes:
     width: float | None = 0.0
 
     def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function that fills a picture's rows; see `Shape.shares`."""
+        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
         drawn: list[float] = dice.uniform(0).tolist()
         angle = math.radians(360 * drawn[0] if self.angle is None else self.angle)
         width = max(0.1 + 0.5 * drawn[1] if self.width is None else self.width, pixel)
@@ -136,7 +136,7 @@ class Spots:
     softness: float = 0.8
 
     def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function that fills a picture's rows; see `Shape.shares`."""
+        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
         discs: list[list[tuple[float, float, float, float]]] = []
         for light in range(1, lights):
             drawn = dice.uniform(light)
@@ -179,7 +179,7 @@ class SmoothFields:
     contrast: float = 2.0
 
     def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function that fills a picture's rows; see `Shape.shares`."""
+        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
         del half, pixel
         knots = math.ceil(2 / self.scale) + 4
         fields: list[Array] = []
@@ -199,7 +199,7 @@ class SmoothFields:
         return {"masks": "smooth", "scale": self.scale, "contrast": self.contrast}
 
     def _splined(self, knots: Array, at: Array) -> Array:
-        """Return (n, m) for `knots` (K, m), their first index running over places `at` (n,) from −0.5 to 0.5."""
+        """Return (n, m) float32 for `knots` (K, m), whose first index runs over places `at` (n,) from −0.5 to 0.5."""
         place = (at + 0.5) * (2 / self.scale)
         first = np.floor(place)
         index = first.astype(np.intp)
@@ -233,7 +233,7 @@ class Windows:
     softness: float | None = None
 
     def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function that fills a picture's rows; see `Shape.shares`."""
+        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
         windows = [self._window(dice.uniform(light), half, pixel) for light in range(1, lights)]
 
         def fill(v: Array) -> Array:
@@ -255,7 +255,10 @@ class Windows:
     def _window(
         self, drawn: npt.NDArray[np.float64], half: tuple[float, float], pixel: float
     ) -> tuple[list[list[float]], int, int, float]:
-        """Return the homography (3, 3) from the picture to the window's unit square, its panes, and its softness."""
+        """Return the homography (3, 3) from the picture to the window's unit square, its panes, and its softness.
+
+        `drawn` (64,) float64 are random numbers between 0 and 1.
+        """
         size = 0.45 + 0.35 * drawn[0]
         shape = 0.7 + 0.7 * drawn[1]
         width, height = size * math.sqrt(shape), size / math.sqrt(shape)

@@ -253,7 +253,7 @@ class Crops:
 
 
 def _below(words: npt.NDArray[np.uint32], bound: int | npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return numbers from 0 up to bounds, from random words."""
+    """Return whole numbers (N,) int64, 0 … bound − 1, from random words (N,) uint32."""
     return (words.astype(np.uint64) * np.asarray(bound, dtype=np.uint64) >> _HALF).astype(np.int64)
 
 

@@ -124,6 +124,7 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
 
 
 def _offsets(sizes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return the index (P,) int64 of the first value of each picture of `sizes` (P, 2) int64."""
     return np.concatenate([[0], np.cumsum(3 * sizes.prod(axis=1))[:-1]]).astype(np.int64)
 
 
