@@ -87,7 +87,7 @@ class Mixture:
         return np.asarray(self.weights) @ lut.white[list(self.lights)]
 
     def samples(self, lut: Lut, seed: int = 0, picture: npt.NDArray[np.uint8] | None = None) -> npt.NDArray[np.uint16]:
-        """Return the samples (8**bits, S, 3) uint16 of this light, as `kernel.draw_samples` takes them.
+        """Return the samples (8**bits, S, 3) uint16 of this light, as `kernels.rendering.draw_samples` takes them.
 
         Parameters
         ----------

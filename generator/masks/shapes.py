@@ -1,7 +1,7 @@
 """Kinds of masks: half planes and soft edges, spots, random smooth fields, windows.
 
 A shape draws its places from an image's dice, and gives a function from places in the picture to the lights' shares.
-Pixels see +, −, ×, ÷ and √ alone; see `making`.
+Pixels are computed with +, −, ×, ÷ and √ alone; see `making`.
 """
 
 from __future__ import annotations
