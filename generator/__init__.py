@@ -67,7 +67,14 @@ _HOMES = {
 
 
 def open_lut(folder: Path | str) -> Lut:
-    """Open a table; see `calibration.table.lut.open_lut`."""
+    """Return the table in a folder; see `calibration.table.lut.open_lut`.
+
+    Examples
+    --------
+    >>> lut = open_lut("lut")
+    >>> lut.samples.shape, lut.samples.dtype, lut.ground_truth.shape
+    ((4, 64, 25, 3), dtype('uint16'), (4, 3))
+    """
     from calibration.table.lut import open_lut
 
     return open_lut(Path(folder))

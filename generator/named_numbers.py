@@ -27,6 +27,11 @@ def parse_numbers(text: str, allowed: Mapping[str, Range], what: str) -> dict[st
     ------
     InputError
         An entry is no ``name=number``, its name is unknown or occurs twice, or its number is out of range.
+
+    Examples
+    --------
+    >>> parse_numbers("r=.3, b=.25", {"r": (0, 1), "b": (0, 1)}, "a light")
+    {'r': 0.3, 'b': 0.25}
     """
     found: dict[str, float] = {}
     for entry in text.split(",") if text.strip() else ():

@@ -130,7 +130,7 @@ def _may_be_mean(mean: Triple, lights: tuple[Triple, ...]) -> bool:
 
 
 def _shown(text: str) -> str:
-    """Return what stands in a line, cut where it is long."""
+    """Return the text of a line for a message, cut where it is long."""
     return repr(text if len(text) <= 80 else f"{text[:80]}…") if text else "nothing"
 
 

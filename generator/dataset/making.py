@@ -80,6 +80,17 @@ def generate_dataset(
         None of the sources can be read.
     StorageError
         The disk is full, read-only or gone; the shards that are done are kept for the next call.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from generator import DatasetOptions, find_pictures, generate_dataset, open_lut
+    >>> lut, options = open_lut("lut"), DatasetOptions(form="tiff", previews=False)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     place = f"{folder}/dataset"
+    ...     made = generate_dataset(lut, place, find_pictures("cat.png"), [0, 3], options=options, workers=2)
+    ...     [(entry.image, entry.source, entry.illumination) for entry in made.entries]
+    [('000000.tiff', 'cat.png', '0'), ('000001.tiff', 'cat.png', '3')]
     """
     choice: LightChoice = lights if isinstance(lights, LightChoice) else ListedLights(tuple(lights))
     plan = Plan(lut, sources, choice, seed, options or DatasetOptions())

@@ -114,7 +114,7 @@ class Dataset:
 
     @property
     def layout(self) -> str:
-        """How its images lie."""
+        """Its layout: ``folder``, ``webdataset`` or ``parquet``."""
         return str(self.description.options.get("layout", "folder"))
 
     @cached_property
@@ -179,7 +179,18 @@ def open_dataset(place: Path | str) -> Dataset:
     Raises
     ------
     FormatError
-        There is no dataset, it is of a version not known here, or its files disagree.
+        There is no dataset, it is of a version that this software does not read, or its files disagree.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from generator import find_pictures, generate_dataset, open_dataset, open_lut
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     made = generate_dataset(open_lut("lut"), f"{folder}/dataset", find_pictures("cat.png"), [2])
+    ...     dataset = open_dataset(f"{folder}/dataset")
+    ...     image = dataset.read_image(dataset.entries[0])
+    >>> image.shape, image.dtype, dataset.entries[0].truth
+    ((40, 50, 3), dtype('uint16'), (0.407407407, 0.296296296, 0.296296296))
     """
     store = open_store(place)
     if not store.has(DESCRIPTION):

@@ -1,10 +1,10 @@
-"""What falls on a picture: a mixture of the table's lights, or several mixtures, each in its part of the picture.
+"""The light on a picture: a mixture of the table's lights, or several mixtures, each in its part of the picture.
 
 Light adds, so a mixture with weights from 0 is a real light, its ground truth the same mixture of the ground truths.
 Rules that hold inside:
 
 - The weights of a mixture sum to 1. So it is as bright as its lights are and never brighter than the brightest, the
-  stray light that every exposure holds once is in the mixture once, and the noise is that of one exposure (`mixing`).
+  stray light of an exposure is in the mixture once, and the noise is that of one exposure (`kernels.mixed_table`).
 - Weights are whole billionths, so that a label gives back the mixture to the last bit.
 - What masks give for a pixel sums to 1 in whole 65535ths, so that a 16-bit file holds it without loss.
 """
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 _BILLION: Final = 10**9
+"""Parts of a weight: as many decimals as a label has."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,11 @@ class Mixture:
     ------
     InputError
         The lights do not ascend, or the weights are not above 0 or do not sum to 1 within a millionth.
+
+    Examples
+    --------
+    >>> Mixture((12, 40), (0.25, 0.75)).label
+    '12:0.25+40:0.75'
     """
 
     lights: tuple[int, ...]
@@ -81,7 +87,7 @@ class Mixture:
         return np.asarray(self.weights) @ lut.white[list(self.lights)]
 
     def samples(self, lut: Lut, seed: int = 0, picture: npt.NDArray[np.uint8] | None = None) -> npt.NDArray[np.uint16]:
-        """Return the samples (8**bits, S, 3) uint16 of this light, as `kernel.draw_samples` takes them.
+        """Return the samples (8**bits, S, 3) uint16 of this light, as `kernels.rendering.draw_samples` takes them.
 
         Parameters
         ----------
@@ -121,12 +127,18 @@ class Mixture:
 
 
 def plain(light: int) -> Mixture:
-    """Return light number `light` alone."""
+    """Return light number `light` alone: a mixture of one."""
     return Mixture((light,), (1.0,))
 
 
 def mixture_of(parts: Mapping[int, float]) -> Mixture:
-    """Return the mixture of lights in the proportion of `parts` ≥ 0 (light to share); shares of 0 are left out."""
+    """Return the mixture of lights in the proportion of `parts` ≥ 0 (light to share); shares of 0 are left out.
+
+    Examples
+    --------
+    >>> mixture_of({40: 3, 12: 1, 7: 0}).label
+    '12:0.25+40:0.75'
+    """
     total = sum(parts.values())
     kept = {light: parts[light] / total for light in sorted(parts) if parts[light] / total * _BILLION >= 0.5}
     total = sum(kept.values())
@@ -140,6 +152,11 @@ def parse_mixture(label: str) -> Mixture:
     ------
     InputError
         The text is no such label.
+
+    Examples
+    --------
+    >>> parse_mixture("12:0.25+40:0.75")
+    Mixture(lights=(12, 40), weights=(0.25, 0.75))
     """
     if re.fullmatch(r"\d{1,9}", label, re.ASCII):
         return plain(int(label))
@@ -153,7 +170,7 @@ def parse_mixture(label: str) -> Mixture:
 
 @dataclass(frozen=True)
 class Lighting:
-    """One image's light.
+    """The light of one image.
 
     Attributes
     ----------
@@ -184,9 +201,9 @@ class Lighting:
         return np.array([mixture.white(lut) for mixture in self.mixtures])
 
     def overall(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Return the light that falls on the picture on the average, (3,) float64, linear camera RGB, not normalised.
+        """Return the mean light of the picture, (3,) float64, linear camera RGB, not normalised.
 
-        The one ground truth of an image of several lights, for methods that know of one only.
+        The one ground truth of an image of several lights, for methods that estimate one.
 
         Parameters
         ----------
@@ -200,7 +217,7 @@ class Lighting:
         return np.asarray(mean_weights(weights) @ self.whites(lut))
 
     def ground_truth_map(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Return the ground truth of each pixel.
+        """Return the ground truth (H, W, 3) float32 of each pixel.
 
         Parameters
         ----------

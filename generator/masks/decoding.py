@@ -12,7 +12,7 @@ from foundation.errors import FormatError
 
 
 def decode_values(file: bytes, what: Path | str) -> npt.NDArray[Any]:
-    """Return the values (H, W) or (H, W, 3), RGB, of the file's own type; transparency is left out.
+    """Return the values (H, W) or (H, W, 3), RGB, of the file's type (uint8, uint16, float32 …), without transparency.
 
     Raises
     ------

@@ -78,7 +78,7 @@ class GivenMaskPlan:
     Attributes
     ----------
     folder
-        Its name.
+        Name of the folder.
     sets
         In the order of their names.
     sha256

@@ -1,4 +1,4 @@
-"""Where each of several lights falls in a picture: masks made anew for each image, at any size.
+"""Masks that are computed: new ones for each image, at any size.
 
 A plan makes the masks of image after image; a maker makes those of one image at any size. Rules that hold inside:
 

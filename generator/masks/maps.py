@@ -60,6 +60,7 @@ def decode_ground_truth(data: bytes, what: str) -> npt.NDArray[np.float32]:
 
 
 def _from_16_bits(data: bytes, dimensions: int, what: str) -> npt.NDArray[np.float32]:
+    """Return the values (H, W) or (H, W, 3) float32, 0 … 1, of a file of 16 bits."""
     image = decode_values(data, what)
     if image.dtype != np.uint16 or image.ndim != dimensions:
         raise FormatError(f"{what} is no map of 16 bits; make the dataset again")

@@ -44,6 +44,12 @@ def parse_masks(text: str, lights: int, seed: int) -> MaskPlan:
         It names none, or a number is out of range.
     FormatError
         The folder's files are no masks for that many lights.
+
+    Examples
+    --------
+    >>> weights = parse_masks("half-plane:angle=0", lights=2, seed=1).maker(0).weights(2, 6, 2)
+    >>> weights.shape, weights.dtype, weights.sum(axis=2).min()
+    ((2, 6, 2), dtype('float32'), np.float32(1.0))
     """
     kind, _, rest = text.strip().partition(":")
     if kind not in _OPTIONS:

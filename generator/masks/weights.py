@@ -87,6 +87,13 @@ def quantise_shares(shares: npt.NDArray[np.floating[Any]], out: Weights) -> None
         (K, H, W) float32 ≥ 0, not all 0 in a pixel.
     out
         (H, W, K) float32, 0 to 1, contiguous.
+
+    Examples
+    --------
+    >>> weights = np.empty((1, 1, 3), np.float32)
+    >>> quantise_shares(np.ones((3, 1, 1), np.float32), weights)
+    >>> (weights * FULL).tolist()
+    [[[21845.0, 21845.0, 21845.0]]]
     """
     if len(shares) == 2:
         _quantise_shares_of_two(shares[0], shares[1], out.reshape(len(out), -1))

@@ -15,7 +15,13 @@ DESCRIPTION: Final = "dataset.json"
 
 
 def is_remote(place: str) -> bool:
-    """Return whether `place` is a URL of a store and not a path of this machine (file:// is a path)."""
+    """Return whether `place` is a URL of a store and not a path of this machine (file:// is a path).
+
+    Examples
+    --------
+    >>> is_remote("s3://bucket/dataset"), is_remote("file:///data/dataset"), is_remote("dataset")
+    (True, False, False)
+    """
     scheme, found, _ = place.partition("://")
     return bool(found) and scheme not in ("file", "local")
 
@@ -27,6 +33,11 @@ def local_path(place: str | Path) -> Path:
     ------
     InputError
         The place is empty, or the root of all folders.
+
+    Examples
+    --------
+    >>> local_path("file:///data/dataset").as_posix()
+    '/data/dataset'
     """
     text = str(place)
     for scheme in ("file://", "local://"):

@@ -59,6 +59,15 @@ class Batch:
         (N,) int64, place of each item's light in `Crops.lights`.
     pictures
         (N,) int64, place of each item's picture in the gallery.
+
+    Examples
+    --------
+    >>> from generator import open_lut, read_picture
+    >>> from generator.training import gallery_of
+    >>> crops = Crops(open_lut("lut"), gallery_of([read_picture("cat.png")]), (8, 8), lights=[3])
+    >>> batch = crops.batch([0])
+    >>> batch.lights, batch.pictures, batch.illuminants.sum(axis=1)
+    (array([0]), array([0]), array([1.], dtype=float32))
     """
 
     images: npt.NDArray[np.float32]
@@ -99,6 +108,15 @@ class Crops:
     ------
     InputError
         A number is out of range, a light is not in the table, or a picture is smaller than a crop.
+
+    Examples
+    --------
+    >>> from generator import open_lut, read_picture
+    >>> from generator.training import gallery_of
+    >>> crops = Crops(open_lut("lut"), gallery_of([read_picture("cat.png")]), (16, 24), length=100, seed=1)
+    >>> batch = crops.batch([0, 99])
+    >>> batch.images.shape, batch.images.dtype, batch.illuminants.shape
+    ((2, 3, 16, 24), dtype('float32'), (2, 3))
     """
 
     def __init__(
@@ -235,7 +253,7 @@ class Crops:
 
 
 def _below(words: npt.NDArray[np.uint32], bound: int | npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return numbers from 0 up to bounds, from random words."""
+    """Return whole numbers (N,) int64, 0 … bound − 1, from random words (N,) uint32."""
     return (words.astype(np.uint64) * np.asarray(bound, dtype=np.uint64) >> _HALF).astype(np.int64)
 
 

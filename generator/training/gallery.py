@@ -1,8 +1,8 @@
 """Many pictures unpacked once, so that training can cut crops from them without decoding.
 
 A gallery is a folder of two files: `codes.u8`, the sRGB codes of all pictures one after another, row by row, R, G, B;
-and `gallery.json`, which says where each begins. It is memory-mapped, so workers share one copy and what is not looked
-at costs no memory.
+and `gallery.json`, with the size of each. It is memory-mapped, so workers share one copy, and pictures
+that are not read take no memory.
 """
 
 from __future__ import annotations
@@ -59,6 +59,11 @@ class Gallery:
         (P,) int64, index in `codes` of each picture's first value.
     folder
         The gallery's folder; None for one in memory.
+
+    Examples
+    --------
+    >>> Gallery(("grey",), np.full(12, 128, np.uint8), np.array([[2, 2]]), np.array([0])).picture(0).shape
+    (2, 2, 3)
     """
 
     names: tuple[str, ...]
@@ -98,6 +103,12 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
     ------
     InputError
         There is none, one is of another shape or type, or there are not as many names.
+
+    Examples
+    --------
+    >>> gallery = gallery_of([np.zeros((4, 6, 3), np.uint8), np.ones((2, 2, 3), np.uint8)], ["dark", "other"])
+    >>> len(gallery), gallery.codes.shape, gallery.picture(1).shape
+    (2, (84,), (2, 2, 3))
     """
     if not pictures:
         raise InputError("a gallery of no pictures was asked for, expected 1 or more")
@@ -113,6 +124,7 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
 
 
 def _offsets(sizes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return the index (P,) int64 of the first value of each picture of `sizes` (P, 2) int64."""
     return np.concatenate([[0], np.cumsum(3 * sizes.prod(axis=1))[:-1]]).astype(np.int64)
 
 
@@ -138,6 +150,15 @@ def save_gallery(
         No source can be read.
     StorageError
         The disk is full or gone; nothing is left behind.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from generator import find_pictures
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     gallery = save_gallery(find_pictures("cat.png"), Path(folder) / "gallery")
+    >>> gallery.names, gallery.sizes.tolist()
+    (('cat.png',), [[40, 50]])
     """
     entries: list[_Entry] = []
     skipped: list[str] = []
@@ -172,6 +193,15 @@ def open_gallery(folder: Path | str) -> Gallery:
     ------
     FormatError
         The folder is none, or its files disagree.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from generator import find_pictures
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = save_gallery(find_pictures("cat.png"), Path(folder) / "gallery")
+    ...     open_gallery(Path(folder) / "gallery").picture(0).shape
+    (40, 50, 3)
     """
     folder = Path(folder)
     path = folder / "gallery.json"

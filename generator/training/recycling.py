@@ -27,7 +27,7 @@ class Recycled:
         self._free: deque[mmap.mmap] = deque(maxlen=KEPT)
 
     def array(self, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
-        """Return an array of any content.
+        """Return an array float32 of any content.
 
         Parameters
         ----------

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -68,6 +69,16 @@ def make_lut(tmp_path: Path) -> MakeLut:
         return open_lut(folder)
 
     return make
+
+
+@pytest.fixture
+def table_and_picture(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Go to a folder that holds a table of four lights, `lut`, and a picture of 50 x 40 px, `cat.png`."""
+    make_lut()
+    codes = np.random.default_rng(3).integers(0, 256, (40, 50, 3)).astype(np.uint8)
+    (tmp_path / "cat.png").write_bytes(cv2.imencode(".png", codes)[1].tobytes())
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 @pytest.fixture

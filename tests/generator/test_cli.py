@@ -173,7 +173,10 @@ def test_a_share_is_gone_on_with_by_the_whole(generate: Generate, capsys: pytest
         (("lut", "out", "--sources", "pictures", "--nearest", "none.csv"), "cannot read ground truths none.csv"),
         (("lut", "out", "--sources", "pictures", "--seed", "-1"), "the seed is -1"),
         (("lut", "out", "--random-scenes", "1", "--size", "big"), "--size is 'big'"),
-        (("lut", "out", "--sources", "pictures", "--random", "1", "--illuminations", "0"), "choose lights in one way"),
+        (
+            ("lut", "out", "--sources", "pictures", "--random", "1", "--illuminations", "0"),
+            "give one of them",
+        ),
         (("lut", "out", "--sources", "pictures", "--workers", "0"), "0 workers"),
         (("lut", "out", "--sources", "pictures", "--engine", "ray"), "'ray' is no engine"),
         (("lut", "out", "--sources", "pictures", "--shard", "4/4"), "'4/4' is no share; write I/N with I from 0"),

@@ -37,6 +37,14 @@ class DatasetOptions:
     ------
     InputError
         An option is none of these.
+
+    Examples
+    --------
+    >>> DatasetOptions(layout="parquet", split=(0.8, 0.1, 0.1)).shard_images
+    256
+    >>> DatasetOptions(split=(0.8, 0.1, 0.2))
+    Traceback (most recent call last):
+    foundation.errors.InputError: the split 0.8,0.1,0.2 is to be three shares from 0 that sum to 1, such as 0.8,0.1,0.1
     """
 
     form: Format = "png"
@@ -67,6 +75,11 @@ def parse_split(text: str) -> tuple[float, float, float]:
     ------
     InputError
         The text is no such list.
+
+    Examples
+    --------
+    >>> parse_split("80,10,10"), parse_split("3,1")
+    ((0.8, 0.1, 0.1), (0.75, 0.0, 0.25))
     """
     try:
         parts = [float(part) for part in text.split(",")]

@@ -35,7 +35,7 @@ _WORD: Final = 1 << 64
 
 @dataclass(frozen=True)
 class ShardJob:
-    """All that a worker needs to make one shard, wherever it is.
+    """Everything that a worker on any machine needs to make one shard.
 
     Attributes
     ----------
@@ -48,9 +48,9 @@ class ShardJob:
     sources
         The sources that its images show.
     choice, seed, options
-        As of the plan.
+        Those of the plan.
     versions
-        What the bytes depend on beside all this; a worker must have the same.
+        Versions of the libraries that the bytes depend on; a worker must have the same.
     """
 
     table: Path
@@ -162,8 +162,8 @@ class Plan:
 def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
     """Return the part of the dataset that a source belongs to.
 
-    Decided by the seed and the source's content, or its name where it has no file, so that no other source has a say
-    and two copies of one file, whatever they are called, are in the same part. The shares hold on average.
+    Decided by the seed and the source's content, or its name where it has no file, and by no other source, so that two
+    copies of one file, whatever their names, are in the same part. The shares hold on average.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str |
     sha256
         Of the source's file.
     name
-        What it is called.
+        Its name.
     """
     if shares is None:
         return None
@@ -189,7 +189,7 @@ def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str |
 
 
 def sources_sha256(sources: Sequence[Source]) -> str:
-    """Return a hash over the list of sources: what each is called, and how it is made or read.
+    """Return a hash over the list of sources: the name of each, and how it is made or read.
 
     Where a file lies and what is in it are left out: a list is the same on every machine, and its files are hashed when
     they are read.
@@ -202,7 +202,10 @@ def sources_sha256(sources: Sequence[Source]) -> str:
 
 @lru_cache
 def versions(form: Format, layout: Layout) -> dict[str, str]:
-    """Return the versions of what decodes sources, finds lights and encodes images: others may give other bytes."""
+    """Return the versions of the libraries that decode sources, find lights and encode images, by their names.
+
+    Other versions may give other bytes.
+    """
     names = {"isal", "numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "scipy", "simplejpeg"}
     if layout == "parquet":
         names.add("pyarrow")
@@ -210,20 +213,20 @@ def versions(form: Format, layout: Layout) -> dict[str, str]:
 
 
 def table_of(lut: Lut) -> Table:
-    """Return what a dataset records of its table."""
-    known = lut.provenance
+    """Return the record of the table."""
+    provenance = lut.provenance
     return Table(
         sha256=lut.sha256,
-        camera=known.camera,
-        bits=known.bits,
+        camera=provenance.camera,
+        bits=provenance.bits,
         samples=lut.samples.shape[2],
-        white_level=known.white_level,
-        software=known.software,
+        white_level=provenance.white_level,
+        software=provenance.software,
     )
 
 
 def light_of(lut: Lut, light: int) -> Light:
-    """Return what a dataset records of light number `light` of its table."""
+    """Return the record of light number `light` of the table."""
     shown = lut.illuminations[light]
     red, green, blue = (float(part) for part in lut.white[light])
     return Light(

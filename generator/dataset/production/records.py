@@ -57,7 +57,7 @@ class Light(_Record):
 
     @property
     def label(self) -> str:
-        """Return what a person calls it: its temperature if a black body, else its codes."""
+        """Return its name for a reader: its temperature if a black body, else its codes."""
         return f"{self.cct_k:.0f} K" if self.cct_k is not None else "{} {} {}".format(*self.codes)
 
 
@@ -69,9 +69,9 @@ class SourceRecord(_Record):
     position
         Place in the list of sources, from 0; the choice of its lights depends on it.
     name, sha256
-        What it was called, and the hash of its file; no hash where it was made and not read.
+        Its name, and the hash of its file; no hash where it was made and not read.
     profile
-        What was done about its colour profile, in words; None where it was made and not read.
+        How its colour profile was used, in words; None where it was made and not read.
     width, height
         Size of its images, px.
     replaced_pixels
@@ -140,7 +140,7 @@ class Description(_Record):
     Attributes
     ----------
     seed, options
-        What the dataset was asked to be; with the table and the sources, enough to make every byte again.
+        What the dataset is; with the table and the sources, enough to make every byte again.
     planned, images
         Images planned and made; the numbers of the rest are free.
     sources, pixels, replaced_pixels
@@ -177,7 +177,7 @@ class Entry:
     Attributes
     ----------
     image
-        Its file name, or in shards what it would be called as a file.
+        Its file name; in shards the name it would have as a file.
     source
         Its source's name.
     lights
@@ -204,10 +204,10 @@ class Entry:
 
 
 def image_key(number: int) -> str:
-    """Return the number of an image as it stands in names: six digits, more where they are needed."""
+    """Return the number of an image as file names have it: six digits, more where they are needed."""
     return f"{number:06d}"
 
 
 def shard_key(shard: int) -> str:
-    """Return the number of a shard as it stands in names."""
+    """Return the number of a shard as file names have it."""
     return f"{shard:06d}"

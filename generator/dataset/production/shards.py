@@ -287,7 +287,7 @@ def _photograph(
 
 
 def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
-    """Return an array of any content in memory of the calling thread, which its next call overwrites.
+    """Return an array uint16 of any content in memory of the calling thread, which its next call overwrites.
 
     Fresh pages take as long to map as the drawing into them.
     """

@@ -26,6 +26,13 @@ class Workers:
     ------
     InputError
         There is no such engine, or no worker.
+
+    Examples
+    --------
+    >>> Workers(count=4)
+    Workers(engine='local', count=4)
+    >>> Workers("dask://10.0.0.7:8786").address
+    'tcp://10.0.0.7:8786'
     """
 
     engine: str = "local"
@@ -60,6 +67,14 @@ class Callbacks:
         Takes the name of a source that cannot be read, the reason, and the number of images that are left out.
     on_wait
         Takes a sentence for the user where the work waits for somebody to do something.
+
+    Examples
+    --------
+    >>> left_out = []
+    >>> callbacks = Callbacks(on_skip=lambda name, reason, images: left_out.append(name))
+    >>> callbacks.on_skip("bad.png", "bad.png is no picture", 2)
+    >>> left_out
+    ['bad.png']
     """
 
     on_done: Callable[[int], None] = _ignore
@@ -102,6 +117,11 @@ def parse_share(text: str) -> tuple[int, int]:
     ------
     InputError
         The text is no such share.
+
+    Examples
+    --------
+    >>> parse_share("3/16")
+    (3, 16)
     """
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip(), re.ASCII)
     if not match or not int(match[1]) < int(match[2]):

@@ -83,8 +83,8 @@ def test_masks_mean_two_lights_and_two_lights_mean_masks(make_lut: Callable[...,
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"illuminations": "0", "light": ("1",)}, "--illuminations and --light were both given; choose lights in one"),
-        ({"random": 2, "nearest": Path("gt")}, "--nearest and --random were both given; choose"),
+        ({"illuminations": "0", "light": ("1",)}, "--illuminations and --light were both given; give one of them"),
+        ({"random": 2, "nearest": Path("gt")}, "--nearest and --random were both given; give one"),
         ({"distribution": "uniform", "match": Path("gt")}, "--match and --distribution were both given"),
         ({"illuminations": "0-2", "lights_per_image": 2}, "3 lights for each picture cannot be shared out 2"),
         ({"lights_per_image": 0}, "0 lights an image were asked for"),

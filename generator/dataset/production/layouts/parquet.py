@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 _GROUP_BYTES: Final = 4 << 20
 """Bytes from which a group of rows is written: what a reader has to read to get at one image."""
 _GROUP_ROWS: Final = 64
+"""Rows of a group at most: small images stay quick to reach too."""
 
 _COLUMNS: Final = {"images": "image", "previews": "preview", "ground_truth": "ground_truth"}
 

@@ -46,7 +46,7 @@ class Sample:
 
     @property
     def key(self) -> str:
-        """The number as it stands in names."""
+        """The number as file names have it."""
         return image_key(self.record.number)
 
 

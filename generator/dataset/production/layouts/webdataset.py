@@ -1,4 +1,4 @@
-"""WebDataset shards: plain tar files in which what belongs to one image stands together under one number.
+"""WebDataset shards: plain tar files in which the files of an image follow each other under one number.
 
     000123.png           the image
     000123.json          its ground truth, source and part
