@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from acquisition.lights.illuminations import Illumination
-from calibration.table.lut import LutWriter, Provenance, open_lut
+from calibration.table.lut import open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.pictures.sources import random_scenes

@@ -149,7 +149,7 @@ def test_a_still_chart_does_not_move(chart: Chart, world: World, white: Mosaic, 
     framing = find_chart(white, chart)
     later = strongest_plane(frame_of(world, tmp_path, colour, key=2))
     shift = shift_between(plane_of(white, later.channel), framing, later)
-    assert shift.tags == len(chart.tags)
+    assert shift.gauges == len(chart.tags)
     assert shift.largest_px < 0.02
 
 
@@ -166,7 +166,7 @@ def test_a_movement_is_measured(chart: Chart, white: Mosaic, moved: tuple[float,
 def test_a_leap_is_not_measured_as_a_step(chart: Chart, white: Mosaic) -> None:
     plane = plane_of(white, "G")
     values = np.roll(plane.values, 40, axis=1)
-    assert shift_between(plane, find_chart(white, chart), Plane("G", values, plane.offset_px)).tags == 0
+    assert shift_between(plane, find_chart(white, chart), Plane("G", values, plane.offset_px)).gauges == 0
 
 
 def test_a_dark_frame_is_called_dark(chart: Chart, world: World, tmp_path: Path) -> None:
