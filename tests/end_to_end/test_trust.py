@@ -1,6 +1,6 @@
-"""A table whose samples are wrong is never accepted: rooms and sessions that go wrong are refused, remarked, or right.
+"""A table whose samples are wrong is never accepted: rooms and sessions that go wrong are refused, remarked on or right.
 
-Each table that is built is held against the room cell by cell, with the noise of its 25 samples taken out, so that a
+Each table that is built is compared with the room cell by cell, with the noise of its 25 samples taken out, so that a
 grid a cell aside, a poster of another order or a hand in the light cannot pass.
 """
 
