@@ -81,7 +81,7 @@ class Stains:
 
     @property
     def doubtful(self) -> _Mask:
-        """(C,) cells in neighbourhoods that are off by a per cent or more: a fold's flanks, a faint stain, a shadow."""
+        """(C,) bool, cells in neighbourhoods that deviate by 1 % or more: a fold's flanks, a faint stain, a shadow."""
         return _beyond(self.deviation, self.error, DOUBTFUL)
 
     @property
@@ -90,7 +90,7 @@ class Stains:
         return bool(np.isfinite(self.deviation).any())
 
     def largest_deviation(self) -> _Array:
-        """Return (C,) the deviation, with its sign, of the channel that deviates most; 0 where it is not known."""
+        """Return (C,) float64 the signed deviation of the channel that deviates most; 0 where it is not known."""
         return _largest(self.deviation)
 
     def deviation_of(self, cell: int) -> float:

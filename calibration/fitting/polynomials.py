@@ -60,7 +60,7 @@ def page_polynomial(points_mm: npt.ArrayLike, page_mm: tuple[float, float], orde
 
 @lru_cache(maxsize=8)
 def _page_basis(points: bytes, page_mm: tuple[float, float], order: int) -> _Array:
-    """Return the basis at points (N, 2) float64, read-only; the same cells and references are asked for every frame."""
+    """Return the basis at points (N, 2) float64, read-only; the same cells and references come with every frame."""
     unit = 2 * np.frombuffer(points).reshape(-1, 2) / np.asarray(page_mm, dtype=np.float64) - 1
     x, y = (np.polynomial.legendre.legvander(unit[:, axis], order) for axis in (0, 1))
     basis = np.stack([x[:, i] * y[:, j] for i, j in page_powers(order)], axis=1)

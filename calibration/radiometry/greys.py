@@ -111,5 +111,5 @@ def references_csv(names: Sequence[str], white: _Array, white_error: _Array, gre
 
 
 def tint_deg(white: _Array, greys: _Array) -> _Array:
-    """Return the angle (..., G) between camera RGB of greys (..., G, 3) and of white (..., 3), degrees."""
+    """Return the angle (..., G) float64, degrees, between camera RGB of greys (..., G, 3) and of white (..., 3)."""
     return angles_deg(np.broadcast_to(white[..., None, :], greys.shape), greys)

@@ -50,7 +50,7 @@ class FoundBlocks:
     score: _Array
 
     def information(self, moves_px: _Array, spacing_mm: _Array, cell_px: float) -> _Array:
-        """Return the inverse covariance (B, 2, 2) px⁻² of the blocks' places.
+        """Return the inverse covariance (B, 2, 2) float64 px⁻² of the blocks' places.
 
         Parameters
         ----------

@@ -70,9 +70,9 @@ def fit_blocks(
     np.add.at(matrix, block, comparison.information)
     np.add.at(right, block, comparison.pull)
     column, row = np.floor((chart.centres_mm - raster.low_mm) / np.array(chart.cell_mm)).astype(int).T
-    held = np.zeros((rows, columns))
-    held[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)] = 1
-    holds = held.ravel()
+    occupied = np.zeros((rows, columns))
+    occupied[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)] = 1
+    holds = occupied.ravel()
     cells = np.bincount(block, holds, count)
     used = cells > 0
     divisor = np.maximum(cells, 1)

@@ -257,8 +257,8 @@ def _rigid(
     centre = field.corners_px.mean(axis=0)
     x, y = ((middles - centre) / np.abs(field.corners_px - centre).max()).T
     # A turn moves (x, y) by (−y, x), a growth by (x, y).
-    aside = np.stack([normals[:, 1] * x - normals[:, 0] * y, normals[:, 0] * x + normals[:, 1] * y], axis=-1)
-    design = np.column_stack([normals, aside])
+    turn_and_growth = np.stack([normals[:, 1] * x - normals[:, 0] * y, normals[:, 0] * x + normals[:, 1] * y], axis=-1)
+    design = np.column_stack([normals, turn_and_growth])
     motion = np.zeros(4)
     trust = np.ones(len(moved))
     for _ in range(4):

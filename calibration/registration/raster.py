@@ -50,7 +50,7 @@ class Raster:
         return cls(low_mm, step_mm, (int(size[1]), int(size[0])))
 
     def point(self, column: float, row: float) -> _Array:
-        """Return the place (2,) mm of a border between elements."""
+        """Return the place (2,) float64 mm of a border between elements."""
         return self.low_mm + np.array([column, row]) * self.step_mm
 
     def tiles(self, size: int) -> tuple[int, int]:
@@ -58,7 +58,7 @@ class Raster:
         return self.shape[0] // size, self.shape[1] // size
 
     def points_of_tiles(self, size: int) -> _Array:
-        """Return the middles (N, 2) mm of tiles of size × size elements, row by row."""
+        """Return the middles (N, 2) float64 mm of tiles of size × size elements, row by row."""
         rows, columns = self.tiles(size)
         y, x = np.mgrid[:rows, :columns]
         return self.low_mm + (np.stack([x.ravel(), y.ravel()], axis=-1) + 0.5) * size * self.step_mm
@@ -160,7 +160,10 @@ def tiles(shape: tuple[int, int], size: int, margin: int) -> Generator[tuple[sli
 
 
 def jacobians(to_pixels: ToPixels, points_mm: _Array, step_mm: _Array) -> _Array:
-    """Return ∂(x, y) px / ∂(column, row) at points (N, 2) mm of a raster with elements of `step_mm` (2,), (N, 2, 2)."""
+    """Return ∂(x, y) px / ∂(column, row) at points (N, 2) mm of a raster with elements of `step_mm` (2,).
+
+    (N, 2, 2) float64.
+    """
     reach = np.diag(step_mm)
     slopes = [(to_pixels(points_mm + reach[axis]) - to_pixels(points_mm - reach[axis])) / 2 for axis in (0, 1)]
     return np.stack(slopes, axis=-1)
@@ -169,7 +172,7 @@ def jacobians(to_pixels: ToPixels, points_mm: _Array, step_mm: _Array) -> _Array
 def to_pixel_units(sums: _Array, jacobians: _Array) -> tuple[_Array, _Array]:
     """Return information (N, 2, 2) px⁻² and pull (N, 2) px⁻¹ of sums (N, 5) xx, xy, yy, xe, ye in raster elements.
 
-    x and y are the image's slopes, e its error; `jacobians` (N, 2, 2) are those of the map.
+    x and y are the image's slopes, e its error; `jacobians` (N, 2, 2) are those of the map; all float64.
     """
     inverse = np.linalg.inv(jacobians)
     matrix = sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
@@ -183,13 +186,13 @@ def box(image: npt.NDArray[np.floating], size: int) -> _Float:
 
 
 def sums_of(image: npt.NDArray[np.floating], size: int) -> _Float:
-    """Return the sums float32 of an image over tiles of size × size elements; what is left over is dropped."""
+    """Return the sums (rows, columns) float32 of an image (H, W) over tiles of size × size; the rest is dropped."""
     rows, columns = (length // size for length in image.shape)
     mean = cv2.resize(image[: rows * size, : columns * size], (columns, rows), interpolation=cv2.INTER_AREA)
     return np.asarray(mean, dtype=np.float32) * np.float32(size * size)
 
 
 def tile_middles(image: npt.NDArray[np.floating], size: int) -> npt.NDArray[np.floating]:
-    """Return the element in the middle of each tile of size × size elements of an image."""
+    """Return the middle element of each tile, (rows, columns) of the image's dtype, of an image (H, W)."""
     rows, columns = (length // size for length in image.shape)
     return image[size // 2 :: size, size // 2 :: size][:rows, :columns]

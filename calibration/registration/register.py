@@ -72,8 +72,7 @@ _APART, _APART_PX = 5.0, 1.0
 _FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
 """Blur in cells of the steps that follow a chart without tags, before its cells are looked at."""
 
-_FEW_SLIPPED = 2
-_SLIPPED_SHARE = 0.015
+_FEW_SLIPPED, _SLIPPED_SHARE = 2, 0.015
 """Number and share of a field's parts from which on it is refused: none looks slipped in any simulated room that is
 registered well."""
 

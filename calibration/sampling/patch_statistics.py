@@ -19,7 +19,7 @@ DEAD_SHARE = 0.5
 sees more."""
 
 DEAD_LEVEL = 300.0
-"""Counts that a cell must have for a dead photosite to be told from noise: 21 σ there."""
+"""Counts that a cell must have for a dead photosite to be distinguished from noise: half of it is 21 σ."""
 
 _NOISE_BINS = 32
 """Levels at which noise is read: a full chart has a thousand patches in each, a chart of 512 colours sixteen."""

@@ -11,6 +11,7 @@ from foundation.errors import FormatError
 
 FORMAT: Final = "crop.lut"
 VERSION: Final = 1
+"""The only version so far: keys that were added since are optional."""
 
 
 class Unfit(BaseModel):

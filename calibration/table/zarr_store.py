@@ -34,6 +34,8 @@ from foundation.hashing import file_sha256
 
 FORMAT: Final = "crop.lut.published"
 VERSION: Final = 1
+"""The only version so far."""
+
 SHARD_LIGHTS: Final = 32
 """Lights of one object of the store: 100 MB compressed of a full table, a size that stores and networks like."""
 

@@ -1,6 +1,6 @@
-"""A table whose samples are wrong is never accepted: rooms and sessions that go wrong, each refused, told, or right.
+"""A table whose samples are wrong is never accepted: rooms and sessions that go wrong are refused, remarked on or right.
 
-Each table that is built is held against the room cell by cell, with the noise of its 25 samples taken out, so that a
+Each table that is built is compared with the room cell by cell, with the noise of its 25 samples taken out, so that a
 grid a cell aside, a poster of another order or a hand in the light cannot pass.
 """
 
@@ -38,8 +38,8 @@ def lab() -> Lab:
     return hang()
 
 
-def held_against(lab: Lab, session: Session, folder: Path) -> tuple[BuildResult, Held]:
-    """Build a session's table and hold it against the room."""
+def compared_with_truth(lab: Lab, session: Session, folder: Path) -> tuple[BuildResult, Held]:
+    """Return the result of building a session's table, and the table compared with the room."""
     result = build(session, folder / "lut")
     table = open_lut(folder / "lut")
     cells = lab.chart.centres_mm[lab.chart.cell_of_colour]
@@ -98,7 +98,7 @@ def shaded(lab: Lab, left: float, when: Callable[[SessionStep], bool]) -> Callab
 def test_cells_have_no_error_but_noise_s(lab: Lab, tmp_path: Path) -> None:
     """3 700 means above 300 counts; beyond 0.3 % of field, response and bleed, chance adds 0.1 % in 10⁴ runs."""
     with take(lab, tmp_path / "session", LIGHTS, every=6) as session:
-        _, held = held_against(lab, session, tmp_path)
+        _, held = compared_with_truth(lab, session, tmp_path)
         table = open_lut(tmp_path / "lut")
     total, alone, systematic, _ = beyond_noise(held.error, held.noise, held.where(300, np.inf))
     assert systematic < 0.004, f"{total:.4f} in all, {alone:.4f} of noise"
@@ -116,7 +116,7 @@ def test_cells_have_no_error_but_noise_s(lab: Lab, tmp_path: Path) -> None:
 def test_two_frames_of_a_light_differ_by_photons_and_read_noise(lab: Lab, tmp_path: Path) -> None:
     """Within 5 %: some 600 variances of 25 values have a mean good to 1.2 %, so chance fails once in 10⁴."""
     with take(lab, tmp_path / "session", renumbered([LIGHTS[5], LIGHTS[5]])) as session:
-        _, held = held_against(lab, session, tmp_path)
+        _, held = compared_with_truth(lab, session, tmp_path)
         result = open_lut(tmp_path / "lut")
         field = held.level[0] * 0 + 1
     ratio = repeated_variance(result.samples[0], result.samples[1], held.level[0], field, lab.world.body, SETTINGS.iso)
@@ -145,7 +145,7 @@ def test_a_random_room_is_refused_or_right(seed: int, tmp_path: Path) -> None:
     hung = hang(room=room, seed=seed)
     with take(hung, tmp_path / "session", FEW, every=2) as session:
         try:
-            result, held = held_against(hung, session, tmp_path)
+            result, held = compared_with_truth(hung, session, tmp_path)
         except QualityError:
             return
     offset = result.figures.registration.to_pixels(hung.chart.centres_mm) - hung.world.project(hung.chart.centres_mm)
@@ -178,7 +178,7 @@ def test_a_chart_moved_by_a_cell_is_followed(lab: Lab, tmp_path: Path) -> None:
         return lab.dng(step.colour, step.number, paint=move)
 
     with session_of(lab, tmp_path, frame) as session:
-        result, held = held_against(lab, session, tmp_path)
+        result, held = compared_with_truth(lab, session, tmp_path)
     assert sum(figures.reregistered for figures in result.figures.frames) == 1
     assert "moved_anew" in {row.threshold.name for row in result.verdict.remarks}
     # The light moves with the picture here, so its field fits the moved frames less well.
@@ -212,7 +212,7 @@ def test_a_lamp_that_flickers_is_reported_and_harms_no_colour(lab: Lab, tmp_path
     bright = {step: ExposureSettings(100, 8.0, 0.5 * (0.94 if step % 2 else 1.0)) for step in range(20)}
     frame = exposed(lab, lambda step: bright[step.number])
     with take(lab, tmp_path / "session", FEW, every=1, frame=frame) as session:
-        result, held = held_against(lab, session, tmp_path)
+        result, held = compared_with_truth(lab, session, tmp_path)
     assert wrong(held) < WRONG
     assert result.verdict.outcome != "refuse"
 
@@ -227,7 +227,7 @@ def test_a_focus_that_is_lost_midway_is_refused(
         build(session, tmp_path / "lut")
 
 
-def test_a_focus_that_softens_is_told(lab: Lab, tmp_path: Path) -> None:
+def test_a_focus_that_softens_is_remarked_on(lab: Lab, tmp_path: Path) -> None:
     soft = hang(room=replace(lab.world.room, blur_px=0.72))
     with session_of(lab, tmp_path, swapped(lab, soft, once)) as session:
         result = build(session, tmp_path / "lut")
@@ -235,12 +235,12 @@ def test_a_focus_that_softens_is_told(lab: Lab, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shutter_s", [0.25, 0.8])
-def test_an_exposure_changed_midway_is_told_or_harms_nothing(lab: Lab, tmp_path: Path, shutter_s: float) -> None:
+def test_an_exposure_changed_midway_is_reported_or_harms_nothing(lab: Lab, tmp_path: Path, shutter_s: float) -> None:
     changed = ExposureSettings(100, 8.0, shutter_s)
     frame = exposed(lab, lambda step: changed if later(step) else SETTINGS)
     with session_of(lab, tmp_path, frame) as session:
         try:
-            _, held = held_against(lab, session, tmp_path)
+            _, held = compared_with_truth(lab, session, tmp_path)
         except CropError:
             return
     assert wrong(held) < WRONG
@@ -253,7 +253,7 @@ def test_frames_that_clip_list_their_cells(lab: Lab, tmp_path: Path) -> None:
     frame = exposed(lab, lambda step: long if step.colour == WHITE else SETTINGS)
     with take(lab, tmp_path / "session", lights, frame=frame) as session:
         try:
-            result, held = held_against(lab, session, tmp_path)
+            result, held = compared_with_truth(lab, session, tmp_path)
         except QualityError as refused:
             assert "saturation" in str(refused)  # noqa: PT017
             return
@@ -267,7 +267,7 @@ def test_a_softer_picture_is_registered_as_well(tmp_path: Path) -> None:
     """0.8 px of the lens's blur: whether samples suffer depends on the cells' size, their places do not."""
     soft = hang(room=Room(waviness_mm=0.5, blur_px=0.8))
     with take(soft, tmp_path / "session", FEW) as session:
-        result, held = held_against(soft, session, tmp_path)
+        result, held = compared_with_truth(soft, session, tmp_path)
     offset = result.figures.registration.to_pixels(soft.chart.centres_mm) - soft.world.project(soft.chart.centres_mm)
     assert np.sqrt((offset**2).sum(axis=1).mean()) < 0.05
     assert wrong(held) < WRONG

@@ -1,4 +1,4 @@
-"""Frames held against the frame that was registered, on colours that are made up.
+"""Frames compared with the frame that was registered, on colours that are made up.
 
 A healthy frame passes half of either limit; noise alone would need five standard errors, one frame in a million.
 """
@@ -17,7 +17,7 @@ _Array = npt.NDArray[np.float64]
 
 
 class Sheet:
-    """4096 colours strewn over a sheet, and what two lights give of them."""
+    """4096 colours at random over a sheet, and what two lights give of them."""
 
     def __init__(self, seed: int = 1) -> None:
         self.random = np.random.default_rng(seed)

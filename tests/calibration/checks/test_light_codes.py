@@ -133,33 +133,33 @@ def test_few_lights_tell_nothing() -> None:
 def test_lights_off_their_codes_make_no_table_and_are_named(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held: list[_Array] = []
+    given: list[_Array] = []
 
-    def told(lights: Sequence[Illumination], white: _Array, errors_deg: _Array) -> _Array:
-        held.extend([white, errors_deg])
+    def angles_off(lights: Sequence[Illumination], white: _Array, errors_deg: _Array) -> _Array:
+        given.extend([white, errors_deg])
         return np.where(np.isin(np.arange(len(lights)), (3, 7)), 5.0 + np.arange(len(lights)), 0.1)
 
-    monkeypatch.setattr("calibration.pipeline.collecting.angles_off_codes_deg", told)
+    monkeypatch.setattr("calibration.pipeline.collecting.angles_off_codes_deg", angles_off)
     with pytest.raises(QualityError, match=r"codes predict: 12°.*, 2 lights: 7, 3; correct the list of frames"):
         build(session, tmp_path / "lut", report=write_report)
     report = json.loads((tmp_path / "lut.refused" / "report.json").read_text())
     assert report["off_codes_deg"][2:4] == [0.1, 8.0]
     assert "12.00° at most, light 7" in (tmp_path / "lut.refused" / "report.html").read_text()
-    assert (held[0] > 0).all()
-    assert (held[1] < 0.5).all()
+    assert (given[0] > 0).all()
+    assert (given[1] < 0.5).all()
 
 
 def test_lights_exposed_otherwise_are_not_held_against_their_codes(
     lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def told(*_: object) -> _Array:
+    def angles_off(*_: object) -> _Array:
         return np.zeros(3)
 
     def longer(step: SessionStep) -> bytes:
         exposed = replace(SETTINGS, shutter_s=0.6) if step.illumination == 1 else SETTINGS
         return lab.dng(step.colour, step.number, exposed)
 
-    monkeypatch.setattr("calibration.pipeline.collecting.angles_off_codes_deg", told)
+    monkeypatch.setattr("calibration.pipeline.collecting.angles_off_codes_deg", angles_off)
     with take(lab, tmp_path / "alike", LIGHTS[:3]) as session:
         result = build(session, tmp_path / "lut")
         assert result.figures.lights.off_codes_deg is not None

@@ -25,7 +25,7 @@ def cells_mm(lab: Lab) -> npt.NDArray[np.float64]:
 
 
 def read(room: Room, folder: Path) -> tuple[Lab, Stains]:
-    """Return a lab and what one white frame tells of its print."""
+    """Return a lab and what one white frame shows of its print."""
     lab = hang(room=room)
     mosaic = lab.mosaic(folder)
     found = register(mosaic, lab.chart)
@@ -64,7 +64,7 @@ def test_a_thumb_s_stain_is_found_cell_by_cell(depth: float, seed: int, tmp_path
 
 
 def drawn(bits: int, seed: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return counts and places of a chart's colours, strewn over a lattice of 5 mm, with the noise of a few frames."""
+    """Return counts and places of a chart's colours, at random over a lattice of 5 mm, with a few frames' noise."""
     random = np.random.default_rng(seed)
     side = 1 << bits
     codes = np.stack(np.meshgrid(*[np.arange(side) / (side - 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -37,9 +37,9 @@ def test_leak_and_hot_photosites_are_read() -> None:
         paper += (shape[:, None] * (4, 7, 5)).astype(np.float32)
         cells[17, 3, 1] += 200
         cells[99 + number, 5, 0] += 900
-        figures, aside = dark_frame(number, cells, paper, shape)
+        figures, excess = dark_frame(number, cells, paper, shape)
         frames.append(DarkFrameFigures.from_json(figures.record, figures.to_json()))
-        hot.add(aside)
+        hot.add(excess)
     dark = dark_summary(frames, hot)
     assert dark.light == pytest.approx([4, 7, 5], abs=4 * 6 / np.sqrt(400 * 25))
     assert (dark.error < 0.1).all()
@@ -56,10 +56,10 @@ def test_a_hot_photosite_is_remembered_over_a_bump() -> None:
     for number in range(4):
         if number == 2:
             hot.restart(noise)
-        aside = none.copy()
-        aside[3 if number < 2 else 4, 12, 0] = 150
-        aside[number, 1, 1] += 800
-        hot.add(aside)
+        excess = none.copy()
+        excess[3 if number < 2 else 4, 12, 0] = 150
+        excess[number, 1, 1] += 800
+        hot.add(excess)
     copy = HotPixels(10, 25)
     copy.restore(hot.to_arrays())
     for one in (hot, copy):

@@ -167,13 +167,13 @@ def test_samples_keep_their_noise(room: Lab, subtracted: BuildResult) -> None:
 
 def test_what_was_subtracted_is_recorded(room: Lab, session: Session, subtracted: BuildResult) -> None:
     assert subtracted.lut is not None
-    told = json.loads((subtracted.lut / "lut.json").read_text())["corrections"]
-    names = [correction["name"] for correction in told]
+    done = json.loads((subtracted.lut / "lut.json").read_text())["corrections"]
+    names = [correction["name"] for correction in done]
     assert names.index("black") < names.index("dark") < names.index("field")
-    dark = np.array(told[names.index("dark")]["per_light"])
+    dark = np.array(done[names.index("dark")]["per_light"])
     black = room.world.white(BLACK, SETTINGS) * np.mean(room.world.field(room.chart.centres_mm))
     assert dark == pytest.approx(np.broadcast_to(black, dark.shape), rel=0.1)
-    at_zero = told[names.index("rounding")]["share_at_zero"]
+    at_zero = done[names.index("rounding")]["share_at_zero"]
     assert len(at_zero) == len(LIGHTS)
     assert max(at_zero) > 0.01
     assert min(at_zero) < 0.001
@@ -183,12 +183,12 @@ def test_a_growing_table_ends_in_the_same_bytes(session: Session, subtracted: Bu
     """Interrupted between two checkpoints, and with another choice in between, which begins anew."""
     assert subtracted.lut is not None
 
-    def told(done: int, total: int, what: str) -> None:
+    def progress(done: int, total: int, what: str) -> None:
         if done == 17:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        build(session, tmp_path / "lut", told, options=SUBTRACTED)
+        build(session, tmp_path / "lut", progress, options=SUBTRACTED)
     done: list[int] = []
     grown = append(session, tmp_path / "lut", lambda number, total, what: done.append(number), options=SUBTRACTED)
     assert not isinstance(grown, TableProgress)
@@ -198,14 +198,14 @@ def test_a_growing_table_ends_in_the_same_bytes(session: Session, subtracted: Bu
 
 
 def test_a_checkpoint_of_another_choice_is_not_gone_on_from(session: Session, tmp_path: Path) -> None:
-    def told(done: int, total: int, what: str) -> None:
+    def progress(done: int, total: int, what: str) -> None:
         if done == 17:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        build(session, tmp_path / "lut", told, options=SUBTRACTED)
+        build(session, tmp_path / "lut", progress, options=SUBTRACTED)
     with pytest.raises(KeyboardInterrupt):
-        build(session, tmp_path / "lut", told)
+        build(session, tmp_path / "lut", progress)
     done: list[int] = []
     build(session, tmp_path / "lut", lambda number, total, what: done.append(number), options=SUBTRACTED)
     assert done[:2] == [0, 1]

@@ -81,11 +81,11 @@ def test_the_table_says_enough_to_undo_the_field() -> None:
     base = read_paper(9000 * falloff(PLACES)).field
     tilted = falloff(PLACES) * (1 + 0.05 * (2 * PLACES[:, :1] / PAGE[0] - 1))
     field = read_paper(9000 * tilted, base).field
-    told = next(c for c in corrections(PAGE, np.zeros((1, 2, 2)), 13584, [field]) if c["name"] == "field")
+    record = next(c for c in corrections(PAGE, np.zeros((1, 2, 2)), 13584, [field]) if c["name"] == "field")
     u, v = (2 * CENTRES / PAGE - 1).T
     for channel in range(3):
         product = np.ones(len(CENTRES))
-        for factor in told["per_light"][0][channel]:
+        for factor in record["per_light"][0][channel]:
             weights, order, rest = np.zeros((7, 7)), 0, list(factor)
             while rest:
                 for j in range(order + 1):
@@ -100,7 +100,7 @@ def test_an_even_field_is_one() -> None:
     assert isinstance(FlatField.uniform(PAGE), FlatField)
 
 
-def test_a_stain_is_ignored_by_the_white_and_told_by_the_spread() -> None:
+def test_a_stain_is_ignored_by_the_white_and_shown_by_the_spread() -> None:
     random = np.random.default_rng(8)
     seen = falloff(PLACES) * 6000 + random.normal(0, 12, (len(PLACES), 3))
     clean = read_paper(seen)
@@ -112,7 +112,7 @@ def test_a_stain_is_ignored_by_the_white_and_told_by_the_spread() -> None:
     assert (found.spread > 0.02).all()
 
 
-def test_references_in_the_margin_tell_no_shape_that_vanishes_there() -> None:
+def test_references_in_the_margin_give_no_shape_that_vanishes_there() -> None:
     """The light bends by 4 % in the middle, which the base knows; noise in the margin must not undo it."""
     side = RANDOM.random((300, 2)) * PAGE
     side[:150, 1] = np.where(RANDOM.random(150) < 0.5, 0.02, 0.98) * PAGE[1]

@@ -1,4 +1,4 @@
-"""Primaries of unlike field: synthetic cells whose light is known, then a session held against its room."""
+"""Primaries of unlike field: synthetic cells whose light is known, then a session compared with its room."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ def test_a_cells_field_is_what_it_reflects() -> None:
     of_paper = np.einsum("p,ip,pc->ic", amounts, fields, paper) / white
     assert np.abs(true / of_paper - 1).max() > 0.01
     assert known.field_ratio(white) == pytest.approx(true / of_paper, abs=3e-3)
-    # Undone by what `lut.json` tells.
-    told = known.correction(white[None])
-    assert told["lights"] == [0, 1, 2]
-    assert told["per_light"][0] == pytest.approx(amounts, rel=1e-3)
+    # Undone by what `lut.json` records.
+    record = known.correction(white[None])
+    assert record["lights"] == [0, 1, 2]
+    assert record["per_light"][0] == pytest.approx(amounts, rel=1e-3)
 
 
 def test_one_primary_has_papers_field() -> None:

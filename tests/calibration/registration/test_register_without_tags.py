@@ -34,7 +34,7 @@ def miss(lab: Lab, mosaic: Mosaic, chart: Chart | None = None) -> npt.NDArray[np
 
 
 @pytest.mark.parametrize("colour", [WHITE, Colour(110, 70, 20), Colour(0, 255, 0), Colour(0, 0, 255)])
-def test_every_light_that_tells_which_way_up_registers(plain: Lab, tmp_path: Path, colour: Colour) -> None:
+def test_every_light_that_shows_which_way_up_registers(plain: Lab, tmp_path: Path, colour: Colour) -> None:
     error = miss(plain, plain.mosaic(tmp_path, colour))
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert error.max() < 0.4
@@ -65,11 +65,11 @@ def test_red_light_registers_where_the_session_knows_the_way_up(plain: Lab, tmp_
     assert np.abs(places - plain.truth_px(plain.chart.centres_mm, mosaic)).max() < 0.5
 
 
-def test_told_corners_find_the_same_places(plain: Lab, tmp_path: Path) -> None:
+def test_stated_corners_find_the_same_places(plain: Lab, tmp_path: Path) -> None:
     mosaic = plain.mosaic(tmp_path)
-    told = plain.truth_px(field_mm(plain.chart), mosaic) + np.array([(6, -5), (-4, 6), (3, 4), (-6, -3)])
+    stated = plain.truth_px(field_mm(plain.chart), mosaic) + np.array([(6, -5), (-4, 6), (3, 4), (-6, -3)])
     by_itself = register(mosaic, plain.chart).to_pixels(plain.chart.centres_mm)
-    by_corners = register(mosaic, plain.chart, corners=told).to_pixels(plain.chart.centres_mm)
+    by_corners = register(mosaic, plain.chart, corners=stated).to_pixels(plain.chart.centres_mm)
     assert np.abs(by_itself - by_corners).max() < 0.1
 
 
@@ -79,10 +79,10 @@ def test_another_order_of_colours_is_refused(plain: Lab, tmp_path: Path) -> None
         register(plain.mosaic(tmp_path), shuffled)
 
 
-def test_cells_that_stand_one_aside_are_refused(plain: Lab, tmp_path: Path) -> None:
-    """The outline fits, and every block of cells looks smooth as it should: only the colours' level tells.
+def test_a_field_displaced_by_one_cell_is_refused(plain: Lab, tmp_path: Path) -> None:
+    """The outline fits, and every block of cells looks smooth as it should: only the colours' level shows it.
 
-    A slip along y is told on large charts alone: with two rows of blocks it looks like an ink that reacts to blue.
+    A slip along y is found on large charts alone: with two rows of blocks it looks like an ink that reacts to blue.
     """
     columns = len(np.unique(plain.chart.centres_mm[:, 0].round(3)))
     grid = plain.chart.colours.reshape(-1, columns)

@@ -23,7 +23,7 @@ def spoil_the_frames(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "fault"),
     [
         (flip("samples.npy", -1), f"the samples of 1 of {len(LIGHTS)} lights have changed: {len(LIGHTS) - 1}"),
         (flip("samples.npy", 128 + 2 * 1200 + 7), f"1 of {len(LIGHTS)} lights have changed: 2"),
@@ -34,13 +34,13 @@ def spoil_the_frames(folder: Path) -> None:
         (spoil_the_frames, "frames.csv is damaged"),
     ],
 )
-def test_damage_is_found_and_told_where(tmp_path: Path, change: Callable[[Path], None], told: str) -> None:
+def test_damage_is_found_and_named(tmp_path: Path, change: Callable[[Path], None], fault: str) -> None:
     lut = write(tmp_path / "lut")
     change(lut.folder)
     seen: list[tuple[int, int]] = []
     faults = find_faults(open_lut(lut.folder), lambda done, total: seen.append((done, total)))
     assert len(faults) == 1
-    assert told in faults[0]
+    assert fault in faults[0]
     assert seen[-1] == (len(LIGHTS), len(LIGHTS))
 
 
@@ -48,7 +48,7 @@ def test_tables_of_one_chart_and_one_list_of_lights_match(tmp_path: Path) -> Non
     require_match(write(tmp_path / "one", 0), write(tmp_path / "other", 1))
 
 
-def test_tables_that_do_not_correspond_are_told_apart(tmp_path: Path) -> None:
+def test_tables_that_do_not_correspond_are_refused(tmp_path: Path) -> None:
     one = write(tmp_path / "one")
     with pytest.raises(FormatError, match=r"chart cdcdcdcdcdcd… against efefefefefef…"):
         require_match(one, write(tmp_path / "chart", chart="ef" * 32))

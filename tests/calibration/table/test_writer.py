@@ -18,10 +18,10 @@ from tests.calibration.table.tables import FRAMES, LIGHTS, flip, write
 
 def test_the_hashes_are_those_of_the_files(tmp_path: Path) -> None:
     lut = write(tmp_path / "lut")
-    told = json.loads((lut.folder / "lut.json").read_text())
-    assert told["samples_sha256"] == hashlib.sha256((lut.folder / "samples.npy").read_bytes()).hexdigest()
-    assert told["illuminations_sha256"] == hashlib.sha256((lut.folder / "illuminations.csv").read_bytes()).hexdigest()
-    assert told["lights_sha256"] == [hashlib.sha256(slab.tobytes()).hexdigest() for slab in lut.samples]
+    record = json.loads((lut.folder / "lut.json").read_text())
+    assert record["samples_sha256"] == hashlib.sha256((lut.folder / "samples.npy").read_bytes()).hexdigest()
+    assert record["illuminations_sha256"] == hashlib.sha256((lut.folder / "illuminations.csv").read_bytes()).hexdigest()
+    assert record["lights_sha256"] == [hashlib.sha256(slab.tobytes()).hexdigest() for slab in lut.samples]
     assert list(lut.frames) == FRAMES
     assert find_faults(lut) == []
 

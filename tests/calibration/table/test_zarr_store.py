@@ -49,9 +49,9 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_there_and_back(lut: Lut, tmp_path: Path, place: str) -> None:
     MemoryFileSystem.store.clear()
     url = place.format(tmp_path)
-    told: list[tuple[int, int]] = []
-    publish(lut, url, lambda done, total: told.append((done, total)))
-    assert told == [(SHARD_LIGHTS, LIGHTS), (LIGHTS, LIGHTS)]
+    steps: list[tuple[int, int]] = []
+    publish(lut, url, lambda done, total: steps.append((done, total)))
+    assert steps == [(SHARD_LIGHTS, LIGHTS), (LIGHTS, LIGHTS)]
     back = fetch(url, tmp_path / "back")
     assert files(tmp_path / "back") == files(lut.folder)
     assert back.sha256 == lut.sha256
@@ -64,10 +64,10 @@ def test_there_and_back(lut: Lut, tmp_path: Path, place: str) -> None:
 
 def test_one_light_a_chunk_and_32_an_object(lut: Lut, tmp_path: Path) -> None:
     publish(lut, str(tmp_path / "published"))
-    told = json.loads((tmp_path / "published" / "zarr.json").read_text())
-    assert (told["zarr_format"], told["data_type"], told["shape"]) == (3, "uint16", [LIGHTS, 64, 25, 3])
-    assert told["chunk_grid"]["configuration"]["chunk_shape"] == [32, 64, 25, 3]
-    (sharding,) = told["codecs"]
+    described = json.loads((tmp_path / "published" / "zarr.json").read_text())
+    assert (described["zarr_format"], described["data_type"], described["shape"]) == (3, "uint16", [LIGHTS, 64, 25, 3])
+    assert described["chunk_grid"]["configuration"]["chunk_shape"] == [32, 64, 25, 3]
+    (sharding,) = described["codecs"]
     assert sharding["name"] == "sharding_indexed"
     assert sharding["configuration"]["chunk_shape"] == [1, 64, 25, 3]
     blosc = sharding["configuration"]["codecs"][-1]
