@@ -31,9 +31,9 @@ from sim.world.drawing import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World
+from tests.data_files import available
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
-RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw"
 CHART = paper_chart("A6", 3)
 
 
@@ -194,13 +194,14 @@ def test_a_bright_sheet_of_something_else_is_no_chart() -> None:
         find_field(planes, CHART, "the frame")
 
 
-@pytest.mark.parametrize("name", ["canon_eos_550d_colorchart.dng", "blackmagic.dng", "canon_powershot_g2.crw"])
-def test_a_photograph_without_the_chart_has_no_chart(name: str) -> None:
-    path = RAW / name
-    if not path.exists():
-        pytest.skip(f"{name} is not at hand")
+@pytest.mark.parametrize(
+    "path",
+    available("raw/canon_eos_550d_colorchart.dng", "raw/blackmagic.dng", "raw/canon_powershot_g2.crw"),
+    ids=lambda path: path.name,
+)
+def test_a_photograph_without_the_chart_has_no_chart(path: Path) -> None:
     with pytest.raises(RegistrationError, match=r"the field of 32768 cells, .* looked for") as caught:
-        find_chart(read_raw(path), paper_chart(), name)
+        find_chart(read_raw(path), paper_chart(), path.name)
     assert "\n" not in str(caught.value)
 
 

@@ -29,9 +29,9 @@ from sim.world.drawing import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES
 from sim.world.world import World
+from tests.data_files import available
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
-RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw"
 FLAT = Room(waviness_mm=0.0, tilt_deg=0, pan_deg=0, k1=0, k2=0, p1=0, p2=0)
 
 
@@ -219,13 +219,12 @@ def test_covered_tags_are_named(chart: Chart, white: Mosaic) -> None:
         find_chart(Plane("G", values, plane.offset_px), chart)
 
 
-@pytest.mark.parametrize("name", ["canon_eos_550d_colorchart.dng", "blackmagic.dng"])
-def test_a_photograph_without_the_chart_has_no_chart(chart: Chart, name: str) -> None:
-    path = RAW / name
-    if not path.exists():
-        pytest.skip(f"{name} is not at hand")
+@pytest.mark.parametrize(
+    "path", available("raw/canon_eos_550d_colorchart.dng", "raw/blackmagic.dng"), ids=lambda path: path.name
+)
+def test_a_photograph_without_the_chart_has_no_chart(chart: Chart, path: Path) -> None:
     with pytest.raises(RegistrationError, match=r"tags 36h11 with ids .* were looked for") as caught:
-        find_chart(read_raw(path), chart, name)
+        find_chart(read_raw(path), chart, path.name)
     assert "\n" not in str(caught.value)
 
 

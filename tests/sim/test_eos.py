@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import datetime, timedelta
 from io import BytesIO
-from pathlib import Path
 from threading import Event as ThreadEvent
 from typing import BinaryIO
 
@@ -59,8 +58,10 @@ from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, 
 from sim.camera.eos_model import OPERATIONS, EosModel
 from sim.camera.eos_state import CARD, DCIM, EMPTY_SLOT, FOLDER
 from sim.clock import OPENING, SimulatedClock
+from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded, conversations, transcript
 
-RECORDING = Path(__file__).parents[2].parent / "shared" / "data" / "ptp" / "eos60d_transactions.json"
+REAL = {"the transcript": transcript} | {name: make for name, make in conversations().items() if name == "EOS 60D"}
+"""Conversations of the real EOS 60D: without the bytes that it sent, and whole where the recording is found."""
 
 
 class NumberedFilm:
@@ -209,13 +210,12 @@ def kind_of(code: int, parameters: list[int], data: bytes) -> object:
             raise AssertionError(f"the recording holds data of 0x{code:04x}")
 
 
-def test_holds_the_conversation_of_a_real_60d() -> None:
-    if not RECORDING.exists():
-        pytest.skip("the recorded EOS 60D is not here")
+@pytest.mark.parametrize("real", REAL.values(), ids=REAL)
+def test_holds_the_conversation_of_a_real_60d(real: Callable[[], list[Recorded]]) -> None:
     host = host_of(EOS_550D)
     host.eos.turn_dial(AeMode.APERTURE_PRIORITY)
     sessions = 0
-    for number, recorded in enumerate(json.loads(RECORDING.read_text())):
+    for number, recorded in enumerate(real()):
         code = int(recorded["code"], 16)
         request = PtpRequest(code, recorded["tid"], tuple(recorded["params"]))
         if code == Operation.OPEN_SESSION:
@@ -231,8 +231,7 @@ def test_holds_the_conversation_of_a_real_60d() -> None:
         assert f"{answer.response.code:04x}" == recorded["rc"], place
         assert len(answer.response.parameters) == len(recorded["rparams"]), place
         assert (answer.data is None) == (recorded["dir"] != "in"), place
-        if recorded["dir"] == "in":
-            assert data is not None
+        if recorded["dir"] == "in" and data is not None:
             assert answer.data is not None
             ours, theirs = (kind_of(code, recorded["params"], octets) for octets in (answer.data, data))
             assert ours == theirs, place
@@ -240,10 +239,7 @@ def test_holds_the_conversation_of_a_real_60d() -> None:
 
 
 def test_tells_of_itself_in_the_order_of_the_60d() -> None:
-    if not RECORDING.exists():
-        pytest.skip("the recorded EOS 60D is not here")
-    recorded = next(t for t in json.loads(RECORDING.read_text()) if t["code"] == "9108")
-    theirs = DeviceInfoEx.decode(bytes.fromhex(recorded["data"])).properties
+    theirs = EOS_60D_PROPERTIES
     ours = [spec.code for spec in EOS_550D.properties]
     assert [code for code in theirs if code in ours] == [code for code in ours if code in theirs]
     assert set(ours) <= set(theirs)
