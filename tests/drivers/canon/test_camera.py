@@ -43,7 +43,7 @@ from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D
 from sim.camera.eos_model import EosModel
 from sim.clock import SimulatedClock
 from tests.contracts.camera import SETTINGS, Bench, CameraContract
-from tests.drivers.eos_lab import Lab
+from tests.drivers.canon.eos_lab import Lab
 from tests.drivers.ptp.conversations import Recorded
 
 IDENTITY = CameraIdentity("Canon Inc.", "Canon EOS 550D", "0000000001", "3-1.0.9")
