@@ -43,7 +43,7 @@ from sim.world.drawing import Print
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES
 from sim.world.world import World
-from tests.drivers.raw_files import write_cr2
+from tests.drivers.raw.raw_files import write_cr2
 
 RUNS = 4
 ROUNDS = 3

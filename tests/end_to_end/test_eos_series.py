@@ -22,7 +22,7 @@ from sim.buses.faults import CutOff, TroubledResponder
 from sim.buses.responder import Answer, NoAnswer, Responder
 from sim.camera.eos_bodies import EOS_550D
 from tests.contracts.camera import SETTINGS
-from tests.drivers.eos_lab import Lab
+from tests.drivers.canon.eos_lab import Lab
 
 FRAMES = 707
 ATTEMPTS = 6

@@ -63,7 +63,7 @@ def simulated_display(display: str | int | None, clock: Clock) -> SimulatedPrese
 @pytest.fixture(scope="module")
 def x_servers() -> ModuleType:
     """Return the module that runs X servers; it stands with the tests of the display."""
-    path = Path(__file__).parents[1] / "drivers" / "x_servers.py"
+    path = Path(__file__).parents[1] / "drivers" / "display" / "x_servers.py"
     spec = importlib.util.spec_from_file_location("x_servers_for_the_lab", path)
     assert spec is not None
     assert spec.loader is not None

@@ -20,7 +20,7 @@ from sim.buses.ptpip_server import serve_ptpip
 from sim.clock import SimulatedClock
 from tests.contracts.link import read_exactly
 from tests.contracts.transport import PATIENCE_S, Bench, Echo, TransportContract
-from tests.drivers.troubled_links import Dribbling
+from tests.drivers.links.troubled_links import Dribbling
 
 GUID = bytes(range(16))
 

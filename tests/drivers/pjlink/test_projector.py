@@ -19,7 +19,7 @@ from sim.clock import SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer, memory_link, serve_pjlink
 from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 from tests.contracts.projector import Bench, ProjectorContract
-from tests.drivers.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling, Slow
+from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling, Slow
 
 PASSWORD = "JBMIAProjectorLink"
 DIGEST = b"5d8409bc1c3fa39749434aa3a5c38682"

@@ -36,7 +36,7 @@ from sim.clock import SimulatedClock
 from sim.projectors.projector import SimulatedProjector
 from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer
 from tests.contracts.projector import Bench, ProjectorContract
-from tests.drivers.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling
+from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling
 
 NAMES = sorted(LANGUAGES)
 on_posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")

@@ -25,7 +25,7 @@ from foundation.errors import FormatError
 from sim.camera.dng import write_dng as write_simulated_dng
 from sim.world.sensors import BODIES, Rectangle
 from tests.data_files import available, shipped
-from tests.drivers.raw_files import Tags, longs, lossless_jpeg, ratios, shorts, text, write_cr2, write_dng
+from tests.drivers.raw.raw_files import Tags, longs, lossless_jpeg, ratios, shorts, text, write_cr2, write_dng
 
 EOS_550D = shipped("raw/canon_eos_550d_colorchart.dng")
 G2 = shipped("raw/canon_powershot_g2.crw")

@@ -27,7 +27,7 @@ from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import ConfigurationError, DeviceError
 from sim.clock import SimulatedClock
 from tests.contracts.presenter import Bench, PresenterContract
-from tests.drivers.x_servers import Picture, VirtualScreen, screenshot, two_outputs, virtual_screen
+from tests.drivers.display.x_servers import Picture, VirtualScreen, screenshot, two_outputs, virtual_screen
 
 PATIENCE_S = 20.0
 """For what must come; nothing waits this long unless it fails."""

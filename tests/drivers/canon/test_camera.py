@@ -43,7 +43,7 @@ from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D
 from sim.camera.eos_model import EosModel
 from sim.clock import SimulatedClock
 from tests.contracts.camera import SETTINGS, Bench, CameraContract
-from tests.drivers.eos_lab import Lab
+from tests.drivers.canon.eos_lab import Lab
 from tests.drivers.ptp.conversations import Recorded
 
 IDENTITY = CameraIdentity("Canon Inc.", "Canon EOS 550D", "0000000001", "3-1.0.9")
@@ -82,9 +82,8 @@ class Replay:
             if int(known["code"], 16) == request.code and tuple(known["params"]) == request.parameters and data == sent:
                 self.left = self.left[number + 1 :]
                 answer = bytes.fromhex(known["data"] or "") if known["dir"] == "in" else b""
-                return Transaction(
-                    PtpResponse(int(known["rc"], 16), request.transaction, tuple(known["rparams"])), answer
-                )
+                response = PtpResponse(int(known["rc"], 16), request.transaction, tuple(known["rparams"]))
+                return Transaction(response, answer)
         pytest.fail(f"the recorded host did not ask {request} with {sent} here")
 
     def events(self) -> tuple[PtpEvent, ...]:
