@@ -1,4 +1,4 @@
-"""A table whose samples are wrong is never accepted: rooms and sessions that go wrong are refused, remarked on or right.
+"""A table whose samples are wrong is never accepted: what goes wrong is refused, remarked on or harmless.
 
 Each table that is built is compared with the room cell by cell, with the noise of its 25 samples taken out, so that a
 grid a cell aside, a poster of another order or a hand in the light cannot pass.
