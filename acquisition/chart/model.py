@@ -23,6 +23,8 @@ from foundation.files import write_whole
 
 FORMAT = "crop.chart"
 VERSION = 1
+"""`format` and `version` of the `chart.json` that this software writes and reads (docs/formats.md)."""
+
 PAPER_WHITE = (255, 255, 255)
 """Printed code of bare paper: no ink."""
 

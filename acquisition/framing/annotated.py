@@ -20,6 +20,7 @@ from drivers.raw.rawfile import Mosaic
 _GREEN, _RED, _AMBER, _GREY = (60, 200, 60), (40, 40, 255), (40, 200, 255), (200, 200, 200)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _TICK_RAW_PX = 500
+"""Raw pixels from tick to tick along the border."""
 
 _Image = npt.NDArray[np.uint8]
 _Points = npt.NDArray[np.float64]

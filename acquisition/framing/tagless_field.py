@@ -73,7 +73,7 @@ class FoundField:
 
 
 def field_mm(chart: Chart) -> _Points:
-    """Return the corners (4, 2) mm of the field of cells, clockwise from its top-left."""
+    """Return the corners of the field of cells, (4, 2) float64 mm, clockwise from its top-left."""
     half = np.array(chart.cell_mm) / 2
     left, top = chart.centres_mm.min(axis=0) - half
     right, bottom = chart.centres_mm.max(axis=0) + half

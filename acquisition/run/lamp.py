@@ -174,7 +174,7 @@ def _warm_up(
 ) -> None:
     if not sequence.warm_up_s:
         return
-    report("warming up", f"the lamp was just lit; {sequence.warm_up_s:g} s are waited until its colour is steady")
+    report("warming up", f"the lamp was just lit; waiting {sequence.warm_up_s:g} s until its colour is steady")
     until = clock.monotonic() + sequence.warm_up_s
     while (left := until - clock.monotonic()) > 0:
         clock.sleep(min(left, IDLE_S))

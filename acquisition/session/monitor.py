@@ -70,7 +70,10 @@ def page(folder: Path) -> str:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    folder: Path
+
+    def __init__(self, folder: Path, port: int) -> None:
+        self.folder = folder
+        super().__init__(("127.0.0.1", port), _Handler)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -113,8 +116,6 @@ def open_monitor(folder: Path, port: int) -> ThreadingHTTPServer:
     """
     read_state(folder)
     try:
-        server = _Server(("127.0.0.1", port), _Handler)
+        return _Server(folder, port)
     except OSError as error:
         raise InputError(f"cannot serve on port {port}: {error.strerror}; name another with --port") from error
-    server.folder = folder
-    return server

@@ -130,7 +130,7 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
             assert theirs.taken_at > OPENING
 
 
-def test_a_look_tells_what_may_bend_the_light(
+def test_check_reports_what_may_alter_the_light(
     lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     class WarningPresenter(SimulatedPresenter):
@@ -139,10 +139,10 @@ def test_a_look_tells_what_may_bend_the_light(
 
     monkeypatch.setattr("acquisition.run.rig.simulated.SimulatedPresenter", WarningPresenter)
     assert main(["check", str(lab)]) == 0
-    told = capsys.readouterr()
-    assert "gamma ramp is not straight" in told.out
-    assert "tags" in told.out
-    assert "warming up: the lamp was just lit and gets 1200 s" in told.err
+    printed = capsys.readouterr()
+    assert "gamma ramp is not straight" in printed.out
+    assert "tags" in printed.out
+    assert "warming up: the lamp was just lit; waiting 1200 s" in printed.err
 
 
 @pytest.mark.parametrize("maker", ["epson", "benq"])

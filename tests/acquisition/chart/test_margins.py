@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acquisition.chart.layout import design_chart, paper_chart
-from acquisition.chart.margins import bar_boxes, edge_boxes, margin_marks, star_boxes, text_boxes, whole_px
+from acquisition.chart.margins import bar_boxes, edge_boxes, margin_marks, star_boxes, text_boxes
 from acquisition.chart.model import Chart
+from acquisition.chart.pixels import whole_px
 from acquisition.chart.printing import drawing, field_drawing
 
 PX_MM = 25.4 / 600

@@ -1,4 +1,4 @@
-"""Corners told by hand: read as raw pixels, and refused where no field can be."""
+"""Corners given by hand: read as raw pixels, and refused where no field can be."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_raw_pixels_become_half_size_ones() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "message"),
+    ("given", "message"),
     [
         (GOOD[:3], "3 corners are given"),
         ((*GOOD, "1,1"), "5 corners are given"),
@@ -34,6 +34,6 @@ def test_raw_pixels_become_half_size_ones() -> None:
         (("0,0", "1000,0", "1000,100", "0,100"), "at least 192 expected"),
     ],
 )
-def test_what_cannot_be_corners_is_refused(told: Sequence[str], message: str) -> None:
+def test_what_cannot_be_corners_is_refused(given: Sequence[str], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        parse_corners(told)
+        parse_corners(given)

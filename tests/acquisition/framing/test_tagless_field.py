@@ -116,7 +116,7 @@ def test_a_light_that_does_not_tell_which_way_up_is_not_guessed_at(tmp_path: Pat
     mosaic = frame_of(tmp_path, UPRIGHT, Colour(255, 0, 0))
     with pytest.raises(RegistrationError, match="it is not certain which way up it hangs; take a white frame"):
         find_chart(mosaic, CHART)
-    # Known from another frame of the session, or told.
+    # Known from another frame of the session, or given.
     corners = truth(UPRIGHT, mosaic, field_mm(CHART))
     for hint in ({"near_px": corners + 30.0}, {"corners_px": corners + 4.0}):
         field = find_field(planes_of(mosaic), CHART, "the frame", **hint)
@@ -142,14 +142,14 @@ def test_half_a_chart_is_not_a_chart(white: Mosaic) -> None:
 
 def test_told_corners_are_drawn_onto_the_outline(white: Mosaic) -> None:
     true = truth(UPRIGHT, white, field_mm(CHART))
-    told = true + np.array([(9, -7), (-8, 6), (5, 8), (-9, -6)])
-    found = find_chart(white, CHART, corners=told).field
+    given = true + np.array([(9, -7), (-8, 6), (5, 8), (-9, -6)])
+    found = find_chart(white, CHART, corners=given).field
     assert found is not None
     assert found.corners_px == pytest.approx(true, abs=0.7)
 
 
 @pytest.mark.parametrize(
-    ("told", "fault", "message"),
+    ("given", "fault", "message"),
     [
         ([(10, 10), (120, 120), (230, 230), (340, 340)], InputError, "no convex quadrilateral"),
         ([(10, 10), (300, 10), (300, 200)], InputError, "no convex quadrilateral"),
@@ -161,10 +161,10 @@ def test_told_corners_are_drawn_onto_the_outline(white: Mosaic) -> None:
     ],
 )
 def test_wrong_corners_are_refused(
-    white: Mosaic, told: Sequence[tuple[float, float]], fault: type[CropError], message: str
+    white: Mosaic, given: Sequence[tuple[float, float]], fault: type[CropError], message: str
 ) -> None:
     with pytest.raises(fault, match=message) as caught:
-        find_chart(white, CHART, corners=np.array(told, dtype=np.float64))
+        find_chart(white, CHART, corners=np.array(given, dtype=np.float64))
     assert "\n" not in str(caught.value)
 
 
@@ -172,9 +172,9 @@ def test_corners_of_a_mirrored_chart_say_so(white: Mosaic) -> None:
     mirrored = [replace(plane, values=np.ascontiguousarray(plane.values[:, ::-1])) for plane in planes_of(white)]
     width = mirrored[0].values.shape[1]
     corners = truth(UPRIGHT, white, field_mm(CHART))
-    told = np.column_stack([width - 1 - corners[:, 0], corners[:, 1]])[[1, 0, 3, 2]]
+    given = np.column_stack([width - 1 - corners[:, 0], corners[:, 1]])[[1, 0, 3, 2]]
     with pytest.raises(RegistrationError, match="fit only in a mirror"):
-        find_field(mirrored, CHART, "the frame", told)
+        find_field(mirrored, CHART, "the frame", given)
 
 
 def test_a_chart_with_tags_needs_no_corners(white: Mosaic) -> None:

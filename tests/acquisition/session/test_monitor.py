@@ -110,9 +110,9 @@ def test_ctrl_c_is_its_proper_end(
 
     monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupted)
     assert main(["monitor", str(folder), "--port", "0"]) == 0
-    told = capsys.readouterr()
-    assert "Ctrl-C ends it" in told.out
-    assert told.err == ""
+    printed = capsys.readouterr()
+    assert "Ctrl-C ends it" in printed.out
+    assert printed.err == ""
 
 
 def test_no_session_no_page(tmp_path: Path) -> None:
