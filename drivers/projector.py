@@ -63,11 +63,11 @@ class Projector(Protocol):
         ...
 
     def switch_on(self) -> None:
-        """Begin to switch on; returns at once, `power` tells when it is done."""
+        """Begin to switch on; returns at once, `power` shows when it is done."""
         ...
 
     def switch_off(self) -> None:
-        """Begin to switch off; returns at once, `power` tells when it is done."""
+        """Begin to switch off; returns at once, `power` shows when it is done."""
         ...
 
     def muted(self) -> bool:

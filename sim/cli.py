@@ -149,8 +149,8 @@ def camera(
     # A lamp that ages would be dark by now: its drift counts from the day when the simulated lab opened.
     world = World(_grey_squares(), BODIES[model], Room(lamp_drift_per_hour=0))
     film = WorldFilm(world, lambda: WHITE, lambda: 1.0, "0000000001", {})
-    with ThreadPoolExecutor(1, "darkroom") as darkroom:
-        eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, darkroom=darkroom)
+    with ThreadPoolExecutor(1, "developing") as executor:
+        eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, executor=executor)
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))
         if port is not None:
             with serve_ptpip(eos, port, name=eos.body.model) as server:

@@ -7,7 +7,7 @@ Laws that hold inside:
 - GetEvent is asked until it has nothing more, but never without end: some firmware repeats itself.
 - A body keeps a frame in its memory until TransferComplete, and refuses the next when that memory is full. So every
   object that it announces is fetched or thrown away, and freed in either case.
-- Sizes and counts that a body tells are checked against what arrives.
+- Sizes and counts that a body reports are checked against what arrives.
 - A fault of cable or protocol ends the session, and goes to `drivers.canon.camera`, which begins a new one.
 
 Source: conversations of an EOS 60D and an EOS 400D with a host; libgphoto2 2.5.34 for the order of a release.
@@ -37,7 +37,7 @@ MAX_FRAME_BYTES = 256 << 20
 MAX_POLLS = 64
 """GetEvent answers that one drain takes, at most."""
 KEEP_ALIVE_S = 10.0
-"""After this long a body is told to stay awake."""
+"""After this long a body is asked to stay awake."""
 SETTLE_LIMIT_S = 5.0
 """How long a body may take to report a value that it was given, or room for a frame."""
 RELEASE_TRIES = 5
@@ -86,7 +86,7 @@ class EosBody:
         return self._session.label
 
     def identity(self) -> CameraIdentity:
-        """Return what the body says of itself; its serial number is the one that is engraved on it, where told."""
+        """Return what the body says of itself; the serial number is the engraved one, where it sends that."""
         serial = self.state.text(Property.EOS_SERIAL_NUMBER) or self._info.serial_number
         return CameraIdentity(self._info.manufacturer, self._info.model, serial, self._info.device_version)
 
@@ -116,7 +116,7 @@ class EosBody:
             self._session.call(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, Property.EOS_SERIAL_NUMBER)
             self._settled(lambda: Property.EOS_SERIAL_NUMBER in self.state.values)
         if not self.state.lists:
-            raise ProtocolError(f"{self.label} tells no state when asked for events; switch it off and on")
+            raise ProtocolError(f"{self.label} sends no state when asked for events; switch it off and on")
         self._receive_frames()
 
     def disconnect(self) -> None:
@@ -296,9 +296,9 @@ class EosBody:
             else:
                 if len(data) > wanted:
                     raise ProtocolError(f"{self.label} gives {len(data)} bytes at {offset}; {wanted} were asked for")
-                # The standard's operation tells how many bytes were sent; what Canon's own answers is not known.
-                told = sent[0] if sent and operation == Operation.GET_PARTIAL_OBJECT else len(data)
-                if data and told == len(data):
+                # The standard's operation answers how many bytes were sent; what Canon's own answers is not known.
+                counted = sent[0] if sent and operation == Operation.GET_PARTIAL_OBJECT else len(data)
+                if data and counted == len(data):
                     return data
             self._clock.sleep(_PAUSES_S[-1])
         raise DeviceError(
@@ -307,7 +307,7 @@ class EosBody:
         )
 
     def _receive_frames(self) -> None:
-        """Have frames sent to the host, and tell the body that there is room for them."""
+        """Have frames sent to the host, and report room for them to the body."""
         host = host_destination(self.state)
         # A body that a killed run left behind stands at the host already; its user wants the card again.
         self._destination = number_value(CaptureDestination.CARD)

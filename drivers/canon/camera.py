@@ -35,7 +35,7 @@ RECOVERY_LIMIT_S = 60.0
 FRAME_LIMIT_S = 90.0
 """How long after its exposure a frame may be announced."""
 REDISCOVERY_S = 10.0
-"""The same on a new connection, on which the body tells all its state at once."""
+"""The same on a new connection, on which the body sends its whole state at once."""
 
 _SYSTEM_CLOCK = SystemClock()
 _CERTAIN_SHARE = 0.9

@@ -1,4 +1,4 @@
-"""The datasets of Canon's EOS bodies that the standard does not have: lists of objects, and what a body can tell.
+"""The datasets of Canon's EOS bodies that the standard does not have: lists of objects, and what a body can report.
 
 ``decode`` and ``encode`` undo each other on well-formed bytes; counts and sizes are checked before they are believed.
 
@@ -72,7 +72,7 @@ class ObjectEntry:
         if len(name) > self.name_width or b"\0" in name:
             raise ValueError(f"{self.name!r} is no name of at most {self.name_width} characters")
         if self.name_width < _NAME_WIDTH if self.time is not None else self.name_width >= _NAME_WIDTH + _TIME_LENGTH:
-            raise ValueError(f"a name's field of {self.name_width} bytes cannot be told from the time behind it")
+            raise ValueError(f"a name's field of {self.name_width} bytes and a time behind it look alike")
         time = b"" if self.time is None else encode_integer(self.time, _TIME_LENGTH)
         return b"".join(
             (

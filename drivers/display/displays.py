@@ -138,7 +138,7 @@ def running_glfw() -> Generator[ModuleType]:
 def _library() -> ModuleType:
     """Return GLFW's module, imported late: to load it asks another process for its version."""
     if sys.platform == "linux":
-        # The wheel holds two libraries; only the one for X can be told to use it.
+        # The wheel holds two libraries; only the one for X can be made to use it.
         os.environ.setdefault("PYGLFW_LIBRARY_VARIANT", "x11")
     try:
         import glfw

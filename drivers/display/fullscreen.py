@@ -123,7 +123,7 @@ class FullScreen:
         self._present(colour)
 
     def identify(self) -> None:
-        """Show the display's number in big white blocks on black, so that it can be told from the others."""
+        """Show the display's number in big white blocks on black, to identify it among the others."""
         self._require_usable()
         self._glfw.make_context_current(self._window)
         self._fill(BLACK)

@@ -51,7 +51,7 @@ SWITCHING_S = 3.0
 _LOOK_AGAIN_S = 0.05
 _STALE_REPLIES = 8
 _SETTLED = (
-    # What is set, to what, and which bits of the answer say so (the rest tells of other things).
+    # What is set, to what, and which bits of the answer say so (the rest means other things).
     (LightCrafterCommand.TEST_PATTERN, PATTERN_SOLID, 0x0F),
     (LightCrafterCommand.INPUT_SOURCE, SOURCE_TEST_PATTERN, 0x07),
     (LightCrafterCommand.DISPLAY_MODE, MODE_VIDEO, 0x03),
@@ -60,7 +60,7 @@ _SYSTEM_CLOCK = SystemClock()
 
 
 def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = None) -> Reports:
-    """Open the one LightCrafter on USB, of whatever kind; `serial` tells it from its like.
+    """Open the one LightCrafter on USB, of whatever kind; `serial` names one of several.
 
     Raises
     ------
@@ -94,7 +94,7 @@ class LightCrafter:
     Raises
     ------
     DeviceError
-        The controller cannot be reached, or does not do as it is told.
+        The controller cannot be reached, or does not do what it was sent.
     """
 
     def __init__(self, connect: Callable[[], Reports], clock: Clock = _SYSTEM_CLOCK) -> None:

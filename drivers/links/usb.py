@@ -2,7 +2,7 @@
 
 Laws that hold inside:
 
-- Devices are told apart by vendor, product and serial number, or by the port they are plugged into: the address
+- Devices are distinguished by vendor, product and serial number, or by the port they are plugged into: the address
   changes whenever a device restarts.
 - The system's errors are translated here and nowhere else, and say what helps: ETIMEDOUT is `LinkTimeout`; ENODEV, EIO
   and whatever else ends the transfer is `LinkClosed`; EPIPE is `PipeStalled`; EBUSY and EACCES are `DeviceRefused`.

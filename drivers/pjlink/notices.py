@@ -1,4 +1,4 @@
-"""PJLink over UDP as bytes: how class 2 projectors are found, and what they tell unasked.
+"""PJLink over UDP as bytes: how class 2 projectors are found, and the notices that they send.
 
 Rules that hold inside:
 

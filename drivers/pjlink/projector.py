@@ -166,7 +166,7 @@ class PjLinkProjector:
         return self._class
 
     def other_information(self) -> str:
-        """Return what the maker found worth telling; empty where there is nothing."""
+        """Return the maker's own text about the projector (INFO); empty where there is none."""
         return self._name("INFO")
 
     def inputs(self) -> tuple[Input, ...]:
@@ -188,7 +188,7 @@ class PjLinkProjector:
         Parameters
         ----------
         code
-            As `inputs` tells it, two characters.
+            As in `inputs`, two characters.
 
         Raises
         ------
@@ -223,7 +223,7 @@ class PjLinkProjector:
         self._set_class_2("FREZ", wire.format_freeze(frozen))
 
     def picture_fault(self) -> str | None:
-        """Return whether the picture is frozen or no signal arrives, as far as class 2 tells; None with class 1."""
+        """Return whether the picture is frozen or no signal arrives, as far as class 2 can say; None with class 1."""
         if self.pjlink_class() < 2:
             return None
         if self.frozen():

@@ -345,7 +345,7 @@ class Resolution:
 
 
 class NoResolution(Enum):
-    """Why an input has no resolution to tell (IRES)."""
+    """Why an input has no resolution (IRES)."""
 
     NO_SIGNAL = "-"
     UNKNOWN_SIGNAL = "*"

@@ -9,7 +9,7 @@ Laws that hold inside:
   phase is handed on as it comes, so that no object ever lies here in full.
 - Lengths are checked before they are believed; whatever arrives, the only error is `ProtocolError`. The stream has
   then lost its place: every further `feed` raises too, until a new reader is taken.
-- The one thing a stream alone cannot tell is where a data phase of unknown length ends. Only there a piece must be
+- The one thing a stream alone does not show is where a data phase of unknown length ends. Only there a piece must be
   what one read of the pipe returned, for a short packet ends it.
 
 Sources: USB Still Image Capture Device Definition 1.0, clauses 5 (control requests) and 7 (containers);
@@ -44,7 +44,7 @@ class ContainerType(IntEnum):
 
 @dataclass(frozen=True)
 class DataStart:
-    """A data phase begins; `length` counts the payload's bytes, None where only a short packet will tell."""
+    """A data phase begins; `length` counts the payload's bytes, None where only a short packet ends it."""
 
     code: int
     transaction: int

@@ -24,7 +24,7 @@ from foundation.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolE
 START_TIMEOUT_S = 1.5
 """Wait for the answer to OpenSession: a body that a killed host left behind never answers before a reset."""
 TIMEOUT_S = 20.0
-"""Wait for every other answer, unless told otherwise."""
+"""Wait for every other answer, unless the caller sets another."""
 PASSING_LIMIT_S = 10.0
 """How long an operation is asked again when a device declines it for the moment."""
 OPEN_TRIES = 3

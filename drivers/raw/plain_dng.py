@@ -163,7 +163,7 @@ def active_area(pixels: Directory | None, sensor: tuple[int, int]) -> Area | Non
 
 
 def stated_areas(pixels: Directory | None, tag: TiffTag, sensor: tuple[int, int]) -> tuple[Area, ...]:
-    """Return the rectangles of `tag`, told as top, left, bottom, right, that lie on the sensor."""
+    """Return the rectangles of `tag`, stored as top, left, bottom, right, that lie on the sensor."""
     edges = () if pixels is None else pixels.integers(tag)
     return tuple(
         Area(top, left, bottom - top, right - left)

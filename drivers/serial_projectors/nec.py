@@ -5,8 +5,8 @@ Rules that hold inside:
 - A frame is a kind, a code, two numbers (0 from us; the projector's own from it), the length of the data, the data,
   and the low byte of the sum of all before. A reply's kind is the command's plus 20h, plus A0h when it failed; then two
   bytes say why.
-- `NecProjector.power` is the running status; warm-up and switching off both show as "switching", and are told apart by
-  whether cooling or our own last command says off.
+- `NecProjector.power` is the running status; warm-up and switching off both show as "switching"; which of them it is
+  follows from the state of cooling or from our own last command.
 
 Source: NEC, Projector Control Command Reference Manual, revision 6.1 (037, 078-2 to 078-5), and Control Commands
 (Basic), revision 5.16 (009, 015, table of error codes). Not confirmed by a manual: the bytes of 016 power off, 020 and
@@ -40,7 +40,7 @@ class NecCommand:
 
 @dataclass(frozen=True)
 class NecReply:
-    """What the projector says; `failed` holds the two bytes that tell why it did not do it."""
+    """What the projector says; `failed` holds the two bytes that give the reason why it did not do it."""
 
     kind: int
     code: int
@@ -163,7 +163,7 @@ def parse_running(data: bytes, ordered_off: bool = False) -> Power:
     Parameters
     ----------
     ordered_off
-        Whether a projector that is switching has been told to switch off.
+        Whether a projector that is switching was commanded off.
     """
     if len(data) < 6:
         raise ProtocolError(f"the running status holds {len(data)} bytes; expected 16")

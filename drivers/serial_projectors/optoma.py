@@ -3,8 +3,8 @@
 Rules that hold inside:
 
 - A command is answered by ``P`` or ``F``, a question by ``OK`` and a value, all ended by CR.
-- The projector says unasked ``INFO`` and a number when it changes its power state or falls ill. `OptomaProjector` keeps
-  what it has overheard: warm-up and cooling are known from there only, as power is else on or off.
+- The projector sends ``INFO`` and a number unasked when it changes its power state or has a fault. `OptomaProjector`
+  keeps what it has received so: warm-up and cooling are known from there only, as power is else on or off.
 - A fault once overheard is reported until the projector warms up again; none can be asked for.
 - Mute cannot be asked of older models; then what this driver has set last is the answer.
 
@@ -213,7 +213,7 @@ class OptomaProjector:
         return tuple(Fault(part, Severity.ERROR) for part in self._faults)
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return its lamp; empty where the projector tells no hours."""
+        """Return its lamp; empty where the projector reports no hours."""
         try:
             value = self._get(LAMP_HOURS)
         except DeviceRefused:

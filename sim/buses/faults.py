@@ -141,7 +141,7 @@ class LosingEvents(TroubledResponder):
 
 
 class DelayingEvents(TroubledResponder):
-    """Tells each event only after it was asked `calls` times more."""
+    """Reports each event only after it was asked `calls` times more."""
 
     def __init__(self, good: Responder, calls: int) -> None:
         super().__init__(good)
@@ -154,7 +154,7 @@ class DelayingEvents(TroubledResponder):
 
 
 class RepeatingEvents(TroubledResponder):
-    """Tells each event `times` times: 2 is a device that stutters, many thousands one that floods."""
+    """Reports each event `times` times: 2 is a device that stutters, many thousands one that floods."""
 
     def __init__(self, good: Responder, times: int = 2) -> None:
         super().__init__(good)
@@ -165,16 +165,16 @@ class RepeatingEvents(TroubledResponder):
         return tuple(event for event in super().events() for _ in range(self._times))
 
 
-class StrangeEvents(TroubledResponder):
-    """Tells of `stranger`, an event that nobody knows, before each real one."""
+class UnknownEvents(TroubledResponder):
+    """Sends `unknown`, an event of a code that nobody knows, before each real one."""
 
-    def __init__(self, good: Responder, stranger: PtpEvent) -> None:
+    def __init__(self, good: Responder, unknown: PtpEvent) -> None:
         super().__init__(good)
-        self._stranger = stranger
+        self._unknown = unknown
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return the good device's events among strangers."""
-        return tuple(event for real in super().events() for event in (self._stranger, real))
+        """Return the good device's events, each behind an unknown one."""
+        return tuple(event for real in super().events() for event in (self._unknown, real))
 
 
 class TroubledPipes:

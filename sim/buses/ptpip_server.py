@@ -45,7 +45,7 @@ from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.responder import Answer, NoAnswer, Responder
 
 GUID = bytes(range(16))
-"""What a simulated device calls itself unless told otherwise."""
+"""What a simulated device calls itself unless another is given."""
 DATA_PIECE = 256 * 1024
 """Bytes of data in a packet to the initiator; what fits goes out in one EndData."""
 
@@ -64,7 +64,7 @@ def serve_ptpip(
 ) -> TcpServer:
     """Put a device on a TCP port; 0 picks a free one.
 
-    Use the result in a ``with`` block; its `address` tells host and port, both connections go there.
+    Use the result in a ``with`` block; its `address` is host and port, both connections go there.
 
     Raises
     ------

@@ -68,7 +68,7 @@ class SimulatedEos(EosSettings, EosRelease):
     forgetful
         Whether frames in the camera's memory are lost with the session. Assumed to be kept: users report memories
         that stay full after a host was killed.
-    darkroom
+    executor
         Where the film is developed. None does it while the release is answered, and is what tests want; a camera on
         a real cable hands in an executor of one thread, so that a large frame does not hold up the answers.
     """
@@ -86,7 +86,7 @@ class SimulatedEos(EosSettings, EosRelease):
         shutter_count: int = 5000,
         without: Iterable[int] = (),
         forgetful: bool = False,
-        darkroom: Executor | None = None,
+        executor: Executor | None = None,
     ) -> None:
         super().__init__(
             body,
@@ -98,7 +98,7 @@ class SimulatedEos(EosSettings, EosRelease):
             battery=battery,
             shutter_count=shutter_count,
             forgetful=forgetful,
-            darkroom=darkroom,
+            executor=executor,
         )
         self._guard = threading.RLock()
         self._operations = self._handlers(frozenset(without))
@@ -133,7 +133,7 @@ class SimulatedEos(EosSettings, EosRelease):
             return Answer(PtpResponse(ResponseCode.OK, request.transaction, reply.parameters), reply.data)
 
     def events(self) -> tuple[PtpEvent, ...]:
-        """Return hints that GetEvent has something to tell, one for a queue that was empty."""
+        """Return hints that GetEvent has something to report, one for a queue that was empty."""
         with self._guard:
             self._move()
             hints, self._hints = tuple(self._hints), []
@@ -179,7 +179,7 @@ class SimulatedEos(EosSettings, EosRelease):
             self._renew_exposure_lists()
 
     def switch_focus(self, automatic: bool, finds: bool = True) -> None:
-        """Move the lens's switch to AF or MF; `finds` tells whether AF will find anything to focus on."""
+        """Move the lens's switch to AF or MF; `finds` says whether AF will find anything to focus on."""
         with self._guard:
             self._move()
             self._finds_focus = finds
@@ -194,7 +194,7 @@ class SimulatedEos(EosSettings, EosRelease):
             if Property.EOS_MIRROR_UP_SETTING in self._properties:
                 self._change(Property.EOS_MIRROR_UP_SETTING, number_value(int(on)))
             else:
-                self._tell(Property.EOS_CUSTOM_FUNCTIONS)
+                self._report(Property.EOS_CUSTOM_FUNCTIONS)
 
     def set_menu(self, code: int, value: int | ImageFormat) -> None:
         """Set a property by the camera's own menu, which no list restricts."""
@@ -261,8 +261,8 @@ class SimulatedEos(EosSettings, EosRelease):
 
     def _check_transaction(self, transaction: int) -> None:
         """Refuse a number that is none or was used: one may be skipped, for a request can be lost on its way."""
-        ahead = (transaction - self._last_transaction) & 0xFFFFFFFF
-        if transaction in (0, 0xFFFFFFFF) or not 0 < ahead < 1 << 31:
+        advance = (transaction - self._last_transaction) & 0xFFFFFFFF
+        if transaction in (0, 0xFFFFFFFF) or not 0 < advance < 1 << 31:
             raise OperationRefusal(ResponseCode.INVALID_TRANSACTION_ID)
         self._last_transaction = transaction
 
@@ -360,12 +360,12 @@ class SimulatedEos(EosSettings, EosRelease):
 
     def _tell_everything(self) -> None:
         for code, known in self._properties.items():
-            if known.told:
-                self._tell(code)
+            if known.reported:
+                self._report(code)
         if self._card is not None:
             self._record(Notice(EosEvent.CTG_INFO_CHECK_COMPLETE, CARD))
         for code in self._properties:
-            self._tell_list(code)
+            self._report_list(code)
         # Assumed: a frame that nobody fetched is offered to the next who listens.
         for item in self._memory.values():
             self._offer_transfer(item)

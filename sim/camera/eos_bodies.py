@@ -228,7 +228,7 @@ EOS_550D = EosModel(
     shots_per_charge=440,
     borrowed=(
         "60D: vendor extension id, operations, events, third-stop apertures, white balance shifts, structures, order",
-        "60D: capture destinations 2, 4, 6; camera time and counters told as there",
+        "60D: capture destinations 2, 4, 6; camera time and counters reported as there",
         "factory settings (third stops, no highlight priority) and 30 s to power off: general knowledge of the body",
     ),
 )

@@ -106,7 +106,7 @@ class EosFiles(SimulatedEosState):
         if item.storage:
             del self._on_card()[item.handle]
             self._record(Notice(EosEvent.OBJECT_REMOVED, item.handle))
-            self._tell(Property.EOS_AVAILABLE_SHOTS)
+            self._report(Property.EOS_AVAILABLE_SHOTS)
         else:
             del self._memory[item.handle]
         return OperationResult()
@@ -122,7 +122,7 @@ class EosFiles(SimulatedEosState):
 
     def _pc_hdd_capacity(self, arguments: Arguments) -> OperationResult:
         self._host_bytes = arguments.one * arguments.two
-        self._tell(Property.EOS_AVAILABLE_SHOTS)
+        self._report(Property.EOS_AVAILABLE_SHOTS)
         return OperationResult()
 
     def _frames_waiting(self) -> int:

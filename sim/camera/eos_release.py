@@ -258,8 +258,8 @@ class EosRelease(EosFiles):
                 return None
             return into.getvalue()
 
-        if self._darkroom is not None:
-            return self._darkroom.submit(develop)
+        if self._executor is not None:
+            return self._executor.submit(develop)
         done: Future[bytes | None] = Future()
         done.set_result(develop())
         return done
@@ -280,7 +280,7 @@ class EosRelease(EosFiles):
                     self._deliver(frame, index, f"{name}{suffix.upper()}", kind, raw)
                 else:
                     self._deliver(frame, index, f"{name}.JPG", ObjectFormat.EXIF_JPEG, _small_jpeg(name))
-        self._tell(Property.EOS_AVAILABLE_SHOTS, Property.EOS_SHUTTER_COUNTER, Property.EOS_BATTERY_POWER)
+        self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_SHUTTER_COUNTER, Property.EOS_BATTERY_POWER)
         if not self._is_busy:
             self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.IDLE))
         self._idle_since = self._clock.monotonic()

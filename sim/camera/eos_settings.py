@@ -48,7 +48,7 @@ class EosSettings(SimulatedEosState):
     def _store(self, code: int, value: bytes) -> None:
         if code == Property.EOS_CAMERA_TIME:
             self._time_offset = datetime.fromtimestamp(number_of(value), UTC) - self._clock.now()
-            self._tell(code)
+            self._report(code)
             return
         if code in (Property.EOS_IMAGE_FORMAT, Property.EOS_IMAGE_FORMAT_SD):
             self._change(Property.EOS_IMAGE_FORMAT, value)
@@ -60,12 +60,12 @@ class EosSettings(SimulatedEosState):
             self._bracket_step = 0
         self._change(code, value)
         if code == Property.EOS_CAPTURE_DESTINATION:
-            self._tell(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
+            self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
 
     def _request_device_prop_value(self, arguments: Arguments) -> OperationResult:
         if arguments.one not in self._properties:
             raise OperationRefusal(ResponseCode.GENERAL_ERROR)
-        self._tell(arguments.one)
+        self._report(arguments.one)
         return OperationResult()
 
     def _description(self, code: int) -> DevicePropDesc:

@@ -28,7 +28,7 @@ from sim.camera.film import Film
 CARD = 0x00020001
 """The store that is the card."""
 EMPTY_SLOT = 0x00020000
-"""What storage ids tell while there is no card."""
+"""The storage id while there is no card."""
 DCIM = 0x90000000
 FOLDER = 0x91900000
 """Handle of the folder 100CANON; files on the card are numbered from it, 16 apart."""
@@ -73,7 +73,7 @@ class PropertyState:
 
     value: bytes
     kind: int
-    told: bool
+    reported: bool
     choices: tuple[int, ...] = ()
     formats: tuple[ImageFormat, ...] = ()
 
@@ -127,13 +127,13 @@ class SimulatedEosState:
         battery: float,
         shutter_count: int,
         forgetful: bool,
-        darkroom: Executor | None,
+        executor: Executor | None,
     ) -> None:
         self.body = body
         self.serial = serial
         self._film = film
         self._clock = clock
-        self._darkroom = darkroom
+        self._executor = executor
         self._forgetful = forgetful
         self._card = None if card_bytes is None else self._blank_card(card_bytes)
         self._battery = battery
@@ -213,7 +213,7 @@ class SimulatedEosState:
             self._hints.append(PtpEvent(EventCode.EOS_REQUEST_GET_EVENT))
         self._queue.append(record)
 
-    def _tell_list(self, code: int) -> None:
+    def _report_list(self, code: int) -> None:
         known = self._properties[code]
         if code in IMAGE_FORMAT_PROPERTIES:
             self._record(AvailableFormats(code, known.formats, known.kind))
@@ -244,7 +244,7 @@ class SimulatedEosState:
         known = self._properties.get(code)
         return 0 if known is None else number_of(known.value)
 
-    def _tell(self, *codes: int) -> None:
+    def _report(self, *codes: int) -> None:
         for code in codes:
             self._record(PropertyChanged(code, self._value(code)))
             if code == Property.EOS_CUSTOM_FUNCTIONS and Property.EOS_MIRROR_UP_SETTING not in self._properties:
@@ -253,12 +253,12 @@ class SimulatedEosState:
 
     def _change(self, code: int, value: bytes) -> None:
         self._properties[code].value = value
-        self._tell(code)
+        self._report(code)
 
     def _offer(self, code: int, choices: tuple[int, ...]) -> None:
         if self._properties[code].choices != choices:
             self._properties[code].choices = choices
-            self._tell_list(code)
+            self._report_list(code)
 
     def _renew_exposure_lists(self) -> None:
         mode = self._number_of(Property.EOS_AE_MODE)
@@ -281,9 +281,9 @@ class SimulatedEosState:
         choices = both if self._card is not None else (CaptureDestination.HOST,)
         self._offer(Property.EOS_CAPTURE_DESTINATION, choices)
         if not self._session or self._number_of(Property.EOS_CAPTURE_DESTINATION) not in choices:
-            # The 60D without a card tells the card as destination all the same.
+            # The 60D without a card reports the card as destination all the same.
             self._change(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.CARD))
-            self._tell(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
+            self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
 
     def _battery_code(self) -> int:
         return next(

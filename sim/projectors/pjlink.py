@@ -244,7 +244,7 @@ def serve_pjlink(
     Parameters
     ----------
     port
-        0 picks a free one; the server's `address` tells which.
+        0 picks a free one, which the server's `address` names.
     host
         Where to listen; loopback unless given.
 

@@ -18,29 +18,29 @@ WATCH_S = 0.5
 
 
 class Announcer:
-    """What a `SimulatedProjector` of class 2 tells unasked: its start, then each change since somebody last looked."""
+    """The notices of a `SimulatedProjector` of class 2: its start, then each change since somebody last looked."""
 
     def __init__(self, projector: SimulatedProjector) -> None:
         self._projector = projector
-        self._told: dict[type[Notice], Notice] = self._state()
+        self._sent: dict[type[Notice], Notice] = self._state()
         self._begun = False
 
     def news(self) -> tuple[Notice, ...]:
-        """Return what is to be told now."""
+        """Return the notices that are due now."""
         if self._projector.traits.pjlink_class < 2:
             return ()
         begun, self._begun = self._begun, True
         if not begun:
             return (LinkUp(self._projector.traits.mac),)
         state = self._state()
-        news = tuple(notice for kind, notice in state.items() if self._told.get(kind) != notice)
-        self._told |= state
+        news = tuple(notice for kind, notice in state.items() if self._sent.get(kind) != notice)
+        self._sent |= state
         return news
 
     def _state(self) -> dict[type[Notice], Notice]:
         projector = self._projector
         state: list[Notice] = [FaultsChanged(projector.faults()), PowerChanged(projector.power())]
-        # In standby there is no input to tell of.
+        # In standby there is no input.
         with contextlib.suppress(DeviceRefused):
             state.append(InputChanged(projector.input()))
         return {type(notice): notice for notice in state}
@@ -54,7 +54,7 @@ class ProjectorDatagrams:
     Parameters
     ----------
     port
-        Where it hears searches; 0 picks a free one, `address` tells which.
+        Where it hears searches; 0 picks a free one, which `address` names.
     controller
         To whom it sends notices, as a projector has it entered in its menu; None for nobody.
 
@@ -89,7 +89,7 @@ class ProjectorDatagrams:
         self.close()
 
     def announce(self) -> None:
-        """Send what there is to tell now; nobody need call it, for it is done every half second."""
+        """Send the notices that are due now; nobody need call it, for it is done every half second."""
         with self._guard:
             if self._controller is None:
                 return

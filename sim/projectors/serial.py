@@ -189,17 +189,17 @@ class OptomaPeer(_Listener):
 
     Parameters
     ----------
-    tells_mute
+    answers_mute
         Whether its model can be asked if it is muted.
     """
 
     MODEL = "1"
 
-    def __init__(self, projector: SimulatedProjector, tells_mute: bool = True) -> None:
+    def __init__(self, projector: SimulatedProjector, answers_mute: bool = True) -> None:
         super().__init__(projector)
-        self._tells_mute = tells_mute
-        self._told_power = projector.power()
-        self._told_faults: frozenset[str] = frozenset()
+        self._answers_mute = answers_mute
+        self._sent_power = projector.power()
+        self._sent_faults: frozenset[str] = frozenset()
 
     def receive(self, data: bytes) -> bytes:
         """Take the next bytes and return the answers to the lines that they complete, and the news."""
@@ -215,10 +215,10 @@ class OptomaPeer(_Listener):
     def _news(self) -> bytes:
         power = self._projector.power()
         broken = frozenset(fault.part for fault in self._projector.faults() if fault.severity is Severity.ERROR)
-        news = [optoma.info_of_fault(part) for part in sorted(broken - self._told_faults)]
-        if power is not self._told_power:
+        news = [optoma.info_of_fault(part) for part in sorted(broken - self._sent_faults)]
+        if power is not self._sent_power:
             news.append(optoma.info_of_power(power))
-        self._told_power, self._told_faults = power, broken
+        self._sent_power, self._sent_faults = power, broken
         return b"".join(optoma.encode_message(info) for info in news if info is not None)
 
     def _answer(self, command: optoma.OptomaCommand) -> optoma.Message:
@@ -242,7 +242,7 @@ class OptomaPeer(_Listener):
                 return optoma.Value("1" if projector.power() is Power.ON else "0")
             case optoma.MODEL, "1":
                 return optoma.Value(self.MODEL)
-            case optoma.AV_MUTE_STATE, "1" if self._tells_mute:
+            case optoma.AV_MUTE_STATE, "1" if self._answers_mute:
                 return optoma.Value("1" if projector.muted() else "0")
             case _:
                 raise ValueError(command)

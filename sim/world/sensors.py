@@ -1,4 +1,4 @@
-"""The camera bodies that the dark room can be photographed with: their sensors, colour filters and noise.
+"""The camera bodies that the simulated room can be photographed with: their sensors, colour filters and noise.
 
 A body is a table of facts, without behaviour. Photosites count from the sensor's top-left corner, masked borders
 included, unless said; a count is what the raw file holds (DN).

@@ -123,8 +123,8 @@ def served(world: World, tmp_path: Path, request: pytest.FixtureRequest) -> Iter
     """Return a served camera; parametrise indirectly with another body than the test body."""
     body = getattr(request, "param", TEST_BODY)
     film = WitnessedFilm(WorldFilm(world, lambda: WHITE, lambda: 1.0, "1", {}))
-    with ThreadPoolExecutor(1) as darkroom:
-        eos = SimulatedEos(body, film, SystemClock(), serial="1", auto_power_off_s=0, darkroom=darkroom)
+    with ThreadPoolExecutor(1) as executor:
+        eos = SimulatedEos(body, film, SystemClock(), serial="1", auto_power_off_s=0, executor=executor)
         with serve_ptpip(eos, 0) as server:
             yield Served(eos, film, server.address[1], tmp_path)
 

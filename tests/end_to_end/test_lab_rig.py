@@ -97,9 +97,9 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
         beamer = SimulatedProjector(clock, power=Power.ON)
         world = World(sheet(load_chart(settings.chart)), simulated_body(settings), simulated_room(settings))
         film = WorldFilm(world, look, beamer.light, "0000000001", {})
-        darkroom = opened.enter_context(ThreadPoolExecutor(1))
+        executor = opened.enter_context(ThreadPoolExecutor(1))
         world.expose(Colour(0, 0, 0), settings.camera.exposure, key=(0,))  # renders before time counts
-        eos = SimulatedEos(EOS_BODIES["Test"], film, clock, auto_power_off_s=0, darkroom=darkroom)
+        eos = SimulatedEos(EOS_BODIES["Test"], film, clock, auto_power_off_s=0, executor=executor)
         bus = SimulatedBus()
         text = lab.read_text().replace('rig = "simulated"', 'rig = "lab"')
         text += "[sequence]\nsettle_s = 0.0\n" if "[sequence]" not in text else ""

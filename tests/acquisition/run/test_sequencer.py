@@ -432,7 +432,7 @@ def test_a_projector_that_cannot_tell_its_mute_is_told() -> None:
     device = SimulatedProjector(clock, power=Power.ON)
     device.set_muted(True)
     make_ready(
-        OptomaProjector(lambda: SerialPeerLink(OptomaPeer(device, tells_mute=False)), clock=clock),
+        OptomaProjector(lambda: SerialPeerLink(OptomaPeer(device, answers_mute=False)), clock=clock),
         clock,
         SequenceSettings(),
     )

@@ -533,7 +533,7 @@ HINTS: dict[str, Callable[[Responder], Responder]] = {
     "lost": faults.LosingEvents,
     "late": lambda good: faults.DelayingEvents(good, 5),
     "flooding": lambda good: faults.RepeatingEvents(good, 2_000),
-    "unknown": lambda good: faults.StrangeEvents(good, PtpEvent(0xC1FE, 7, (1, 2, 3))),
+    "unknown": lambda good: faults.UnknownEvents(good, PtpEvent(0xC1FE, 7, (1, 2, 3))),
 }
 
 

@@ -365,7 +365,7 @@ def test_benq_on_the_way_is_known_by_where_it_was() -> None:
         (b"\r*pow=?#\r", b">*pow=?#\r\n*POW=ON#\r\n>"),
         (b"\r*pow=?#\r", blocked),
     )
-    with pytest.raises(DeviceRefused, match="does not tell which"):
+    with pytest.raises(DeviceRefused, match="does not report which"):
         projector.power()
     assert projector.power() is Power.STANDBY
     assert projector.power() is Power.WARMING
@@ -447,7 +447,7 @@ def test_optoma_mute_lamp_model_and_refusal() -> None:
 
 def test_optoma_mute_that_nobody_knows_is_refused() -> None:
     device = SimulatedProjector(SimulatedClock(), Power.ON)
-    peer = OptomaPeer(device, tells_mute=False)
+    peer = OptomaPeer(device, answers_mute=False)
     projector = OptomaProjector(lambda: SerialPeerLink(peer))
     with pytest.raises(DeviceRefused):
         projector.muted()

@@ -23,7 +23,7 @@ from sim.buses.faults import (
     Occasion,
     PulledOut,
     RepeatingEvents,
-    StrangeEvents,
+    UnknownEvents,
 )
 from sim.buses.ptp_memory import MemoryTransport
 from sim.buses.responder import Responder
@@ -117,14 +117,14 @@ def told(responder: Responder, calls: int = 1) -> list[tuple[PtpEvent, ...]]:
 
 
 A, B = PtpEvent(0xC101, parameters=(0,)), PtpEvent(0xC101, parameters=(1,))
-STRANGER = PtpEvent(0xC1FF)
+UNKNOWN = PtpEvent(0xC1FF)
 
 
 def test_events_in_trouble() -> None:
     assert told(Echo()) == [(A, B)]
     assert told(LosingEvents(Echo())) == [()]
     assert told(RepeatingEvents(Echo())) == [(A, A, B, B)]
-    assert told(StrangeEvents(Echo(), STRANGER)) == [(STRANGER, A, STRANGER, B)]
+    assert told(UnknownEvents(Echo(), UNKNOWN)) == [(UNKNOWN, A, UNKNOWN, B)]
     # The bus asks until there is nothing: a call of ours is two of the device's.
     assert [bool(events) for events in told(DelayingEvents(Echo(), 2), 4)] == [False, False, True, False]
 

@@ -622,15 +622,15 @@ def test_film_is_developed_beside_the_answers() -> None:
             return super().expose(settings, released_at, into)
 
     clock, film = SimulatedClock(), SlowFilm()
-    with ThreadPoolExecutor(1) as darkroom:
-        eos = SimulatedEos(TEST_BODY, film, clock, auto_power_off_s=0, darkroom=darkroom)
+    with ThreadPoolExecutor(1) as executor:
+        eos = SimulatedEos(TEST_BODY, film, clock, auto_power_off_s=0, executor=executor)
         host = Host(eos, clock, film).take_control()
         assert host.press() == ResponseCode.OK
         clock.sleep(60)
         assert transfers(host.events()) == []
         assert eos.busy
         gate.set()
-        darkroom.submit(lambda: None).result(30)
+        executor.submit(lambda: None).result(30)
         clock.sleep(0.02)
         assert len(transfers(host.events())) == 1
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -58,6 +58,7 @@ def test_a_point_nearer_to_the_camera_lies_farther_from_the_axis() -> None:
     np.testing.assert_array_equal(grows, wavy.surface.height(points) > 0)
 
 
+@settings(deadline=None)
 @given(
     x=st.floats(-100, 2700),
     y=st.floats(-100, 1832),
