@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DEMO := build/demo
-ROOMS := drivers sim acquisition calibration generator evaluation
+ROOMS := foundation drivers sim acquisition calibration generator evaluation
 
 .PHONY: demo test lint docs bench full-session lock clean
 

@@ -10,9 +10,9 @@ from typing import Annotated
 
 import typer
 
-from drivers import console
-from drivers.console import EXIT_CODES, orderly_end
-from drivers.errors import InputError, QualityError, first_of
+from foundation import console
+from foundation.console import EXIT_CODES, orderly_end
+from foundation.errors import InputError, QualityError, first_of
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -61,11 +61,11 @@ def chart(
     proof.pdf (an A4 page to try the printer with) and PRINTING.txt. Print the PDF or the TIFF with the printer's colour
     management off, at 100 %, on matte paper. A line on stderr tells when cells are too small for the paper's cameras.
     """
-    from acquisition.layout import design_chart, paper_chart
-    from acquisition.printing import save_pdf, save_preview, save_tiff
-    from acquisition.proof import save_instructions, save_proof
-    from acquisition.visibility import warning
-    from drivers.storage import whole_folder
+    from acquisition.chart.layout import design_chart, paper_chart
+    from acquisition.chart.printing import save_pdf, save_preview, save_tiff
+    from acquisition.chart.proof import save_instructions, save_proof
+    from acquisition.framing.visibility import warning
+    from foundation.files import whole_folder
 
     if arrangement is Arrangement.PAPER:
         if cell_mm is not None:
@@ -113,9 +113,9 @@ def illuminations(
 
     Reads no file. Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb-chromaticities beside it.
     """
-    from acquisition.illuminations import parse_ccts, plan_illuminations, save_illuminations
-    from acquisition.plots import plot_illuminations
-    from drivers.storage import require_free
+    from acquisition.lights.illuminations import parse_ccts, plan_illuminations, save_illuminations
+    from acquisition.lights.plots import plot_illuminations
+    from foundation.files import require_free
 
     plot = out.with_suffix(".png")
     if plot == out:
@@ -141,7 +141,7 @@ def devices(
 
     Reads and writes no file.
     """
-    from acquisition.rig import attached_devices, identify_displays
+    from acquisition.run.rig import attached_devices, identify_displays
 
     for attached in attached_devices(search):
         print(f"{attached.kind}:")
@@ -172,17 +172,17 @@ def check(
     Reads LAB.toml, the chart and the lights it names. Writes nothing unless asked with --picture. Ends with 4 when the
     frame would not do.
     """
-    from acquisition.checking import check_lab
     from acquisition.config import load_lab
+    from acquisition.run.checking import check_lab
 
     settings = load_lab(lab)
     told = None
     if corners is not None:
-        from acquisition.corners import parse_corners
+        from acquisition.framing.corners import parse_corners
 
         told = parse_corners(corners)
     if identify:
-        from acquisition.rig import identify_displays
+        from acquisition.run.rig import identify_displays
 
         identify_displays(10.0)
     with orderly_end():
@@ -205,8 +205,8 @@ def run(
     refused; the next run tries those again.
     """
     from acquisition.config import load_lab
-    from acquisition.taking import run_session
-    from drivers.console import progress
+    from acquisition.run.taking import run_session
+    from foundation.console import progress
 
     settings = load_lab(lab)
     with orderly_end(), progress("frames") as advance:
@@ -224,8 +224,8 @@ def status(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> 
 
     Reads SESSION, also while it is being taken; writes nothing.
     """
-    from acquisition.progress import duration_text, session_progress
-    from acquisition.session import Session
+    from acquisition.session.folder import Session
+    from acquisition.session.progress import duration_text, session_progress
 
     with Session.open(session) as opened:
         state = session_progress(opened)
@@ -246,7 +246,7 @@ def monitor(
 
     Reads SESSION anew for each request, also while it is being taken; writes nothing.
     """
-    from acquisition.monitor import open_monitor
+    from acquisition.session.monitor import open_monitor
 
     with open_monitor(session, port) as server, suppress(KeyboardInterrupt):
         print(f"http://127.0.0.1:{server.server_address[1]}/ shows {session}; Ctrl-C ends it", flush=True)
@@ -266,8 +266,8 @@ def import_(
     Reads FRAMES, illuminations.csv beside it, CHART and the raw files. Writes SESSION, as acquire run does. Ends with 4
     when a light, or every white or dark frame, is without an accepted frame; the session is there all the same.
     """
-    from acquisition.importing import import_session
-    from drivers.console import progress
+    from acquisition.run.importing import import_session
+    from foundation.console import progress
 
     with progress("files") as advance:
         imported = import_session(frames, chart, session, advance)

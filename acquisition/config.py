@@ -15,7 +15,7 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 from drivers.camera import ExposureSettings
-from drivers.errors import ConfigurationError
+from foundation.errors import ConfigurationError
 
 MAX_TURN_ERROR = 0.005
 """How far a shutter time may lie from whole turns of the colour wheel, as a share: shutters are no more exact."""
@@ -80,7 +80,7 @@ class SimulatedSettings(_Settings):
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of everything that chance decides: paper, noise."""
     room: dict[str, bool | int | float | str] = {}
-    """Physical parameters of the room that differ from the default; see sim.world.Room."""
+    """Physical parameters of the room that differ from the default; see sim.world.world.Room."""
 
 
 class ReplaySettings(_Settings):

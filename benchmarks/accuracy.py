@@ -21,18 +21,19 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart import Chart
+from acquisition.chart.layout import design_chart
+from acquisition.chart.model import Chart
 from acquisition.config import LabSettings, SequenceSettings, SimulatedSettings
-from acquisition.illuminations import Illumination, plan_illuminations, save_illuminations
-from acquisition.layout import design_chart
-from acquisition.rig import sheet, simulated_body, simulated_room
-from acquisition.session import Session
-from acquisition.taking import run_session
-from calibration.build import build
-from calibration.lut import Lut, open_lut
+from acquisition.lights.illuminations import Illumination, plan_illuminations, save_illuminations
+from acquisition.run.rig import sheet, simulated_body, simulated_room
+from acquisition.run.taking import run_session
+from acquisition.session.folder import Session
+from calibration.pipeline.build import build
+from calibration.table.lut import Lut, open_lut
 from drivers.camera import ExposureSettings
-from sim.bodies import BODIES, Body
-from sim.world import World
+from foundation.angles import angles_deg
+from sim.camera.sensors import BODIES, Body
+from sim.world.world import World
 
 WELL_LIT_DN = 300
 BINS_DN = ((300, 1000), (1000, 3000), (3000, 20000))
@@ -159,12 +160,6 @@ def repeated_variance(
     """
     measured = (one.astype(np.float64) - other).var(axis=1, ddof=1) / 2
     return measured / (sample_variance(counts, body, iso) / field**2 + 1 / 12)
-
-
-def angles_deg(one: _Array, other: _Array) -> _Array:
-    """Return the angles (N,) between vectors (N, 3), degrees."""
-    crossed = np.linalg.norm(np.cross(one, other), axis=1)
-    return np.degrees(np.arctan2(crossed, (one * other).sum(axis=1)))
 
 
 def lights_with_repeats() -> tuple[Illumination, ...]:

@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.generator import natural_picture, noisy_table, report
-from calibration.lut import Lut, open_lut
-from generator.batches import Crops
-from generator.gallery import Gallery, gallery_of
-from generator.production.engines import default_workers
+from calibration.table.lut import Lut, open_lut
+from foundation.processors import processor_count
+from generator.training.crops import Crops
+from generator.training.gallery import Gallery, gallery_of
 
 SIDE = 128
 BATCH = 512
@@ -62,7 +62,7 @@ def measure(lut: Lut) -> None:
     int(np.asarray(lut.samples).reshape(-1)[::2048].max())
     ours = {
         threads: Crops(lut, gallery, (SIDE, SIDE), exposure=(0.5, 1.0), threads=threads)
-        for threads in sorted({1, default_workers()})
+        for threads in sorted({1, processor_count()})
     }
     spent: dict[int, list[float]] = {threads: [] for threads in ours}
     peer: list[float] = []

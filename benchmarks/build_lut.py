@@ -26,19 +26,19 @@ from typing import NamedTuple
 import numpy as np
 import rawpy
 
-from acquisition.illuminations import plan_illuminations
-from acquisition.layout import design_chart
-from acquisition.planes import frame_black
-from acquisition.printing import drawing
-from acquisition.session import ACCEPTED, Session, plan_steps
-from calibration.build import build
-from calibration.frames import threads
-from calibration.registration import register
-from calibration.sampling import gather_values, sites_at
-from drivers.rawfile import read_raw
-from sim.bodies import BODIES
-from sim.dng import write_dng
-from sim.world import REFERENCE_EXPOSURE, Print, Room, World
+from acquisition.chart.layout import design_chart
+from acquisition.chart.printing import drawing
+from acquisition.framing.planes import frame_black
+from acquisition.lights.illuminations import plan_illuminations
+from acquisition.session.folder import ACCEPTED, Session, plan_steps
+from calibration.pipeline.build import build
+from calibration.pipeline.frames import threads
+from calibration.registration.register import register
+from calibration.sampling.samples import gather_values, sites_at
+from drivers.raw.rawfile import read_raw
+from sim.camera.dng import write_dng
+from sim.camera.sensors import BODIES
+from sim.world.world import REFERENCE_EXPOSURE, Print, Room, World
 from tests.drivers.raw_files import write_cr2
 
 RUNS = 4

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.generator import SAMPLES, report
-from generator.kernel import draw_samples
-from generator.kernels.compiled import compiled
+from foundation.compiled import compiled
+from generator.kernels.rendering import draw_samples
 
 LIMIT = 5.3
 """Of 72 statistics, two-sided: 72 · 1.2·10⁻⁷ = 0.8·10⁻⁵."""

@@ -21,9 +21,9 @@ import numpy.typing as npt
 import skimage.data
 
 from benchmarks.generator import in_turns, natural_picture, noisy_table, report
-from generator.encode import FORMATS, Shot, encode_image
-from generator.encoders.png import encode_png
-from generator.kernel import draw_samples
+from generator.files.formats import FORMATS, Shot, encode_image
+from generator.files.png import encode_png
+from generator.kernels.rendering import draw_samples
 
 REPEATS = 3
 GRAIN = 2.0

@@ -28,12 +28,12 @@ from isal import isal_zlib
 
 from benchmarks.encode import SHOT, at_once, photograph
 from benchmarks.generator import SAMPLES, noisy_table, report
-from calibration.lut import Lut
-from generator.dataset import generate_dataset
-from generator.encode import encode_pieces
-from generator.production.engines import default_workers
-from generator.scene import find_pictures
-from generator.store import LocalStore
+from calibration.table.lut import Lut
+from foundation.processors import processor_count
+from generator.dataset.reader import generate_dataset
+from generator.dataset.store import LocalStore
+from generator.files.formats import encode_pieces
+from generator.pictures.sources import find_pictures
 
 LARGE_REPEATS = 3
 SMALL_REPEATS = 5
@@ -95,7 +95,7 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
     sources.mkdir()
     for number, picture in enumerate(pictures):
         cv2.imwrite(str(sources / f"{number:04d}.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
-    workers = default_workers()
+    workers = processor_count()
 
     def by_hand() -> None:
         shutil.rmtree(usual, ignore_errors=True)

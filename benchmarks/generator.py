@@ -30,13 +30,13 @@ import numpy as np
 import numpy.typing as npt
 import skimage.data
 
-from calibration.lut import Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
-from generator.kernel import draw_mosaic, draw_samples
+from foundation.compiled import compiled
 from generator.kernels.choice import SCRATCH, choose_group, row_keys
-from generator.kernels.compiled import compiled
 from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_planar
+from generator.kernels.rendering import draw_mosaic, draw_samples
 from generator.kernels.vector import GROUP, LINE, copy8, offset_at, prefetch_once
 from generator.masks.making import parse_masks
 
@@ -75,7 +75,7 @@ def natural_picture(width: int, height: int) -> npt.NDArray[np.uint8]:
 
 def noisy_table(folder: Path, lights: int) -> Lut:
     """Return a table of 32768 colours with shot noise."""
-    from acquisition.illuminations import Illumination
+    from acquisition.lights.illuminations import Illumination
 
     index = np.arange(32768)
     code = np.stack([index >> 10, index >> 5 & 31, index & 31], axis=-1) / 31
@@ -232,7 +232,7 @@ START = """
 import time
 import numpy as np
 begin = time.process_time()
-import generator.kernel as kernel
+import generator.kernels.rendering as kernel
 middle = time.process_time()
 kernel.draw_samples(np.zeros((8, 25, 3), np.uint16), np.zeros((9, 99, 3), np.uint8))
 print(middle - begin, time.process_time() - middle)

@@ -21,13 +21,13 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from calibration.lut import Lut, LutWriter, Provenance, open_lut
-from drivers.console import run
-from drivers.errors import DeviceError
+from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
-from generator.dataset import generate_dataset
-from generator.illuminant import RandomLights
-from generator.scene import random_scenes
+from foundation.console import run
+from foundation.errors import DeviceError
+from generator.dataset.reader import generate_dataset
+from generator.lights.choices import RandomLights
+from generator.pictures.sources import random_scenes
 
 IMAGES = 10_000
 LIGHTS = 2
@@ -41,7 +41,7 @@ def report(name: str, value: float, unit: str, against: str = "") -> None:
 
 def small_table(folder: Path) -> Lut:
     """Return a table of 64 colours and 8 lights."""
-    from acquisition.illuminations import Illumination
+    from acquisition.lights.illuminations import Illumination
 
     folder.mkdir()
     rng = np.random.default_rng(1)

@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from benchmarks.encode import SHOT, photograph
 from benchmarks.generator import SAMPLES, WHITE, in_turns, mask_weights, noisy_table, report
-from calibration.lut import Lut
-from generator.encode import encode_pieces
+from calibration.table.lut import Lut
+from generator.files.formats import encode_pieces
 from generator.kernels.mixing import mix_samples
 from generator.lights.lighting import Lighting, plain
 from generator.masks.files import encode_maps

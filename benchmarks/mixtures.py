@@ -25,14 +25,16 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.chart.layout import A_SERIES_MM, design_chart
 from acquisition.config import LabSettings, SimulatedSettings
-from acquisition.illuminations import Illumination, decode_srgb, plan_illuminations, save_illuminations
-from acquisition.layout import A_SERIES_MM, design_chart
-from acquisition.session import Session
-from acquisition.taking import run_session
-from calibration.build import build
-from calibration.lut import Lut, open_lut
-from generator.lights.gamut import Gamut, Match, OutsideGamutError, angles_between
+from acquisition.lights.illuminations import Illumination, plan_illuminations, save_illuminations
+from acquisition.run.taking import run_session
+from acquisition.session.folder import Session
+from calibration.pipeline.build import build
+from calibration.table.lut import Lut, open_lut
+from foundation.angles import angles_deg
+from foundation.srgb import decode_srgb
+from generator.lights.gamut import Gamut, Match, OutsideGamutError
 
 _Array = npt.NDArray[np.float64]
 WELL_LIT_DN = 300
@@ -104,7 +106,7 @@ def judge(way: str, found: Sequence[Left], lut: Lut, cells: Cells) -> None:
         weights = np.asarray(left.weights)
         others = list(left.others)
         white = weights @ lut.white[others]
-        angles.append(float(angles_between(white, lut.white[left.light])))
+        angles.append(float(angles_deg(white, lut.white[left.light])))
         scale = lut.white[left.light] / white
         mean = np.tensordot(weights, cells.mean[others], 1) * scale
         real = cells.mean[left.light]
@@ -146,7 +148,7 @@ def judge_black_bodies(lut: Lut) -> None:
     for (cold, first), (kelvin, light), (hot, second) in zip(bodies, bodies[1:], bodies[2:], strict=False):
         share = (1 / cold - 1 / kelvin) / (1 / cold - 1 / hot)
         joined = (1 - share) * lut.ground_truth[first] + share * lut.ground_truth[second]
-        angles.append(float(angles_between(joined, lut.white[light])))
+        angles.append(float(angles_deg(joined, lut.white[light])))
     if angles:
         against = f"{len(angles)} black bodies between two others, twice as far apart as in use"
         report("black bodies: white, median angle", float(np.median(angles)), "degrees", against)

@@ -13,11 +13,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from acquisition.layout import paper_chart
+from acquisition.chart.layout import paper_chart
 from benchmarks.rooms import Case, photographed
-from calibration.registration import register
-from sim.bodies import BODIES
-from sim.world import Room
+from calibration.registration.register import register
+from sim.camera.sensors import BODIES
+from sim.world.world import Room
 
 LIMITS_PX = {0.5: (0.05, 0.5), 3.0: (0.05, 0.5), 6.0: (0.1, 0.7)}
 """RMS and worst, px, for each waviness in mm."""

@@ -19,8 +19,8 @@ import time
 from collections.abc import Generator
 from typing import Any
 
-from acquisition.illuminations import plan_illuminations
-from drivers.fullscreen import FullScreen, list_displays
+from acquisition.lights.illuminations import plan_illuminations
+from drivers.display.fullscreen import FullScreen, list_displays
 
 SIZE = "1920x1080"
 

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 from statistics import median
 
-from drivers.clock import SystemClock
 from drivers.links.tcp import LOOPBACK
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import Operation, ResponseCode
@@ -21,10 +20,11 @@ from drivers.ptp.ip_transport import IpTransport
 from drivers.ptp.messages import Event, Request, Response
 from drivers.ptp.transport import Transport
 from drivers.ptp.usb_transport import UsbTransport
-from sim.ptpip_server import serve_ptpip
-from sim.responder import Answer
-from sim.usb import SimulatedBus
-from sim.usb_device import PtpUsbDevice
+from foundation.clock import SystemClock
+from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.responder import Answer
+from sim.buses.usb import SimulatedBus
+from sim.buses.usb_device import PtpUsbDevice
 
 OBJECT = bytes(range(256)) * 117_188
 """30 MB, a raw file."""

@@ -21,21 +21,21 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart import Chart
-from acquisition.layout import A_SERIES_MM, design_chart
-from acquisition.planes import frame_black
-from acquisition.printing import drawing
+from acquisition.chart.layout import A_SERIES_MM, design_chart
+from acquisition.chart.model import Chart
+from acquisition.chart.printing import drawing
+from acquisition.framing.planes import frame_black
 from benchmarks.accuracy import WELL_LIT_DN, sample_variance
-from calibration.registration import Registration, register
-from calibration.sampling import gather, sites_at
-from calibration.verdict import bleed, judge
+from calibration.registration.register import Registration, register
+from calibration.sampling.samples import gather, sites_at
+from calibration.verdict.verdict import bleed, judge
 from drivers.camera import ExposureSettings
-from drivers.errors import CropError
 from drivers.presenter import WHITE, Colour
-from drivers.rawfile import Mosaic, read_raw
-from sim.bodies import BODIES
-from sim.dng import write_dng
-from sim.world import Print, Room, World
+from drivers.raw.rawfile import Mosaic, read_raw
+from foundation.errors import CropError
+from sim.camera.dng import write_dng
+from sim.camera.sensors import BODIES
+from sim.world.world import Print, Room, World
 
 SILENT_PX = 1.0
 """A cell this far off lies beyond what its samples' window allows for, 0.25 px, by enough to hold another colour."""

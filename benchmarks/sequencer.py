@@ -16,16 +16,16 @@ from typing import BinaryIO
 
 import numpy as np
 
+from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings
-from acquisition.illuminations import Illumination
-from acquisition.layout import design_chart
-from acquisition.sequencer import Devices, judge_file, take_session
-from acquisition.session import Session, plan_steps
+from acquisition.lights.illuminations import Illumination
+from acquisition.run.sequencer import Devices, judge_file, take_session
+from acquisition.session.folder import Session, plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
-from sim.bodies import BODIES
+from sim.camera.dng import write_dng
+from sim.camera.sensors import BODIES
 from sim.clock import SimulatedClock
-from sim.dng import write_dng
 
 LIGHTS = 12
 BODY = BODIES["EOS 550D"]

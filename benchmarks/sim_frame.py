@@ -15,9 +15,9 @@ from io import BytesIO
 import numpy as np
 
 from drivers.presenter import WHITE
-from sim.bodies import BODIES
-from sim.dng import write_dng
-from sim.world import REFERENCE_EXPOSURE, Print, Room, World
+from sim.camera.dng import write_dng
+from sim.camera.sensors import BODIES
+from sim.world.world import REFERENCE_EXPOSURE, Print, Room, World
 
 PAGE_MM = (1189.0, 841.0)
 CELLS = (221, 155)

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drivers import console
-from drivers.console import EXIT_CODES
-from drivers.errors import FormatError, InputError
+from foundation import console
+from foundation.console import EXIT_CODES
+from foundation.errors import FormatError, InputError
 
 if TYPE_CHECKING:
-    from acquisition.session import Session
-    from calibration.choices import Choices
-    from calibration.result import BuildResult, Growth
+    from acquisition.session.folder import Session
+    from calibration.pipeline.options import Choices
+    from calibration.pipeline.result import BuildResult, Growth
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -174,8 +174,8 @@ def build_lut(
     elif fetch is not None:
         _fetch(*fetch)
     else:
-        from acquisition.corners import parse_corners
-        from calibration.choices import Choices
+        from acquisition.framing.corners import parse_corners
+        from calibration.pipeline.options import Choices
 
         if picture is not None and not check:
             raise InputError("--picture goes with --check; a table that is built has its report")
@@ -199,16 +199,16 @@ def _make(
         raise InputError("a session is expected: build-lut SESSION LUT; see build-lut --help")
     if not check and lut is None:
         raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
-    from acquisition.session import Session
+    from acquisition.session.folder import Session
 
     with Session.open(session) as opened:
         if lut is None:
-            from calibration.build import check as judge
+            from calibration.pipeline.build import check as judge
 
             result = judge(opened, choices, linearity, picture)
         else:
             result = _build(opened, lut, append, choices, linearity)
-    from calibration.result import Growth
+    from calibration.pipeline.result import Growth
 
     if isinstance(result, Growth):
         print(
@@ -218,36 +218,36 @@ def _make(
         return
     _tell(result)
     if lut is None and (verdict := result.verdict).refused:
-        from calibration.verdict import refusal
-        from drivers.errors import QualityError
+        from calibration.verdict.verdict import refusal
+        from foundation.errors import QualityError
 
         raise QualityError(f"{result.session}: {refusal(verdict, result)}")
 
 
 def _build(opened: Session, lut: Path, growing: bool, choices: Choices, linearity: Path | None) -> BuildResult | Growth:
-    from calibration.build import append, build
-    from calibration.report import write_report
+    from calibration.pipeline.build import append, build
+    from calibration.report.report import write_report
 
     with _bar("finding the chart") as told:
         return (append if growing else build)(opened, lut, told, write_report, choices, linearity)
 
 
 def _tell_table(folder: Path) -> None:
-    from calibration.lut import open_lut, summary
+    from calibration.table.lut import open_lut, summary
 
     for name, value in summary(open_lut(folder)):
         print(f"{name + ':':17}{value}")
 
 
 def _verify(folder: Path, session: Path | None) -> None:
-    from calibration.lut import damage, open_lut
+    from calibration.table.lut import damage, open_lut
 
     lut = open_lut(folder)
     with _bar("reading the samples") as told:
         faults = damage(lut, lambda done, total: told(done, total, "reading the samples"))
     if session is not None:
-        from acquisition.session import Session
-        from calibration.frames import lost_frames
+        from acquisition.session.folder import Session
+        from calibration.pipeline.frames import lost_frames
 
         with Session.open(session) as opened, _bar("reading the frames") as told:
             faults += lost_frames(lut, opened, told)
@@ -262,7 +262,7 @@ def _verify(folder: Path, session: Path | None) -> None:
 
 
 def _match(one: Path, other: Path) -> None:
-    from calibration.lut import open_lut, require_match
+    from calibration.table.lut import open_lut, require_match
 
     tables = open_lut(one), open_lut(other)
     require_match(*tables)
@@ -271,8 +271,8 @@ def _match(one: Path, other: Path) -> None:
 
 
 def _publish(folder: Path, url: str) -> None:
-    from calibration.lut import open_lut
-    from calibration.published import publish
+    from calibration.table.lut import open_lut
+    from calibration.table.zarr_store import publish
 
     lut = open_lut(folder)
     with _bar("writing lights") as told:
@@ -281,7 +281,7 @@ def _publish(folder: Path, url: str) -> None:
 
 
 def _fetch(url: str, folder: Path) -> None:
-    from calibration.published import fetch
+    from calibration.table.zarr_store import fetch
 
     with _bar("reading lights") as told:
         lut = fetch(url, folder, lambda done, total: told(done, total, "reading lights"))
@@ -310,8 +310,8 @@ def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
 
 
 def _tell(result: BuildResult) -> None:
-    from calibration.report import summary
-    from calibration.verdict import with_place
+    from calibration.report.report import summary
+    from calibration.verdict.verdict import with_place
 
     names = {
         "Tags found",

@@ -18,8 +18,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, BinaryIO
 
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
-from drivers.clock import Clock, SystemClock
-from drivers.errors import ConfigurationError, DeviceError, DeviceRefused, LinkClosed, LinkTimeout
+from foundation.clock import Clock, SystemClock
+from foundation.errors import ConfigurationError, DeviceError, DeviceRefused, LinkClosed, LinkTimeout
 
 if TYPE_CHECKING:
     import gphoto2

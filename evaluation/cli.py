@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from drivers.console import EXIT_CODES, run
+from foundation.console import EXIT_CODES, run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -67,17 +67,17 @@ def evaluate(
     from rich.console import Console
     from rich.progress import Progress
 
-    from drivers.storage import write_whole
     from evaluation import experiments
     from evaluation.datasets import open_scenes
-    from generator.dataset import default_workers
+    from foundation.files import write_whole
+    from foundation.processors import processor_count
 
     chosen = _choose(methods)
     _require_free(csv, images)
     scenes = open_scenes(dataset)
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("images", total=len(scenes))
-        results = experiments.evaluate(scenes, chosen, workers or default_workers(), lambda: progress.advance(task))
+        results = experiments.evaluate(scenes, chosen, workers or processor_count(), lambda: progress.advance(task))
     print(f"{_name_of(dataset)}: {error} angular error of {len(scenes)} images, degrees")
     _print_table(results, error)
     for result in results:
@@ -96,8 +96,8 @@ def _name_of(dataset: str) -> str:
 
 
 def _require_free(csv: Path | None, images: Path | None) -> None:
-    from drivers.errors import InputError
-    from drivers.storage import require_free_file
+    from foundation.errors import InputError
+    from foundation.files import require_free_file
 
     for path, what in ((csv, "the table"), (images, "the images' errors")):
         if path is not None:
@@ -126,8 +126,8 @@ def _print_table(results: Sequence[Result], error: ErrorKind) -> None:
 
 
 def _choose(text: str) -> list[Method]:
-    from drivers.errors import InputError
     from evaluation.methods import standard_methods
+    from foundation.errors import InputError
 
     known = standard_methods()
     if text.strip().lower() == "all":
@@ -140,7 +140,7 @@ def _choose(text: str) -> list[Method]:
 
 
 def main() -> int:
-    """Run the command; see `drivers.console.EXIT_CODES` for what is returned."""
+    """Run the command; see `foundation.console.EXIT_CODES` for what is returned."""
     return run(lambda: app(prog_name="evaluate"))
 
 

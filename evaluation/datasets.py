@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.methods import Image
-from generator.dataset import Dataset, Entry, open_dataset
+from generator.dataset.reader import Dataset, Entry, open_dataset
 
 
 class Scene(Protocol):

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import InputError
 from evaluation.datasets import Scene
 from evaluation.methods import Method
 from evaluation.methods.pixels import GREY
 from evaluation.metrics import ErrorKind, Summary, recovery_error, reproduction_error, summarise
+from foundation.errors import InputError
 
 COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg")
 

@@ -12,7 +12,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import InputError
+from foundation.angles import angles_deg
+from foundation.errors import InputError
 
 ErrorKind = Literal["reproduction", "recovery"]
 
@@ -30,7 +31,7 @@ def recovery_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDArray
     ndarray
         (...) float64, 0 … 180.
     """
-    return _angle(np.asarray(estimate, dtype=np.float64), np.asarray(truth, dtype=np.float64))
+    return angles_deg(estimate, truth)
 
 
 def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -50,15 +51,7 @@ def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDA
     # Zero would divide; next to nothing beside the largest channel has the limit's angle to the last digit.
     floor = 1e-12 * given.max(axis=-1, keepdims=True)
     corrected = np.asarray(truth, dtype=np.float64) / np.maximum(given, floor)
-    return _angle(corrected, np.ones_like(corrected))
-
-
-def _angle(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    # The arc tangent keeps its digits where the arc cosine of equation 3 loses half of them: at small angles.
-    a, b = np.broadcast_arrays(a, b)
-    a = a / np.linalg.norm(a, axis=-1, keepdims=True)
-    b = b / np.linalg.norm(b, axis=-1, keepdims=True)
-    return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
+    return angles_deg(corrected, np.ones_like(corrected))
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ import skimage.data
 import torch
 from torch.utils.data import DataLoader
 
-from calibration.lut import open_lut
+from calibration.table.lut import open_lut
 from evaluation.methods import standard_methods
 from evaluation.metrics import recovery_error, summarise
-from generator.batches import CropDataset, Crops, collated
-from generator.gallery import Gallery, gallery_of
-from generator.scene import find_pictures
+from generator.pictures.sources import find_pictures
+from generator.training.crops import CropDataset, Crops, collated
+from generator.training.gallery import Gallery, gallery_of
 
 SIDE = 64
 BATCH = 64

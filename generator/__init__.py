@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
-    from generator.dataset import generate_dataset, open_dataset
-    from generator.kernel import draw_mosaic, draw_samples, render
+    from calibration.table.lut import Lut
+    from generator.dataset.reader import generate_dataset, open_dataset
     from generator.kernels.mixing import mix_samples, mixed_table
     from generator.kernels.planar import draw_batch, draw_planar
-    from generator.picture import read_picture
-    from generator.scene import find_pictures
-    from generator.tonemap import flash
+    from generator.kernels.rendering import draw_mosaic, draw_samples, render
+    from generator.pictures.picture import read_picture
+    from generator.pictures.sources import find_pictures
+    from generator.pictures.tonemap import flash
 
 __all__ = [
     "draw_batch",
@@ -44,23 +44,23 @@ __all__ = [
 
 _HOMES = {
     "draw_batch": "generator.kernels.planar",
-    "draw_mosaic": "generator.kernel",
+    "draw_mosaic": "generator.kernels.rendering",
     "draw_planar": "generator.kernels.planar",
-    "draw_samples": "generator.kernel",
-    "find_pictures": "generator.scene",
-    "flash": "generator.tonemap",
-    "generate_dataset": "generator.dataset",
+    "draw_samples": "generator.kernels.rendering",
+    "find_pictures": "generator.pictures.sources",
+    "flash": "generator.pictures.tonemap",
+    "generate_dataset": "generator.dataset.reader",
     "mix_samples": "generator.kernels.mixing",
     "mixed_table": "generator.kernels.mixing",
-    "open_dataset": "generator.dataset",
-    "read_picture": "generator.picture",
-    "render": "generator.kernel",
+    "open_dataset": "generator.dataset.reader",
+    "read_picture": "generator.pictures.picture",
+    "render": "generator.kernels.rendering",
 }
 
 
 def open_lut(folder: Path | str) -> Lut:
-    """Open a table; see `calibration.lut.open_lut`."""
-    from calibration.lut import open_lut
+    """Open a table; see `calibration.table.lut.open_lut`."""
+    from calibration.table.lut import open_lut
 
     return open_lut(Path(folder))
 

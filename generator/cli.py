@@ -14,14 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from drivers.console import EXIT_CODES, run
+from foundation.console import EXIT_CODES, run
+from foundation.processors import processor_count
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from generator.dataset import Dataset
-    from generator.picture import Preparation
-    from generator.scene import Source
+    from generator.dataset.reader import Dataset
+    from generator.pictures.picture import Preparation
+    from generator.pictures.sources import Source
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
 
@@ -280,25 +281,25 @@ def generate(
         _draw_sheet(_verify(verify, workers), verify, contact_sheet)
         return
     if finish is not None:
-        from generator.dataset import finish_dataset
+        from generator.dataset.reader import finish_dataset
 
         dataset = finish_dataset(finish)
         _tell(dataset, finish)
         _draw_sheet(dataset, finish, contact_sheet)
         return
 
-    from calibration.lut import open_lut
-    from drivers.errors import InputError
-    from generator.dataset import make_dataset, make_share
-    from generator.light_request import LightRequest
-    from generator.picture import Preparation
-    from generator.production.engines import check_workers, default_workers
-    from generator.production.plan import Options, Plan, parse_share, parse_split
-    from generator.production.workplace import require_free_place
+    from calibration.table.lut import open_lut
+    from foundation.errors import InputError
+    from generator.dataset.production.engines import check_workers
+    from generator.dataset.production.plan import Options, Plan, parse_share, parse_split
+    from generator.dataset.production.workplace import require_free_place
+    from generator.dataset.reader import make_dataset, make_share
+    from generator.lights.request import LightRequest
+    from generator.pictures.picture import Preparation
 
     if lut is None or out is None:
         raise InputError("the table and the place of the dataset are missing; write generate LUT OUT --sources DIR")
-    at_once = default_workers() if workers is None else workers
+    at_once = processor_count() if workers is None else workers
     check_workers(engine, at_once)
     require_free_place(out)
     table = open_lut(lut)
@@ -358,7 +359,7 @@ def generate(
 
 def _require_alone(commands: dict[str, str | None], more: Path | None) -> None:
     """Refuse a second command beside one that needs its place only, and a table or place that it would not look at."""
-    from drivers.errors import InputError
+    from foundation.errors import InputError
 
     given = [name for name, place in commands.items() if place is not None]
     if len(given) > 1:
@@ -439,15 +440,15 @@ def _counted(number: int, thing: str) -> str:
 
 def _verify(out: str, workers: int | None) -> Dataset:
     """Print every fault of a dataset and return it; a QualityError if there is one."""
-    from drivers.console import progress
-    from drivers.errors import QualityError
-    from generator.dataset import open_dataset
-    from generator.production.assembly import damage
-    from generator.production.engines import check_workers, default_workers
-    from generator.store import is_remote
+    from foundation.console import progress
+    from foundation.errors import QualityError
+    from generator.dataset.production.assembly import damage
+    from generator.dataset.production.engines import check_workers
+    from generator.dataset.reader import open_dataset
+    from generator.dataset.store import is_remote
 
     # Whoever reads from a store waits for it most of the time.
-    at_once = max(default_workers(), _STORE_READERS if is_remote(out) else 1) if workers is None else workers
+    at_once = max(processor_count(), _STORE_READERS if is_remote(out) else 1) if workers is None else workers
     check_workers("local", at_once)
     faults = 0
     with progress("files") as told:
@@ -465,8 +466,8 @@ def _draw_sheet(dataset: Dataset, out: str, contact_sheet: Path | None) -> None:
     """Write the contact sheet if one is wanted; a StorageError says how to have it made without the dataset."""
     if contact_sheet is None:
         return
-    from drivers.errors import StorageError
-    from generator.contact import save_contact_sheet
+    from foundation.errors import StorageError
+    from generator.dataset.contact_sheet import save_contact_sheet
 
     try:
         save_contact_sheet(dataset, contact_sheet)
@@ -480,8 +481,8 @@ def _draw_sheet(dataset: Dataset, out: str, contact_sheet: Path | None) -> None:
 
 
 def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None) -> None:
-    from drivers.errors import InputError
-    from generator.store import is_remote, local_path
+    from foundation.errors import InputError
+    from generator.dataset.store import is_remote, local_path
 
     if shard is not None:
         raise InputError(
@@ -500,8 +501,8 @@ def _check_sheet(contact_sheet: Path, out: str | None, shard: str | None) -> Non
 def _choose_sources(
     places: list[str], random_scenes: int, size: str, seed: int, preparation: Preparation
 ) -> tuple[Source, ...]:
-    from drivers.errors import InputError
-    from generator import scene
+    from foundation.errors import InputError
+    from generator.pictures import sources as scene
 
     if not places and (preparation.crop or preparation.max_side):
         raise InputError("--crop and --max-side are for pictures, and --sources names none; random ones have --size")
@@ -516,7 +517,7 @@ def _choose_sources(
 def _size(text: str, option: str) -> tuple[int, int]:
     import re
 
-    from drivers.errors import InputError
+    from foundation.errors import InputError
 
     match = re.fullmatch(r"(\d+)[xX×](\d+)", text)
     if not match:
@@ -525,7 +526,7 @@ def _size(text: str, option: str) -> tuple[int, int]:
 
 
 def main() -> int:
-    """Run the command; see `drivers.console.EXIT_CODES` for what is returned."""
+    """Run the command; see `foundation.console.EXIT_CODES` for what is returned."""
     return run(lambda: app(prog_name="generate"))
 
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drivers import console
-from drivers.console import EXIT_CODES
+from foundation import console
+from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
-    from sim.projector import SimulatedProjector
-    from sim.world import Print
+    from sim.projectors.pjlink import SimulatedProjector
+    from sim.world.world import Print
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -55,10 +55,10 @@ def projector(
     (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there is no such language or not exactly one
     cable, 3 when the port is taken.
     """
-    from drivers.clock import SystemClock
-    from drivers.errors import ConfigurationError, InputError
     from drivers.pjlink.wire import MAX_PASSWORD
-    from sim.projector import SimulatedProjector
+    from foundation.clock import SystemClock
+    from foundation.errors import ConfigurationError, InputError
+    from sim.projectors.pjlink import SimulatedProjector
 
     if (pjlink is None) == (serial is None):
         raise ConfigurationError("one projector hangs on one cable: either --pjlink PORT or --serial LANGUAGE")
@@ -78,7 +78,7 @@ def projector(
 def _serve_network(
     device: SimulatedProjector, pjlink: int, password: str | None, udp: int | None, controller: tuple[str, int] | None
 ) -> None:
-    from sim.projector import ProjectorDatagrams, serve_pjlink
+    from sim.projectors.pjlink import ProjectorDatagrams, serve_pjlink
 
     with ExitStack() as served:
         host, port = served.enter_context(serve_pjlink(device, pjlink, password)).address
@@ -90,15 +90,15 @@ def _serve_network(
 
 
 def _serve_serial(device: SimulatedProjector, name: str) -> None:
-    from drivers.errors import ConfigurationError
     from drivers.serial_projectors import language
+    from foundation.errors import ConfigurationError
 
     spoken = language(name)
     try:
-        from sim.pty import PseudoTerminal
+        from sim.projectors.pty import PseudoTerminal
     except ImportError as error:
         raise ConfigurationError("this system has no pseudo-terminals; --serial needs Linux or macOS") from error
-    from sim.serial_projectors import PEERS
+    from sim.projectors.serial import PEERS
 
     with PseudoTerminal(PEERS[spoken.name](device)) as terminal:
         _until_interrupted(f"{spoken.maker} projector at {terminal.path}")
@@ -125,19 +125,19 @@ def camera(
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    from drivers.clock import SystemClock
-    from drivers.errors import ConfigurationError
+    from drivers.canon.apex import SHUTTER
     from drivers.presenter import WHITE
-    from drivers.ptp.apex import SHUTTER
     from drivers.ptp.codes import Property
-    from sim.bodies import BODIES
-    from sim.eos import SimulatedEos
-    from sim.eos_bodies import EOS_BODIES
-    from sim.film import WorldFilm
-    from sim.ptpip_server import serve_ptpip
-    from sim.usb_device import Identity, PtpUsbDevice
-    from sim.usbip import serve_usbip
-    from sim.world import REFERENCE_EXPOSURE, Room, World
+    from foundation.clock import SystemClock
+    from foundation.errors import ConfigurationError
+    from sim.buses.ptpip_server import serve_ptpip
+    from sim.buses.usb_device import Identity, PtpUsbDevice
+    from sim.buses.usbip import serve_usbip
+    from sim.camera.eos import SimulatedEos
+    from sim.camera.eos_bodies import EOS_BODIES
+    from sim.camera.film import WorldFilm
+    from sim.camera.sensors import BODIES
+    from sim.world.world import REFERENCE_EXPOSURE, Room, World
 
     if (port is None) == (usbip is None):
         raise ConfigurationError("one camera hangs on one cable: either --port N for PTP/IP or --usbip N for USB/IP")
@@ -162,7 +162,7 @@ def _grey_squares() -> Print:
     """Return an A4 sheet with five by three squares from black to paper white."""
     import numpy as np
 
-    from sim.world import Print
+    from sim.world.world import Print
 
     column, row = (grid.ravel() for grid in np.meshgrid(np.arange(5), np.arange(3)))
     left, top = 18 + 54.0 * column, 21 + 60.0 * row
@@ -172,7 +172,7 @@ def _grey_squares() -> Print:
 
 
 def _host_and_port(text: str) -> tuple[str, int]:
-    from drivers.errors import InputError
+    from foundation.errors import InputError
 
     host, _, port = text.rpartition(":")
     if not host or not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:

@@ -9,7 +9,7 @@ OPENING = datetime(2026, 1, 1, 8, 0, 0, tzinfo=UTC)
 
 
 class SimulatedClock:
-    """A `drivers.clock.Clock` that stands still until `sleep` moves it."""
+    """A `foundation.clock.Clock` that stands still until `sleep` moves it."""
 
     def __init__(self, start: datetime = OPENING) -> None:
         self._start = start

@@ -1,8 +1,8 @@
 """Trouble with cameras and cables, each as a wrapper around something good; nothing good knows of it.
 
-Three places can be troubled: the device, as a `sim.responder.Responder`; its pipes, as `drivers.pipes.UsbPipes`; the
-whole cable, as a `drivers.ptp.transport.Transport`. A wrapper keeps the contract of what it wraps and may be wrapped
-again. What happens and when is said on construction; nothing is random.
+Three places can be troubled: the device, as a `sim.buses.responder.Responder`; its pipes, as
+`drivers.links.pipes.UsbPipes`; the whole cable, as a `drivers.ptp.transport.Transport`. A wrapper keeps the contract of
+what it wraps and may be wrapped again. What happens and when is said on construction; nothing is random.
 
 A device that restarts in the middle of an operation is `Interrupting` with the simulated bus's ``replug``, one that is
 pulled out the same with ``unplug``.
@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
-from drivers.errors import LinkClosed, LinkTimeout
-from drivers.pipes import Pipe, PipeStalled, UsbPipes
+from drivers.links.pipes import Pipe, PipeStalled, UsbPipes
 from drivers.ptp.container import HEADER_LENGTH
 from drivers.ptp.messages import Event, Request, Response
 from drivers.ptp.transport import Transaction, Transport
-from sim.responder import Answer, NoAnswer, Responder
+from foundation.errors import LinkClosed, LinkTimeout
+from sim.buses.responder import Answer, NoAnswer, Responder
 
 
 class Occasion:

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Protocol
 import usb.core
 import usb.util
 
-from drivers.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
 from drivers.links.usb_claim import Claim
+from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
 
 if TYPE_CHECKING:
     from usb.backend import IBackend

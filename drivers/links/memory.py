@@ -2,7 +2,7 @@
 
 Rules that hold inside:
 
-- Both kinds keep the contract of `drivers.link.Link`; what was sent before hanging up can still be read after it.
+- Both kinds keep the contract of `drivers.links.link.Link`; what was sent before hanging up can still be read after it.
 - `memory_pair` may be used from two threads, one an end. `PeerLink` has no thread and never waits: its peer has
   answered by the time `write` returns, so an empty read can only mean that nothing will come.
 """
@@ -13,7 +13,7 @@ import threading
 import time
 from typing import Protocol
 
-from drivers.errors import LinkClosed, LinkTimeout
+from foundation.errors import LinkClosed, LinkTimeout
 
 
 class Peer(Protocol):

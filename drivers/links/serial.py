@@ -16,14 +16,14 @@ import errno
 import serial
 from serial.tools import list_ports
 
-from drivers.errors import ConfigurationError, DeviceRefused, LinkClosed, LinkError, LinkTimeout
+from foundation.errors import ConfigurationError, DeviceRefused, LinkClosed, LinkError, LinkTimeout
 
 PARITIES = ("N", "E", "O")
 """None, even, odd."""
 
 
 class SerialLink:
-    """A `drivers.link.Link` over one serial port."""
+    """A `drivers.links.link.Link` over one serial port."""
 
     def __init__(self, port: serial.Serial, device: str) -> None:
         self._port = port

@@ -14,13 +14,13 @@ import threading
 from collections.abc import Callable
 from types import TracebackType
 
-from drivers.errors import LinkClosed, LinkError, LinkTimeout
+from foundation.errors import LinkClosed, LinkError, LinkTimeout
 
 LOOPBACK = "127.0.0.1"
 
 
 class TcpLink:
-    """A `drivers.link.Link` over one TCP connection."""
+    """A `drivers.links.link.Link` over one TCP connection."""
 
     def __init__(self, connection: socket.socket, far_end: str) -> None:
         self._socket = connection

@@ -12,7 +12,7 @@ import socket
 import time
 from types import TracebackType
 
-from drivers.errors import LinkClosed, LinkTimeout
+from foundation.errors import LinkClosed, LinkTimeout
 
 ANY_HOST = "0.0.0.0"
 BROADCAST = "255.255.255.255"

@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING
 import usb.core
 import usb.util
 
-from drivers.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
+from drivers.links.pipes import Pipe, PipeStalled
 from drivers.links.usb_claim import Claim
-from drivers.pipes import Pipe, PipeStalled
 from drivers.ptp.container import INTERFACE_CLASS
+from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
 
 if TYPE_CHECKING:
     from usb.backend import IBackend
@@ -114,7 +114,7 @@ def open_usb(
 
 
 class OpenUsbDevice:
-    """The `drivers.pipes.UsbPipes` of a device that `open_usb` found."""
+    """The `drivers.links.pipes.UsbPipes` of a device that `open_usb` found."""
 
     def __init__(self, device: usb.core.Device, description: UsbDevice) -> None:
         self._device = device

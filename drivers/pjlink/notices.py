@@ -17,9 +17,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from drivers.errors import ProtocolError
 from drivers.pjlink import wire
 from drivers.projector import Fault, Power
+from foundation.errors import ProtocolError
 
 SEARCH = b"%2SRCH\r"
 COLLECT_S = 30.0

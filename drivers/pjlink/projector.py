@@ -14,12 +14,12 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable
 
-from drivers.clock import Clock, SystemClock
-from drivers.errors import DeviceFault, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
-from drivers.link import Link
+from drivers.links.link import Link
 from drivers.pjlink import notices, wire
 from drivers.pjlink.wire import ErrorCode, Input, LineCutter, NoResolution, Refused, Reply, Request, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
+from foundation.clock import Clock, SystemClock
+from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
 DEFAULT_TIMEOUT_S = 5.0
 """The standard asks for an answer within 2 s; real projectors take longer while they warm up."""

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol
 
-from drivers.clock import Clock, SystemClock
-from drivers.errors import LinkTimeout
 from drivers.links.udp import ANY_HOST, BROADCAST, Address, UdpSocket
 from drivers.pjlink import notices, wire
 from drivers.pjlink.notices import COLLECT_S, Found, Notice
+from foundation.clock import Clock, SystemClock
+from foundation.errors import LinkTimeout
 
 ASKED = 3
 """A datagram may be lost, so the search is sent so often, a second apart; a projector may answer each."""

@@ -20,8 +20,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from drivers.errors import ProtocolError
 from drivers.projector import Fault, Lamp, Power, Severity
+from foundation.errors import ProtocolError
 
 PORT = 4352
 MAX_LINE = 136

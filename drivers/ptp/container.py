@@ -21,10 +21,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
-from drivers.errors import ProtocolError
 from drivers.ptp.cursor import Cursor
 from drivers.ptp.datasets import encode_integer
 from drivers.ptp.messages import MAX_PARAMETERS, Event, Request, Response
+from foundation.errors import ProtocolError
 
 INTERFACE_CLASS = (6, 1, 1)
 """USB class, subclass and protocol of a still image device."""

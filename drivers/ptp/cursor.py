@@ -10,7 +10,7 @@ Laws that hold inside:
 
 from __future__ import annotations
 
-from drivers.errors import ProtocolError
+from foundation.errors import ProtocolError
 
 
 class Cursor:

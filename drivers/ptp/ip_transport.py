@@ -15,9 +15,7 @@ import contextlib
 from collections import deque
 from collections.abc import Callable
 
-from drivers.clock import Clock
-from drivers.errors import DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
-from drivers.link import Link
+from drivers.links.link import Link
 from drivers.links.tcp import TcpLink
 from drivers.ptp.messages import Event, Request, Response
 from drivers.ptp.ptpip import (
@@ -42,6 +40,8 @@ from drivers.ptp.ptpip import (
 )
 from drivers.ptp.reception import Reception, Turns
 from drivers.ptp.transport import Transaction
+from foundation.clock import Clock
+from foundation.errors import DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
 DATA_PIECE = 64 * 1024
 """Bytes of data in a packet to the device; what libgphoto2 sends, and bodies are used to it."""

@@ -22,10 +22,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
-from drivers.errors import ProtocolError
 from drivers.ptp.cursor import Cursor
 from drivers.ptp.datasets import encode_integer
 from drivers.ptp.messages import MAX_PARAMETERS, Event, Request, Response
+from foundation.errors import ProtocolError
 
 PORT = 15740
 VERSION = 0x00010000

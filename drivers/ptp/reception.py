@@ -15,9 +15,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.errors import LinkClosed, LinkError, ProtocolError
 from drivers.ptp.messages import Request, Response
 from drivers.ptp.transport import MAX_COLLECTED, Transaction
+from foundation.errors import LinkClosed, LinkError, ProtocolError
 
 
 class Turns:

@@ -15,11 +15,11 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolError
 from drivers.ptp.codes import Operation, ResponseCode, describe
 from drivers.ptp.messages import Event, Request, next_transaction
 from drivers.ptp.transport import Transport
+from foundation.clock import Clock
+from foundation.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolError
 
 START_TIMEOUT_S = 1.5
 """Wait for the answer to OpenSession: a body that a killed host left behind never answers before a reset."""

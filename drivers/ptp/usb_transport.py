@@ -14,9 +14,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 
-from drivers.clock import Clock
-from drivers.errors import LinkError, LinkTimeout, ProtocolError
-from drivers.pipes import Pipe, PipeStalled, UsbPipes
+from drivers.links.pipes import Pipe, PipeStalled, UsbPipes
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.container import (
     MAX_DEVICE_STATUS,
@@ -33,6 +31,8 @@ from drivers.ptp.container import (
 from drivers.ptp.messages import Event, Request, Response
 from drivers.ptp.reception import Reception, Turns
 from drivers.ptp.transport import Transaction
+from foundation.clock import Clock
+from foundation.errors import LinkError, LinkTimeout, ProtocolError
 
 PIECE = 512 * 1024
 """Bytes of the largest transfer; bigger ones are more than some hosts and cameras bear."""

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
-from drivers.clock import Clock
-from drivers.errors import ConfigurationError
-from drivers.link import Link
+from drivers.links.link import Link
 from drivers.projector import Projector
 from drivers.serial_projectors import benq, epson, nec, optoma
 from drivers.serial_projectors.exchange import DEFAULT_TIMEOUT_S, SYSTEM_CLOCK
+from foundation.clock import Clock
+from foundation.errors import ConfigurationError
 
 
 class ProjectorFactory(Protocol):

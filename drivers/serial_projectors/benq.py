@@ -19,9 +19,7 @@ import contextlib
 import re
 from collections.abc import Callable
 
-from drivers.clock import Clock
-from drivers.errors import DeviceRefused, ProtocolError
-from drivers.link import Link
+from drivers.links.link import Link
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
 from drivers.serial_projectors.exchange import (
     CHECK_SPEED,
@@ -31,6 +29,8 @@ from drivers.serial_projectors.exchange import (
     Taker,
     text_of,
 )
+from foundation.clock import Clock
+from foundation.errors import DeviceRefused, ProtocolError
 
 BAUD = 115200
 TCP_PORT = 8000

@@ -17,11 +17,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 
-from drivers.clock import Clock
-from drivers.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
-from drivers.link import Link
+from drivers.links.link import Link
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
 from drivers.serial_projectors.exchange import CHECK_SPEED, DEFAULT_TIMEOUT_S, SYSTEM_CLOCK, Exchange, quoted, text_of
+from foundation.clock import Clock
+from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
 
 BAUD = 9600
 TCP_PORT = 3629

@@ -14,9 +14,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-from drivers.clock import Clock, SystemClock
-from drivers.errors import LinkClosed, LinkTimeout, ProtocolError
-from drivers.link import Link
+from drivers.links.link import Link
+from foundation.clock import Clock, SystemClock
+from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 
 SYSTEM_CLOCK = SystemClock()
 

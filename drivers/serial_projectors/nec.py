@@ -18,11 +18,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-from drivers.clock import Clock
-from drivers.errors import DeviceFault, DeviceRefused, ProtocolError
-from drivers.link import Link
+from drivers.links.link import Link
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
 from drivers.serial_projectors.exchange import CHECK_SPEED, DEFAULT_TIMEOUT_S, SYSTEM_CLOCK, Exchange, quoted
+from foundation.clock import Clock
+from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 
 BAUD = 38400
 TCP_PORT = 7142

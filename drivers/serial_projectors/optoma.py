@@ -18,11 +18,11 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.clock import Clock
-from drivers.errors import DeviceRefused, ProtocolError
-from drivers.link import Link
+from drivers.links.link import Link
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
 from drivers.serial_projectors.exchange import CHECK_SPEED, DEFAULT_TIMEOUT_S, SYSTEM_CLOCK, Exchange, quoted, text_of
+from foundation.clock import Clock
+from foundation.errors import DeviceRefused, ProtocolError
 
 BAUD = 9600
 EVERYBODY = 0

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import InputError
+from foundation.errors import InputError
 from generator.kernels.palette import bits_of
 from generator.kernels.philox import key_of
 

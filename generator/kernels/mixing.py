@@ -25,7 +25,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import uint32
 
-from drivers.errors import InputError
+from foundation.compiled import compiled
+from foundation.errors import InputError
 from generator.kernels import philox, streaming
 from generator.kernels.arguments import (
     Picture,
@@ -41,7 +42,6 @@ from generator.kernels.arguments import (
     writable,
 )
 from generator.kernels.choice import OFFSETS, SCRATCH, ask_group, four_words, group_of, row_keys
-from generator.kernels.compiled import compiled
 from generator.kernels.drawing import choose_first, draw_groups
 from generator.kernels.palette import bits_of, colours_in
 from generator.kernels.streaming import line_at, line_room, pass_on

@@ -14,13 +14,13 @@ import numpy as np
 import numpy.typing as npt
 from numba import uint32
 
-from drivers.errors import InputError, QualityError
+from foundation.compiled import compiled
+from foundation.errors import InputError, QualityError
 from generator.kernels.choice import EDGE, OFFSETS, group_of
-from generator.kernels.compiled import compiled
 from generator.kernels.vector import GROUP, copy1, name_colours, offset_at
 
 if TYPE_CHECKING:
-    from calibration.lut import Provenance
+    from calibration.table.lut import Provenance
 
 
 def bits_of(colours: int) -> int:

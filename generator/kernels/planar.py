@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import InputError
+from foundation.compiled import compiled
+from foundation.errors import InputError
 from generator.kernels.arguments import (
     check_picture,
     check_samples,
@@ -28,7 +29,6 @@ from generator.kernels.arguments import (
     share,
 )
 from generator.kernels.choice import EDGE, OFFSETS, choose_group, row_keys
-from generator.kernels.compiled import compiled
 from generator.kernels.vector import EIGHT, GROUP, mirrored8, offset_at, plane1, planes8, prefetch
 
 Window = tuple[int, int, int, int]

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from generator.kernels.compiled import compiled
+from foundation.compiled import compiled
 
 _ZERO: Final = np.float32(0)
 

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError
 from generator.kernels.philox import Words
 from generator.lights.gamut import rb_of
 from generator.lights.options import parse_numbers

@@ -23,11 +23,12 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import InputError
+from foundation.angles import angles_deg
+from foundation.errors import InputError
 from generator.lights.lighting import Mixture, mixture_of
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 TOLERANCE_DEG: Final = 0.01
 """How far one or two lights may be from what is wanted to be taken instead of three: about a table's own error."""
@@ -196,7 +197,7 @@ class Gamut:
 
     def _nearest_light(self, target: _Array) -> Match:
         light = int((self.directions @ target).argmax())
-        return Match(mixture_of({light: 1.0}), float(angles_between(self.white[light], target)))
+        return Match(mixture_of({light: 1.0}), float(angles_deg(self.white[light], target)))
 
     def _pairs(self, target: _Array) -> tuple[npt.NDArray[np.int64], _Array, _Array]:
         """Return the pairs between whose lights the target's foot falls, their shares, and the angles in degrees."""
@@ -214,7 +215,7 @@ class Gamut:
         weights = np.maximum(shares, 0) / np.linalg.norm(self.white[lights], axis=1)
         mixture = mixture_of({int(light): float(weight) for light, weight in zip(lights, weights, strict=True)})
         made = np.asarray(mixture.weights) @ self.white[list(mixture.lights)]
-        return Match(mixture, float(angles_between(made, target)))
+        return Match(mixture, float(angles_deg(made, target)))
 
 
 def rb_of(rgb: _Array) -> _Array:
@@ -232,19 +233,14 @@ def _unit(rgb: _Array) -> _Array:
     return rgb / np.linalg.norm(rgb, axis=-1, keepdims=True)
 
 
-def angles_between(one: _Array, other: _Array) -> _Array:
-    """Return the angles in degrees between vectors (..., 3) of any length above 0; exact for small angles too."""
-    across = np.linalg.norm(np.cross(one, other), axis=-1)
-    return np.degrees(np.arctan2(across, (one * other).sum(axis=-1)))
-
-
 def black_body(lut: Lut, cct_k: float) -> Mixture:
     """Return the light of a black body between those of the table: its two neighbours, in proportion by mired.
 
     The temperature says what was asked of the projector, which shows three primaries in the proportion that looks, to
-    the CIE 1931 standard observer, like the black body (`acquisition.illuminations.blackbody_light`). The camera is not
-    that observer: its white under this light is what the ground truth says, and not what the black body's own spectrum
-    would give. So a temperature names one of the table's lights, or one between, and is no measurement by the camera.
+    the CIE 1931 standard observer, like the black body (`acquisition.lights.illuminations.blackbody_light`). The camera
+    is not that observer: its white under this light is what the ground truth says, and not what the black body's own
+    spectrum would give. So a temperature names one of the table's lights, or one between, and is no measurement by the
+    camera.
 
     Chromaticities along the black bodies are close to linear in mired (10⁶ / K). Between lights 200 K apart that is
     as good as a cubic spline and within what the projector's codes of 8 bits allow: 0.05° median, 0.2° worst.

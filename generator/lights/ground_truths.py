@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import FormatError
+from foundation.errors import FormatError
 
 _TRIPLES = (("gt_r", "gt_g", "gt_b"), ("r", "g", "b"), ("red", "green", "blue"), ("white_r", "white_g", "white_b"))
 

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import InputError
+from foundation.errors import InputError
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 FULL: Final = 65535
 """A pixel's weight 1 as it is written to a file."""
@@ -100,9 +100,9 @@ class Mixture:
         InputError
             The table has no such light.
         """
-        from generator.kernel import WHOLE_LIGHT, read_light
         from generator.kernels.mixing import mixed_table
         from generator.kernels.palette import colours_in
+        from generator.kernels.rendering import WHOLE_LIGHT, read_light
 
         self._require(lut)
         pixels = WHOLE_LIGHT if picture is None else picture.shape[0] * picture.shape[1]

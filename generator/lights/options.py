@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 
-from drivers.errors import InputError
+from foundation.errors import InputError
 
 Range = tuple[float, float]
 

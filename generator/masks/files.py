@@ -29,14 +29,14 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import FormatError
-from generator.encoders.maps import encode_map
+from foundation.errors import FormatError
+from generator.files.maps import encode_map
 from generator.kernels.whites import whole_chromaticities, whole_weights
 from generator.lights.lighting import FULL, Lighting, MaskMaker
 from generator.masks.making import whole_parts
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".webp", ".pgm", ".ppm")
 """Endings of what is taken for a mask."""

@@ -20,8 +20,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from drivers.errors import InputError
-from generator.kernels.compiled import compiled
+from foundation.compiled import compiled
+from foundation.errors import InputError
 from generator.lights.lighting import FULL, MaskMaker
 from generator.lights.options import Range, parse_numbers
 from generator.masks.shapes import Array, Dice, HalfPlanes, Shape, SmoothFields, Spots, Windows

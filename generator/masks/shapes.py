@@ -15,8 +15,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from foundation.compiled import compiled
 from generator.kernels import philox
-from generator.kernels.compiled import compiled
 
 Array = npt.NDArray[np.floating[Any]]
 """float32: what is computed from float32 arrays and Python's own numbers stays float32."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from acquisition.chart import Chart
-from acquisition.illuminations import Illumination, plan_illuminations
-from acquisition.layout import design_chart
+from acquisition.chart.layout import design_chart
+from acquisition.chart.model import Chart
+from acquisition.lights.illuminations import Illumination, plan_illuminations
 
 
 @pytest.fixture(scope="session")

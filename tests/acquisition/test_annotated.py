@@ -9,16 +9,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.annotated import annotated_png
-from acquisition.chart import Chart
-from acquisition.field import field_mm
-from acquisition.framing import find_chart
-from acquisition.layout import design_chart, paper_chart
-from drivers.rawfile import read_raw
-from sim.world import Room
+from acquisition.chart.layout import design_chart, paper_chart
+from acquisition.chart.model import Chart
+from acquisition.framing.annotated import annotated_png
+from acquisition.framing.tagless_field import field_mm
+from acquisition.framing.tags import find_chart
+from drivers.raw.rawfile import read_raw
+from sim.world.world import Room
 from tests.calibration.lab import hang_chart
+from tests.data_files import shipped
 
-RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw" / "canon_eos_550d_colorchart.dng"
 PLAIN = paper_chart("A6", 3)
 
 
@@ -42,9 +42,7 @@ def test_a_field_found_has_its_outline_drawn(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("chart", [PLAIN, design_chart(3)], ids=["plain", "tagged"])
 def test_a_photograph_without_the_chart_says_what_was_looked_for(chart: Chart) -> None:
-    if not RAW.exists():
-        pytest.skip(f"{RAW.name} is not at hand")
-    mosaic = read_raw(RAW)
+    mosaic = read_raw(shipped("raw/canon_eos_550d_colorchart.dng"))
     seen = picture(annotated_png(mosaic, chart, None))
     assert seen.shape[:2] == mosaic.block_planes().shape[2:]
     # The lines stand in amber on a black strip below.

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acquisition.chart import Chart, colour_of_index, load_chart
-from acquisition.layout import design_chart, paper_chart
-from drivers.errors import FormatError
+from acquisition.chart.layout import design_chart, paper_chart
+from acquisition.chart.model import Chart, colour_of_index, load_chart
+from foundation.errors import FormatError
 
 # Written by hand from the format's description, with keys that this version does not know.
 BY_HAND = """{"format": "crop.chart", "version": 1, "page_mm": [60, 40.5], "bits": 1, "cell_mm": [5, 4],

@@ -11,9 +11,9 @@ import pytest
 import tifffile
 from pyapriltags import Detector
 
-from acquisition.chart import load_chart
+from acquisition.chart.layout import design_chart
+from acquisition.chart.model import load_chart
 from acquisition.cli import main
-from acquisition.layout import design_chart
 
 Run = Callable[..., int]
 

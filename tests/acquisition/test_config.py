@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.config import CameraSettings, ProjectorCable, load_lab, parse_lab, require_whole_turns
-from drivers.errors import ConfigurationError
+from foundation.errors import ConfigurationError
 
 MINIMAL = 'rig = "simulated"\nchart = "c/chart.json"\nilluminations = "lights.csv"\n'
 

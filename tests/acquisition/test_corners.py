@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from acquisition.corners import corners_text, parse_corners
-from drivers.errors import InputError
+from acquisition.framing.corners import corners_text, parse_corners
+from foundation.errors import InputError
 
 GOOD = ("101,51", "3000.5,60", "2990,1900", "95,1890")
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from acquisition.config import LimitSettings
-from acquisition.exposure import Exposure, disagreement, measure_exposure, refusal
+from acquisition.run.exposure import Exposure, disagreement, measure_exposure, refusal
 from drivers.camera import ExposureSettings
-from drivers.rawfile import Mosaic, read_raw
-from sim.bodies import BODIES
-from sim.dng import write_dng
+from drivers.raw.rawfile import Mosaic, read_raw
+from sim.camera.dng import write_dng
+from sim.camera.sensors import BODIES
 
 BODY = BODIES["Test"]
 RANGE = BODY.saturation - BODY.black

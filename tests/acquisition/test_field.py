@@ -14,24 +14,24 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart import Chart
-from acquisition.field import field_mm, find_field
-from acquisition.framing import find_chart
-from acquisition.layout import design_chart, paper_chart
-from acquisition.outline import refined
-from acquisition.planes import CHANNELS, Plane, plane_of
-from acquisition.printing import drawing
-from acquisition.sharpness import blur_px
+from acquisition.chart.layout import design_chart, paper_chart
+from acquisition.chart.model import Chart
+from acquisition.chart.printing import drawing
+from acquisition.framing.outline import refined
+from acquisition.framing.planes import CHANNELS, Plane, plane_of
+from acquisition.framing.sharpness import blur_px
+from acquisition.framing.tagless_field import field_mm, find_field
+from acquisition.framing.tags import find_chart
 from drivers.camera import ExposureSettings
-from drivers.errors import CropError, InputError, RegistrationError
 from drivers.presenter import BLACK, WHITE, Colour
-from drivers.rawfile import Mosaic, read_raw
-from sim.bodies import BODIES
-from sim.dng import write_dng
-from sim.world import Print, Room, World
+from drivers.raw.rawfile import Mosaic, read_raw
+from foundation.errors import CropError, InputError, RegistrationError
+from sim.camera.dng import write_dng
+from sim.camera.sensors import BODIES
+from sim.world.world import Print, Room, World
+from tests.data_files import available
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
-RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw"
 CHART = paper_chart("A6", 3)
 
 
@@ -192,13 +192,14 @@ def test_a_bright_sheet_of_something_else_is_no_chart() -> None:
         find_field(planes, CHART, "the frame")
 
 
-@pytest.mark.parametrize("name", ["canon_eos_550d_colorchart.dng", "blackmagic.dng", "canon_powershot_g2.crw"])
-def test_a_photograph_without_the_chart_has_no_chart(name: str) -> None:
-    path = RAW / name
-    if not path.exists():
-        pytest.skip(f"{name} is not at hand")
+@pytest.mark.parametrize(
+    "path",
+    available("raw/canon_eos_550d_colorchart.dng", "raw/blackmagic.dng", "raw/canon_powershot_g2.crw"),
+    ids=lambda path: path.name,
+)
+def test_a_photograph_without_the_chart_has_no_chart(path: Path) -> None:
     with pytest.raises(RegistrationError, match=r"the field of 32768 cells, .* looked for") as caught:
-        find_chart(read_raw(path), paper_chart(), name)
+        find_chart(read_raw(path), paper_chart(), path.name)
     assert "\n" not in str(caught.value)
 
 

@@ -13,23 +13,23 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart import Chart
-from acquisition.framing import find_chart, find_tags
-from acquisition.layout import A_SERIES_MM, design_chart
-from acquisition.movement import shift_between
-from acquisition.planes import CHANNELS, Plane, channel_offset_px, phases, plane_of, strongest_plane
-from acquisition.printing import drawing
-from acquisition.sharpness import blur_px
+from acquisition.chart.layout import A_SERIES_MM, design_chart
+from acquisition.chart.model import Chart
+from acquisition.chart.printing import drawing
+from acquisition.framing.planes import CHANNELS, Plane, channel_offset_px, phases, plane_of, strongest_plane
+from acquisition.framing.sharpness import blur_px
+from acquisition.framing.tags import find_chart, find_tags
+from calibration.registration.movement import shift_between
 from drivers.camera import ExposureSettings
-from drivers.errors import RegistrationError
 from drivers.presenter import BLACK, WHITE, Colour
-from drivers.rawfile import Mosaic, read_raw
-from sim.bodies import BODIES
-from sim.dng import write_dng
-from sim.world import Print, Room, World
+from drivers.raw.rawfile import Mosaic, read_raw
+from foundation.errors import RegistrationError
+from sim.camera.dng import write_dng
+from sim.camera.sensors import BODIES
+from sim.world.world import Print, Room, World
+from tests.data_files import available
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
-RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw"
 FLAT = Room(waviness_mm=0.0, tilt_deg=0, pan_deg=0, k1=0, k2=0, p1=0, p2=0)
 
 
@@ -217,13 +217,12 @@ def test_covered_tags_are_named(chart: Chart, white: Mosaic) -> None:
         find_chart(Plane("G", values, plane.offset_px), chart)
 
 
-@pytest.mark.parametrize("name", ["canon_eos_550d_colorchart.dng", "blackmagic.dng"])
-def test_a_photograph_without_the_chart_has_no_chart(chart: Chart, name: str) -> None:
-    path = RAW / name
-    if not path.exists():
-        pytest.skip(f"{name} is not at hand")
+@pytest.mark.parametrize(
+    "path", available("raw/canon_eos_550d_colorchart.dng", "raw/blackmagic.dng"), ids=lambda path: path.name
+)
+def test_a_photograph_without_the_chart_has_no_chart(chart: Chart, path: Path) -> None:
     with pytest.raises(RegistrationError, match=r"tags 36h11 with ids .* were looked for") as caught:
-        find_chart(read_raw(path), chart, name)
+        find_chart(read_raw(path), chart, path.name)
     assert "\n" not in str(caught.value)
 
 

@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acquisition.cli import main
-from acquisition.illuminations import (
+from acquisition.lights.illuminations import (
     Illumination,
-    decode_srgb,
     encode_srgb,
     illuminations_to_csv,
     load_illuminations,
@@ -23,9 +22,10 @@ from acquisition.illuminations import (
     shown_colour,
     uniform_lights,
 )
-from acquisition.plots import plot_illuminations
-from drivers.errors import FormatError, InputError
+from acquisition.lights.plots import plot_illuminations
 from drivers.presenter import Colour
+from foundation.errors import FormatError, InputError
+from foundation.srgb import decode_srgb
 
 HEADER = "index,kind,cct_k,red,green,blue\n"
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from acquisition.chart.layout import design_chart
 from acquisition.cli import main
-from acquisition.illuminations import Illumination, save_illuminations
-from acquisition.importing import Imported, import_session
-from acquisition.layout import design_chart
-from acquisition.session import FRAME_COLUMNS, Session
-from drivers.errors import FormatError
+from acquisition.lights.illuminations import Illumination, save_illuminations
+from acquisition.run.importing import Imported, import_session
+from acquisition.session.folder import FRAME_COLUMNS, Session
 from drivers.presenter import Colour
+from foundation.errors import FormatError
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(3))
 Row = Mapping[str, object]

@@ -11,10 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acquisition.chart import Chart
-from acquisition.layout import A_SERIES_MM, GREY_CODES, LEAST_WHITES, design_chart, paper_chart, smallest_page, spread
-from acquisition.printing import field_drawing
-from drivers.errors import InputError
+from acquisition.chart.layout import (
+    A_SERIES_MM,
+    GREY_CODES,
+    LEAST_WHITES,
+    design_chart,
+    paper_chart,
+    smallest_page,
+    spread,
+)
+from acquisition.chart.model import Chart
+from acquisition.chart.printing import field_drawing
+from foundation.errors import InputError
 
 PX_MM = 25.4 / 600
 MARGIN_MM = 8.0

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acquisition.chart import Chart
-from acquisition.layout import design_chart, paper_chart
-from acquisition.marks import bar_boxes, edge_boxes, margin_marks, star_boxes, text_boxes, whole_px
-from acquisition.printing import drawing, field_drawing
+from acquisition.chart.layout import design_chart, paper_chart
+from acquisition.chart.margins import bar_boxes, edge_boxes, margin_marks, star_boxes, text_boxes, whole_px
+from acquisition.chart.model import Chart
+from acquisition.chart.printing import drawing, field_drawing
 
 PX_MM = 25.4 / 600
 design = cache(design_chart)

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import pytest
 
+from acquisition.chart.layout import design_chart
 from acquisition.cli import main
-from acquisition.illuminations import Illumination
-from acquisition.layout import design_chart
-from acquisition.monitor import open_monitor
-from acquisition.progress import duration_text
-from acquisition.session import Session, plan_steps
+from acquisition.lights.illuminations import Illumination
+from acquisition.session.folder import Session, plan_steps
+from acquisition.session.monitor import open_monitor
+from acquisition.session.progress import duration_text
 from drivers.camera import CapturedFrame
-from drivers.errors import FormatError, InputError
 from drivers.presenter import Colour
+from foundation.errors import FormatError, InputError
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(4))
 BEGUN = datetime(2026, 1, 1, 9, 0, tzinfo=UTC)

@@ -11,13 +11,13 @@ import numpy.typing as npt
 import pytest
 from scipy import ndimage
 
-from acquisition.framing import Framing, find_chart
-from acquisition.layout import paper_chart
-from acquisition.movement import gauge_boxes, shift_between
-from acquisition.planes import Plane, plane_of, strongest_plane
+from acquisition.chart.layout import paper_chart
+from acquisition.framing.planes import Plane, plane_of, strongest_plane
+from acquisition.framing.tags import Framing, find_chart
+from calibration.registration.movement import gauge_boxes, shift_between
 from drivers.presenter import WHITE, Colour
-from drivers.rawfile import Mosaic
-from sim.world import Room
+from drivers.raw.rawfile import Mosaic
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang, hang_chart
 
 CHART = paper_chart("A6", 3)

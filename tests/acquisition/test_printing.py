@@ -18,10 +18,10 @@ import pytest
 import tifffile
 from pyapriltags import Detector
 
-from acquisition.chart import Chart, Tag
-from acquisition.layout import design_chart, paper_chart
-from acquisition.printing import drawing, label, preview, save_pdf, save_preview, save_tiff, tag_modules
-from drivers.errors import InputError, StorageError
+from acquisition.chart.layout import design_chart, paper_chart
+from acquisition.chart.model import Chart, Tag
+from acquisition.chart.printing import drawing, label, preview, save_pdf, save_preview, save_tiff, tag_modules
+from foundation.errors import InputError, StorageError
 
 
 def detect(picture: npt.NDArray[np.uint8]) -> dict[int, npt.NDArray[np.float64]]:

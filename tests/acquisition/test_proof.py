@@ -13,10 +13,10 @@ import numpy.typing as npt
 import pytest
 from pyapriltags import Detector
 
-from acquisition.chart import Chart
-from acquisition.layout import design_chart, paper_chart
-from acquisition.printing import drawing, field_px
-from acquisition.proof import WEDGE_CODES, instructions, proof_drawing, save_proof
+from acquisition.chart.layout import design_chart, paper_chart
+from acquisition.chart.model import Chart
+from acquisition.chart.printing import drawing, field_px
+from acquisition.chart.proof import WEDGE_CODES, instructions, proof_drawing, save_proof
 
 PX_MM = 25.4 / 600
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings, load_lab, parse_lab
-from acquisition.layout import design_chart
-from acquisition.rig import attached_devices, open_rig, simulated_body, simulated_room
-from drivers.errors import ConfigurationError
-from sim.presenter import Screen, SimulatedPresenter
+from acquisition.run.rig import attached_devices, open_rig, simulated_body, simulated_room
+from foundation.errors import ConfigurationError
+from sim.projectors.screen import Screen, SimulatedPresenter
 
 HEAD = 'rig = "simulated"\nchart = "c.json"\nilluminations = "l.csv"\n'
 
@@ -72,7 +72,7 @@ def test_an_imported_session_cannot_be_taken() -> None:
 )
 def test_a_cable_that_is_not_named_is_said(text: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
     # Whatever display this machine has stays dark.
-    monkeypatch.setattr("acquisition.rig.FullScreen", lambda display, clock: SimulatedPresenter(Screen(), clock))  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    monkeypatch.setattr("acquisition.run.rig.FullScreen", lambda display, clock: SimulatedPresenter(Screen(), clock))  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
     real = parse_lab(HEAD.replace("simulated", "lab") + text, "LAB.toml")
     with pytest.raises(ConfigurationError, match=expected), open_rig(real, design_chart(bits=1)):
         pass

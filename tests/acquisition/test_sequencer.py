@@ -12,25 +12,25 @@ from typing import BinaryIO
 import numpy as np
 import pytest
 
+from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings, SequenceSettings
-from acquisition.health import PAUSE_S, POWER_LIMIT_S, RELIGHT_S, make_ready, require_healthy
-from acquisition.illuminations import Illumination
-from acquisition.layout import design_chart
-from acquisition.sequencer import Devices, take_session
-from acquisition.session import Session, plan_steps
+from acquisition.lights.illuminations import Illumination
+from acquisition.run.lamp import PAUSE_S, POWER_LIMIT_S, RELIGHT_S, make_ready, require_healthy
+from acquisition.run.sequencer import Devices, take_session
+from acquisition.session.folder import Session, plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
-from drivers.errors import DeviceError, DeviceFault, DeviceRefused, LinkClosed, LinkTimeout
-from drivers.link import Link
+from drivers.links.link import Link
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.pjlink.wire import NoResolution
 from drivers.presenter import BLACK, Colour
 from drivers.projector import Power, Severity
 from drivers.serial_projectors.optoma import OptomaProjector
-from sim.bodies import BODIES
+from foundation.errors import DeviceError, DeviceFault, DeviceRefused, LinkClosed, LinkTimeout
+from sim.camera.dng import write_dng
+from sim.camera.sensors import BODIES
 from sim.clock import SimulatedClock
-from sim.dng import write_dng
-from sim.projector import PjLinkPeer, SimulatedProjector, memory_link
-from sim.serial_projectors import OptomaPeer, SerialPeerLink
+from sim.projectors.pjlink import PjLinkPeer, SimulatedProjector, memory_link
+from sim.projectors.serial import OptomaPeer, SerialPeerLink
 
 BODY = BODIES["Test"]
 EXPOSURE = ExposureSettings(100, 8.0, 0.5)

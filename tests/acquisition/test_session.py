@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.illuminations import Illumination, save_illuminations
-from acquisition.layout import design_chart
-from acquisition.session import Session, plan_steps
+from acquisition.chart.layout import design_chart
+from acquisition.lights.illuminations import Illumination, save_illuminations
+from acquisition.session.folder import Session, plan_steps
 from drivers.camera import CapturedFrame
-from drivers.errors import FormatError, InputError
 from drivers.presenter import BLACK, WHITE, Colour
+from foundation.errors import FormatError, InputError
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
 NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from acquisition.chart import Chart
-from acquisition.layout import design_chart, paper_chart
-from acquisition.visibility import sizes, warning
+from acquisition.chart.layout import design_chart, paper_chart
+from acquisition.chart.model import Chart
+from acquisition.framing.visibility import sizes, warning
 
 
 def test_the_paper_s_chart_in_both_cameras(a0: Chart) -> None:

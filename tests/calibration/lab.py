@@ -13,17 +13,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart import Chart
-from acquisition.illuminations import Illumination, plan_illuminations
-from acquisition.layout import A_SERIES_MM, design_chart
-from acquisition.printing import drawing
-from acquisition.session import ACCEPTED, Session, Step, plan_steps
+from acquisition.chart.layout import A_SERIES_MM, design_chart
+from acquisition.chart.model import Chart
+from acquisition.chart.printing import drawing
+from acquisition.lights.illuminations import Illumination, plan_illuminations
+from acquisition.session.folder import ACCEPTED, Session, Step, plan_steps
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
-from drivers.rawfile import Mosaic, read_raw
-from sim.bodies import BODIES
-from sim.dng import write_dng
-from sim.world import Print, Room, World
+from drivers.raw.rawfile import Mosaic, read_raw
+from sim.camera.dng import write_dng
+from sim.camera.sensors import BODIES
+from sim.world.world import Print, Room, World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 Paint = Callable[[npt.NDArray[np.uint16]], None]

@@ -12,21 +12,21 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart import Chart
-from acquisition.layout import A_SERIES_MM, design_chart
-from acquisition.session import Session, Step, plan_steps
-from calibration.build import build, check
+from acquisition.chart.layout import A_SERIES_MM, design_chart
+from acquisition.chart.model import Chart
+from acquisition.session.folder import Session, Step, plan_steps
 from calibration.cli import main
-from calibration.frames import session_sha256
-from calibration.lut import Lut, open_lut
-from calibration.radiometry import order_of, polynomial
-from calibration.report import summary, write_report
-from calibration.result import BuildResult
+from calibration.pipeline.build import build, check
+from calibration.pipeline.frames import session_sha256
+from calibration.pipeline.result import BuildResult
+from calibration.radiometry.paper import order_of, polynomial
+from calibration.report.report import summary, write_report
+from calibration.table.lut import Lut, open_lut
 from drivers.camera import ExposureSettings
-from drivers.errors import FormatError, InputError, QualityError, RegistrationError
 from drivers.presenter import BLACK, WHITE
-from sim.dng import write_dng
-from sim.world import Room
+from foundation.errors import FormatError, InputError, QualityError, RegistrationError
+from sim.camera.dng import write_dng
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, hang, renumbered, take
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.session import Session
-from calibration.build import build
+from acquisition.session.folder import Session
 from calibration.cli import main
+from calibration.pipeline.build import build
 from tests.calibration.lab import LIGHTS
 
 VERSION_1 = Path(__file__).parent / "table_v1"

@@ -6,13 +6,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.layout import paper_chart
-from acquisition.printing import drawing
-from calibration.cell_field import field_of_cells
-from calibration.radiometry import PaperReader
+from acquisition.chart.layout import paper_chart
+from acquisition.chart.printing import drawing
+from calibration.radiometry.cell_field import field_of_cells
+from calibration.radiometry.paper import PaperReader
 from drivers.presenter import WHITE, Colour
-from sim.bodies import BODIES
-from sim.world import Print, Room, World
+from sim.camera.sensors import BODIES
+from sim.world.world import Print, Room, World
 from tests.calibration.lab import SETTINGS
 
 CHART = paper_chart("A1", 4)

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.illuminations import Illumination
-from acquisition.session import FrameRecord
-from calibration.darkness import DarkFigures, HotSamples, additivity, darkness, drift_gains, read_dark
+from acquisition.lights.illuminations import Illumination
+from acquisition.session.folder import FrameRecord
+from calibration.radiometry.darkness import DarkFigures, HotSamples, additivity, darkness, drift_gains, read_dark
 from drivers.presenter import Colour
 
 PRIMARIES = ((255, 0, 0), (0, 255, 0), (0, 0, 255))

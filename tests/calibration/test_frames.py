@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.session import FrameRecord, Session
-from calibration import frames
-from calibration.build import build
-from calibration.frames import ahead
+from acquisition.session.folder import FrameRecord, Session
+from calibration.pipeline import frames
+from calibration.pipeline.build import build
+from calibration.pipeline.frames import ahead
 
 AT = datetime(2024, 3, 1, tzinfo=UTC)
 

@@ -16,31 +16,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import calibration.build as building
-from acquisition.session import Session, Step
-from calibration.build import append, build
-from calibration.frames import lost_frames
-from calibration.growing import CHECKPOINT, Checkpoint, growing
-from calibration.lut import damage, open_lut
-from calibration.result import BuildResult, Growth
-from drivers.errors import FormatError, InputError
-from sim.world import Room
+import calibration.pipeline.build as building
+from acquisition.session.folder import Session, Step
+from calibration.pipeline.build import append, build
+from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, growing
+from calibration.pipeline.frames import lost_frames
+from calibration.pipeline.result import BuildResult, Growth
+from calibration.table.lut import damage, open_lut
+from foundation.errors import FormatError, InputError
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
 
 KILLER = """
 import os, signal, sys
-import calibration.build, calibration.growing, calibration.lut, calibration.report
+import calibration.pipeline.build, calibration.pipeline.checkpoint, calibration.table.lut, calibration.report.report
 from calibration.cli import main
 
 place, count = sys.argv[1], int(sys.argv[2])
 del sys.argv[1:3]
-calibration.build.CHECKPOINT_EVERY = 3
-calibration.report.write_report = lambda *_: None
+calibration.pipeline.build.CHECKPOINT_EVERY = 3
+calibration.report.report.write_report = lambda *_: None
 owner, name = {
-    "putting": (calibration.lut.LutWriter, "put"),
-    "saving": (calibration.growing.Growing, "save"),
-    "finishing": (calibration.lut, "write_whole"),
-    "publishing": (calibration.growing.Path, "replace"),
+    "putting": (calibration.table.lut.LutWriter, "put"),
+    "saving": (calibration.pipeline.checkpoint.Growing, "save"),
+    "finishing": (calibration.table.lut, "write_whole"),
+    "publishing": (calibration.pipeline.checkpoint.Path, "replace"),
 }[place]
 real = getattr(owner, name)
 

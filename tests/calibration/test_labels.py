@@ -11,16 +11,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.illuminations import Illumination, decode_srgb, plan_illuminations
-from acquisition.session import Session, Step
-from calibration.build import build
-from calibration.labels import DEGREE, LIGHTS_A_TERM, angles_off_codes_deg
-from calibration.measuring import FrameFigures
-from calibration.report import write_report
-from calibration.thresholds import THRESHOLDS
-from calibration.verdict import judge
-from drivers.errors import FormatError, QualityError
-from sim.world import Room
+from acquisition.lights.illuminations import Illumination, plan_illuminations
+from acquisition.session.folder import Session, Step
+from calibration.checks.labels import DEGREE, LIGHTS_A_TERM, angles_off_codes_deg
+from calibration.pipeline.build import build
+from calibration.pipeline.measuring import FrameFigures
+from calibration.report.report import write_report
+from calibration.verdict.thresholds import THRESHOLDS
+from calibration.verdict.verdict import judge
+from foundation.errors import FormatError, QualityError
+from foundation.srgb import decode_srgb
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, take
 
 PLAN = plan_illuminations(13, (3000, 6500))
@@ -138,7 +139,7 @@ def test_lights_off_their_codes_make_no_table_and_are_named(
         held.extend([white, errors_deg])
         return np.where(np.isin(np.arange(len(lights)), (3, 7)), 5.0 + np.arange(len(lights)), 0.1)
 
-    monkeypatch.setattr("calibration.build.angles_off_codes_deg", told)
+    monkeypatch.setattr("calibration.pipeline.build.angles_off_codes_deg", told)
     with pytest.raises(QualityError, match=r"what its codes give: 12°.*, 2 lights: 7, 3; correct the list of frames"):
         build(session, tmp_path / "lut", report=write_report)
     report = json.loads((tmp_path / "lut.refused" / "report.json").read_text())
@@ -158,7 +159,7 @@ def test_lights_exposed_otherwise_are_not_held_against_their_codes(
         exposed = replace(SETTINGS, shutter_s=0.6) if step.illumination == 1 else SETTINGS
         return lab.dng(step.colour, step.number, exposed)
 
-    monkeypatch.setattr("calibration.build.angles_off_codes_deg", told)
+    monkeypatch.setattr("calibration.pipeline.build.angles_off_codes_deg", told)
     with take(lab, tmp_path / "alike", LIGHTS[:3]) as session:
         result = build(session, tmp_path / "lut")
         assert result.off_codes_deg is not None

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.likeness import Expectation, Likeness, can_tell
-from calibration.thresholds import THRESHOLDS
+from calibration.checks.likeness import Expectation, Likeness, can_tell
+from calibration.verdict.thresholds import THRESHOLDS
 
 LIMITS = {limit.name: limit for limit in THRESHOLDS}
 _Array = npt.NDArray[np.float64]

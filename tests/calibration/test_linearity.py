@@ -10,17 +10,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session import Session
-from calibration.build import build, check
+from acquisition.session.folder import Session
 from calibration.cli import main
-from calibration.linearity import deviations
-from calibration.lut import damage, open_lut
-from calibration.report import summary, write_report
-from calibration.result import BuildResult
+from calibration.pipeline.build import build, check
+from calibration.pipeline.linearity import deviations
+from calibration.pipeline.result import BuildResult
+from calibration.report.report import summary, write_report
+from calibration.table.lut import damage, open_lut
 from drivers.camera import ExposureSettings
-from drivers.errors import FormatError, InputError
 from drivers.presenter import WHITE
-from sim.world import Room
+from foundation.errors import FormatError, InputError
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang
 
 TIMES = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration import loops
+from calibration.sampling import loops
 
 
 @pytest.mark.parametrize("unknowns", [1, 3, 10, 28])

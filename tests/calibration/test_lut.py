@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.illuminations import plan_illuminations
-from calibration.lut import Frame, Lut, LutWriter, Provenance, damage, frames_sha256, open_lut, require_match
-from drivers.errors import FormatError, InputError, StorageError
+from acquisition.lights.illuminations import plan_illuminations
+from calibration.table.lut import Frame, Lut, LutWriter, Provenance, damage, frames_sha256, open_lut, require_match
+from foundation.errors import FormatError, InputError, StorageError
 
 VERSION_1 = Path(__file__).parent / "table_v1"
 """Written by the first release of the format; never to be written again."""

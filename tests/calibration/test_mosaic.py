@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.mosaic import half_size
-from drivers.rawfile import Area, Mosaic
+from calibration.report.mosaic import half_size
+from drivers.raw.rawfile import Area, Mosaic
 
 
 def mosaic_of(

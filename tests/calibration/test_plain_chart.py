@@ -9,14 +9,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.chart import Chart
-from acquisition.field import field_mm
-from acquisition.layout import paper_chart
-from calibration.registration import register
-from drivers.errors import RegistrationError
+from acquisition.chart.layout import paper_chart
+from acquisition.chart.model import Chart
+from acquisition.framing.tagless_field import field_mm
+from calibration.registration.register import register
 from drivers.presenter import WHITE, Colour
-from drivers.rawfile import Mosaic
-from sim.world import Room
+from drivers.raw.rawfile import Mosaic
+from foundation.errors import RegistrationError
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang_chart
 
 SMALL = paper_chart("A6", 3)

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.field import field_mm
-from acquisition.illuminations import Illumination
-from acquisition.layout import A_SERIES_MM, design_chart, paper_chart
-from acquisition.session import ACCEPTED, Step
-from calibration.build import build
+from acquisition.chart.layout import A_SERIES_MM, design_chart, paper_chart
+from acquisition.framing.tagless_field import field_mm
+from acquisition.lights.illuminations import Illumination
+from acquisition.session.folder import ACCEPTED, Step
 from calibration.cli import main
-from calibration.lut import open_lut
-from calibration.report import write_report
+from calibration.pipeline.build import build
+from calibration.report.report import write_report
+from calibration.table.lut import open_lut
 from drivers.presenter import Colour
-from sim.world import Room
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang_chart, renumbered, take
 
 SMALL = paper_chart("A6", 3)

@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.illuminations import plan_illuminations
-from calibration.build import build
-from calibration.lut import open_lut
-from calibration.primaries import Primaries, pure_lights
-from calibration.radiometry import Field, Paper, PaperReader
-from sim.world import Room
+from acquisition.lights.illuminations import plan_illuminations
+from calibration.pipeline.build import build
+from calibration.radiometry.paper import Field, Paper, PaperReader
+from calibration.radiometry.primaries import Primaries, pure_lights
+from calibration.table.lut import open_lut
+from sim.world.world import Room
 from tests.calibration.lab import SETTINGS, hang, renumbered, take
 
 PAGE = (400.0, 300.0)

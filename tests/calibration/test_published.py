@@ -11,11 +11,11 @@ import numpy.typing as npt
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from acquisition.illuminations import Illumination
-from calibration.lut import Frame, Lut, LutWriter, Provenance, open_lut
-from calibration.published import SHARD_LIGHTS, fetch, publish
-from drivers.errors import FormatError, InputError, StorageError
+from acquisition.lights.illuminations import Illumination
+from calibration.table.lut import Frame, Lut, LutWriter, Provenance, open_lut
+from calibration.table.zarr_store import SHARD_LIGHTS, fetch, publish
 from drivers.presenter import Colour
+from foundation.errors import FormatError, InputError, StorageError
 
 LIGHTS = SHARD_LIGHTS + 3
 
@@ -127,6 +127,6 @@ def test_what_is_not_there_or_not_installed(lut: Lut, tmp_path: Path, monkeypatc
     def find_spec(name: str) -> None:
         del name
 
-    monkeypatch.setattr("calibration.published.find_spec", find_spec)
+    monkeypatch.setattr("calibration.table.zarr_store.find_spec", find_spec)
     with pytest.raises(InputError, match=r"need zarr; install it with: pip install croplab\[cluster\]"):
         publish(lut, str(tmp_path / "published"))

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.radiometry import (
+from calibration.radiometry.paper import (
     AROUND,
     Field,
     Paper,
@@ -24,8 +24,8 @@ from calibration.radiometry import (
     terms,
 )
 from drivers.camera import ExposureSettings
-from drivers.errors import QualityError
 from drivers.presenter import WHITE
+from foundation.errors import QualityError
 from tests.calibration.lab import Lab
 
 PAGE = (400.0, 300.0)

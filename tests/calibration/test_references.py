@@ -8,8 +8,8 @@ import io
 import numpy as np
 import pytest
 
-from acquisition.chart import Reference
-from calibration.references import Levels, references_csv, tint_deg
+from acquisition.chart.model import Reference
+from calibration.radiometry.greys import Levels, references_csv, tint_deg
 
 GREYS = [
     Reference(f"grey {code}", (code, code, code), (float(n), 0.0), (5.0, 5.0)) for n, code in enumerate([71, 188] * 20)

@@ -11,18 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acquisition.layout import A_SERIES_MM, design_chart
+from acquisition.chart.layout import A_SERIES_MM, design_chart
 from benchmarks import rooms
-from calibration.displacement import Displacement
-from calibration.lens import fit_lens
-from calibration.registration import register
-from drivers.errors import RegistrationError
+from calibration.registration.displacement import Displacement
+from calibration.registration.lens import fit_lens
+from calibration.registration.register import register
 from drivers.presenter import WHITE, Colour
-from drivers.rawfile import Mosaic, read_raw
-from sim.world import Room
+from drivers.raw.rawfile import Mosaic, read_raw
+from foundation.errors import RegistrationError
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang
-
-RAW = Path(__file__).parents[2].parent / "shared" / "data" / "raw"
+from tests.data_files import shipped
 
 
 def miss(lab: Lab, mosaic: Mosaic) -> npt.NDArray[np.float64]:
@@ -144,9 +143,7 @@ def test_too_far_away_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_real_photograph_without_the_chart_is_refused(lab: Lab) -> None:
-    path = RAW / "canon_eos_550d_colorchart.dng"
-    if not path.exists():
-        pytest.skip("the photograph is not at hand")
+    path = shipped("raw/canon_eos_550d_colorchart.dng")
     with pytest.raises(RegistrationError, match="looked for, none found") as caught:
         register(read_raw(path), lab.chart, path.name)
     assert "\n" not in str(caught.value)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.mosaic import half_size
-from calibration.sampling import gather, gather_values, noise_of, patch_means, sites_at, table_values, uneven
+from calibration.report.mosaic import half_size
+from calibration.sampling.samples import gather, gather_values, noise_of, patch_means, sites_at, table_values, uneven
 from tests.calibration.lab import Lab
 
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.layout import design_chart
-from calibration.build import build
-from calibration.lut import open_lut
-from calibration.registration import register
-from calibration.report import write_report
-from calibration.verdict import figures_of
-from sim.world import Room
+from acquisition.chart.layout import design_chart
+from calibration.pipeline.build import build
+from calibration.registration.register import register
+from calibration.report.report import write_report
+from calibration.table.lut import open_lut
+from calibration.verdict.verdict import figures_of
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, hang_chart, renumbered, take
 
 LIGHT = renumbered(LIGHTS[5:6])

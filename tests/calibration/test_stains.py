@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.planes import frame_black
-from calibration.radiometry import PaperReader
-from calibration.registration import register
-from calibration.sampling import gather, sites_at
-from calibration.stains import Stains, find_stains
-from sim.world import Room
+from acquisition.framing.planes import frame_black
+from calibration.checks.stains import Stains, find_stains
+from calibration.radiometry.paper import PaperReader
+from calibration.registration.register import register
+from calibration.sampling.samples import gather, sites_at
+from sim.world.world import Room
 from tests.calibration.lab import Lab, hang
 
 

@@ -10,18 +10,18 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session import Session, Step
-from calibration.build import append, build, check
-from calibration.choices import Choices
+from acquisition.session.folder import Session, Step
 from calibration.cli import main
-from calibration.lut import open_lut
-from calibration.radiometry import Paper, even_field
-from calibration.report import summary
-from calibration.result import BuildResult, Growth
-from calibration.subtraction import Subtraction, quiet_means, reflectances
-from drivers.errors import FormatError
+from calibration.pipeline.build import append, build, check
+from calibration.pipeline.options import Choices
+from calibration.pipeline.result import BuildResult, Growth
+from calibration.radiometry.dark_light import Subtraction, quiet_means, reflectances
+from calibration.radiometry.paper import Paper, even_field
+from calibration.report.report import summary
+from calibration.table.lut import open_lut
 from drivers.presenter import BLACK
-from sim.world import Room
+from foundation.errors import FormatError
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
 
 PATCHES = 4000

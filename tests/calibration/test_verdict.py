@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.session import Session
-from calibration import verdict as verdicts
-from calibration.build import build, refused_folder
+from acquisition.session.folder import Session
 from calibration.cli import main
-from calibration.report import write_report
-from calibration.thresholds import THRESHOLDS, Threshold
-from calibration.verdict import bleed, figures_of, judge, truth_errors_deg
-from drivers.errors import QualityError
+from calibration.pipeline.build import build, refused_folder
+from calibration.report.report import write_report
+from calibration.verdict import verdict as verdicts
+from calibration.verdict.thresholds import THRESHOLDS, Threshold
+from calibration.verdict.verdict import bleed, figures_of, judge, truth_errors_deg
+from foundation.errors import QualityError
 from tests.calibration.lab import LIGHTS, Lab, take
 
 LIMIT = Threshold("x", "A figure", "px", "at most", 1.0, 2.0, "why", "source", "remedy")

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquisition.session import Session
-from calibration.build import build, check
-from calibration.choices import WINDOWS, Choices
+from acquisition.session.folder import Session
 from calibration.cli import main
-from calibration.lut import damage, open_lut, summary
-from calibration.report import summary as report_summary
-from calibration.report import write_report
-from calibration.verdict import bleed, figures_of, largest_window
-from drivers.errors import InputError
+from calibration.pipeline.build import build, check
+from calibration.pipeline.options import WINDOWS, Choices
+from calibration.report.report import summary as report_summary
+from calibration.report.report import write_report
+from calibration.table.lut import damage, open_lut, summary
+from calibration.verdict.verdict import bleed, figures_of, largest_window
+from foundation.errors import InputError
 
 
 @pytest.mark.parametrize("window", [1, 2, 4, 11, -5])

@@ -15,14 +15,14 @@ from typing import BinaryIO
 import pytest
 
 from drivers.camera import Camera, CameraIdentity, ExposureSettings
-from drivers.errors import DeviceError, DeviceRefused
+from foundation.errors import DeviceError, DeviceRefused
 
 SETTINGS = ExposureSettings(iso=100, aperture=8, shutter_s=1 / 60)
 """What every camera under test offers."""
 
 
 class SeededFilm:
-    """A `sim.film.Film` whose pictures are noise, each another one, and remembered."""
+    """A `sim.camera.film.Film` whose pictures are noise, each another one, and remembered."""
 
     suffix = ".cr2"
 

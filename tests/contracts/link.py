@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.errors import LinkClosed, LinkTimeout
-from drivers.link import Link
+from drivers.links.link import Link
+from foundation.errors import LinkClosed, LinkTimeout
 
 Ends = tuple[Link, Link]
 """The near end, which is under test, and the far one, which helps."""

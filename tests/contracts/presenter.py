@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from drivers.errors import DeviceError
 from drivers.presenter import BLACK, WHITE, Colour, Presenter
+from foundation.errors import DeviceError
 
 RAMPS = tuple(
     colour for code in range(0, 256, 17) for colour in (Colour(code, 0, 0), Colour(0, code, 0), Colour(0, 0, code))

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from drivers.errors import DeviceRefused
 from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
+from foundation.errors import DeviceRefused
 
 
 @dataclass(frozen=True)

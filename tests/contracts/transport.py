@@ -11,11 +11,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import LinkClosed, LinkTimeout, ProtocolError
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.messages import Event, Request, Response
 from drivers.ptp.transport import MAX_COLLECTED, Transport
-from sim.responder import Answer, NoAnswer
+from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
+from sim.buses.responder import Answer, NoAnswer
 
 PATIENCE_S = 10.0
 """For what must come; nothing waits this long unless it fails."""
@@ -69,7 +69,7 @@ def payload(size: int) -> bytes:
 
 @dataclass
 class Echo:
-    """A `sim.responder.Responder` that does what it is told."""
+    """A `sim.buses.responder.Responder` that does what it is told."""
 
     raised: list[Event] = field(default_factory=list[Event])
     cancellations: list[int] = field(default_factory=list[int])

@@ -1,13 +1,20 @@
-"""Where the real raw files are."""
+"""Conversations of a host with an EOS body, for the tests of what reads and leads them."""
 
-from pathlib import Path
+from __future__ import annotations
 
 import pytest
 
+from tests.drivers.ptp.conversations import Recorded, conversations
+
+CONVERSATIONS = conversations()
+
+
+@pytest.fixture(scope="session", params=CONVERSATIONS)
+def body(request: pytest.FixtureRequest) -> str:
+    """Give the name of the body that answered in `recording`."""
+    return request.param
+
 
 @pytest.fixture(scope="session")
-def raw_folder() -> Path:
-    folder = Path(__file__).parents[2].parent / "shared" / "data" / "raw"
-    if not folder.is_dir():
-        pytest.skip("the real raw files are not on this machine")
-    return folder
+def recording(body: str) -> list[Recorded]:
+    return CONVERSATIONS[body]()

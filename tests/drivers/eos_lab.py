@@ -7,17 +7,17 @@ from collections.abc import Callable
 from typing import Any
 
 from drivers.camera import CapturedFrame
-from drivers.errors import DeviceError, DeviceFault, DeviceRefused
-from drivers.pipes import UsbPipes
-from drivers.ptp.canon_eos import CanonEos
+from drivers.canon.camera import CanonEos
+from drivers.links.pipes import UsbPipes
 from drivers.ptp.transport import Transport
 from drivers.ptp.usb_transport import UsbTransport
+from foundation.errors import DeviceError, DeviceFault, DeviceRefused
+from sim.buses.ptp_memory import MemoryPipes
+from sim.buses.responder import Responder
+from sim.buses.usb_device import PtpUsbDevice
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import EOS_550D, EosBody
 from sim.clock import SimulatedClock
-from sim.eos import SimulatedEos
-from sim.eos_bodies import EOS_550D, EosBody
-from sim.ptp_memory import MemoryPipes
-from sim.responder import Responder
-from sim.usb_device import PtpUsbDevice
 from tests.contracts.camera import SeededFilm
 
 

@@ -13,11 +13,11 @@ from datetime import datetime
 from typing import BinaryIO
 
 from drivers.camera import ExposureSettings
-from drivers.clock import SystemClock
 from drivers.ptp.codes import AeMode
-from sim.eos import SimulatedEos
-from sim.eos_bodies import EOS_550D
-from sim.ptpip_server import serve_ptpip
+from foundation.clock import SystemClock
+from sim.buses.ptpip_server import serve_ptpip
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import EOS_550D
 from tests.contracts.camera import SeededFilm
 
 FILM_BYTES = 3_000_000

@@ -62,10 +62,10 @@ def text(value: str) -> tuple[int, int, bytes]:
     return 2, len(value) + 1, value.encode() + b"\0"
 
 
-def write_dng(path: Path, counts: NDArray[np.uint16], more: Tags | None = None) -> None:
-    """Write an uncompressed DNG of `counts` (H, W) uint16, RGGB unless `more` has it otherwise."""
+def write_dng(path: Path, counts: NDArray[np.uint16], more: Tags | None = None, strip: bytes | None = None) -> None:
+    """Write a DNG of `counts` (H, W) uint16, RGGB unless `more` has it otherwise; uncompressed unless `strip` is."""
     height, width = counts.shape
-    strip = counts.astype("<u2").tobytes()
+    strip = strip or counts.astype("<u2").tobytes()
     tags: Tags = {
         254: longs(0),
         256: longs(width),

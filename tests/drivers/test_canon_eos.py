@@ -1,12 +1,10 @@
-"""The EOS driver against a recorded EOS 60D, and against scripted bodies that speak the recorded layouts."""
+"""The EOS driver against recorded conversations, and against scripted bodies that speak the recorded layouts."""
 
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Callable, Generator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,10 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.camera import CameraIdentity, ExposureSettings
-from drivers.errors import DeviceError, DeviceRefused, LinkClosed, StorageError
-from drivers.links.usb import open_usb
-from drivers.pipes import Pipe, UsbPipes
-from drivers.ptp.canon import (
+from drivers.canon.camera import CanonEos
+from drivers.canon.records import (
     ImageFile,
     ImageFormat,
     Notice,
@@ -28,40 +24,41 @@ from drivers.ptp.canon import (
     decode_events,
     encode_events,
 )
-from drivers.ptp.canon_eos import CanonEos
+from drivers.canon.state import EosState, custom_functions, problems
+from drivers.links.pipes import Pipe, UsbPipes
+from drivers.links.usb import open_usb
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode
-from drivers.ptp.eos_state import EosState, custom_functions, problems
 from drivers.ptp.ip_transport import IpTransport
 from drivers.ptp.messages import Event, Request, Response
 from drivers.ptp.transport import Transaction, Transport
 from drivers.ptp.usb_transport import UsbTransport
+from foundation.errors import DeviceError, DeviceRefused, LinkClosed, StorageError
 from sim import faults
+from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.responder import Answer, Responder
+from sim.buses.usb import SimulatedBus
+from sim.buses.usb_device import PtpUsbDevice
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D, EosBody
 from sim.clock import SimulatedClock
-from sim.eos import SimulatedEos
-from sim.eos_bodies import EOS_6D_MARK_II, EOS_550D, EosBody
 from sim.faults import Occasion
-from sim.ptpip_server import serve_ptpip
-from sim.responder import Answer, Responder
-from sim.usb import SimulatedBus
-from sim.usb_device import PtpUsbDevice
 from tests.contracts.camera import SETTINGS, Bench, CameraContract
 from tests.drivers.eos_lab import Lab
+from tests.drivers.ptp.conversations import Recorded
+
+IDENTITY = CameraIdentity("Canon Inc.", "Canon EOS 550D", "0000000001", "3-1.0.9")
+IDENTITIES = {
+    "EOS 60D": CameraIdentity("Canon Inc.", "Canon EOS 60D", "1280627086", "3-1.1.0"),
+    "EOS 550D": IDENTITY,
+}
 
 
-@pytest.fixture(scope="session")
-def recording() -> list[dict[str, Any]]:
-    path = Path(__file__).parents[2].parent / "shared" / "data" / "ptp" / "eos60d_transactions.json"
-    if not path.is_file():
-        pytest.skip("the recorded conversation is not on this machine")
-    return json.loads(path.read_text())
-
-
-class Recorded:
+class Replay:
     """A cable on which a recorded body answers as it did; what it was not asked then, it does not know now."""
 
-    label = "the recorded EOS 60D"
+    label = "the recorded body"
 
-    def __init__(self, transactions: list[dict[str, Any]]) -> None:
+    def __init__(self, transactions: list[Recorded]) -> None:
         self.left = list(transactions)
         self.transactions: list[int] = []
         self.asked: list[tuple[int, tuple[int, ...], bytes | None]] = []
@@ -84,7 +81,7 @@ class Recorded:
             data = known["data"] if known["dir"] == "out" else None
             if int(known["code"], 16) == request.code and tuple(known["params"]) == request.parameters and data == sent:
                 self.left = self.left[number + 1 :]
-                answer = bytes.fromhex(known["data"]) if known["dir"] == "in" else b""
+                answer = bytes.fromhex(known["data"] or "") if known["dir"] == "in" else b""
                 return Transaction(Response(int(known["rc"], 16), request.transaction, tuple(known["rparams"])), answer)
         pytest.fail(f"the recorded host did not ask {request} with {sent} here")
 
@@ -98,10 +95,10 @@ class Recorded:
         self.closed = True
 
 
-def test_speaks_as_the_recorded_host_did(recording: list[dict[str, Any]]) -> None:
-    cable = Recorded(recording[:37])
+def test_speaks_as_the_recorded_host_did(body: str, recording: list[Recorded]) -> None:
+    cable = Replay(recording[:37])
     camera = CanonEos(lambda: cable, SimulatedClock())
-    assert camera.identity() == CameraIdentity("Canon Inc.", "Canon EOS 60D", "1280627086", "3-1.1.0")
+    assert camera.identity() == IDENTITIES[body]
     camera.close()
     camera.close()
     assert cable.closed
@@ -113,16 +110,20 @@ def test_speaks_as_the_recorded_host_did(recording: list[dict[str, Any]]) -> Non
 
 
 def test_a_recorded_body_that_is_not_set_up_is_refused_with_all_reasons_at_once(
-    recording: list[dict[str, Any]],
+    body: str, recording: list[Recorded]
 ) -> None:
-    cable = Recorded([*recording[:22], *[recording[6]] * 10])
+    cable = Replay([*recording[:22], *[recording[6]] * 10])
     camera = CanonEos(lambda: cable, SimulatedClock())
     with pytest.raises(DeviceRefused) as caught:
         camera.configure(ExposureSettings(iso=110, aperture=8, shutter_s=0.5))
+    drive, speeds = {
+        "EOS 60D": ("continuous high", "100, 125, 160, 200"),
+        "EOS 550D": ("continuous", "100, 200, 400, 800"),
+    }[body]
     assert str(caught.value) == (
         "the camera cannot take the series: the mode dial stands at aperture priority: turn it to M; "
-        "the drive mode is continuous high: set single shooting; "
-        "ISO speed 110 is not offered; near it: 100, 125, 160, 200; "
+        f"the drive mode is {drive}: set single shooting; "
+        f"ISO speed 110 is not offered; near it: {speeds}; "
         "shutter time 0.5 is not offered; near it: nothing, the list is empty"
     )
 
@@ -136,9 +137,6 @@ def lab() -> Lab:
 def moody_lab(request: pytest.FixtureRequest) -> Lab:
     """Give a body that keeps what waits in its memory when a session ends, and one that does not."""
     return Lab(forgetful=request.param)
-
-
-IDENTITY = CameraIdentity("Canon Inc.", "Canon EOS 550D", "0000000001", "3-1.0.9")
 
 
 class TestOverMemory(CameraContract):
@@ -698,14 +696,15 @@ def test_a_release_that_stays_refused_says_where_to_look(lab: Lab) -> None:
 # What a body tells, as values.
 
 
-def test_mirror_lockup_among_recorded_custom_functions(recording: list[dict[str, Any]]) -> None:
+def test_mirror_lockup_among_recorded_custom_functions(body: str, recording: list[Recorded]) -> None:
     state = EosState()
-    state.take(decode_events(bytes.fromhex(recording[5]["data"])))
+    records = decode_events(bytes.fromhex(recording[5]["data"] or ""))
+    state.take(records)
     assert state.functions[0x060F] == 0
-    assert len(state.functions) == 20
+    assert len(state.functions) == {"EOS 60D": 20, "EOS 550D": 2}[body]
     groups = [
         record.value
-        for record in decode_events(bytes.fromhex(recording[5]["data"]))
+        for record in records
         if isinstance(record, PropertyChanged) and record.code == Property.EOS_CUSTOM_FUNCTIONS
     ]
     number, count = (0x060F).to_bytes(4, "little"), (1).to_bytes(4, "little")

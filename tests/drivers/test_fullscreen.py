@@ -19,11 +19,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from acquisition.illuminations import plan_illuminations
-from drivers.errors import ConfigurationError, DeviceError
-from drivers.fullscreen import Display, FullScreen, choose_display, identify_displays, list_displays
+from acquisition.lights.illuminations import plan_illuminations
+from drivers.display.fullscreen import Display, FullScreen, choose_display, identify_displays, list_displays
+from drivers.display.x11 import XScreen
 from drivers.presenter import BLACK, WHITE, Colour
-from drivers.x11 import XScreen
+from foundation.errors import ConfigurationError, DeviceError
 from sim.clock import SimulatedClock
 from tests.contracts.presenter import Bench, PresenterContract
 from tests.drivers.x_servers import Picture, VirtualScreen, screenshot, two_outputs, virtual_screen
@@ -168,7 +168,7 @@ def test_only_its_own_thread_may_show(screen: FullScreen, virtual: VirtualScreen
 
 def test_the_light_goes_out_with_a_process_that_is_killed(virtual: VirtualScreen) -> None:
     program = (
-        "from drivers.fullscreen import FullScreen; from drivers.presenter import Colour\n"
+        "from drivers.display.fullscreen import FullScreen; from drivers.presenter import Colour\n"
         "screen = FullScreen(); screen.show(Colour(250, 240, 230)); print('lit', flush=True); input()"
     )
     process = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -186,7 +186,7 @@ def test_the_light_goes_out_with_a_process_that_is_killed(virtual: VirtualScreen
 
 def test_a_server_that_ends_does_not_end_us(tmp_path: Path) -> None:
     program = (
-        "from drivers.errors import DeviceError; from drivers.fullscreen import FullScreen\n"
+        "from foundation.errors import DeviceError; from drivers.display.fullscreen import FullScreen\n"
         "from drivers.presenter import WHITE\n"
         "screen = FullScreen(); screen.show(WHITE); print('lit', flush=True); input()\n"
         "for _ in range(2):\n"

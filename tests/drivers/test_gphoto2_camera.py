@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from drivers.camera import CameraIdentity, ExposureSettings
-from drivers.clock import SystemClock
-from drivers.errors import ConfigurationError, DeviceError, DeviceRefused, LinkError
 from drivers.gphoto2_camera import Gphoto2Camera
+from foundation.clock import SystemClock
+from foundation.errors import ConfigurationError, DeviceError, DeviceRefused, LinkError
 from tests.contracts.camera import SETTINGS, Bench, CameraContract, SeededFilm
 from tests.drivers.gphoto2_server import FILM_BYTES
 

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.clock import SystemClock
-from drivers.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
-from drivers.link import Link
+from drivers.links.link import Link
 from drivers.links.memory import MemoryLink, memory_pair
 from drivers.links.tcp import TcpServer
 from drivers.ptp.ip_transport import IpTransport
 from drivers.ptp.messages import Request, Response
+from foundation.clock import SystemClock
+from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
+from sim.buses.ptpip_server import serve_ptpip
 from sim.clock import SimulatedClock
-from sim.ptpip_server import serve_ptpip
 from tests.contracts.link import read_exactly
 from tests.contracts.transport import PATIENCE_S, Bench, Echo, TransportContract
 from tests.drivers.troubled_links import Dribbling

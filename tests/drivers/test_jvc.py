@@ -8,15 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import jvc
-from drivers.errors import DeviceError, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
-from drivers.jvc import JvcFlatField
+from drivers.display import jvc
+from drivers.display.jvc import JvcFlatField
 from drivers.links.memory import PeerLink
 from drivers.links.tcp import TcpLink
 from drivers.presenter import BLACK, WHITE, Colour
+from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
-from sim.jvc import JvcPeer, serve_jvc
-from sim.presenter import Screen
+from sim.projectors.jvc import JvcPeer, serve_jvc
+from sim.projectors.screen import Screen
 from tests.contracts.presenter import Bench, PresenterContract
 
 ACKNOWLEDGED = b"\x06\x89\x01SS\n"

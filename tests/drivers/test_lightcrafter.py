@@ -12,15 +12,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import lightcrafter_wire as wire
-from drivers.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
-from drivers.lightcrafter import PRODUCTS, VENDOR, LightCrafter, find_lightcrafter
-from drivers.lightcrafter_wire import Command, Reply, Request
+from drivers.display import lightcrafter_wire as wire
+from drivers.display.lightcrafter import PRODUCTS, VENDOR, LightCrafter, find_lightcrafter
+from drivers.display.lightcrafter_wire import Command, Reply, Request
 from drivers.links.hid import HidDevice, open_hid
 from drivers.presenter import BLACK, WHITE, Colour
+from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
-from sim.lightcrafter import VIDEO_INPUT, Controller, HidBus, LightCrafterUsb
-from sim.presenter import Screen
+from sim.projectors.lightcrafter import VIDEO_INPUT, Controller, HidBus, LightCrafterUsb
+from sim.projectors.screen import Screen
 from tests.contracts.presenter import Bench, PresenterContract
 
 

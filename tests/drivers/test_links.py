@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.errors import LinkClosed, LinkTimeout
 from drivers.links.memory import PeerLink, memory_pair
 from drivers.links.tcp import LOOPBACK, TcpLink, TcpServer
+from foundation.errors import LinkClosed, LinkTimeout
 from tests.contracts.link import PATIENCE_S, Ends, LinkContract, read_exactly
 
 

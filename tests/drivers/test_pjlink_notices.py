@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import LinkClosed, LinkTimeout
 from drivers.links.udp import Address, UdpSocket
 from drivers.pjlink import notices
 from drivers.pjlink.notices import FaultsChanged, Found, InputChanged, LinkUp, Notice, PowerChanged
 from drivers.pjlink.search import FoundProjector, NoticePort, search
 from drivers.projector import Fault, Power, Severity
+from foundation.errors import LinkClosed, LinkTimeout
 from sim.clock import SimulatedClock
 
 MAC = "00:11:22:aa:bb:cc"

@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from drivers.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
-from drivers.link import Link
+from drivers.links.link import Link
 from drivers.links.tcp import TcpLink
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.pjlink.wire import Input, NoResolution, Resolution
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
+from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
-from sim.projector import PjLinkPeer, ProjectorTraits, SimulatedProjector, memory_link, serve_pjlink
+from sim.projectors.pjlink import PjLinkPeer, ProjectorTraits, SimulatedProjector, memory_link, serve_pjlink
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling, Slow
 

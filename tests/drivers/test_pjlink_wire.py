@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolError
 from drivers.pjlink import wire
 from drivers.pjlink.wire import (
     ErrorCode,
@@ -21,6 +20,7 @@ from drivers.pjlink.wire import (
     Resolution,
 )
 from drivers.projector import Fault, Lamp, Power, Severity
+from foundation.errors import ProtocolError
 
 PRINTABLE = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_size=100)
 

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from drivers.ptp.codes import Operation, ResponseCode
 from drivers.ptp.messages import LAST_TRANSACTION, Event, Request, Response
 from drivers.ptp.session import OPEN_TRIES, PASSING_LIMIT_S, Declined, PtpSession
 from drivers.ptp.transport import Transaction
+from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
 from sim.clock import SimulatedClock
 
 

@@ -16,15 +16,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from drivers import dng_reading, rawfile, tiff
 from drivers.camera import ExposureSettings
-from drivers.errors import FormatError
-from drivers.rawfile import Area, Mosaic, read_raw
-from sim.bodies import BODIES, Rectangle
-from sim.dng import write_dng as write_simulated_dng
-from tests.drivers.raw_files import Tags, longs, ratios, shorts, text, write_cr2, write_dng
+from drivers.raw import plain_dng as dng_reading
+from drivers.raw import rawfile
+from drivers.raw.rawfile import Area, Mosaic, read_raw
+from drivers.tiff import reading as tiff
+from foundation.errors import FormatError
+from sim.camera.dng import write_dng as write_simulated_dng
+from sim.camera.sensors import BODIES, Rectangle
+from tests.data_files import available, shipped
+from tests.drivers.raw_files import Tags, longs, lossless_jpeg, ratios, shorts, text, write_cr2, write_dng
 
-REAL = ("canon_eos_550d_colorchart.dng", "canon_powershot_g2.crw", "blackmagic.dng")
+EOS_550D = shipped("raw/canon_eos_550d_colorchart.dng")
+G2 = shipped("raw/canon_powershot_g2.crw")
+REAL = (EOS_550D, G2, *available("raw/blackmagic.dng"))
 
 
 def noise(shape: tuple[int, int], top: int = 4096) -> NDArray[np.uint16]:
@@ -42,19 +47,19 @@ def outcome(path: Path) -> Mosaic | FormatError:
 # Real files
 
 
-def test_counts_are_dcraws(raw_folder: Path) -> None:
+def test_counts_are_dcraws() -> None:
     # Measured with dcraw 9.28, -D -4 -T.
-    for line in (raw_folder / "dcraw_D4T.sha256").read_text().splitlines():
+    for line in shipped("raw/dcraw_D4T.sha256").read_text().splitlines():
         digest, name, shape = line.split()
-        mosaic = read_raw(raw_folder / name)
+        mosaic = read_raw(shipped(f"raw/{name}"))
         assert f"{mosaic.counts.shape[0]}x{mosaic.counts.shape[1]}" == shape
         assert hashlib.sha256(mosaic.counts.astype("<u2").tobytes()).hexdigest() == digest
 
 
-def test_a_real_550d_file(raw_folder: Path) -> None:
+def test_a_real_550d_file() -> None:
     # Tags as exiftool and tifffile show them; the sensor's left border is black on a real sensor, near the 2048 counts
     # that Canon's bodies of this generation are set to.
-    mosaic = read_raw(raw_folder / "canon_eos_550d_colorchart.dng")
+    mosaic = read_raw(EOS_550D)
     assert mosaic.camera == "Canon EOS Kiss X4"
     assert mosaic.pattern == "RGGB"
     assert mosaic.visible == Area(26, 152, 1156, 1734)
@@ -67,8 +72,8 @@ def test_a_real_550d_file(raw_folder: Path) -> None:
     np.testing.assert_allclose(black, 2048, atol=4)
 
 
-def test_a_real_g2_file(raw_folder: Path) -> None:
-    mosaic = read_raw(raw_folder / "canon_powershot_g2.crw")
+def test_a_real_g2_file() -> None:
+    mosaic = read_raw(G2)
     assert mosaic.camera == "Canon PowerShot G2"
     assert mosaic.pattern == "RGGB"
     assert (mosaic.iso, mosaic.aperture) == (50, 4.0)
@@ -80,10 +85,19 @@ def test_a_real_g2_file(raw_folder: Path) -> None:
     np.testing.assert_allclose(black, 32, atol=0.2)
 
 
-def test_a_real_file_of_another_maker(raw_folder: Path) -> None:
-    mosaic = read_raw(raw_folder / "blackmagic.dng")
+@pytest.mark.parametrize("real", [None, *available("raw/blackmagic.dng")], ids=lambda real: real and real.name)
+def test_a_compressed_file_of_another_maker(tmp_path: Path, real: Path | None) -> None:
+    # The made one has the same structure: lossless JPEG of 12-bit codes, a table that decodes them, no masked area.
+    path, codes, tones = real or tmp_path / "made.dng", noise((64, 96)), np.arange(4096, dtype=np.uint16) * 16
+    if real is None:
+        tags = {50708: text("Blackmagic Pocket Cinema Camera 4K"), 50712: shorts(*tones.tolist()), 50714: shorts(512)}
+        write_dng(path, codes, {**tags, 50717: longs(65535), 259: shorts(7)}, lossless_jpeg(codes))
+    mosaic = read_raw(path)
     assert mosaic.camera == "Blackmagic Pocket Cinema Camera 4K"
-    assert mosaic.counts.shape == (2176, 4128)
+    if real is None:
+        np.testing.assert_array_equal(mosaic.counts, tones[codes])
+    else:
+        assert mosaic.counts.shape == (2176, 4128)
     np.testing.assert_array_equal(mosaic.black, np.full((2, 2), 512.0))
     assert mosaic.masked == ()
     assert mosaic.masked_black() is None
@@ -318,7 +332,7 @@ def test_what_is_no_raw_file(tmp_path: Path, content: bytes, capfd: pytest.Captu
 LATE_WRITER = """
 import ctypes
 from pathlib import Path
-from drivers import rawfile
+from drivers.raw import rawfile
 
 libc = ctypes.CDLL(None)
 with rawfile._libraw_silenced():
@@ -349,13 +363,13 @@ def test_a_sensor_that_is_no_bayer_is_named_so(tmp_path: Path) -> None:
 # Damage
 
 
-@pytest.mark.parametrize("name", REAL)
-def test_a_cut_file_is_an_error(raw_folder: Path, tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]) -> None:
-    data = (raw_folder / name).read_bytes()
+@pytest.mark.parametrize("real", REAL, ids=lambda real: real.name)
+def test_a_cut_file_is_an_error(tmp_path: Path, real: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    data = real.read_bytes()
     # The last 58 bytes of blackmagic.dng pad the file; no tag points at them.
-    whole = len(data) - (58 if name == "blackmagic.dng" else 0)
+    whole = len(data) - (58 if real.name == "blackmagic.dng" else 0)
     lengths = [0, 7, 8, 100, 999, 1500, 5000, 20_000, *np.linspace(30_000, whole - 1, 9).astype(int).tolist()]
-    cut = tmp_path / name
+    cut = tmp_path / real.name
     for length in lengths:
         cut.write_bytes(data[:length])
         assert isinstance(outcome(cut), FormatError), length
@@ -394,13 +408,11 @@ def test_flipped_bytes_are_a_mosaic_or_an_error(tmp_path: Path, make: str, capfd
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("name", REAL[1:])
-def test_flipped_bytes_of_real_files(
-    raw_folder: Path, tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
-) -> None:
-    data = (raw_folder / name).read_bytes()
+@pytest.mark.parametrize("real", REAL[1:], ids=lambda real: real.name)
+def test_flipped_bytes_of_real_files(tmp_path: Path, real: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    data = real.read_bytes()
     rng = np.random.default_rng(5)
-    path = tmp_path / name
+    path = tmp_path / real.name
     for _ in range(12):
         flipped = bytearray(data)
         for place in rng.integers(0, len(data), 20):

@@ -19,8 +19,8 @@ import serial
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from drivers.errors import ConfigurationError, DeviceError, DeviceRefused, LinkClosed, LinkTimeout
 from drivers.links.serial import SerialLink
+from foundation.errors import ConfigurationError, DeviceError, DeviceRefused, LinkClosed, LinkTimeout
 from tests.contracts.link import PATIENCE_S, Ends, LinkContract, read_exactly
 
 

@@ -14,7 +14,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import (
+from drivers.links.link import Link
+from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
+from drivers.serial_projectors import LANGUAGES, benq, epson, language, nec, optoma
+from drivers.serial_projectors.benq import BenqProjector
+from drivers.serial_projectors.epson import EpsonProjector
+from drivers.serial_projectors.exchange import MAX_MESSAGE
+from drivers.serial_projectors.nec import NecProjector
+from drivers.serial_projectors.optoma import OptomaProjector
+from foundation.errors import (
     ConfigurationError,
     DeviceError,
     DeviceFault,
@@ -23,17 +31,9 @@ from drivers.errors import (
     LinkTimeout,
     ProtocolError,
 )
-from drivers.link import Link
-from drivers.projector import Fault, Lamp, Power, Projector, ProjectorIdentity, Severity
-from drivers.serial_projectors import LANGUAGES, benq, epson, language, nec, optoma
-from drivers.serial_projectors.benq import BenqProjector
-from drivers.serial_projectors.epson import EpsonProjector
-from drivers.serial_projectors.exchange import MAX_MESSAGE
-from drivers.serial_projectors.nec import NecProjector
-from drivers.serial_projectors.optoma import OptomaProjector
 from sim.clock import SimulatedClock
-from sim.projector import SimulatedProjector
-from sim.serial_projectors import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer, SerialPeerLink
+from sim.projectors.pjlink import SimulatedProjector
+from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer, SerialPeerLink
 from tests.contracts.projector import Bench, ProjectorContract
 from tests.drivers.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling
 
@@ -125,7 +125,7 @@ class TestOverAPseudoTerminal(ProjectorContract):
     @pytest.fixture(params=NAMES)
     def bench(self, request: pytest.FixtureRequest) -> Iterator[Bench]:
         from drivers.links.serial import SerialLink
-        from sim.pty import PseudoTerminal
+        from sim.projectors.pty import PseudoTerminal
 
         spoken = LANGUAGES[request.param]
         device = SimulatedProjector(SimulatedClock())
@@ -711,7 +711,7 @@ def test_a_late_answer_never_meets_a_later_question(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cable_pulled_out_is_told(name: str) -> None:
     from drivers.links.serial import SerialLink
-    from sim.pty import PseudoTerminal
+    from sim.projectors.pty import PseudoTerminal
 
     spoken = language(name)
     with PseudoTerminal(PEERS[name](SimulatedProjector(SimulatedClock(), Power.ON))) as terminal:

@@ -7,14 +7,14 @@ from importlib import resources
 import pytest
 import usb.core
 
-from drivers.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
+from drivers.links.pipes import Pipe, PipeStalled
 from drivers.links.usb import UDEV_RULE, UsbDevice, list_devices, open_usb
-from drivers.pipes import Pipe, PipeStalled
 from drivers.ptp.messages import Request
 from drivers.ptp.usb_transport import UsbTransport
+from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
+from sim.buses.usb import SimulatedBus
+from sim.buses.usb_device import BULK_IN, Identity, PtpUsbDevice, Setup
 from sim.clock import SimulatedClock
-from sim.usb import SimulatedBus
-from sim.usb_device import BULK_IN, Identity, PtpUsbDevice, Setup
 from tests.contracts.transport import ECHO, PATIENCE_S, Bench, Echo, TransportContract
 
 

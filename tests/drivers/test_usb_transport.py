@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
-from drivers.pipes import Pipe, PipeStalled, UsbPipes
+from drivers.links.pipes import Pipe, PipeStalled, UsbPipes
 from drivers.ptp.messages import Event, Request, Response
 from drivers.ptp.usb_transport import UsbTransport
+from foundation.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
+from sim.buses.ptp_memory import MemoryPipes
+from sim.buses.usb_device import PtpUsbDevice
 from sim.clock import SimulatedClock
 from sim.faults import CutOff, Deaf, Garbling, HeaderAlone, Joining, ShortReads, Stalling, WithoutEmptyPackets
-from sim.ptp_memory import MemoryPipes
-from sim.usb_device import PtpUsbDevice
 from tests.contracts.transport import (
     ECHO,
     GIVE,

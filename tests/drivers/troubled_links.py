@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.clock import Clock
-from drivers.errors import LinkClosed, LinkTimeout
-from drivers.link import Link
+from drivers.links.link import Link
+from foundation.clock import Clock
+from foundation.errors import LinkClosed, LinkTimeout
 
 
 class Dribbling:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.illuminations import Illumination, save_illuminations
-from acquisition.layout import design_chart
+from acquisition.chart.layout import design_chart
+from acquisition.lights.illuminations import Illumination, save_illuminations
 from drivers.presenter import Colour
 
 LIGHTS = (

@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 
 from drivers.camera import CapturedFrame
-from drivers.errors import DeviceError, DeviceRefused
-from drivers.pipes import UsbPipes
-from drivers.ptp.canon import OtherRecord, TransferRequest, decode_events, encode_events
-from drivers.ptp.canon_eos import CanonEos
+from drivers.canon.camera import CanonEos
+from drivers.canon.records import OtherRecord, TransferRequest, decode_events, encode_events
+from drivers.links.pipes import UsbPipes
 from drivers.ptp.codes import Operation, ResponseCode
 from drivers.ptp.messages import Request, Response
-from drivers.storage import whole_file
-from sim.eos_bodies import EOS_550D
+from foundation.errors import DeviceError, DeviceRefused
+from foundation.files import whole_file
+from sim.buses.responder import Answer, NoAnswer, Responder
+from sim.camera.eos_bodies import EOS_550D
 from sim.faults import CutOff, TroubledResponder
-from sim.responder import Answer, NoAnswer, Responder
 from tests.contracts.camera import SETTINGS
 from tests.drivers.eos_lab import Lab
 

@@ -23,18 +23,18 @@ import numpy as np
 import pytest
 
 from drivers.camera import ExposureSettings
-from drivers.clock import SystemClock
+from drivers.canon import apex
+from drivers.canon.records import RAW_ONLY, ImageFile, ImageFormat
 from drivers.presenter import WHITE
-from drivers.ptp import apex
-from drivers.ptp.canon import RAW_ONLY, ImageFile, ImageFormat
 from drivers.ptp.codes import Property
-from drivers.rawfile import read_raw
-from sim.bodies import BODIES
-from sim.eos import SimulatedEos
-from sim.eos_bodies import EOS_6D_MARK_II, EOS_550D_AS_LISTED, TEST_BODY
-from sim.film import Film, WorldFilm
-from sim.ptpip_server import serve_ptpip
-from sim.world import Print, Room, World
+from drivers.raw.rawfile import read_raw
+from foundation.clock import SystemClock
+from sim.buses.ptpip_server import serve_ptpip
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D_AS_LISTED, TEST_BODY
+from sim.camera.film import Film, WorldFilm
+from sim.camera.sensors import BODIES
+from sim.world.world import Print, Room, World
 
 SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
 LIMIT_S = 60

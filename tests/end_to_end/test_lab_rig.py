@@ -18,29 +18,29 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from acquisition.chart import load_chart
+from acquisition.chart.model import load_chart
 from acquisition.cli import main
 from acquisition.config import load_lab
-from acquisition.rig import open_rig, sheet, simulated_body, simulated_room
-from acquisition.session import Session
-from acquisition.taking import run_session
-from drivers.clock import SystemClock
+from acquisition.run.rig import open_rig, sheet, simulated_body, simulated_room
+from acquisition.run.taking import run_session
+from acquisition.session.folder import Session
 from drivers.links.usb import open_usb
 from drivers.presenter import Colour
 from drivers.projector import Power
-from drivers.rawfile import read_raw
+from drivers.raw.rawfile import read_raw
+from foundation.clock import SystemClock
+from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.usb import SimulatedBus
+from sim.buses.usb_device import PtpUsbDevice
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import EOS_BODIES
+from sim.camera.film import WorldFilm
 from sim.clock import OPENING
-from sim.eos import SimulatedEos
-from sim.eos_bodies import EOS_BODIES
-from sim.film import WorldFilm
-from sim.presenter import Screen, SimulatedPresenter
-from sim.projector import SimulatedProjector, serve_pjlink
-from sim.ptpip_server import serve_ptpip
-from sim.pty import PseudoTerminal
-from sim.serial_projectors import PEERS, BenqPeer, EpsonPeer, serve_network
-from sim.usb import SimulatedBus
-from sim.usb_device import PtpUsbDevice
-from sim.world import World
+from sim.projectors.pjlink import SimulatedProjector, serve_pjlink
+from sim.projectors.pty import PseudoTerminal
+from sim.projectors.screen import Screen, SimulatedPresenter
+from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer, serve_network
+from sim.world.world import World
 
 FRAMES = 10
 ROOM = """
@@ -107,7 +107,7 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
             text += '[lab.camera]\nconnection = "usb"\n'
             text += f'[lab.projector]\ncontrol = "benq"\ndevice = "{terminal.path}"\n'
         lab.write_text(text)
-        monkeypatch.setattr("acquisition.rig.open_usb", partial(open_usb, backend=bus))
+        monkeypatch.setattr("acquisition.run.rig.open_usb", partial(open_usb, backend=bus))
         assert run_session(load_lab(lab), folder / "real", lambda done, total: None).complete
         assert beamer.power() is not Power.ON, "a complete session switches the lamp off"
         assert look() == Colour(0, 0, 0), "the screen is black when the lab is left"
@@ -129,7 +129,7 @@ def test_a_look_tells_what_may_bend_the_light(
         def warnings(self) -> tuple[str, ...]:
             return ("the gamma ramp is not straight: switch off night light",)
 
-    monkeypatch.setattr("acquisition.rig.SimulatedPresenter", Doubting)
+    monkeypatch.setattr("acquisition.run.rig.SimulatedPresenter", Doubting)
     monkeypatch.setattr(sys, "argv", ["acquire", "check", str(lab)])
     assert main() == 0
     told = capsys.readouterr()
@@ -140,7 +140,7 @@ def test_a_look_tells_what_may_bend_the_light(
 
 @pytest.mark.parametrize("maker", ["epson", "benq"])
 def test_a_makers_language_over_the_network(lab: Path, maker: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("acquisition.rig.FullScreen", lambda display, clock: SimulatedPresenter(Screen(), clock))  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    monkeypatch.setattr("acquisition.run.rig.FullScreen", lambda display, clock: SimulatedPresenter(Screen(), clock))  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
     beamer = SimulatedProjector(SystemClock(), power=Power.ON)
     peer = partial(EpsonPeer, beamer, network=True) if maker == "epson" else partial(BenqPeer, beamer, network=True)
     with serve_network(peer) as server:

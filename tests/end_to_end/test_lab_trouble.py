@@ -18,22 +18,22 @@ if sys.platform == "win32":
     pytest.skip("Windows has no pseudo-terminals", allow_module_level=True)
 
 from acquisition.cli import main
-from drivers.clock import Clock, SystemClock
-from drivers.errors import DeviceRefused
-from drivers.fullscreen import Display, choose_display
+from drivers.display.fullscreen import Display, choose_display
 from drivers.links.tcp import TcpLink, TcpServer
 from drivers.links.usb import open_usb
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.projector import Power
-from sim.eos import SimulatedEos
-from sim.eos_bodies import EOS_BODIES
-from sim.presenter import Screen, SimulatedPresenter
-from sim.projector import SimulatedProjector, serve_pjlink
-from sim.ptpip_server import serve_ptpip
-from sim.pty import PseudoTerminal
-from sim.serial_projectors import EpsonPeer
-from sim.usb import SimulatedBus
-from sim.usb_device import Identity, PtpUsbDevice
+from foundation.clock import Clock, SystemClock
+from foundation.errors import DeviceRefused
+from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.usb import SimulatedBus
+from sim.buses.usb_device import Identity, PtpUsbDevice
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import EOS_BODIES
+from sim.projectors.pjlink import SimulatedProjector, serve_pjlink
+from sim.projectors.pty import PseudoTerminal
+from sim.projectors.screen import Screen, SimulatedPresenter
+from sim.projectors.serial import EpsonPeer
 from tests.contracts.camera import SeededFilm
 
 DESK = Display(1, "DP-1", 0, 0, 2560, 1440, 60)
@@ -86,8 +86,8 @@ def bench(lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
         choose_display(bench.displays, display)
         return SimulatedPresenter(Screen(), clock)
 
-    monkeypatch.setattr("acquisition.rig.FullScreen", presenter)
-    monkeypatch.setattr("acquisition.rig.open_usb", partial(open_usb, backend=bench.bus))
+    monkeypatch.setattr("acquisition.run.rig.FullScreen", presenter)
+    monkeypatch.setattr("acquisition.run.rig.open_usb", partial(open_usb, backend=bench.bus))
     return bench
 
 
@@ -162,7 +162,7 @@ def test_a_port_that_answers_something_else(bench: Bench, camera: str) -> None:
 
 
 def test_a_projector_that_does_not_answer(bench: Bench, camera: str) -> None:
-    bench.monkeypatch.setattr("acquisition.rig.PjLinkProjector", partial(PjLinkProjector, timeout=0.05))
+    bench.monkeypatch.setattr("acquisition.run.rig.PjLinkProjector", partial(PjLinkProjector, timeout=0.05))
 
     def say_nothing(link: TcpLink) -> None:
         link.read(1, 60.0)

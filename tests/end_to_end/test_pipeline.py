@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from acquisition.config import load_lab
-from acquisition.rig import sheet, simulated_body, simulated_room
-from acquisition.session import Session
-from calibration.lut import Lut, open_lut
-from drivers.errors import FormatError
-from sim.world import World
+from acquisition.run.rig import sheet, simulated_body, simulated_room
+from acquisition.session.folder import Session
+from calibration.table.lut import Lut, open_lut
+from foundation.errors import FormatError
+from sim.world.world import World
 
 Run = Callable[..., int]
 
@@ -147,7 +147,7 @@ def test_the_dataset_can_be_evaluated(built: Path, run: Run, capsys: pytest.Capt
 
 
 def test_an_interrupted_session_gives_the_same_table(built: Path, run: Run, lut: Lut) -> None:
-    from acquisition.taking import run_session
+    from acquisition.run.taking import run_session
 
     settings = load_lab(built / "LAB.toml")
     session = built / "interrupted"
@@ -207,7 +207,7 @@ def test_a_table_of_another_version_is_named(built: Path, lut: Lut, tmp_path: Pa
 
 
 def test_a_session_without_frames_is_said(built: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    from acquisition.taking import open_session
+    from acquisition.run.taking import open_session
 
     settings = load_lab(built / "LAB.toml")
     open_session(settings, built / "bare").close()

@@ -15,25 +15,25 @@ import pytest
 
 from acquisition.cli import main
 from acquisition.config import load_lab
-from acquisition.session import Session
-from acquisition.taking import run_session
+from acquisition.run.taking import run_session
+from acquisition.session.folder import Session
+from drivers.canon.camera import CanonEos
 from drivers.pjlink.projector import PjLinkProjector
-from drivers.ptp.canon_eos import CanonEos
 
 Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 
 KILLER = """
 import os, signal, sys
 from acquisition.cli import main
-import acquisition.session, drivers.storage
+import acquisition.session.folder, foundation.files
 
 place, count = sys.argv[1], int(sys.argv[2])
 del sys.argv[1:3]
 owner, name = {
-    "renaming": (drivers.storage.Path, "replace"),
-    "committing": (acquisition.session.Session, "commit"),
-    "deriving": (acquisition.session.Session, "write_frames_csv"),
-    "beginning": (acquisition.session.Session, "begin"),
+    "renaming": (foundation.files.Path, "replace"),
+    "committing": (acquisition.session.folder.Session, "commit"),
+    "deriving": (acquisition.session.folder.Session, "write_frames_csv"),
+    "beginning": (acquisition.session.folder.Session, "begin"),
 }[place]
 real = getattr(owner, name)
 
@@ -300,8 +300,8 @@ def test_a_replay_with_another_exposure_is_told_the_recordings(
 
 
 def test_a_series_longer_than_a_battery_lasts(lab: Path) -> None:
-    from acquisition.chart import load_chart
-    from acquisition.rig import open_rig
+    from acquisition.chart.model import load_chart
+    from acquisition.run.rig import open_rig
 
     settings = load_lab(lab)
     with open_rig(settings, load_chart(settings.chart)) as devices:

@@ -14,15 +14,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session import Session, Step
-from benchmarks.accuracy import Held, angles_deg, beyond_noise, hold, repeated_variance
+from acquisition.session.folder import Session, Step
+from benchmarks.accuracy import Held, beyond_noise, hold, repeated_variance
 from benchmarks.rooms import random_case
-from calibration.build import BuildResult, build
-from calibration.lut import open_lut
+from calibration.pipeline.build import BuildResult, build
+from calibration.table.lut import open_lut
 from drivers.camera import ExposureSettings
-from drivers.errors import CropError, QualityError
 from drivers.presenter import WHITE, Colour
-from sim.world import Room
+from foundation.angles import angles_deg
+from foundation.errors import CropError, QualityError
+from sim.world.world import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
 
 FEW = renumbered([LIGHTS[4], LIGHTS[5], LIGHTS[0]])

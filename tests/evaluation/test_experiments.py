@@ -14,17 +14,17 @@ import numpy.typing as npt
 import pytest
 from fsspec.core import url_to_fs
 
-from acquisition.illuminations import Illumination
-from calibration.lut import LutWriter, Provenance, open_lut
-from drivers.errors import InputError
+from acquisition.lights.illuminations import Illumination
+from calibration.table.lut import LutWriter, Provenance, open_lut
 from drivers.presenter import Colour
 from evaluation import experiments
 from evaluation.cli import main
 from evaluation.datasets import open_scenes
 from evaluation.experiments import evaluate, images_csv, table_csv
 from evaluation.methods import GrayEdge, standard_methods
-from generator.dataset import generate_dataset
-from generator.scene import random_scenes
+from foundation.errors import InputError
+from generator.dataset.reader import generate_dataset
+from generator.pictures.sources import random_scenes
 
 LIGHTS = np.array([[2000.0, 3000, 1000], [1500, 3000, 2500]])
 

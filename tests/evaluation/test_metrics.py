@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import InputError
 from evaluation.metrics import recovery_error, reproduction_error, summarise
+from foundation.errors import InputError
 
 lights = st.tuples(*[st.floats(0.01, 100)] * 3)
 

@@ -19,8 +19,8 @@ from typing import TypeVar
 import atheris  # pyright: ignore[reportMissingModuleSource]  # installed by hand only
 
 with atheris.instrument_imports():
-    from drivers.errors import ProtocolError
-    from drivers.ptp import canon, container, ptpip
+    from drivers.canon import records as canon
+    from drivers.ptp import container, ptpip
     from drivers.ptp.datasets import (
         DeviceInfo,
         DevicePropDesc,
@@ -29,6 +29,7 @@ with atheris.instrument_imports():
         decode_u32_array,
         encode_u32_array,
     )
+    from foundation.errors import ProtocolError
     from tests.drivers.ptp import examples
 
 T = TypeVar("T")

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.illuminations import Illumination
-from calibration.lut import Lut, LutWriter, Provenance, Unfit, open_lut
+from acquisition.lights.illuminations import Illumination
+from calibration.table.lut import Lut, LutWriter, Provenance, Unfit, open_lut
 from drivers.presenter import Colour
 from generator.kernels import philox
 

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import FormatError, InputError
-from generator.batches import Crops
-from generator.gallery import Gallery, gallery_of, open_gallery, save_gallery
+from foundation.errors import FormatError, InputError
 from generator.lights.lighting import Mixture
-from generator.picture import Picture
-from generator.scene import random_scenes
+from generator.pictures.picture import Picture
+from generator.pictures.sources import random_scenes
+from generator.training.crops import Crops
+from generator.training.gallery import Gallery, gallery_of, open_gallery, save_gallery
 from tests.generator.conftest import MakeLut
 
 BITS = 2
@@ -194,9 +194,9 @@ def test_a_gallery_on_disk_is_the_pictures(tmp_path: Path) -> None:
 WITHOUT_TORCH = """
 import sys
 sys.modules["torch"] = None
-from generator.batches import Crops
+from generator.training.crops import Crops
 try:
-    from generator.batches import CropDataset
+    from generator.training.crops import CropDataset
 except ImportError as error:
     print(error)
 """

@@ -15,20 +15,20 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from drivers.errors import FormatError, InputError
-from generator.contact import contact_sheet
-from generator.dataset import Dataset, Entry, generate_dataset, open_dataset
-from generator.illuminant import ListedLights, RandomLights, TogetherLights
-from generator.kernel import render
+from foundation.errors import FormatError, InputError
+from generator.dataset.contact_sheet import contact_sheet
+from generator.dataset.reader import Dataset, Entry, generate_dataset, open_dataset
+from generator.kernels.rendering import render
+from generator.lights.choices import ListedLights, RandomLights, TogetherLights
 from generator.lights.lighting import mixture_of
 from generator.masks.making import parse_masks
-from generator.picture import read_picture
-from generator.scene import find_pictures, random_scenes
+from generator.pictures.picture import read_picture
+from generator.pictures.sources import find_pictures, random_scenes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 
 NUMBERS = (0, 1, 2, 3, 6, 7, 8, 9)

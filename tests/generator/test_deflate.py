@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from isal import isal_zlib
 
-from drivers.errors import InputError
-from generator.encode import Shot
-from generator.encoders import png
-from generator.encoders.deflate import Packer, find_repeats
-from generator.encoders.huffman import LONGEST, code_lengths, codes_of
-from generator.encoders.png import encode_png
+from foundation.errors import InputError
+from generator.files import png
+from generator.files.deflate import Packer, find_repeats
+from generator.files.formats import Shot
+from generator.files.huffman import LONGEST, code_lengths, codes_of
+from generator.files.png import encode_png
 
 SHOT = Shot(12000, (1.0, 1.0, 1.0), "Benchmark")
 

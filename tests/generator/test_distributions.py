@@ -10,9 +10,9 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import chisquare, kstest
 
-from drivers.errors import FormatError, InputError
-from generator.illuminant import DrawnLights
+from foundation.errors import FormatError, InputError
 from generator.kernels.philox import CHROMATICITIES, words
+from generator.lights.choices import DrawnLights
 from generator.lights.distributions import Distribution, Fitted, Gaussian, Uniform, parse_distribution
 from generator.lights.gamut import Gamut, rb_of
 from generator.lights.lighting import LightChoice

@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from drivers.errors import FormatError, InputError
-from generator.encode import (
+from foundation.errors import FormatError, InputError
+from generator.files.formats import (
     FORMATS,
     Format,
     Shot,

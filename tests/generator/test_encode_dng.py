@@ -15,10 +15,10 @@ import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.camera_matrix import camera_matrix
-from drivers.errors import InputError
-from drivers.rawfile import decode_raw
-from generator.encode import Shot, decode_image, encode_image
+from drivers.raw.camera_matrix import camera_matrix
+from drivers.raw.rawfile import decode_raw
+from foundation.errors import InputError
+from generator.files.formats import Shot, decode_image, encode_image
 
 WHITES = {
     "candle": (1945.3, 492.3, 105.1),

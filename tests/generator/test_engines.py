@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING
 import psutil
 import pytest
 
-from drivers.errors import InputError
-from generator.dataset import generate_dataset
-from generator.illuminant import RandomLights
-from generator.production.engines import parse_engine
-from generator.scene import find_pictures, random_scenes
+from foundation.errors import InputError
+from generator.dataset.production.engines import parse_engine
+from generator.dataset.reader import generate_dataset
+from generator.lights.choices import RandomLights
+from generator.pictures.sources import find_pictures, random_scenes
 
 if TYPE_CHECKING:
     from distributed import LocalCluster
 
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 IMAGES = 240
 SHARD = 12
@@ -89,7 +89,7 @@ PROGRAM = """
 import os, signal, sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-from calibration.lut import open_lut
+from calibration.table.lut import open_lut
 from test_engines import make
 
 if __name__ == "__main__":
@@ -201,7 +201,7 @@ def test_an_unknown_engine_is_refused(name: str) -> None:
 def test_a_scheduler_that_does_not_answer(
     make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("generator.production.engines.CONNECT_S", 0.2)
+    monkeypatch.setattr("generator.dataset.production.engines.CONNECT_S", 0.2)
     with pytest.raises(InputError, match=r"no Dask scheduler answers at 127\.0\.0\.1:1: .*; start one with dask"):
         generate_dataset(make_lut(), tmp_path / "out", random_scenes(2, 24, 16), [0], engine="dask://127.0.0.1:1")
     assert [path.name for path in tmp_path.iterdir()] == ["lut"]

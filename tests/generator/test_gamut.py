@@ -11,19 +11,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import InputError
+from foundation.angles import angles_deg
+from foundation.errors import InputError
 from generator.lights.gamut import (
     TOLERANCE_DEG,
     Gamut,
     OutsideGamutError,
-    angles_between,
     black_body,
     rb_of,
     rgb_of,
 )
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
     from generator.lights.lighting import Mixture
 
 PRIMARIES = np.array([[5000.0, 900.0, 300.0], [900.0, 6000.0, 1000.0], [150.0, 1100.0, 4800.0]])
@@ -49,15 +49,15 @@ def test_any_light_within_is_matched_by_three_neighbours_at_most(drives: tuple[f
     wanted = np.array(drives) @ PRIMARIES
     match = GRID.match(wanted)
     assert len(match.mixture.lights) <= 3
-    off = float(angles_between(made(GRID, match.mixture), wanted))
+    off = float(angles_deg(made(GRID, match.mixture), wanted))
     assert off == pytest.approx(match.angle, abs=1e-9)
     # Three lights match exactly, but for weights in billionths.
     assert off < (1e-6 if len(match.mixture.lights) == 3 else TOLERANCE_DEG)
     assert sum(match.mixture.weights) == pytest.approx(1, abs=1e-12)
     # Neighbours: no light of the mixture is farther than the farthest side of any triangle of the grid.
     lights = GRID.white[list(match.mixture.lights)]
-    longest = angles_between(GRID.directions[GRID.edges[:, 0]], GRID.directions[GRID.edges[:, 1]]).max()
-    assert angles_between(lights[:, None], lights[None]).max() <= longest + 1e-9
+    longest = angles_deg(GRID.directions[GRID.edges[:, 0]], GRID.directions[GRID.edges[:, 1]]).max()
+    assert angles_deg(lights[:, None], lights[None]).max() <= longest + 1e-9
 
 
 def test_the_fewest_lights_that_do() -> None:
@@ -94,7 +94,7 @@ def test_a_light_outside_is_refused_with_how_far_and_what_is_nearest() -> None:
     # By brute force: no mixture of any two lights is nearer.
     share = np.linspace(0, 1, 401)[:, None, None, None]
     pairs = share * GRID.directions[:, None] + (1 - share) * GRID.directions[None]
-    least = angles_between(pairs.reshape(-1, 3), wanted).min()
+    least = angles_deg(pairs.reshape(-1, 3), wanted).min()
     assert nearest.angle == pytest.approx(info.value.angle)
     assert nearest.angle == pytest.approx(least, rel=1e-4)
     assert f"{nearest.angle:.2f}°" in str(info.value)
@@ -157,7 +157,7 @@ def test_black_bodies_are_joined_by_mired(make_lut: Callable[..., Lut]) -> None:
     white = mixture.white(lut)
     np.testing.assert_allclose(white / white.sum(), lut.ground_truth[[1, 3]].mean(axis=0), rtol=1e-8)
     nearly = black_body(lut, 3001.2).white(lut)
-    assert angles_between(nearly, lut.white[1]) < angles_between(nearly, lut.white[3])
+    assert angles_deg(nearly, lut.white[1]) < angles_deg(nearly, lut.white[3])
 
 
 def test_a_temperature_beyond_the_tables_is_refused(make_lut: Callable[..., Lut]) -> None:

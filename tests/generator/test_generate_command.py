@@ -11,15 +11,16 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.errors import StorageError
-from generator import contact, open_lut, read_picture, render
+from foundation.errors import StorageError
+from generator import open_lut, read_picture, render
 from generator.cli import main
-from generator.dataset import open_dataset
+from generator.dataset import contact_sheet as contact
+from generator.dataset.reader import open_dataset
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
     Generate = Callable[..., int]
 

@@ -7,10 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.errors import FormatError
+from foundation.errors import FormatError
 from generator.lights.ground_truths import load_ground_truths
+from tests.data_files import available
 
-GT = Path(__file__).parents[2].parent / "shared" / "data" / "gt"
+CUBEPLUS = [0.16238344, 0.45326359, 0.38435297]
+NUS = [0.507292583011997, 0.809736795789161, 0.294924662865143]
+REAL = {
+    "gt/cubeplus_12_rows.csv": (12, CUBEPLUS),
+    "gt/nus_18_rows.csv": (18, NUS),
+    "gt/cubeplus_gt_1707.csv": (1707, CUBEPLUS),
+    "gt/nus8_gt_1853.csv": (1853, NUS),
+}
+"""Number of lights and the first of them, by file."""
 
 
 @pytest.mark.parametrize(
@@ -54,12 +63,9 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         load_ground_truths(tmp_path / "none.csv")
 
 
-def test_real_ground_truths_are_read() -> None:
-    if not GT.is_dir():
-        pytest.skip("the ground truths of Cube+ and NUS are not at hand")
-    assert load_ground_truths(GT / "cubeplus_gt_1707.csv").shape == (1707, 3)
-    assert load_ground_truths(GT / "nus8_gt_1853.csv")[0].tolist() == [
-        0.507292583011997,
-        0.809736795789161,
-        0.294924662865143,
-    ]
+@pytest.mark.parametrize("path", available(*REAL), ids=lambda path: path.name)
+def test_real_ground_truths_are_read(path: Path) -> None:
+    lights = load_ground_truths(path)
+    number, first = REAL[f"gt/{path.name}"]
+    assert lights.shape == (number, 3)
+    assert lights[0].tolist() == first

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from drivers.errors import InputError
-from generator.illuminant import (
+from foundation.errors import InputError
+from generator.lights.choices import (
     ListedLights,
     RandomLights,
     TogetherLights,
@@ -25,7 +25,7 @@ from generator.lights.lighting import LightChoice, Lighting, Mixture, plain
 from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 WHITES = np.array([[8.0, 1, 1], [1, 8, 1], [1, 1, 8], [3, 4, 3]])
 

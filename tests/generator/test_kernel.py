@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.lut import Provenance, Unfit
-from drivers.errors import InputError
-from generator.kernel import PATTERNS, draw_mosaic, draw_samples, render
+from calibration.table.lut import Provenance, Unfit
+from foundation.errors import InputError
 from generator.kernels import streaming
 from generator.kernels.palette import bits_of, channels_of, colours_in, fit_picture, stand_ins
+from generator.kernels.rendering import PATTERNS, draw_mosaic, draw_samples, render
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 Rule = Callable[..., npt.NDArray[np.int64]]
 

@@ -20,16 +20,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from drivers.errors import FormatError, InputError, StorageError
-from generator.dataset import Dataset, generate_dataset, open_dataset
-from generator.illuminant import ListedLights, TogetherLights
+from foundation.errors import FormatError, InputError, StorageError
+from generator.dataset.production.assembly import damage
+from generator.dataset.production.records import Layout
+from generator.dataset.reader import Dataset, generate_dataset, open_dataset
+from generator.lights.choices import ListedLights, TogetherLights
 from generator.masks.making import parse_masks
-from generator.production.assembly import damage
-from generator.production.records import Layout
-from generator.scene import Scene, random_scenes
+from generator.pictures.sources import Scene, random_scenes
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
     Make = Callable[..., Dataset]
 
@@ -267,7 +267,7 @@ def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.M
     def find_spec(name: str) -> None:
         del name
 
-    monkeypatch.setattr("generator.production.parquet.find_spec", find_spec)
+    monkeypatch.setattr("generator.dataset.production.parquet.find_spec", find_spec)
     with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install croplab\[parquet\]"):
         make("parquet")
 

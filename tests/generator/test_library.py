@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 ROOT = Path(__file__).parents[2]
 

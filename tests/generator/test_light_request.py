@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from drivers.errors import InputError
-from generator.illuminant import DrawnLights, FollowedLights, ListedLights, RandomLights, TogetherLights
-from generator.light_request import LightRequest
+from foundation.errors import InputError
+from generator.lights.choices import DrawnLights, FollowedLights, ListedLights, RandomLights, TogetherLights
 from generator.lights.lighting import Mixture, plain
+from generator.lights.request import LightRequest
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 
 @pytest.fixture

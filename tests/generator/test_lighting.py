@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import InputError
+from foundation.errors import InputError
 from generator.lights.lighting import Lighting, Mixture, mixture_of, parse_mixture, plain
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 _parts = st.dictionaries(
     st.integers(0, 999_999), st.floats(1e-6, 1e6, allow_nan=False, allow_infinity=False), min_size=1, max_size=5

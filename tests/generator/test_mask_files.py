@@ -16,15 +16,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from drivers.errors import FormatError
-from generator.encoders.maps import encode_map
-from generator.lights.gamut import angles_between
+from foundation.angles import angles_deg
+from foundation.errors import FormatError
+from generator.files.maps import encode_map
 from generator.lights.lighting import FULL, Lighting, plain
 from generator.masks.files import decode_ground_truth, decode_weights, encode_maps, find_masks
 from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 RAMP = np.tile(np.linspace(0, 1, 64), (48, 1))
 
@@ -140,7 +140,7 @@ def test_maps_are_read_back_as_the_image_was_made(tmp_path: Path, make_lut: Call
     np.testing.assert_array_equal(decode_weights(masks, "it"), weights)
     truth = decode_ground_truth(truths, "it")
     exact = weights.astype(np.float64) @ lut.white[shining]
-    assert angles_between(truth.astype(np.float64), exact).max() < 0.002
+    assert angles_deg(truth.astype(np.float64), exact).max() < 0.002
     np.testing.assert_allclose(truth.sum(axis=2), 1, atol=1e-6)
     # The same by an independent reader; and the masks can be given again.
     with PIL.Image.open(tmp_path / "masks/000004_1.png") as mask:

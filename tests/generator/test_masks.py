@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from drivers.errors import InputError
+from foundation.errors import InputError
 from generator.lights.lighting import FULL, MaskMaker
 from generator.masks.making import MadeMaskPlan, parse_masks, whole_parts
 from generator.masks.shapes import HalfPlanes, SmoothFields, Spots, Windows

@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from drivers.errors import InputError
-from generator.kernel import draw_samples
+from foundation.errors import InputError
 from generator.kernels import streaming
 from generator.kernels.mixing import mix_samples, mixed_table
+from generator.kernels.rendering import draw_samples
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 Rule = Callable[..., npt.NDArray[np.int64]]
 GAIN, READ = 1.0, 6.0

@@ -11,13 +11,14 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import f as f_distribution
 
-from acquisition.illuminations import Illumination
-from calibration.build import build
-from calibration.lut import Lut, open_lut
+from acquisition.lights.illuminations import Illumination
+from calibration.pipeline.build import build
+from calibration.table.lut import Lut, open_lut
 from drivers.presenter import Colour
-from generator.lights.gamut import Gamut, angles_between
+from foundation.angles import angles_deg
+from generator.lights.gamut import Gamut
 from generator.lights.lighting import Mixture, plain
-from sim.world import Room
+from sim.world.world import Room
 from tests.calibration.lab import SETTINGS, Lab, hang, take
 
 CODES = (
@@ -59,9 +60,9 @@ def test_white_and_every_colour_are_those_of_the_real_light(
 ) -> None:
     truth = lab.world.white(CODES[photographed], SETTINGS)
     white = mixture.white(table)
-    assert angles_between(white, table.white[photographed]) < 0.05
+    assert angles_deg(white, table.white[photographed]) < 0.05
     # The small chart's table is itself within 0.2° of the room's light.
-    assert angles_between(white, truth) < 0.2
+    assert angles_deg(white, truth) < 0.2
     np.testing.assert_allclose(white / table.white[photographed], 1, atol=0.005)
     codes = lab.chart.rgb[lab.chart.cell_of_colour]
     true = lab.world.reflected(codes, CODES[photographed], SETTINGS) / truth * white

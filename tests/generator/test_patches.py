@@ -15,14 +15,14 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import norm
 
-from generator.kernel import draw_samples
+from foundation.angles import angles_deg
 from generator.kernels.mixing import mix_samples
-from generator.lights.gamut import angles_between
+from generator.kernels.rendering import draw_samples
 from generator.lights.lighting import Lighting, Mixture, plain
 from generator.masks.making import parse_masks
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 _Array = npt.NDArray[np.float64]
 SIDE = 160
@@ -97,9 +97,9 @@ def test_white_follows_the_ground_truth_of_every_pixel(make_lut: Callable[..., L
     light = cells(weights @ lighting.whites(lut)).mean(axis=1)
     mean = cells(image).mean(axis=1)
     # The table's 25 samples of white are drawn about the ground truth: 5 · √(variance / 25) is 1.3 % of it, 0.7°.
-    assert angles_between(mean, light).max() < 0.7
+    assert angles_deg(mean, light).max() < 0.7
     own = cells(weights @ np.array([table[-1].mean(axis=0) for table in tables])).mean(axis=1)
-    assert angles_between(mean, own).max() < 0.05
+    assert angles_deg(mean, own).max() < 0.05
     # And the map that is written says the same in every pixel.
     truth = lighting.ground_truth_map(lut, weights).astype(np.float64)
-    assert angles_between(truth, (weights @ lighting.whites(lut)).astype(np.float64)).max() < 1e-3
+    assert angles_deg(truth, (weights @ lighting.whites(lut)).astype(np.float64)).max() < 1e-3

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import InputError
+from foundation.errors import InputError
 from generator.kernels import philox
 
 # "philox4x32 10" of tests/kat_vectors in Random123 1.14.0: counter, key, words.

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, ImageCms
 
-from drivers.errors import FormatError, InputError
-from generator.picture import Preparation, open_picture
-from generator.profile import to_srgb
+from foundation.errors import FormatError, InputError
+from generator.pictures.picture import Preparation, open_picture
+from generator.pictures.profiles import to_srgb
 from tests.generator.icc import gamma_profile
 
 Codes = npt.NDArray[np.uint8]

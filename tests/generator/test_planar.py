@@ -11,12 +11,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import InputError
-from generator.kernel import draw_samples
+from foundation.errors import InputError
 from generator.kernels.planar import draw_batch, draw_planar
+from generator.kernels.rendering import draw_samples
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 WHITE = 3500
 

@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from drivers.errors import FormatError, InputError
-from generator.dataset import Dataset, finish_dataset, generate_dataset, make_dataset, make_share
-from generator.illuminant import ListedLights, RandomLights
-from generator.production import layouts
-from generator.production.plan import Options, Plan
-from generator.production.records import ShardRecord
-from generator.production.workplace import Workplace, workplace
-from generator.scene import random_scenes
+from foundation.errors import FormatError, InputError
+from generator.dataset.production import layouts
+from generator.dataset.production.plan import Options, Plan
+from generator.dataset.production.records import ShardRecord
+from generator.dataset.production.workplace import Workplace, workplace
+from generator.dataset.reader import Dataset, finish_dataset, generate_dataset, make_dataset, make_share
+from generator.lights.choices import ListedLights, RandomLights
+from generator.pictures.sources import random_scenes
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 SCENES = random_scenes(4, 24, 16, 8)
 

@@ -19,11 +19,12 @@ import pytest
 import tifffile
 from PIL import Image
 
-from drivers.errors import FormatError, InputError, StorageError
-from generator import picture, scene
-from generator.picture import Preparation, read_picture
-from generator.scene import RandomScene, find_pictures, random_scenes
-from generator.store import filesystem
+from foundation.errors import FormatError, InputError, StorageError
+from generator.dataset.store import filesystem
+from generator.pictures import picture
+from generator.pictures import sources as scene
+from generator.pictures.picture import Preparation, read_picture
+from generator.pictures.sources import RandomScene, find_pictures, random_scenes
 
 
 def write(path: Path, pixels: npt.NDArray[np.generic], form: str, **attributes: object) -> Path:

@@ -14,13 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import InputError
-from generator.dataset import generate_dataset
-from generator.production.plan import parse_share, parse_split, split_of
-from generator.scene import find_pictures
+from foundation.errors import InputError
+from generator.dataset.production.plan import parse_share, parse_split, split_of
+from generator.dataset.reader import generate_dataset
+from generator.pictures.sources import find_pictures
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 SHARES = (0.7, 0.1, 0.2)
 

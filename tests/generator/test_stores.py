@@ -15,18 +15,18 @@ import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from drivers.errors import FormatError, InputError, StorageError
-from generator.dataset import finish_dataset, generate_dataset, make_dataset, make_share, open_dataset
-from generator.illuminant import ListedLights
-from generator.production.assembly import damage
-from generator.production.plan import Options, Plan
-from generator.production.shards import make_elsewhere
-from generator.production.workplace import workplace
-from generator.scene import find_pictures, random_scenes
-from generator.store import LocalStore, RemoteStore, open_store
+from foundation.errors import FormatError, InputError, StorageError
+from generator.dataset.production.assembly import damage
+from generator.dataset.production.plan import Options, Plan
+from generator.dataset.production.shards import make_elsewhere
+from generator.dataset.production.workplace import workplace
+from generator.dataset.reader import finish_dataset, generate_dataset, make_dataset, make_share, open_dataset
+from generator.dataset.store import LocalStore, RemoteStore, open_store
+from generator.lights.choices import ListedLights
+from generator.pictures.sources import find_pictures, random_scenes
 
 if TYPE_CHECKING:
-    from calibration.lut import Lut
+    from calibration.table.lut import Lut
 
 SCENES = random_scenes(4, 24, 16, 8)
 

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from drivers.errors import InputError
-from generator.preview import preview_of
-from generator.tonemap import fit_flash, flash
+from foundation.errors import InputError
+from generator.pictures.preview import preview_of
+from generator.pictures.tonemap import fit_flash, flash
 
 
 def test_two_pixels_by_hand() -> None:

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import InputError
-from generator.batches import Crops
-from generator.gallery import gallery_of
+from foundation.errors import InputError
+from generator.training.crops import Crops
+from generator.training.gallery import gallery_of
 from tests.generator.conftest import MakeLut
 
 torch: Any = pytest.importorskip("torch", reason="PyTorch is not installed: pip install 'croplab[torch]'")
-batches: Any = pytest.importorskip("generator.torch_batches")
+batches: Any = pytest.importorskip("generator.training.torch_crops")
 CropDataset, CropStream, collated = batches.CropDataset, batches.CropStream, batches.collated
 
 
@@ -76,5 +76,6 @@ def test_single_items_and_their_bounds(crops: Crops) -> None:
 
 
 def test_nothing_else_imports_pytorch() -> None:
-    code = "import sys, generator.batches, generator.dataset, generator.kernel; sys.exit('torch' in sys.modules)"
+    modules = "generator.training.crops, generator.dataset.reader, generator.kernels.rendering"
+    code = f"import sys, {modules}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -108,7 +108,7 @@ def test_an_unknown_option_is_the_users_fault(module: str) -> None:
 def test_a_mistake_of_ours_shows_a_plain_traceback(module: str) -> None:
     code = (
         f"from {module} import app\n@app.command()\ndef fail():\n    raise ValueError('our mistake')\n"
-        "from drivers.console import run\nrun(lambda: app(['fail']))"
+        "from foundation.console import run\nrun(lambda: app(['fail']))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.bodies import BODIES
-from sim.world import Print, Room, World
+from sim.camera.sensors import BODIES
+from sim.world.world import Print, Room, World
 
 PAGE_MM = (180.0, 125.0)
 

@@ -18,9 +18,9 @@ import tifffile
 from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
-from drivers.rawfile import read_raw
-from sim.bodies import BODIES, Body
-from sim.dng import write_dng
+from drivers.raw.rawfile import read_raw
+from sim.camera.dng import write_dng
+from sim.camera.sensors import BODIES, Body
 
 TAKEN_AT = datetime(2021, 3, 14, 15, 9, 26, tzinfo=UTC)
 SETTINGS = ExposureSettings(iso=400, aperture=5.6, shutter_s=0.5)

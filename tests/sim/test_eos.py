@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import datetime, timedelta
 from io import BytesIO
-from pathlib import Path
 from threading import Event as ThreadEvent
 from typing import BinaryIO
 
@@ -16,9 +15,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.camera import ExposureSettings
-from drivers.errors import DeviceRefused, LinkClosed
-from drivers.ptp import apex
-from drivers.ptp.canon import (
+from drivers.canon import apex
+from drivers.canon.camera import CanonEos
+from drivers.canon.records import (
     RAW_ONLY,
     AvailableFormats,
     AvailableValues,
@@ -37,7 +36,6 @@ from drivers.ptp.canon import (
     number_value,
     text_value,
 )
-from drivers.ptp.canon_eos import CanonEos
 from drivers.ptp.codes import (
     AeMode,
     CaptureDestination,
@@ -59,9 +57,11 @@ from drivers.ptp.datasets import (
     encode_string,
 )
 from drivers.ptp.messages import Request
-from sim.clock import OPENING, SimulatedClock
-from sim.eos import SimulatedEos
-from sim.eos_bodies import (
+from foundation.errors import DeviceRefused, LinkClosed
+from sim.buses.ptp_memory import MemoryTransport
+from sim.buses.responder import Answer
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import (
     EOS_6D_MARK_II,
     EOS_550D,
     EOS_550D_AS_LISTED,
@@ -70,11 +70,12 @@ from sim.eos_bodies import (
     TEST_BODY,
     EosBody,
 )
-from sim.eos_state import CARD, DCIM, EMPTY_SLOT, FOLDER
-from sim.ptp_memory import MemoryTransport
-from sim.responder import Answer
+from sim.camera.eos_state import CARD, DCIM, EMPTY_SLOT, FOLDER
+from sim.clock import OPENING, SimulatedClock
+from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded, conversations, transcript
 
-RECORDING = Path(__file__).parents[2].parent / "shared" / "data" / "ptp" / "eos60d_transactions.json"
+REAL = {"the transcript": transcript} | {name: make for name, make in conversations().items() if name == "EOS 60D"}
+"""Conversations of the real EOS 60D: without the bytes that it sent, and whole where the recording is found."""
 
 
 class NumberedFilm:
@@ -223,13 +224,12 @@ def kind_of(code: int, parameters: list[int], data: bytes) -> object:
             raise AssertionError(f"the recording holds data of 0x{code:04x}")
 
 
-def test_holds_the_conversation_of_a_real_60d() -> None:
-    if not RECORDING.exists():
-        pytest.skip("the recorded EOS 60D is not here")
+@pytest.mark.parametrize("real", REAL.values(), ids=REAL)
+def test_holds_the_conversation_of_a_real_60d(real: Callable[[], list[Recorded]]) -> None:
     host = host_of(EOS_550D)
     host.eos.turn_dial(AeMode.APERTURE_PRIORITY)
     sessions = 0
-    for number, recorded in enumerate(json.loads(RECORDING.read_text())):
+    for number, recorded in enumerate(real()):
         code = int(recorded["code"], 16)
         request = Request(code, recorded["tid"], tuple(recorded["params"]))
         if code == Operation.OPEN_SESSION:
@@ -245,8 +245,7 @@ def test_holds_the_conversation_of_a_real_60d() -> None:
         assert f"{answer.response.code:04x}" == recorded["rc"], place
         assert len(answer.response.parameters) == len(recorded["rparams"]), place
         assert (answer.data is None) == (recorded["dir"] != "in"), place
-        if recorded["dir"] == "in":
-            assert data is not None
+        if recorded["dir"] == "in" and data is not None:
             assert answer.data is not None
             ours, theirs = (kind_of(code, recorded["params"], octets) for octets in (answer.data, data))
             assert ours == theirs, place
@@ -254,10 +253,7 @@ def test_holds_the_conversation_of_a_real_60d() -> None:
 
 
 def test_tells_of_itself_in_the_order_of_the_60d() -> None:
-    if not RECORDING.exists():
-        pytest.skip("the recorded EOS 60D is not here")
-    recorded = next(t for t in json.loads(RECORDING.read_text()) if t["code"] == "9108")
-    theirs = DeviceInfoEx.decode(bytes.fromhex(recorded["data"])).properties
+    theirs = EOS_60D_PROPERTIES
     ours = [spec.code for spec in EOS_550D.properties]
     assert [code for code in theirs if code in ours] == [code for code in ours if code in theirs]
     assert set(ours) <= set(theirs)

@@ -6,12 +6,16 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.errors import LinkClosed, LinkTimeout, ProtocolError
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import ResponseCode
 from drivers.ptp.messages import Event, Request
 from drivers.ptp.transport import Transport
 from drivers.ptp.usb_transport import UsbTransport
+from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
+from sim.buses.ptp_memory import MemoryTransport
+from sim.buses.responder import Responder
+from sim.buses.usb import SimulatedBus
+from sim.buses.usb_device import PtpUsbDevice
 from sim.clock import SimulatedClock
 from sim.faults import (
     Declining,
@@ -26,10 +30,6 @@ from sim.faults import (
     RepeatingEvents,
     StrangeEvents,
 )
-from sim.ptp_memory import MemoryTransport
-from sim.responder import Responder
-from sim.usb import SimulatedBus
-from sim.usb_device import PtpUsbDevice
 from tests.contracts.transport import ECHO, GIVE, PATIENCE_S, RAISE, TAKE, Echo, payload
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sim.geometry import View, Waviness
+from sim.world.geometry import View, Waviness
 
 PAGE_MM = (1189.0, 841.0)
 FRAME_PX = (2601, 1732)

@@ -22,7 +22,7 @@ from drivers.links.tcp import TcpServer
 from drivers.pjlink.wire import NoResolution
 from drivers.projector import Power, Severity
 from sim.clock import SimulatedClock
-from sim.projector import ProjectorTraits, SimulatedProjector, serve_pjlink
+from sim.projectors.pjlink import ProjectorTraits, SimulatedProjector, serve_pjlink
 
 PATIENCE_S = 30.0
 """How long a client may wait for an answer on a computer that has much else to do."""

@@ -6,14 +6,14 @@ import hashlib
 
 import pytest
 
-from drivers.errors import DeviceFault, LinkTimeout
 from drivers.links.udp import UdpSocket
 from drivers.pjlink.notices import FaultsChanged, InputChanged, LinkUp, PowerChanged
 from drivers.pjlink.search import NoticePort, search
 from drivers.pjlink.wire import NoResolution
 from drivers.projector import Fault, Power, Severity
+from foundation.errors import DeviceFault, LinkTimeout
 from sim.clock import SimulatedClock
-from sim.projector import Announcer, PjLinkPeer, ProjectorDatagrams, ProjectorTraits, SimulatedProjector
+from sim.projectors.pjlink import Announcer, PjLinkPeer, ProjectorDatagrams, ProjectorTraits, SimulatedProjector
 from tests.contracts.projector import Bench, ProjectorContract
 
 

@@ -25,9 +25,9 @@ from drivers.serial_projectors.benq import BenqProjector
 from drivers.serial_projectors.epson import EpsonProjector
 from sim.cli import main
 from sim.clock import SimulatedClock
-from sim.projector import ProjectorTraits, SimulatedProjector
-from sim.pty import PseudoTerminal
-from sim.serial_projectors import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer, serve_network
+from sim.projectors.pjlink import ProjectorTraits, SimulatedProjector
+from sim.projectors.pty import PseudoTerminal
+from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer, serve_network
 
 AT_ONCE = ProjectorTraits(warm_up_s=0.0, cool_down_s=0.0)
 """Other software waits by its own clock; a projector that is on at once keeps it short."""

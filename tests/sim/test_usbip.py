@@ -15,20 +15,20 @@ import usbip.host
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import LinkClosed, LinkTimeout, ProtocolError
 from drivers.links.memory import MemoryLink, memory_pair
+from drivers.links.pipes import Pipe, PipeStalled
 from drivers.links.tcp import TcpServer
-from drivers.pipes import Pipe, PipeStalled
 from drivers.ptp.container import ContainerReader, DataPiece, DataStart, encode
 from drivers.ptp.datasets import DeviceInfo
 from drivers.ptp.messages import Request, Response
 from drivers.ptp.usb_transport import UsbTransport
+from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
+from sim.buses.usb_device import BULK_IN, BULK_OUT, INTERRUPT_IN, Identity, PtpUsbDevice
+from sim.buses.usbip import UsbIpService, serve_usbip
+from sim.buses.usbip_wire import ImportRequest, RequestReader, Submit, Unlink
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import EOS_550D
 from sim.clock import SimulatedClock
-from sim.eos import SimulatedEos
-from sim.eos_bodies import EOS_550D
-from sim.usb_device import BULK_IN, BULK_OUT, INTERRUPT_IN, Identity, PtpUsbDevice
-from sim.usbip import UsbIpService, serve_usbip
-from sim.usbip_wire import ImportRequest, RequestReader, Submit, Unlink
 from tests.contracts.camera import SeededFilm
 from tests.contracts.transport import GIVE, HANG, PATIENCE_S, RAISE, Bench, Echo, TransportContract, payload
 

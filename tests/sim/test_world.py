@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
-from sim.bodies import BODIES, Body, Rectangle
-from sim.world import REFERENCE_EXPOSURE, Print, Room, World
+from sim.camera.sensors import BODIES, Body, Rectangle
+from sim.world.world import REFERENCE_EXPOSURE, Print, Room, World
 
 SIX_SIGMA = 5.0
 PRIMARIES = (Colour(255, 0, 0), Colour(0, 255, 0), Colour(0, 0, 255))
@@ -181,10 +181,10 @@ def test_squares_are_where_project_says(square_world: World) -> None:
 def test_a_frame_is_its_key(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     frame = world.expose(WHITE, REFERENCE_EXPOSURE, key=(3, 1))
     np.testing.assert_array_equal(frame, world.expose(WHITE, REFERENCE_EXPOSURE, key=(3, 1)))
-    monkeypatch.setattr("sim.world.os.cpu_count", lambda: 1)
+    monkeypatch.setattr("sim.world.world.os.cpu_count", lambda: 1)
     alone = World(world.sheet, world.body, world.room)
     np.testing.assert_array_equal(frame, alone.expose(WHITE, REFERENCE_EXPOSURE, key=(3, 1)))
-    monkeypatch.setattr("sim.world.os.cpu_count", lambda: 7)
+    monkeypatch.setattr("sim.world.world.os.cpu_count", lambda: 7)
     crowd = World(world.sheet, world.body, world.room)
     np.testing.assert_array_equal(frame, crowd.expose(WHITE, REFERENCE_EXPOSURE, key=(3, 1)))
 
@@ -306,7 +306,7 @@ def test_later_rectangles_cover_earlier_ones_and_paper_shows_between() -> None:
 
 def test_a_drawing_off_every_lattice_is_still_drawn(square_world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand crumbs have more edges than are kept apart; joining them moves the squares beside them little."""
-    monkeypatch.setattr("sim.world._MOST_LINES", 1500)
+    monkeypatch.setattr("sim.world.world._MOST_LINES", 1500)
     rng = np.random.default_rng(3)
     corner = rng.uniform(0, [10, 115], (1000, 2))
     crumbs = np.concatenate([corner, corner + rng.uniform(1, 5, (1000, 2))], axis=1)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.ptp import canon, container, ptpip
+from drivers.canon import records as canon
+from drivers.ptp import container, ptpip
 from drivers.ptp.datasets import DeviceInfo, DevicePropDesc, ObjectInfo, StorageInfo, decode_u32_array, decode_value
 
 # ISO 15740, 5.5.1: version 1.00, vendor 0xb "ab", two operations, one event, no properties, one capture format,

@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import pytest
 
-from drivers.errors import InputError, ProtocolError
-from drivers.ptp.apex import APERTURE, ISO, SHUTTER, TOLERANCE, Scale
+from drivers.canon.apex import APERTURE, ISO, SHUTTER, TOLERANCE, Scale
+from foundation.errors import InputError, ProtocolError
 
 SCALES = pytest.mark.parametrize("scale", [SHUTTER, APERTURE, ISO], ids=lambda scale: scale.name)
 # The list of apertures that the recorded 60D offered: third stops, f/3.5 to f/22.

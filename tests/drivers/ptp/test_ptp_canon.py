@@ -6,9 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolError
-from drivers.ptp import canon
-from drivers.ptp.canon import (
+from drivers.canon import records as canon
+from drivers.canon.records import (
     AvailableFormats,
     AvailableValues,
     DeviceInfoEx,
@@ -24,6 +23,7 @@ from drivers.ptp.canon import (
     TransferRequest,
 )
 from drivers.ptp.codes import CameraStatus, CaptureDestination, EosEvent, ObjectFormat, Property
+from foundation.errors import ProtocolError
 from tests.drivers.ptp import examples
 
 U32 = st.integers(0, 0xFFFFFFFF)

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolError
 from drivers.ptp import container
 from drivers.ptp.codes import EventCode, Operation, ResponseCode
 from drivers.ptp.container import ContainerReader, DataPiece, DataStart, DeviceStatus, Message
 from drivers.ptp.messages import Event, Request, Response, next_transaction
+from foundation.errors import ProtocolError
 from tests.drivers.ptp import examples
 
 U16 = st.integers(0, 0xFFFF)

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolError
 from drivers.ptp import datasets
 from drivers.ptp.codes import DataType, ObjectFormat, Operation
 from drivers.ptp.datasets import (
@@ -20,6 +19,7 @@ from drivers.ptp.datasets import (
     StorageInfo,
     Value,
 )
+from foundation.errors import ProtocolError
 from tests.drivers.ptp import examples
 
 U16 = st.integers(0, 0xFFFF)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolError
+from foundation.errors import ProtocolError
 from tests.drivers.ptp.examples import READERS, STREAMS
 
 Read = Callable[[bytes], object]

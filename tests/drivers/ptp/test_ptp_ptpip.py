@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolError
 from drivers.ptp import ptpip
 from drivers.ptp.messages import Event, Request, Response
 from drivers.ptp.ptpip import (
@@ -28,6 +27,7 @@ from drivers.ptp.ptpip import (
     Pong,
     StartData,
 )
+from foundation.errors import ProtocolError
 from tests.drivers.ptp import examples
 
 CONVERSATION: tuple[Packet, ...] = (

@@ -1,13 +1,18 @@
-"""All that a real EOS 60D said and was told: read to the last byte, and built again."""
+"""All that an EOS body and its host sent in two sessions: read to the last byte, and built again.
+
+The body is a real EOS 60D where its recording is found, and in any case the simulated EOS 550D.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 
-from drivers.ptp import canon, container
-from drivers.ptp.apex import APERTURE, ISO
-from drivers.ptp.canon import AvailableValues, DeviceInfoEx, ImageFormat, Notice, PropertyChanged, PropertySetting
+from drivers.canon import records as canon
+from drivers.canon.apex import APERTURE, ISO
+from drivers.canon.records import AvailableValues, DeviceInfoEx, ImageFormat, Notice, PropertyChanged, PropertySetting
+from drivers.ptp import container
 from drivers.ptp.codes import Operation, Property
 from drivers.ptp.container import ContainerReader, DataPiece, DataStart
 from drivers.ptp.datasets import (
@@ -20,7 +25,7 @@ from drivers.ptp.datasets import (
 )
 from drivers.ptp.messages import Request, Response
 from drivers.ptp.ptpip import EndData, OperationRequest, PacketCutter, StartData, encode
-from tests.drivers.ptp.conftest import Recorded
+from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded
 
 REBUILT: dict[int, Callable[[bytes], bytes]] = {
     Operation.GET_DEVICE_INFO: lambda data: DeviceInfo.decode(data).encode(),
@@ -30,6 +35,27 @@ REBUILT: dict[int, Callable[[bytes], bytes]] = {
     Operation.EOS_GET_DEVICE_INFO_EX: lambda data: DeviceInfoEx.decode(data).encode(),
     Operation.EOS_SET_DEVICE_PROP_VALUE_EX: lambda data: PropertySetting.decode(data).encode(),
     Operation.EOS_GET_EVENT: lambda data: canon.encode_events(canon.decode_events(data)),
+}
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a body is and how it stands: of the 60D as other programs read the recording, of the 550D as listed."""
+
+    version: str
+    model_id: int
+    properties: int
+    values: int
+    lists: int
+    iso: float
+    aperture: float
+    image_format: str
+    battery_percent: int
+
+
+FACTS = {
+    "EOS 60D": Facts("3-1.1.0", 0x80000287, 87, 77, 84, 1600, 4, "JPEG L fine", 50),
+    "EOS 550D": Facts("3-1.0.9", 0x80000270, 63, 56, 61, 100, 8, "RAW", 100),
 }
 
 
@@ -81,37 +107,43 @@ def test_commands_are_the_bytes_that_the_host_sent(recording: list[Recorded]) ->
     assert [PropertySetting(code, canon.number_value(value)).encode() for code, value in sent] == settings
 
 
-def test_what_the_body_is(recording: list[Recorded]) -> None:
+def test_what_the_body_is(body: str, recording: list[Recorded]) -> None:
     info = DeviceInfo.decode(first(recording, Operation.GET_DEVICE_INFO))
-    assert (info.manufacturer, info.model, info.device_version) == ("Canon Inc.", "Canon EOS 60D", "3-1.1.0")
+    assert (info.manufacturer, info.model, info.device_version) == ("Canon Inc.", f"Canon {body}", FACTS[body].version)
     assert (info.vendor_extension_id, info.vendor_extension_version) == (6, 200)
     assert Operation.EOS_REMOTE_RELEASE_ON in info.operations
     assert Operation.EOS_BULB_START not in info.operations
     extended = DeviceInfoEx.decode(first(recording, Operation.EOS_GET_DEVICE_INFO_EX))
-    assert (len(extended.events), len(extended.properties), extended.others) == (18, 87, (0, 1, 2, 4))
+    assert (len(extended.events), extended.others) == (18, (0, 1, 2, 4))
+    assert len(extended.properties) == FACTS[body].properties
+    if body == "EOS 60D":
+        assert extended.properties == EOS_60D_PROPERTIES
 
 
-def test_the_state_dump(recording: list[Recorded]) -> None:
+def test_the_state_dump(body: str, recording: list[Recorded]) -> None:
+    facts = FACTS[body]
     records = canon.decode_events(first(recording, Operation.EOS_GET_EVENT))
-    # 77 values, then one notice, then 86 lists.
+    # The values, then one notice, then the lists.
     assert Counter(type(record).__name__ for record in records) == {
-        "PropertyChanged": 77,
-        "AvailableValues": 84,
+        "PropertyChanged": facts.values,
+        "AvailableValues": facts.lists,
         "AvailableFormats": 2,
         "Notice": 1,
     }
-    assert isinstance(records[77], Notice)
+    assert isinstance(records[facts.values], Notice)
     state = {record.code: record for record in records if isinstance(record, PropertyChanged)}
-    assert state[Property.EOS_MODEL_ID].number == 0x80000287  # An EOS 60D.
-    assert ISO.value(state[Property.EOS_ISO_SPEED].number) == 1600
-    assert APERTURE.value(state[Property.EOS_APERTURE].number) == 4
-    assert str(ImageFormat.decode(state[Property.EOS_IMAGE_FORMAT].value)) == "JPEG L fine"
+    assert state[Property.EOS_MODEL_ID].number == facts.model_id
+    assert ISO.value(state[Property.EOS_ISO_SPEED].number) == facts.iso
+    assert APERTURE.value(state[Property.EOS_APERTURE].number) == facts.aperture
+    assert str(ImageFormat.decode(state[Property.EOS_IMAGE_FORMAT].value)) == facts.image_format
     lists = {record.code: record.values for record in records if isinstance(record, AvailableValues)}
     assert lists[Property.EOS_CAPTURE_DESTINATION] == (2, 4, 6)
+    # Both wear a lens of f/3.5 and offer third stops.
     assert APERTURE.labels(lists[Property.EOS_APERTURE]).startswith("3.5, 4, 4.5, 5, 5.6, 6.3")
     assert lists[Property.EOS_SHUTTER_SPEED] == ()
 
 
-def test_the_battery_is_told_in_words_of_16_bits(recording: list[Recorded]) -> None:
+def test_the_battery_is_told_in_words_of_16_bits(body: str, recording: list[Recorded]) -> None:
     described = DevicePropDesc.decode(first(recording, Operation.GET_DEVICE_PROP_DESC))
+    assert described.current == FACTS[body].battery_percent
     assert described.form == EnumerationForm((100, 75, 50, 25, 0), widened=True)

@@ -1,0 +1,1 @@
+"""Taking a session: devices opened, frames taken in order, judged, and imported from elsewhere."""

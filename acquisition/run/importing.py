@@ -1,0 +1,220 @@
+"""A session from raw files taken by other means: a list of frames, the chart, the lights.
+
+Every file is copied byte for byte, checked against its hash where the list has one, and judged where the list has no
+verdict. The result is a session like any other.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import BinaryIO
+
+from acquisition.chart.model import load_chart
+from acquisition.config import LabSettings
+from acquisition.lights.illuminations import Illumination, load_illuminations
+from acquisition.run.sequencer import judge_file
+from acquisition.session.folder import ACCEPTED, FRAME_COLUMNS, REFUSED, FrameKind, Session, Step
+from drivers.camera import CapturedFrame
+from drivers.presenter import BLACK, WHITE
+from foundation.errors import FormatError
+from foundation.files import require_free
+from foundation.hashing import file_sha256
+
+
+@dataclass(frozen=True)
+class ListedFrame:
+    """One row of the list; empty text and None where it is silent."""
+
+    kind: FrameKind
+    illumination: int | None
+    path: Path
+    sha256: str
+    taken_at: datetime
+    exposure_s: float
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Imported:
+    """How an import ended.
+
+    Attributes
+    ----------
+    refused
+        What was refused, one line a frame.
+    left
+        Lights and kinds of frames of which none was accepted, in words.
+    """
+
+    refused: tuple[str, ...]
+    left: tuple[str, ...]
+
+
+def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, ...]]:
+    """Read a list of frames, columns as `frames.csv`, files relative to the list; and the lights beside it.
+
+    Only `kind`, `illumination` and `file` must be filled.
+
+    Raises
+    ------
+    FormatError
+        The list is missing, lacks a column, or holds an unusable row, the message names it; or the lights are unusable.
+    """
+    try:
+        rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except OSError as error:
+        raise FormatError(f"cannot read the list of frames {path}: {error.strerror}; name a CSV file") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FormatError(f"cannot read the list of frames {path}: {error}; save it as CSV in UTF-8") from error
+    if not rows or any(column not in rows[0] for column in FRAME_COLUMNS[:3]):
+        raise FormatError(f"{path}: expected frames under the columns {','.join(FRAME_COLUMNS)}")
+    lights = load_illuminations(path.parent / "illuminations.csv")
+    frames = [_listed(row, f"{path}, line {number}", path.parent, len(lights)) for number, row in enumerate(rows, 2)]
+    return frames, lights
+
+
+def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int) -> ListedFrame:
+    def cell(column: str) -> str:
+        return (row.get(column) or "").strip()
+
+    kind = cell("kind")
+    if kind != "light" and kind != "white" and kind != "dark":
+        raise FormatError(f"{where}: kind is {kind!r}, expected light, white or dark")
+    file = folder / cell("file")
+    if not cell("file") or not file.is_file():
+        raise FormatError(f"{where}: there is no file {file}; files are named relative to the list")
+    try:
+        illumination = int(cell("illumination")) if kind == "light" else None
+        exposure_s = float(cell("exposure_s") or 0)
+        taken_at = datetime.fromisoformat(cell("taken_at")) if cell("taken_at") else _modified(file)
+    except ValueError as error:
+        raise FormatError(f"{where}: {error}") from error
+    if illumination is not None and not 0 <= illumination < lights:
+        raise FormatError(f"{where}: illumination is {illumination}, illuminations.csv has 0 … {lights - 1}")
+    if not 0 <= exposure_s < math.inf:
+        raise FormatError(f"{where}: exposure_s is {exposure_s:g}, expected seconds, or nothing if it is not known")
+    verdict = cell("verdict")
+    if verdict not in ("", ACCEPTED, REFUSED) and not verdict.startswith(f"{REFUSED}: "):
+        raise FormatError(f"{where}: verdict is {verdict!r}, expected {ACCEPTED}, {REFUSED}: REASON, or nothing")
+    if not taken_at.tzinfo:
+        taken_at = taken_at.replace(tzinfo=UTC)
+    return ListedFrame(kind, illumination, file, cell("sha256").lower(), taken_at, exposure_s, verdict)
+
+
+def import_session(
+    frame_list: Path, chart: Path, folder: Path, observe: Callable[[int, int], None] = lambda done, total: None
+) -> Imported:
+    """Make a session of listed raw files.
+
+    Parameters
+    ----------
+    frame_list
+        The list; `illuminations.csv` lies beside it.
+    chart
+        `chart.json` of the print.
+    folder
+        The new session.
+    observe
+        Called with frames done and in all.
+
+    Raises
+    ------
+    FormatError
+        The list, the chart, the lights or a hash is wrong, or two lights have the same raw file; no session is left
+        behind.
+    InputError
+        `folder` holds something already.
+    """
+    require_free(folder, "the session")
+    frames, lights = read_frame_list(frame_list)
+    loaded = load_chart(chart)
+    for frame in frames:
+        if frame.sha256 and file_sha256(frame.path) != frame.sha256:
+            raise FormatError(
+                f"{frame.path} is not the file that {frame_list} lists: its SHA-256 differs; copy it again"
+            )
+    settings = LabSettings(rig="imported", chart=chart, illuminations=frame_list.parent / "illuminations.csv")
+    steps = [_step(number, frame, lights) for number, frame in enumerate(frames)]
+    refused: list[str] = []
+    taken: dict[str, ListedFrame] = {}
+    with Session.create(folder, settings.to_toml(), loaded, lights, steps) as session:
+        try:
+            for step, frame in zip(steps, frames, strict=True):
+                reason, sha256 = _take_over(session, step, frame, settings)
+                if frame.kind == "light":
+                    _require_another_light(taken.setdefault(sha256, frame), frame, frame_list)
+                if reason:
+                    refused.append(f"{frame.path.name}: {reason}")
+                observe(step.number + 1, len(frames))
+            session.note(datetime.now(UTC), "import", f"{len(frames)} frames from {frame_list.name}")
+        except BaseException:
+            session.close()
+            shutil.rmtree(folder)
+            raise
+        return Imported(tuple(refused), tuple(_left(session)))
+
+
+def _left(session: Session) -> list[str]:
+    """Return what was listed of which no frame is accepted."""
+    accepted = {(frame.kind, frame.illumination) for frame in session.frames() if frame.accepted}
+    listed = dict.fromkeys((step.kind, step.illumination) for step in session.steps)
+    return [
+        f"every {kind} frame" if light is None else f"light {light}"
+        for kind, light in listed
+        if (kind, light) not in accepted
+    ]
+
+
+def _step(number: int, frame: ListedFrame, lights: tuple[Illumination, ...]) -> Step:
+    colour = WHITE if frame.kind == "white" else BLACK
+    if frame.illumination is not None:
+        colour = lights[frame.illumination].colour
+    return Step(number, frame.kind, frame.illumination, colour)
+
+
+def _take_over(session: Session, step: Step, frame: ListedFrame, settings: LabSettings) -> tuple[str | None, str]:
+    """Copy and judge a frame; return why it is refused, None if it is not, and the SHA-256 of its file."""
+
+    def copy(into: BinaryIO) -> CapturedFrame:
+        with frame.path.open("rb") as stream:
+            shutil.copyfileobj(stream, into, 1 << 20)
+        return CapturedFrame(frame.path.name, frame.path.stat().st_size, frame.taken_at)
+
+    attempt = session.begin(step, f"frames/{step.stem}", frame.taken_at)
+    received = session.receive(step.stem, copy)
+    if frame.verdict:
+        listed = frame.verdict.removeprefix(REFUSED).removeprefix(":").strip() or "for no reason that is listed"
+        reason = None if frame.verdict == ACCEPTED else listed
+    else:
+        reason = judge_file(received.path, frame.kind, settings)
+    session.commit(
+        attempt,
+        file=f"frames/{received.path.name}",
+        size=received.size,
+        sha256=received.sha256,
+        taken_at=frame.taken_at,
+        exposure_s=frame.exposure_s,
+        ended_at=frame.taken_at,
+        verdict=ACCEPTED if reason is None else REFUSED,
+        reason=reason or "",
+    )
+    return reason, received.sha256
+
+
+def _require_another_light(first: ListedFrame, frame: ListedFrame, frame_list: Path) -> None:
+    """Refuse a raw file that is listed for two lights."""
+    if first.illumination != frame.illumination:
+        raise FormatError(
+            f"{frame_list}: lights {first.illumination} and {frame.illumination} have the same raw file, "
+            f"{first.path.name} and {frame.path.name}; list each light's own"
+        )
+
+
+def _modified(path: Path) -> datetime:
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC)

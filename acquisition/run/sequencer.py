@@ -1,0 +1,177 @@
+"""Walks the plan: shows each light, settles, releases, saves, judges, and writes all of it down.
+
+Knows devices by contract only. The plan is a value, why a run ended is a value; what has been taken stays taken
+whatever happens, and a second call goes on where the first stopped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from acquisition.config import LabSettings
+from acquisition.run.exposure import disagreement, measure_exposure, refusal
+from acquisition.run.lamp import await_health, complaint_of, make_ready
+from acquisition.session.folder import ACCEPTED, REFUSED, FrameKind, Session, Step
+from drivers.camera import Camera, keep_awake
+from drivers.presenter import Presenter
+from drivers.projector import Projector
+from drivers.raw.rawfile import read_raw
+from foundation.clock import Clock
+from foundation.errors import DeviceError, DeviceFault, DeviceRefused, FormatError
+
+REFUSED_IN_A_ROW = 3
+"""Steps refused one after another that end a run: something lasting is wrong."""
+
+
+@dataclass(frozen=True)
+class Devices:
+    """What a session is taken with; `projector` is None where its lamp is not under control."""
+
+    camera: Camera
+    presenter: Presenter
+    projector: Projector | None
+    clock: Clock
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Why a run ended: `left` steps are without an accepted frame; `refused` says why, one line a step."""
+
+    total: int
+    left: int
+    refused: tuple[str, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every step has its frame."""
+        return self.left == 0
+
+
+def take_session(
+    session: Session,
+    devices: Devices,
+    settings: LabSettings,
+    observe: Callable[[Step, bool], None] = lambda step, accepted: None,
+    announce: Callable[[str], None] = lambda sentence: None,
+) -> Outcome:
+    """Take every step of the session's plan that has no accepted frame yet.
+
+    Parameters
+    ----------
+    observe
+        Called after each step with whether it got an accepted frame.
+    announce
+        Called with a sentence when the run waits, tries again, pauses and goes on.
+
+    Raises
+    ------
+    DeviceError
+        A device failed beyond the allowed attempts; the session can be taken up again.
+    StorageError
+        The disk is full; likewise.
+    """
+    with session.held():
+        return _take(session, devices, settings, observe, announce)
+
+
+def _take(
+    session: Session,
+    devices: Devices,
+    settings: LabSettings,
+    observe: Callable[[Step, bool], None],
+    announce: Callable[[str], None],
+) -> Outcome:
+    clock = devices.clock
+    for stray in session.set_aside_strays():
+        session.note(clock.now(), "stray", f"{stray.name}: complete but never counted; kept, not used")
+    steps = session.steps
+    done = session.done_steps()
+    open_steps = [step for step in steps if step.number not in done]
+    if not open_steps:
+        return Outcome(len(steps), 0, ())
+    session.note(clock.now(), "start", f"{len(open_steps)} of {len(steps)} frames to take")
+    devices.camera.configure(settings.camera.exposure)
+
+    def tell(what: str, sentence: str) -> None:
+        session.note(clock.now(), what, sentence)
+        announce(f"{what}: {sentence}")
+
+    if devices.projector is not None:
+        make_ready(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), tell)
+    refused: list[str] = []
+    taken = 0
+    in_a_row = 0
+    for step in open_steps:
+        reason = _take_step(session, step, devices, settings, tell)
+        observe(step, reason is None)
+        if reason is None:
+            taken += 1
+            if step.kind != "dark":  # a dark frame is well taken in a dark room, too
+                in_a_row = 0
+            continue
+        refused.append(f"{_name(step)}: {reason}")
+        in_a_row += 1
+        if in_a_row == REFUSED_IN_A_ROW:
+            break
+    outcome = Outcome(len(steps), len(open_steps) - taken, tuple(refused))
+    if outcome.complete and settings.sequence.switch_off and devices.projector is not None:
+        devices.projector.switch_off()
+    session.note(clock.now(), "complete" if outcome.complete else "incomplete", f"{outcome.left} frames left")
+    return outcome
+
+
+def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None:
+    """Decode a raw file and return why it cannot be used, or None when it can."""
+    try:
+        mosaic = read_raw(path)
+    except FormatError as error:
+        return str(error)
+    # Of frames taken by other means nobody here knows what was asked for.
+    differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
+    return differs or refusal(measure_exposure(mosaic), kind, settings.limits)
+
+
+def _take_step(
+    session: Session, step: Step, devices: Devices, settings: LabSettings, tell: Callable[[str, str], None]
+) -> str | None:
+    """Try a step until its frame is accepted; return None then, else the last refusal."""
+    clock = devices.clock
+    reason: str | None = None
+    for remaining in reversed(range(settings.sequence.attempts)):
+        if devices.projector is not None:
+            await_health(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), tell)
+        kept = session.kept_files(step)
+        stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
+        attempt = session.begin(step, f"frames/{stem}", clock.now())
+        try:
+            devices.presenter.show(step.colour)
+            clock.sleep(settings.sequence.settle_s)
+            received = session.receive(stem, devices.camera.capture)
+        except DeviceError as error:
+            session.fail(attempt, clock.now(), str(error))
+            if remaining == 0 or isinstance(error, DeviceFault | DeviceRefused):
+                raise
+            tell("retry", f"{_name(step)}: {error}")
+            continue
+        complaint = complaint_of(devices.projector)
+        reason = judge_file(received.path, step.kind, settings) or (None if complaint is None else str(complaint))
+        session.commit(
+            attempt,
+            file=f"frames/{received.path.name}",
+            size=received.size,
+            sha256=received.sha256,
+            taken_at=received.captured.released_at,
+            exposure_s=settings.camera.shutter_s,
+            ended_at=clock.now(),
+            verdict=ACCEPTED if reason is None else REFUSED,
+            reason=reason or "",
+        )
+        if reason is None:
+            return None
+    return reason
+
+
+def _name(step: Step) -> str:
+    return f"light {step.illumination}" if step.illumination is not None else f"{step.kind} frame {step.number}"

@@ -1,0 +1,1 @@
+"""Checks of frames against each other and against their codes."""

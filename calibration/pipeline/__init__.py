@@ -1,0 +1,1 @@
+"""From the frames of a session to a table, step by step."""

@@ -1,0 +1,136 @@
+"""A table in the making: its hidden folder, and how far it has come.
+
+Laws that hold inside:
+
+- The folder stands beside the table's place under a hidden name until the table is complete, so that under the final
+  name there is never a table that lacks a light.
+- A checkpoint is one file, replaced whole. It tells which frames were taken in, in what order, and all that the next
+  frame needs to know of them. It is believed only if what it was made of is what is asked for now, and if the samples
+  on the disk have the hashes it tells; otherwise the work begins anew.
+- One program makes a table at a time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+import zipfile
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.files import partial_path, publish_folder, require_free, storage_error, sync_folder, write_whole
+from foundation.held_folders import LOCK_FILE, held_folder
+
+CHECKPOINT = "checkpoint.npz"
+
+_TEXT = "text"
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """How far a table has come.
+
+    Attributes
+    ----------
+    identity
+        What it is made of and by what; two checkpoints of one identity can go on from each other.
+    frames
+        Hash of each frame taken in, in their order.
+    told
+        Anything JSON can hold; numbers come back to the last bit.
+    arrays
+        Arrays of plain numbers, by name.
+    """
+
+    identity: dict[str, Any]
+    frames: list[str]
+    told: dict[str, Any]
+    arrays: dict[str, npt.NDArray[Any]]
+
+
+class Growing:
+    """The hidden folder of a table in the making; made by `growing`."""
+
+    def __init__(self, folder: Path, out: Path) -> None:
+        self.folder = folder
+        self._out = out
+        self._keep = True
+
+    def load(self) -> Checkpoint | None:
+        """Return how far an earlier program came, or None where there is nothing that can be read."""
+        try:
+            with np.load(self.folder / CHECKPOINT, allow_pickle=False) as stored:
+                arrays: dict[str, npt.NDArray[Any]] = {name: stored[name] for name in stored.files}
+            text = json.loads(arrays.pop(_TEXT).tobytes())
+            return Checkpoint(text["identity"], text["frames"], text["told"], arrays)
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+            return None
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Replace the checkpoint."""
+        told = {"identity": checkpoint.identity, "frames": checkpoint.frames, "told": checkpoint.told}
+        text = np.frombuffer(json.dumps(told).encode(), dtype=np.uint8)
+        stream = io.BytesIO()
+        np.savez(stream, allow_pickle=False, **{**checkpoint.arrays, _TEXT: text})
+        write_whole(self.folder / CHECKPOINT, stream.getvalue())
+
+    def begin_anew(self) -> None:
+        """Empty the folder."""
+        for path in self.folder.iterdir():
+            if path.name == LOCK_FILE:
+                continue
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+
+    def discard(self) -> None:
+        """Leave nothing behind when the block ends, since going on would lead to the same end."""
+        self._keep = False
+
+    def publish(self) -> None:
+        """Give the table its final name."""
+        require_free(self._out, "the table")
+        try:
+            (self.folder / CHECKPOINT).unlink(missing_ok=True)
+            (self.folder / LOCK_FILE).unlink(missing_ok=True)
+            sync_folder(self.folder)
+        except OSError as error:
+            raise storage_error(self._out, error) from error
+        publish_folder(self.folder, self._out, "the table")
+
+    @property
+    def worth_keeping(self) -> bool:
+        """Whether a later program could go on from here."""
+        return self._keep and (self.folder / CHECKPOINT).is_file()
+
+
+@contextmanager
+def growing(out: Path) -> Generator[Growing]:
+    """Open, or make, the hidden folder of the table `out`; what is not published stays if it holds a checkpoint.
+
+    Raises
+    ------
+    InputError
+        `out` is taken, or another program is making it.
+    StorageError
+        The folder cannot be made.
+    """
+    require_free(out, "the table")
+    folder = partial_path(out)
+    with held_folder(folder, f"{out} is being made by another program; wait for it, or name another place"):
+        making = Growing(folder, out)
+        try:
+            yield making
+        finally:
+            if folder.is_dir() and not making.worth_keeping:
+                with contextlib.suppress(OSError):
+                    shutil.rmtree(folder)

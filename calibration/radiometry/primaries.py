@@ -1,0 +1,149 @@
+"""Primaries that light the print unlike one another: what white paper cannot tell of a coloured cell.
+
+A projector's red, green and blue do not fade alike towards the corners. The field of a light that mixes them, as bare
+paper shows it in a channel, is their fields' mean by what paper reflects of each into that channel; a coloured cell
+reflects other shares, and its mean is another. The frames of the primaries alone tell both: the field of each, on
+paper, and what each cell reflects of it. What a light is mixed of follows from its paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.lights.illuminations import Illumination
+from calibration.radiometry.fitting import product
+from calibration.radiometry.paper import Field, Paper
+
+LEAST_PAPER = 300.0
+"""Counts above black that paper must show under a primary for its field to be told."""
+
+_LARGEST = 0.2
+"""A cell's field differs from paper's by less than that, or it is not believed."""
+
+_Array = npt.NDArray[np.float64]
+
+
+def pure_lights(illuminations: Sequence[Illumination]) -> tuple[int, int, int] | None:
+    """Return the index of the brightest light of red alone, of green and of blue; None where one is not planned."""
+    found: list[int] = []
+    for channel in range(3):
+        alone: list[tuple[int, int]] = []
+        for light in illuminations:
+            codes = light.colour.red, light.colour.green, light.colour.blue
+            if codes[channel] > 0 and sum(codes) == codes[channel]:
+                alone.append((codes[channel], -light.index))
+        if not alone:
+            return None
+        found.append(-max(alone)[1])
+    return found[0], found[1], found[2]
+
+
+@dataclass(frozen=True, eq=False)
+class Primaries:
+    """The three primaries of a session, each from a frame of it alone.
+
+    Attributes
+    ----------
+    lights
+        Index of red, green and blue.
+    fields
+        Each one's field, of the channel that sees it best, for all channels.
+    paper
+        (3, 3) float64 counts of bare paper by primary and channel, field divided out.
+    at_cells
+        (3, C) float64, the fields at the cells.
+    cells
+        (3, C, 3) float64 mean counts of each cell by primary, as in the table's samples of that light.
+    """
+
+    lights: tuple[int, int, int]
+    fields: tuple[Field, Field, Field]
+    paper: _Array
+    at_cells: _Array
+    cells: _Array
+
+    @staticmethod
+    def of(
+        lights: Sequence[int], papers: Sequence[Paper], cells: Sequence[_Array], cells_mm: _Array
+    ) -> Primaries | None:
+        """Return the primaries, None where one is too dim to tell.
+
+        Parameters
+        ----------
+        lights
+            Their indices.
+        papers
+            What paper says in the frame of each.
+        cells
+            (C, 3) mean counts of each cell in them, field divided out.
+        cells_mm
+            (C, 2) places.
+        """
+        white = np.array([paper.white for paper in papers])
+        if white.max(axis=1).min() < LEAST_PAPER:
+            return None
+        best = white.argmax(axis=1).tolist()
+        red, green, blue = (
+            _for_all_channels(paper.field, int(channel)) for paper, channel in zip(papers, best, strict=True)
+        )
+        at_cells = np.array([shape.at(cells_mm)[:, 0] for shape in (red, green, blue)])
+        one, two, three = lights
+        return Primaries(
+            (one, two, three), (red, green, blue), np.maximum(white, 0), at_cells, np.maximum(np.array(cells), 0)
+        )
+
+    def amounts(self, white: _Array) -> _Array:
+        """Return how much of each primary (3,) a light is made of, given its paper (3,) in counts; ≥ 0."""
+        from scipy.optimize import nnls
+
+        return np.asarray(nnls(self.paper.T, np.maximum(white, 0))[0])
+
+    def beside_paper(self, white: _Array) -> _Array:
+        """Return the field of each cell over the field of paper in its place, (C, 3), near 1.
+
+        Parameters
+        ----------
+        white
+            (3,) counts of bare paper under the light, field divided out.
+        """
+        amounts = self.amounts(white)
+        shares = amounts[:, None] * self.paper
+        total = shares.sum(axis=0)
+        of_paper = np.where(total > 1, product(self.at_cells.T, shares) / np.maximum(total, 1), 1.0)
+        plain, lit = np.zeros(self.cells.shape[1:]), np.zeros(self.cells.shape[1:])
+        for amount, at_cells, cells in zip(amounts, self.at_cells, self.cells, strict=True):
+            if amount > 0:
+                part = amount * cells
+                plain += part
+                lit += at_cells[:, None] * part
+        ratio = np.where((plain > 1) & (total > 1), lit / np.maximum(plain, 1) / of_paper, 1.0)
+        return np.where(np.abs(ratio - 1) < _LARGEST, ratio, 1.0)
+
+    @property
+    def difference(self) -> float:
+        """By how much the fields of two primaries differ at a cell, at most, as a share."""
+        return float((self.at_cells.max(axis=0) / self.at_cells.min(axis=0)).max() - 1)
+
+    def correction(self, white: _Array) -> dict[str, Any]:
+        """Return what was done, for `lut.json`; `white` is (L, 3), paper under each light."""
+        return {
+            "name": "primaries",
+            "how": "samples divided by R besides the field: R = [sum w F a / sum w a] / [sum w F p / sum w p], sums "
+            "over the primaries; F the field of each at the cell, factors as under field; w how much of each a light "
+            "is made of; p paper under each, by channel; a the mean of the cell's samples in the light of each; R = 1 "
+            "where a divisor is below 1 count or R further from 1 than 0.2; multiply to undo, to within rounding",
+            "lights": list(self.lights),
+            "field": [field.parameters()[0] for field in self.fields],
+            "paper": np.round(self.paper, 4).tolist(),
+            "per_light": np.round([self.amounts(light) for light in white], 7).tolist(),
+        }
+
+
+def _for_all_channels(field: Field, channel: int) -> Field:
+    factors = field.coefficients[channel]
+    return Field(field.page_mm, (factors, factors, factors))

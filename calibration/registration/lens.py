@@ -1,0 +1,102 @@
+"""The print as a plane seen through a lens: a homography and Brown's distortion, fitted to places known on both.
+
+Places are half-size pixels, pixel centres at integers; millimetres on the print. Source: D. C. Brown, "Close-range
+camera calibration", 1971.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import optimize
+
+from acquisition.framing.homography import fit_homography, project
+from foundation.errors import RegistrationError
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A plane seen through a lens: homography, then Brown's radial and tangential distortion about the frame's middle.
+
+    Attributes
+    ----------
+    homography
+        (3, 3) float64, millimetres to undistorted half-size px.
+    centre_px
+        (2,) middle of the frame.
+    radius_px
+        Unit of distance for the coefficients: half the frame's diagonal.
+    distortion
+        (4,) k1, k2, p1, p2.
+    """
+
+    homography: _Array
+    centre_px: _Array
+    radius_px: float
+    distortion: _Array
+
+    def to_pixels(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return places (N, 2) of points (N, 2) on the print."""
+        k1, k2, p1, p2 = self.distortion
+        x, y = ((project(self.homography, points_mm) - self.centre_px) / self.radius_px).T
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * k2)
+        seen = np.column_stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ]
+        )
+        return seen * self.radius_px + self.centre_px
+
+
+def fit_lens(
+    points_mm: _Array, places_px: _Array, frame_size: tuple[int, int], normals: _Array | None = None
+) -> tuple[Lens, _Array]:
+    """Return the lens through point pairs and the residuals.
+
+    Plain least squares first, then robustly: robust from the start it sticks far off.
+
+    Parameters
+    ----------
+    points_mm, places_px
+        (N, 2) pairs, N ≥ 8.
+    frame_size
+        Width and height of the frame, half-size px.
+    normals
+        (N, 2) the directions in which places are known, if they lie on lines; None where they are points.
+
+    Returns
+    -------
+    Lens, ndarray
+        (N, 2) float64 residuals, seen minus fitted, px; along the normals if there are some.
+    """
+    centre = (np.array(frame_size, dtype=np.float64) - 1) / 2
+    radius = float(np.hypot(*frame_size)) / 2
+    # Few tags cannot tell the coefficients apart; each is given up where it would only fit noise.
+    free = 4 if len(points_mm) >= 48 else 1 if len(points_mm) >= 16 else 0
+    middle, spread = points_mm.mean(axis=0), points_mm.std(axis=0).max()
+    normal = np.array([[1 / spread, 0, -middle[0] / spread], [0, 1 / spread, -middle[1] / spread], [0, 0, 1]])
+    start = fit_homography((points_mm - middle) / spread, (places_px - centre) / radius)
+    if start is None:
+        raise RegistrationError("the marks lie on one line; bring more of the chart into the frame")
+    scale = np.array([[radius, 0, centre[0]], [0, radius, centre[1]], [0, 0, 1]])
+
+    def lens(parameters: _Array) -> Lens:
+        inner = np.append(parameters[:8], 1.0).reshape(3, 3)
+        return Lens(scale @ inner @ normal, centre, radius, np.append(parameters[8:], np.zeros(4 - free)))
+
+    def residuals(parameters: _Array) -> _Array:
+        off = lens(parameters).to_pixels(points_mm) - places_px
+        return off.ravel() if normals is None else np.asarray((off * normals).sum(axis=1))
+
+    start = np.append((start / start[2, 2]).ravel()[:8], np.zeros(free))
+    plain = optimize.least_squares(residuals, start, x_scale="jac")
+    robust = optimize.least_squares(residuals, plain.x, loss="soft_l1", f_scale=1.0, x_scale="jac")
+    found = lens(np.asarray(robust.x))
+    left = places_px - found.to_pixels(points_mm)
+    return found, left if normals is None else (left * normals).sum(axis=1, keepdims=True) * normals

@@ -1,0 +1,379 @@
+"""Where every point of the print lies in a frame: tags or the field's outline first, then the cells themselves.
+
+Laws that hold inside:
+
+- Tags give a homography and Brown's distortion and nothing finer: 35 of them cannot sample a wavy sheet. The local
+  part is measured on the cells: the frame is rectified to the print, compared with the print's colours as the camera
+  sees them (a colour model fitted on the frame itself), and a smooth displacement is fitted to what does not coincide.
+- A chart without tags has the outline of its field for that, and is then followed from coarse to fine: a map that has
+  slipped by a cell is looked for, and refused.
+- All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres.
+- The result judges itself. A registration that cannot be trusted is a `RegistrationError`, never a value.
+
+Places are half-size pixels, pixel centres at integers; millimetres on the print.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from acquisition.chart.model import Chart
+from acquisition.framing.homography import rms
+from acquisition.framing.outline import refined
+from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
+from acquisition.framing.sharpness import blur_px
+from acquisition.framing.tagless_field import Field
+from acquisition.framing.tags import Framing, find_chart
+from calibration.registration.colour_model import ColourModel
+from calibration.registration.displacement import Displacement
+from calibration.registration.lens import Lens, fit_lens
+from calibration.registration.matching import Anchors, Blocks, Matcher, not_this_chart
+from drivers.raw.rawfile import Mosaic
+from foundation.errors import RegistrationError
+from foundation.robust import MAD_TO_SIGMA, sigma_of
+
+SAMPLE_REACH_PX = 3.25
+"""From a cell's true centre to the outer edge of its 25 pixels: 2.5, rounding 0.5, registration 0.25."""
+
+MIN_CELL_PX = 8.0
+"""Half-size pixels a cell must have for 25 of them to lie safely inside; 8.6 already bleeds 1 % at σ = 0.7."""
+
+MAX_BLUR_PX = 1.0
+"""σ of the tags' edges up to which cells of any size are found to a few hundredths of a pixel, as `acquire check` has
+it. What such a blur mixes into the samples depends on the cells' size, and the verdict judges it as bleed."""
+
+ROOM_PX = 1.75
+"""From there to the edge of a cell of 10 px, for which the limits of places were found."""
+
+MAX_TAG_RESIDUAL_PX = 8.0
+"""RMS of the tags against homography and distortion; 2.3 is a sheet that waves by 6 mm and curls by 10."""
+
+MIN_AGREEMENT = 0.8
+"""Least correlation of the cells' colours with those predicted; another order of cells gives about 0."""
+
+MIN_PLAIN_AGREEMENT = 0.95
+"""The same for a chart without tags, whose smooth order a model of colours can follow into a cover; 0.99 is usual."""
+
+MIN_GOOD_BLOCKS = 0.75
+MAX_BLOCK_RESIDUAL_PX = 0.5
+
+_GAUSS_NEWTON_STEPS = 5
+_TAG_SIGMA_PX = 0.15
+_OUTLINE_SIGMA_PX = 0.1
+_APART, _APART_PX = 5.0, 1.0
+"""Points of an outline further from the lens than five of their standard deviations, and a pixel, are not of it."""
+
+_FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
+"""Blur in cells of the steps that follow a chart without tags, before its cells are looked at."""
+
+_FEW_SLIPPED = 2
+_SLIPPED_SHARE = 0.015
+"""Parts of a field from which on it is refused; none looks slipped in any simulated room that is registered well."""
+
+_LEAST_COLOURS = 64
+"""A model fitted on fewer colours is no judge of one of them."""
+
+_STRANGE_SIGMA = 10.0
+_NEIGHBOURS = 13
+"""A cell and the twelve within two cells of it."""
+
+_STRANGE_NEIGHBOURS = 0.35
+_STRANGE_SHARE = 0.08
+"""Of paper white: the model's own errors at the gamut's corners stay below."""
+
+_Array = npt.NDArray[np.float64]
+_Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The chart's place in a frame.
+
+    Attributes
+    ----------
+    framing
+        The tags, or the field's outline, as found.
+    lens, displacement
+        The two parts of the map.
+    marks_residual_px
+        (N, 2) float64, the tags' corners against the final map; of a chart without tags the field's outline, across.
+    lens_residual_px
+        RMS of the same against the lens alone: what the paper's waviness leaves.
+    blocks
+        Fit of the cells.
+    colours
+        The colour model of the frame.
+    strangers
+        (N,) bool, cells in the chart's order whose colour is not nearly the model's: covered, damaged, misprinted.
+    agreement
+        Correlation of the cells' colours with the model's, the mean of the channels that carry light.
+    blur_px
+        σ of the tags' edges, or of the field's.
+    cell_px
+        Half-size pixels per cell, the shorter side of the smallest.
+    shift_px
+        Movement since the frame that was registered, (dx, dy).
+    """
+
+    framing: Framing
+    lens: Lens
+    displacement: Displacement
+    marks_residual_px: _Array
+    lens_residual_px: float
+    blocks: Blocks
+    colours: ColourModel
+    strangers: _Mask
+    agreement: float
+    blur_px: float
+    cell_px: float
+    shift_px: tuple[float, float] = (0.0, 0.0)
+
+    def to_pixels(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return the half-size pixels (N, 2) float64, x then y, of points (N, 2) on the print."""
+        return self.lens.to_pixels(points_mm) + self.displacement.at(points_mm) + self.shift_px
+
+    def shifted(self, dx: float, dy: float) -> Registration:
+        """Return this registration for a frame in which the chart lies (dx, dy) px further."""
+        return replace(self, shift_px=(self.shift_px[0] + dx, self.shift_px[1] + dy))
+
+    @property
+    def marks_rms_px(self) -> float:
+        """RMS distance of the tags' corners, or the field's outline, from the final map."""
+        return rms(self.marks_residual_px)
+
+    @property
+    def block_rms_px(self) -> float:
+        """RMS of what the good blocks would still ask for: the registration's own estimate of its error."""
+        return rms(self.blocks.residual_px[self.blocks.good])
+
+    @property
+    def room(self) -> float:
+        """How much further samples are from their cells' edges than in cells of 10 px, ≥ 1: places matter less by it.
+
+        Cells of a hundred pixels are found to a pixel, which is nothing to them.
+        """
+        return max(1.0, (self.cell_px / 2 - SAMPLE_REACH_PX) / ROOM_PX)
+
+
+def register(
+    mosaic: Mosaic,
+    chart: Chart,
+    what: str = "the frame",
+    corners: npt.ArrayLike | None = None,
+    near: Registration | None = None,
+) -> Registration:
+    """Return where the chart lies in a frame.
+
+    About 5 s of one processor for the 32 768 cells on an 18-megapixel frame, three times that without tags.
+
+    Parameters
+    ----------
+    mosaic
+        The frame; a white one is best, any with light in it will do if the chart has tags.
+    chart
+        The chart expected.
+    what
+        The frame's name for messages.
+    corners
+        For a chart without tags: (4, 2) half-size px, the corners of the field of cells, clockwise from the printed
+        top-left, to some 20 px; found by themselves if not given.
+    near
+        An earlier registration of the same session: a chart without tags then hangs the same way up.
+
+    Raises
+    ------
+    RegistrationError
+        The tags or the field are missing, mirrored, too small or do not fit; the frame is out of focus or too small in
+        the picture; the cells' colours are not those of the chart, or are those of their neighbours.
+    """
+    black = frame_black(mosaic)
+    framing = find_chart(mosaic, chart, what, corners, None if near is None else near.framing)
+    blur = blur_px(framing)
+    planes = [plane_of(mosaic, channel, black) for channel in CHANNELS]
+    height, width = planes[0].values.shape
+    if framing.field is None:
+        marks = _tag_corners(framing, chart)
+        lens, residual = fit_lens(marks.points_mm, marks.places_px, (width, height))
+    else:
+        clear = _clear_edges(framing.field, planes, blur)
+        field, lens, residual = _field_through_lens(clear, (width, height))
+        framing, marks = replace(framing, field=field), _outline(field)
+    lens_rms = rms(residual)
+    if lens_rms > MAX_TAG_RESIDUAL_PX:
+        raise RegistrationError(
+            f"{what}: the {'tags' if chart.tags else 'edges of the field'} lie {lens_rms:.1f} px RMS off a plane seen "
+            f"through a lens, {MAX_TAG_RESIDUAL_PX:g} allowed; hang the print flat, and see that it is this chart's"
+        )
+    cell_px = _cell_px(lens, chart)
+    _require_size_and_focus(cell_px, blur, what)
+    matcher = Matcher(chart, planes, lens, marks, blur, cell_px)
+    if chart.tags:
+        matcher.match_coarsely(what)
+    else:
+        for softness in _FOLLOWED_SOFTLY:
+            matcher.follow(softness)
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        if matcher.step() < 0.01:
+            break
+    registration = _registered(chart, framing, matcher, marks, lens_rms)
+    _judge(registration, MIN_AGREEMENT if chart.tags else MIN_PLAIN_AGREEMENT, what)
+    if not chart.tags:
+        _require_own_cells(matcher, registration.strangers, what)
+    return registration
+
+
+def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
+    tags = {tag.id: tag for tag in chart.tags}
+    corners_mm = np.concatenate([tags[tag.id].corners_mm for tag in framing.tags])
+    corners_px = np.concatenate([tag.corners_px for tag in framing.tags])
+    return Anchors(corners_mm, corners_px, np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2)))
+
+
+def _outline(field: Field) -> Anchors:
+    """Return the field's outline, whose places are known across alone."""
+    known = np.einsum("ni,nj->nij", field.normals, field.normals) / _OUTLINE_SIGMA_PX**2
+    return Anchors(field.outline_mm, field.outline_px, known)
+
+
+def _clear_edges(field: Field, planes: list[Plane], blur: float) -> Field:
+    """Return the field with its outline measured finely, where it is clear enough for that."""
+    places, clear = refined(planes, field.outline_px, field.normals, blur)
+    return replace(field, outline_mm=field.outline_mm[clear], outline_px=places[clear], normals=field.normals[clear])
+
+
+def _field_through_lens(field: Field, frame_size: tuple[int, int]) -> tuple[Field, Lens, _Array]:
+    """Return the field without points of its outline that stand apart, which are marks; its lens; and residuals."""
+    lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
+    for _ in range(2):
+        size = np.linalg.norm(residual, axis=1)
+        fits = size <= max(_APART * sigma_of(size), _APART_PX)
+        field = replace(
+            field,
+            outline_mm=field.outline_mm[fits],
+            outline_px=field.outline_px[fits],
+            normals=field.normals[fits],
+        )
+        lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
+    return field, lens, residual
+
+
+def _require_own_cells(matcher: Matcher, strangers: _Mask, what: str) -> None:
+    """Refuse a map on which parts of the field show the colours of the cells beside them."""
+    places, parts = matcher.slipped(strangers)
+    if len(places) >= max(_FEW_SLIPPED, _SLIPPED_SHARE * parts):
+        x, y = places[0]
+        raise RegistrationError(
+            f"{what}: {len(places)} of {parts} parts of the field look as if they lay one cell aside, the first about "
+            f"{x:.0f}, {y:.0f} mm from the sheet's top-left corner; uncover the print, hang it flatter, and see that "
+            "chart.json has its cells where they are printed"
+        )
+
+
+def _cell_px(lens: Lens, chart: Chart) -> float:
+    """Return the shorter side of the smallest cell, half-size px."""
+    half = np.array(chart.cell_mm) / 2
+    across = [lens.to_pixels(chart.centres_mm + half * sign) for sign in ((-1, 0), (1, 0), (0, -1), (0, 1))]
+    sides = [np.linalg.norm(across[1] - across[0], axis=1), np.linalg.norm(across[3] - across[2], axis=1)]
+    return float(min(side.min() for side in sides))
+
+
+def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
+    if cell_px < MIN_CELL_PX:
+        raise RegistrationError(
+            f"{what}: a cell is {cell_px:.1f} px wide, at least {MIN_CELL_PX:g} expected for 25 pixels inside it; "
+            "bring the camera nearer"
+        )
+    allowed = max(MAX_BLUR_PX, (cell_px / 2 - SAMPLE_REACH_PX) / 2)
+    if not blur <= allowed:
+        raise RegistrationError(
+            f"{what} is out of focus: edges are blurred by σ = {blur:.2f} px, at most {allowed:.2f} allowed for cells "
+            f"of {cell_px:.1f} px; focus on the print, stop down, and keep the camera still"
+        )
+
+
+def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors, lens_rms: float) -> Registration:
+    """Return the map with everything that tells how good it is."""
+    seen, wanted, paper = matcher.patches()
+    there = np.asarray(np.isfinite(seen).all(axis=1))
+    residual = marks.places_px - matcher.to_pixels(marks.points_mm)
+    if framing.field is not None:
+        residual = (residual * framing.field.normals).sum(axis=1, keepdims=True) * framing.field.normals
+    strangers = np.zeros(chart.colour_count, dtype=np.bool_)
+    if chart.colour_count >= _LEAST_COLOURS:
+        strangers = _with_neighbours(
+            _strangers(seen, wanted, paper)[: chart.colour_count], chart.centres_mm / np.array(chart.cell_mm)
+        )
+    blocks = matcher.blocks()
+    if not chart.tags:
+        there[: chart.colour_count] &= ~strangers
+        blocks = _without_strangers(blocks, strangers, chart)
+    return Registration(
+        framing=framing,
+        lens=matcher.lens,
+        displacement=matcher.displacement,
+        marks_residual_px=residual,
+        lens_residual_px=lens_rms,
+        blocks=blocks,
+        colours=matcher.colours,
+        strangers=strangers,
+        agreement=_agreement(seen[there], wanted[there]),
+        blur_px=matcher.blur_px,
+        cell_px=matcher.cell_px,
+    )
+
+
+def _without_strangers(blocks: Blocks, strangers: _Mask, chart: Chart) -> Blocks:
+    """Return blocks whose score sinks with the share of strangers: a smooth order looks alike through a wide window."""
+    block = np.asarray(cKDTree(blocks.centres_mm).query(chart.centres_mm)[1])
+    cells = np.maximum(np.bincount(block, minlength=len(blocks.score)), 1)
+    share = np.bincount(block, strangers, minlength=len(blocks.score)) / cells
+    return replace(blocks, score=blocks.score * (1 - share))
+
+
+def _strangers(seen: _Array, wanted: _Array, paper: _Array) -> _Mask:
+    """Return which patches (N,) differ from their model far more than is usual, and by a visible share of white."""
+    residual = np.abs(seen - wanted)
+    usual = MAD_TO_SIGMA * np.nanmedian(residual, axis=0)
+    return np.asarray(((residual > _STRANGE_SIGMA * usual) & (residual > _STRANGE_SHARE * paper)).any(axis=1))
+
+
+def _with_neighbours(strangers: _Mask, centres: _Array) -> _Mask:
+    """Return the strangers (N,) and the cells amid them, which a cover of their own colour would hide.
+
+    `centres` (N, 2) in cells.
+    """
+    near = cKDTree(centres).query(centres, k=min(_NEIGHBOURS, len(centres)))[1]
+    share = strangers[np.asarray(near).reshape(len(centres), -1)].mean(axis=1)
+    return np.asarray(strangers | (share > _STRANGE_NEIGHBOURS))
+
+
+def _agreement(seen: _Array, wanted: _Array) -> float:
+    """Return the correlation of colours with those wanted, the mean of the channels that carry most light."""
+    light = np.median(seen, axis=0)
+    used = np.flatnonzero(light >= 0.3 * light.max())
+    return float(np.mean([np.corrcoef(seen[:, channel], wanted[:, channel])[0, 1] for channel in used]))
+
+
+def _judge(registration: Registration, least_agreement: float, what: str) -> None:
+    """Refuse a registration that would build a wrong table."""
+    blocks = registration.blocks
+    if registration.agreement < least_agreement:
+        raise not_this_chart(
+            what, f"they correlate by {registration.agreement:.2f} with those expected, {least_agreement:g} needed"
+        )
+    share = float(blocks.good.mean())
+    if share < MIN_GOOD_BLOCKS:
+        raise not_this_chart(
+            what,
+            f"{share:.0%} of the blocks of cells look as the chart has them, at least {MIN_GOOD_BLOCKS:.0%} needed",
+        )
+    allowed = MAX_BLOCK_RESIDUAL_PX * registration.room
+    if registration.block_rms_px > allowed:
+        raise RegistrationError(
+            f"{what}: blocks of cells still ask for movements of {registration.block_rms_px:.2f} px RMS, "
+            f"{allowed:.2g} allowed; hang the print flatter"
+        )

@@ -1,0 +1,1 @@
+"""From photosites to the samples of a cell."""

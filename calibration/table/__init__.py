@@ -1,0 +1,1 @@
+"""The look-up table on disk and in a store."""

@@ -1,0 +1,1 @@
+"""Whether a table may be used: figures against thresholds."""

@@ -1,0 +1,1 @@
+"""Canon EOS bodies over PTP: their records, their state, their release."""

@@ -1,0 +1,361 @@
+"""An EOS body in one session: from the connection to the last byte of a frame.
+
+Laws that hold inside:
+
+- Every step is one that the recorded conversations have, or one that libgphoto2 takes; an operation that the body does
+  not list is never sent.
+- GetEvent is asked until it has nothing more, but never without end: some firmware repeats itself.
+- A body keeps a frame in its memory until TransferComplete, and refuses the next when that memory is full. So every
+  object that it announces is fetched or thrown away, and freed in either case.
+- Sizes and counts that a body tells are checked against what arrives.
+- A fault of cable or protocol ends the session, and goes to `drivers.canon.camera`, which begins a new one.
+
+Source: conversations of an EOS 60D and an EOS 400D with a host; libgphoto2 2.5.34 for the order of a release.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import BinaryIO
+
+from drivers.camera import CameraIdentity
+from drivers.canon.records import PropertySetting, decode_events, number_value
+from drivers.canon.state import EosState, WaitingObject, host_destination
+from drivers.ptp.codes import CaptureDestination, Operation, Property, ReleaseButton, ResponseCode
+from drivers.ptp.datasets import DeviceInfo
+from drivers.ptp.session import PASSING_LIMIT_S, START_TIMEOUT_S, Declined, PtpSession
+from drivers.ptp.transport import Transport
+from foundation.clock import Clock
+from foundation.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolError
+
+PIECE_BYTES = 1 << 20
+"""Asked for at once; pieces of 5 MiB have crashed newer bodies."""
+MAX_FRAME_BYTES = 256 << 20
+"""No raw file of an EOS body comes near it."""
+MAX_POLLS = 64
+"""GetEvent answers that one drain takes, at most."""
+KEEP_ALIVE_S = 10.0
+"""After this long a body is told to stay awake."""
+SETTLE_LIMIT_S = 5.0
+"""How long a body may take to report a value that it was given, or room for a frame."""
+RELEASE_TRIES = 5
+CAPTURE_TIMEOUT_S = 100.0
+"""Wait for the answer to a release; some bodies expose before they answer."""
+
+_REMOTE_ON, _REMOTE_OFF = 1, 0
+_WITHOUT_AF = 1
+_HOST_CLUSTERS, _HOST_CLUSTER_BYTES = 0x04FFFFFF, 0x1000
+_PAUSES_S = (0.05, 0.1, 0.15, 0.2)
+_PIECE_TRIES = 5
+_FREE_TRIES = 3
+_LASTING = (ResponseCode.INVALID_OBJECT_HANDLE, ResponseCode.SESSION_NOT_OPEN, ResponseCode.DEVICE_BUSY)
+"""Responses to a request for a piece that asking again does not change."""
+_RELEASE_RESULTS = {
+    1: "it finds no focus: set the lens to MF",
+    3: "its mirror is up: switch mirror lockup off",
+    7: "its card is full: empty it",
+    8: "its card is read-only: unlock it",
+}
+"""What RemoteRelease answers as parameter; 0 is success."""
+
+
+class EosBody:
+    """An EOS body behind an open cable.
+
+    Parameters
+    ----------
+    transport
+        Stays the caller's to close.
+    clock
+        Measures and makes every pause.
+    """
+
+    def __init__(self, transport: Transport, clock: Clock) -> None:
+        self._clock = clock
+        self._session = PtpSession(transport, clock)
+        self._info = DeviceInfo()
+        self._destination: bytes | None = None
+        self._spoken_at = clock.monotonic()
+        self.state = EosState()
+
+    @property
+    def label(self) -> str:
+        """What messages call the body."""
+        return self._session.label
+
+    def identity(self) -> CameraIdentity:
+        """Return what the body says of itself; its serial number is the one that is engraved on it, where told."""
+        serial = self.state.text(Property.EOS_SERIAL_NUMBER) or self._info.serial_number
+        return CameraIdentity(self._info.manufacturer, self._info.model, serial, self._info.device_version)
+
+    def connect(self) -> None:
+        """Open the session, take the body under remote control and learn its state.
+
+        Raises
+        ------
+        DeviceRefused
+            It is no EOS body, or offers no way to send frames to the host.
+        LinkError, ProtocolError
+            From the cable.
+        """
+        self._session.open()
+        _, data = self._session.call(Operation.GET_DEVICE_INFO)
+        self._info = DeviceInfo.decode(data)
+        remote = (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_GET_EVENT)
+        if "canon" not in self._info.manufacturer.lower() or not all(map(self._offers, remote)):
+            raise DeviceRefused(
+                f"{self.label} is a {self._info.manufacturer} {self._info.model}, which does not speak as a Canon EOS "
+                "does; connect an EOS body, or take the frames otherwise and use `acquire import`"
+            )
+        self._session.call(Operation.EOS_SET_REMOTE_MODE, _REMOTE_ON)
+        self._session.call(Operation.EOS_SET_EVENT_MODE, _REMOTE_ON)
+        self.drain()
+        if self._offers(Operation.EOS_REQUEST_DEVICE_PROP_VALUE):
+            self._session.call(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, Property.EOS_SERIAL_NUMBER)
+            self._settled(lambda: Property.EOS_SERIAL_NUMBER in self.state.values)
+        if not self.state.lists:
+            raise ProtocolError(f"{self.label} tells no state when asked for events; switch it off and on")
+        self._receive_frames()
+
+    def disconnect(self) -> None:
+        """Give the body back as it was found; a fault of the cable goes to the caller."""
+        self.free_waiting()
+        if self._destination is not None:
+            with contextlib.suppress(Declined):
+                self._send(Property.EOS_CAPTURE_DESTINATION, self._destination)
+        for operation in (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_SET_EVENT_MODE):
+            with contextlib.suppress(Declined):
+                self._session.call(operation, _REMOTE_OFF, timeout=START_TIMEOUT_S, patience=1.0)
+        self._session.close()
+
+    def poll(self) -> bool:
+        """Ask once what is new; return whether anything was."""
+        with contextlib.suppress(ProtocolError):
+            self._session.events()  # hints that asking would be worth while, which it is anyway
+        _, data = self._session.call(Operation.EOS_GET_EVENT)
+        records = decode_events(data)
+        self.state.take(records)
+        self._keep_awake()
+        return bool(records)
+
+    def drain(self) -> None:
+        """Ask until there is nothing new."""
+        for _ in range(MAX_POLLS):
+            if not self.poll():
+                return
+
+    def set(self, code: int, value: bytes) -> None:
+        """Set a property, and see that the body reports it.
+
+        Raises
+        ------
+        DeviceRefused
+            It declines, or goes on reporting another value.
+        """
+        if self.state.holds(code, value):
+            return
+        self._send(code, value)
+        self._verify(code, value)
+
+    def make_ready(self) -> None:
+        """Empty the event queue and the memory, and wait until the body can take a frame.
+
+        Raises
+        ------
+        DeviceRefused
+            Its memory stays full.
+        """
+        self.drain()
+        self.free_waiting()
+        # A body whose "idle" was lost would seem busy for ever; it says itself whether it takes the release.
+        self._settled(lambda: not self.state.busy)
+        self.free_waiting()
+        if not self._settled(lambda: self.state.number(Property.EOS_AVAILABLE_SHOTS) != 0):
+            raise DeviceRefused(f"{self.label} has no room for a frame; switch it off and on to empty its memory")
+
+    def release(self) -> None:
+        """Press the release down and let it go, without autofocus.
+
+        Raises
+        ------
+        DeviceRefused
+            The body declines; no frame was taken.
+        """
+        if not self._offers(Operation.EOS_REMOTE_RELEASE_ON):
+            parameters, _ = self._session.call(Operation.EOS_REMOTE_RELEASE, timeout=CAPTURE_TIMEOUT_S)
+            result = parameters[0] if parameters else 0
+            if result:
+                reason = _RELEASE_RESULTS.get(result, f"result 0x{result:x}")
+                raise DeviceRefused(f"{self.label} does not release: {reason}")
+            return
+        for left in reversed(range(RELEASE_TRIES)):
+            try:
+                self._session.call(
+                    Operation.EOS_REMOTE_RELEASE_ON,
+                    ReleaseButton.HALF_AND_FULL,
+                    _WITHOUT_AF,
+                    timeout=CAPTURE_TIMEOUT_S,
+                    patience=0.0,
+                )
+                break
+            except Declined as error:
+                # What keeps a body busy here is a release still held down, or events that nobody fetched.
+                self._let_go()
+                self.drain()
+                if error.code != ResponseCode.DEVICE_BUSY:
+                    raise
+                if not left:
+                    raise Declined(
+                        f"{error}; look for mirror lockup, a timer or a menu on its display", error.code
+                    ) from error
+                self._clock.sleep(PASSING_LIMIT_S / RELEASE_TRIES)
+        self._let_go()
+
+    def await_object(self, not_before: float, until: float, wanted: Callable[[WaitingObject], bool]) -> WaitingObject:
+        """Return the newest object that waits and is wanted.
+
+        Parameters
+        ----------
+        not_before
+            Moment of the clock before which nothing can be the frame; what is announced earlier is left over from
+            before and thrown away.
+        until
+            Moment of the clock at which waiting ends.
+
+        Raises
+        ------
+        LinkTimeout
+            Nothing came.
+        """
+        pauses = iter(_PAUSES_S)
+        while True:
+            if self.poll():
+                pauses = iter(_PAUSES_S)
+            if self._clock.monotonic() < not_before:
+                self.free_waiting()
+            # Of two the later one belongs to this release: the other's announcement was late.
+            for candidate in reversed(list(self.state.waiting.values())):
+                if wanted(candidate):
+                    return candidate
+            if self._clock.monotonic() >= until:
+                raise LinkTimeout(f"{self.label} has announced no frame in time")
+            self._clock.sleep(next(pauses, _PAUSES_S[-1]))
+
+    def fetch(self, waiting: WaitingObject, into: BinaryIO, offset: int = 0) -> None:
+        """Append an object's bytes from `offset` on to `into`, piece by piece.
+
+        Raises
+        ------
+        Declined
+            There is no such object (`ResponseCode.INVALID_OBJECT_HANDLE`), or the body will not give it.
+        DeviceError
+            It gives less than it announced, or announced a size that no frame has.
+        ProtocolError
+            It gives more than was asked for.
+        """
+        if not 0 < waiting.size <= MAX_FRAME_BYTES:
+            raise DeviceError(
+                f"{self.label} announces {waiting.name!r} of {waiting.size} bytes; 1 to {MAX_FRAME_BYTES} were expected"
+            )
+        while offset < waiting.size:
+            offset += into.write(self._piece(waiting, offset))
+            self._keep_awake()
+
+    def free(self, waiting: WaitingObject) -> None:
+        """Let the body forget an object; where it will not, the next `make_ready` tries again."""
+        for left in reversed(range(_FREE_TRIES)):
+            try:
+                self._session.call(Operation.EOS_TRANSFER_COMPLETE, waiting.handle)
+            except Declined as error:
+                if error.code != ResponseCode.INVALID_OBJECT_HANDLE:  # else it has gone, which is as well
+                    if left:
+                        self._clock.sleep(_PAUSES_S[-1])
+                    continue
+            self.state.waiting.pop(waiting.handle, None)
+            return
+
+    def free_waiting(self) -> None:
+        """Let the body forget every object that waits."""
+        for waiting in list(self.state.waiting.values()):
+            self.free(waiting)
+
+    def _piece(self, waiting: WaitingObject, offset: int) -> bytes:
+        """Return the next bytes of an object; fewer than were asked for are good, for the rest follows."""
+        wanted = min(PIECE_BYTES, waiting.size - offset)
+        operation = Operation.EOS_GET_PARTIAL_OBJECT
+        if not self._offers(operation):
+            operation = Operation.GET_PARTIAL_OBJECT
+        for left in reversed(range(_PIECE_TRIES)):
+            try:
+                sent, data = self._session.call(operation, waiting.handle, offset, wanted)
+            except Declined as error:
+                if not left or error.code in _LASTING:
+                    raise
+            else:
+                if len(data) > wanted:
+                    raise ProtocolError(f"{self.label} gives {len(data)} bytes at {offset}; {wanted} were asked for")
+                # The standard's operation tells how many bytes were sent; what Canon's own answers is not known.
+                told = sent[0] if sent and operation == Operation.GET_PARTIAL_OBJECT else len(data)
+                if data and told == len(data):
+                    return data
+            self._clock.sleep(_PAUSES_S[-1])
+        raise DeviceError(
+            f"{self.label} announced {waiting.size} bytes for {waiting.name!r}, but gives only {offset}; "
+            "the frame is worthless and may be retaken"
+        )
+
+    def _receive_frames(self) -> None:
+        """Have frames sent to the host, and tell the body that there is room for them."""
+        host = host_destination(self.state)
+        # A body that a killed run left behind stands at the host already; its user wants the card again.
+        self._destination = number_value(CaptureDestination.CARD)
+        if not self.state.holds(Property.EOS_CAPTURE_DESTINATION, host):
+            self._destination = self.state.values.get(Property.EOS_CAPTURE_DESTINATION, self._destination)
+            self._send(Property.EOS_CAPTURE_DESTINATION, host)
+        if self._offers(Operation.EOS_PC_HDD_CAPACITY):
+            self._session.call(Operation.EOS_PC_HDD_CAPACITY, _HOST_CLUSTERS, _HOST_CLUSTER_BYTES, 1)
+        self.drain()
+        self._verify(Property.EOS_CAPTURE_DESTINATION, host)
+
+    def _send(self, code: int, value: bytes) -> None:
+        self._session.call(Operation.EOS_SET_DEVICE_PROP_VALUE_EX, send=PropertySetting(code, value).encode())
+
+    def _verify(self, code: int, value: bytes) -> None:
+        if self._settled(lambda: self.state.holds(code, value)):
+            return
+        if self._offers(Operation.EOS_REQUEST_DEVICE_PROP_VALUE):
+            self._session.call(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, code)
+            if self._settled(lambda: self.state.holds(code, value)):
+                return
+        came = self.state.values.get(code)
+        raise DeviceRefused(
+            f"{self.label} was given {value.hex()} for property 0x{code:04x} and reports "
+            f"{came.hex() if came is not None else 'nothing'}; set it by hand, or switch the camera off and on"
+        )
+
+    def _let_go(self) -> None:
+        with contextlib.suppress(Declined):
+            self._session.call(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
+
+    def _settled(self, condition: Callable[[], bool]) -> bool:
+        """Poll until `condition` holds, for a limited time; return whether it does."""
+        end = self._clock.monotonic() + SETTLE_LIMIT_S
+        while not condition():
+            if self._clock.monotonic() >= end:
+                return False
+            self.poll()
+            if not condition():
+                self._clock.sleep(_PAUSES_S[0])
+        return True
+
+    def _keep_awake(self) -> None:
+        now = self._clock.monotonic()
+        if now - self._spoken_at >= KEEP_ALIVE_S:
+            self._spoken_at = now
+            if self._offers(Operation.EOS_KEEP_DEVICE_ON):
+                with contextlib.suppress(Declined):
+                    self._session.call(Operation.EOS_KEEP_DEVICE_ON, patience=0.0)
+
+    def _offers(self, operation: int) -> bool:
+        return operation in self._info.operations

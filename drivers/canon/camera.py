@@ -1,0 +1,293 @@
+"""A Canon EOS body as the suite's `Camera`: one raw frame after another, for hours, without a human.
+
+Laws that hold inside:
+
+- A connection that fails is renewed, a limited number of times for one call and a limited time for each: reset, closed,
+  opened again wherever the body is now, and given the settings again. `drivers.canon.body` is one connection.
+- A release is never repeated once it may have happened: after a fault the frame is looked for in the camera's memory,
+  and what is not found there is an error. So no frame is ever taken for another one's.
+- What waits in the memory before a release belongs to nobody any more, and is thrown away.
+- When a capture ends, well or badly, the body's memory is empty, or the next call empties it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import BinaryIO, TypeVar
+
+from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
+from drivers.canon.body import EosBody
+from drivers.canon.state import WaitingObject, plan
+from drivers.ptp.codes import ResponseCode
+from drivers.ptp.session import PASSING, Declined
+from drivers.ptp.transport import Transport
+from foundation.clock import Clock, SystemClock
+from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
+
+RECOVERIES = 3
+"""How often one call renews the connection."""
+RECOVERY_LIMIT_S = 60.0
+"""How long each renewal may take; a body that was switched off and on is back well within it."""
+FRAME_LIMIT_S = 90.0
+"""How long after its exposure a frame may be announced."""
+REDISCOVERY_S = 10.0
+"""The same on a new connection, on which the body tells all its state at once."""
+
+_SYSTEM_CLOCK = SystemClock()
+_CERTAIN_SHARE = 0.9
+"""Share of the nominal shutter time that passes at least: 1/6 s is really 0.149 s."""
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 5.0
+_STUCK = (
+    *PASSING,
+    ResponseCode.UNDEFINED,
+    ResponseCode.GENERAL_ERROR,
+    ResponseCode.SESSION_NOT_OPEN,
+    ResponseCode.INVALID_TRANSACTION_ID,
+    ResponseCode.INCOMPLETE_TRANSFER,
+    ResponseCode.TRANSACTION_CANCELLED,
+)
+"""Responses that a new session may cure."""
+_REMEDY = (
+    "check the cable and the battery, switch the camera off and on, and end other programs that use it (photo "
+    "importers of the desktop do so by themselves); then run again"
+)
+
+_Result = TypeVar("_Result")
+
+
+@dataclass
+class _Shot:
+    """A release that has happened, or may have; objects that are `absent` cannot be its frame."""
+
+    body: EosBody
+    released_at: datetime
+    not_before: float
+    until: float
+    shutter_s: float
+    fetched: WaitingObject | None = None
+    absent: set[int] = field(default_factory=set[int])
+
+
+class CanonEos:
+    """A `drivers.camera.Camera` over PTP, whatever the cable.
+
+    Parameters
+    ----------
+    open_transport
+        Opens a new cable to the same body, wherever it is now; called again after a fault.
+    clock
+        Measures and makes every pause.
+    """
+
+    def __init__(self, open_transport: Callable[[], Transport], clock: Clock = _SYSTEM_CLOCK) -> None:
+        self._open_transport = open_transport
+        self._clock = clock
+        self._transport: Transport | None = None
+        self._body: EosBody | None = None
+        self._identity: CameraIdentity | None = None
+        self._settings: ExposureSettings | None = None
+        self._closed = False
+
+    def identity(self) -> CameraIdentity:
+        """Return maker, model, serial number and firmware."""
+        return self._carry_out(EosBody.identity)
+
+    def configure(self, settings: ExposureSettings) -> None:
+        """Set and verify the exposure, raw format and destination.
+
+        Raises
+        ------
+        DeviceRefused
+            The body does not offer a value, or is set up in a way that spoils a series; all of it in one message.
+        DeviceError
+            It cannot be reached.
+        """
+
+        def configured(body: EosBody) -> None:
+            body.make_ready()
+            _apply(body, settings)
+
+        self._settings = None
+        self._carry_out(configured)
+        self._settings = settings
+
+    def capture(self, into: BinaryIO) -> CapturedFrame:
+        """Release the shutter without autofocus and write the raw file, whole and unchanged, to `into`.
+
+        Raises
+        ------
+        DeviceRefused
+            The body was never configured, or declines to take a frame.
+        DeviceError
+            The frame did not arrive; what `into` holds is worthless and may be retaken.
+        """
+        settings = self._settings
+        if settings is None:
+            raise DeviceRefused("the camera has no exposure settings; configure it before the first capture")
+        start = into.tell()
+        shot = self._release(settings)
+        try:
+            frame = self._carry_out(lambda body: self._receive(body, shot, into, start))
+        except Exception:
+            self._empty()
+            raise
+        self._empty()
+        return CapturedFrame(_file_name(frame), frame.size, shot.released_at)
+
+    def idle(self) -> None:
+        """Fetch what has happened while nothing was asked, and keep the body awake; call it now and then in a pause."""
+        self._carry_out(EosBody.drain)
+
+    def close(self) -> None:
+        """Give the camera back to its user; a second call does nothing."""
+        self._closed = True
+        body = self._body
+        if body is not None:
+            try:
+                body.disconnect()
+            except DeviceError as error:
+                self._drop(error)
+            else:
+                self._drop(None)
+
+    def _carry_out(self, action: Callable[[EosBody], _Result]) -> _Result:
+        """Return what `action` does with a connected body, over a new connection if this one fails."""
+        for left in reversed(range(RECOVERIES + 1)):
+            body = self._connected()
+            try:
+                return action(body)
+            except DeviceError as error:
+                if not _curable(error):
+                    raise
+                self._drop(error)
+                if not left:
+                    # A body that is busy in every session is kept so by its own settings, not by a fault.
+                    busy = isinstance(error, Declined) and error.code == ResponseCode.DEVICE_BUSY
+                    kind = DeviceRefused if busy else DeviceError
+                    raise kind(
+                        f"{error}; the connection was renewed {RECOVERIES} times without success: {_REMEDY}"
+                    ) from error
+        raise AssertionError
+
+    def _release(self, settings: ExposureSettings) -> _Shot:
+        """Return the release that has happened, or may have; one that the body declines has not."""
+
+        def released(body: EosBody) -> _Shot:
+            body.make_ready()
+            _apply(body, settings)  # says nothing on the wire unless a dial was turned
+            now = self._clock.monotonic()
+            exposed = now + _CERTAIN_SHARE * settings.shutter_s
+            until = now + settings.shutter_s + FRAME_LIMIT_S
+            shot = _Shot(body, self._clock.now(), exposed, until, settings.shutter_s, absent=set(body.state.waiting))
+            try:
+                body.release()
+            except (LinkError, ProtocolError) as error:
+                self._drop(error)
+            return shot
+
+        return self._carry_out(released)
+
+    def _receive(self, body: EosBody, shot: _Shot, into: BinaryIO, start: int) -> WaitingObject:
+        """Return the frame of a release when it is complete in `into`, from `start` on."""
+        renewed = body is not shot.body
+        until = self._clock.monotonic() + shot.shutter_s + REDISCOVERY_S if renewed else shot.until
+        while True:
+            try:
+                frame = body.await_object(
+                    shot.not_before, until, lambda waiting: waiting.is_raw and waiting.handle not in shot.absent
+                )
+            except LinkTimeout as error:
+                if not renewed:
+                    raise  # its announcement may be lost: a new connection hears it again
+                raise DeviceError(f"{error}, and holds none in its memory; take it again") from error
+            # What has come of the same object before a fault is good: pieces are written whole.
+            offset = into.tell() - start if frame == shot.fetched else 0
+            into.seek(start + offset)
+            into.truncate()
+            shot.fetched = frame
+            try:
+                body.fetch(frame, into, offset)
+            except Declined as error:
+                if error.code != ResponseCode.INVALID_OBJECT_HANDLE:
+                    raise
+                shot.absent.add(frame.handle)
+                body.free(frame)
+                continue
+            return frame
+
+    def _empty(self) -> None:
+        """Let the body forget what waits; where that fails the next call sees to it over a new connection."""
+        if self._body is not None:
+            try:
+                self._body.free_waiting()
+                self._body.drain()
+                self._body.free_waiting()
+            except DeviceError as error:
+                self._drop(error)
+
+    def _connected(self) -> EosBody:
+        """Return the connected body, after a fault on a new connection and with its settings."""
+        if self._closed:
+            raise DeviceError("the camera has been closed; open the rig again")
+        if self._body is not None:
+            return self._body
+        first = self._identity is None
+        end = self._clock.monotonic() + RECOVERY_LIMIT_S
+        pause = _FIRST_PAUSE_S
+        while True:
+            try:
+                return self._connect()
+            except DeviceError as error:
+                # While it comes back a body may be absent, or in the hands of the desktop.
+                curable = not first if self._transport is None else _curable(error)
+                self._drop(error)
+                if not curable:
+                    raise
+                if self._clock.monotonic() + pause > end:
+                    raise DeviceError(f"no camera to work with: {error}; {_REMEDY}") from error
+            self._clock.sleep(pause)
+            pause = min(2 * pause, _LONGEST_PAUSE_S)
+
+    def _connect(self) -> EosBody:
+        self._transport = self._open_transport()
+        body = EosBody(self._transport, self._clock)
+        body.connect()
+        found, known = body.identity(), self._identity
+        if known is not None and (found.model, found.serial) != (known.model, known.serial):
+            raise DeviceRefused(
+                f"in place of the {known.model} with serial number {known.serial} there is now a {found.model} with "
+                f"{found.serial}; connect the first one again"
+            )
+        if self._settings is not None:
+            _apply(body, self._settings)
+        self._identity = found
+        self._body = body
+        return body
+
+    def _drop(self, fault: DeviceError | None) -> None:
+        """Close the cable, with a reset where the body may still be in the midst of something."""
+        transport, self._transport, self._body = self._transport, None, None
+        if transport is not None:
+            if fault is not None and not isinstance(fault, LinkClosed):
+                with contextlib.suppress(DeviceError):
+                    transport.reset()
+            transport.close()
+
+
+def _apply(body: EosBody, settings: ExposureSettings) -> None:
+    for code, value in plan(body.state, settings).items():
+        body.set(code, value)
+
+
+def _curable(error: DeviceError) -> bool:
+    """Return whether a new connection may help."""
+    return isinstance(error, LinkError | ProtocolError) or (isinstance(error, Declined) and error.code in _STUCK)
+
+
+def _file_name(frame: WaitingObject) -> str:
+    """Return the camera's name for a file, with nothing in it that a file name cannot hold."""
+    return re.sub(r"[^A-Za-z0-9._-]", "_", frame.name) or f"{frame.handle:08X}"

@@ -1,0 +1,518 @@
+"""Plain colours on a real display: exact codes, looked at where they arrive before anybody takes a picture.
+
+Laws that hold inside:
+
+- The picture fills one whole display in the mode that the desktop set: no scaling, no cursor, no frame.
+- `show` returns when the drawn frame and what the display's server shows are exactly the colour, in every pixel: on X,
+  the screen is read over another connection, as a screenshot program does; on Windows and macOS, the front buffer.
+- One thread owns the window: the one that opened it. OpenGL contexts and GLFW want it so.
+- The window belongs to this process: however that ends, killed included, the window goes with it.
+- GLFW and OpenGL are spoken to here and nowhere else; GLFW runs while anything here is open.
+
+On Linux the window is an X window. Under Wayland that is XWayland, whose compositor may scale and tint behind our back:
+`FullScreen.warnings` says so. Gamma ramps, which night light and colour management load, lie behind everything that can
+be read back; `warnings` looks at them, too.
+
+Sources: GLFW 3.4 reference; OpenGL 2.1, clauses 4.2.3 (Clear) and 4.3.2 (ReadPixels); ICC Profiles in X
+Specification 0.4.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import re
+import sys
+import threading
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.display.x11 import XScreen, is_lost, outlive
+from drivers.presenter import BLACK, Colour
+from foundation.clock import Clock, SystemClock
+from foundation.errors import ConfigurationError, DeviceError
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+OPENING_S = 5.0
+"""How long a window may take to fill its display; window managers animate."""
+CONFIRMING_S = 1.0
+"""How long a frame may take from the swap to the screen; a compositor adds a frame or two."""
+RAMP_TOLERANCE = 1.5 / 255
+"""How far a gamma ramp may be from a straight line: drivers end it at 255/256 or at 1."""
+
+_LOOK_AGAIN_S = 0.002
+_GL_FRONT, _GL_BACK = 0x0404, 0x0405
+_GL_COLOUR_BIT = 0x4000
+_GL_DITHER, _GL_SCISSOR = 0x0BD0, 0x0C11
+_GL_BGRA, _GL_8888_REVERSED = 0x80E1, 0x8367
+"""Read so, a pixel is the number 0xAARRGGBB, which is how drivers keep it: nothing needs converting."""
+_DIGITS = ("111101101101111", "010110010010111", "111001111100111", "111001111001111", "101101111001001",
+           "111100111001111", "111100111101111", "111001001001001", "111101111101111", "111101111001111")  # fmt: skip
+"""0 … 9 in 3×5 blocks, rows from the top."""
+
+_SYSTEM_CLOCK = SystemClock()
+_users = 0
+
+
+@dataclass(frozen=True)
+class Display:
+    """A display as the desktop arranged it; `x`, `y`, `width`, `height` in px of the whole desktop, y down."""
+
+    number: int
+    name: str
+    x: int
+    y: int
+    width: int
+    height: int
+    refresh_hz: int
+
+    @property
+    def place(self) -> str:
+        """Where it is, such as ``+1920+0``."""
+        return f"{self.x:+d}{self.y:+d}"
+
+    def __str__(self) -> str:
+        return f"{self.number}: {self.name} {self.width}×{self.height} at {self.place}, {self.refresh_hz} Hz"
+
+
+def list_displays() -> tuple[Display, ...]:
+    """Return every display, from left to right, then from top to bottom; `number` counts them from 1.
+
+    Raises
+    ------
+    DeviceError
+        There is no desktop to ask.
+    """
+    with _running() as glfw:
+        return tuple(display for display, _ in _displays(glfw))
+
+
+def choose_display(displays: tuple[Display, ...], wanted: str | int | None = None) -> Display:
+    """Return the display that `wanted` names.
+
+    Parameters
+    ----------
+    wanted
+        Its name (``"HDMI-1"``), its place (``"+1920+0"``), ``"left"``, ``"right"``, or its number; None stands for
+        the only one.
+
+    Raises
+    ------
+    ConfigurationError
+        None fits, or several do; the message lists what there is.
+    """
+    there = "; ".join(str(display) for display in displays) or "none"
+    if wanted is None:
+        fitting = list(displays)
+    elif isinstance(wanted, int):
+        fitting = [display for display in displays if display.number == wanted]
+    elif wanted in ("left", "right"):
+        # With one display, the other is the one that is missing: that is no time to guess.
+        ends = [display.x for display in displays]
+        if len(set(ends)) < 2:
+            raise ConfigurationError(
+                f"display {wanted!r}: there are not two displays side by side, but {there}; "
+                "connect the projector and extend the desktop to it"
+            )
+        end = min(ends) if wanted == "left" else max(ends)
+        fitting = [display for display in displays if display.x == end]
+    elif re.fullmatch(r"[+-]\d+[+-]\d+", wanted):
+        fitting = [display for display in displays if display.place == wanted]
+    else:
+        fitting = [display for display in displays if display.name == wanted]
+        if not fitting and wanted.isdecimal():
+            return choose_display(displays, int(wanted))
+    if len(fitting) == 1:
+        return fitting[0]
+    named = "no display is named" if wanted is None else f"display {wanted!r}"
+    if fitting:
+        raise ConfigurationError(f"{named}: {len(fitting)} fit; name one by its place, such as +1920+0; found: {there}")
+    raise ConfigurationError(
+        f"{named} is not there; found: {there}; connect and switch on the projector, or name another"
+    )
+
+
+class FullScreen:
+    """A `drivers.presenter.Presenter` on a display; black from the moment it opens.
+
+    Use it from the thread that opened it. It takes no keys: the way out is `close`, or the end of the process.
+
+    Parameters
+    ----------
+    display
+        As `choose_display` takes it.
+    clock
+        Waits between two looks at the screen.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such display, or several.
+    DeviceError
+        There is no desktop or no OpenGL, or the window does not come to fill the display.
+    """
+
+    def __init__(self, display: str | int | None = None, clock: Clock = _SYSTEM_CLOCK) -> None:
+        self._clock = clock
+        self._thread = threading.get_ident()
+        self._closing = contextlib.ExitStack()
+        with contextlib.ExitStack() as opening:
+            self._glfw = glfw = opening.enter_context(_running())
+            found = _displays(glfw)
+            self.display = choose_display(tuple(one for one, _ in found), display)
+            """The display that it fills."""
+            self._monitor: Any = next(monitor for one, monitor in found if one == self.display)
+            self._screen: XScreen | None = None
+            if glfw.get_platform() == glfw.PLATFORM_X11:
+                self._screen = XScreen()
+                opening.callback(self._screen.close)
+            self._window: Any = self._open_window()
+            opening.callback(glfw.destroy_window, self._window)
+            self._gl = _Gl(glfw)
+            self._drawn: npt.NDArray[np.uint32] = np.empty((self.display.height, self.display.width), np.uint32)
+            glfw.swap_interval(1)
+            self._wait_until_full()
+            self._present(BLACK)
+            self._closing = opening.pop_all()
+        self._open = True
+
+    def show(self, colour: Colour) -> None:
+        """Fill the display with exactly `colour`; returns when every pixel has been read back from the screen.
+
+        Raises
+        ------
+        DeviceError
+            A pixel has another colour, the display is gone, or another thread than its own asks.
+        """
+        self._require_usable()
+        self._glfw.poll_events()
+        if self._screen is not None and is_lost(self._glfw.get_x11_display()):
+            raise DeviceError(
+                f"the X server of display {self.display} is gone: somebody logged out, or it crashed; log in, then run "
+                "again"
+            )
+        if not self._is_full():
+            raise DeviceError(
+                f"the window no longer fills display {self.display}; check its cable and the desktop's display "
+                "settings, then open it again"
+            )
+        self._present(colour)
+
+    def identify(self) -> None:
+        """Show the display's number in big white blocks on black, so that it can be told from the others."""
+        self._require_usable()
+        self._glfw.make_context_current(self._window)
+        self._fill(BLACK)
+        digits = [_DIGITS[int(digit)] for digit in str(self.display.number)]
+        columns, rows = 4 * len(digits) + 1, 7
+        block = min(self.display.width // columns, self.display.height // rows)
+        left = (self.display.width - columns * block) // 2
+        top = (self.display.height + rows * block) // 2
+        self._gl.enable(_GL_SCISSOR)
+        self._gl.clear_colour(1.0, 1.0, 1.0, 1.0)
+        for place, digit in enumerate(digits):
+            for cell in (cell for cell, lit in enumerate(digit) if lit == "1"):
+                row, column = divmod(cell, 3)
+                # OpenGL counts from the bottom.
+                x, y = left + (1 + 4 * place + column) * block, top - (2 + row) * block
+                self._gl.scissor(x, y, block, block)
+                self._gl.clear(_GL_COLOUR_BIT)
+        self._gl.disable(_GL_SCISSOR)
+        self._glfw.swap_buffers(self._window)
+        self._gl.finish()
+        self._glfw.poll_events()
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what changes, or may change, the light behind the codes that were read back; empty when nothing does.
+
+        Raises
+        ------
+        DeviceError
+            It is closed, or another thread than its own asks.
+        """
+        self._require_usable()
+        found: list[str] = []
+        bent = self._bent_ramp()
+        if bent:
+            found.append(
+                f"the gamma ramp of {self.display.name} is not straight ({bent}): switch off night light and colour "
+                "management for this display"
+            )
+        if self._screen is not None and (
+            self._screen.has_extension("XWAYLAND") or self.display.name.startswith("XWAYLAND")
+        ):
+            found.append(
+                "the desktop is Wayland, whose compositor may scale and tint unseen: log in to an X session (Xorg)"
+            )
+        if self._screen is not None and not self._screen.stays_awake:
+            found.append(
+                "power saving may darken the display: install libxcb-screensaver0, or switch it off (xset -dpms)"
+            )
+        if self._screen is not None and self._screen.has_root_property(_profile_of(self._glfw, self._monitor)):
+            found.append(
+                f"a colour profile is set for {self.display.name}, which desktops may apply to what they show: remove "
+                "it in the desktop's colour settings (colormgr, dispwin -U)"
+            )
+        twins = [str(one) for one, _ in _displays(self._glfw) if one.place == self.display.place]
+        if len(twins) > 1:
+            found.append(f"the same picture goes to several displays ({'; '.join(twins)}): extend, do not mirror")
+        return tuple(found)
+
+    def close(self) -> None:
+        """Leave the display black and give it back to the desktop; a second call does nothing.
+
+        Raises
+        ------
+        DeviceError
+            Another thread than its own asks.
+        """
+        if not self._open:
+            return
+        self._require_usable()
+        self._open = False
+        # What cannot be shown any more, the end of the window darkens.
+        with self._closing, contextlib.suppress(DeviceError):
+            self._present(BLACK)
+
+    def _open_window(self) -> Any:
+        glfw = self._glfw
+        glfw.default_window_hints()
+        for hint, value in (
+            (glfw.DECORATED, False),
+            (glfw.FLOATING, True),
+            (glfw.AUTO_ICONIFY, False),  # or it goes away when the operator clicks on another display
+            (glfw.CENTER_CURSOR, False),
+            (glfw.RED_BITS, 8),
+            (glfw.GREEN_BITS, 8),
+            (glfw.BLUE_BITS, 8),
+            (glfw.ALPHA_BITS, 0),
+            (glfw.DEPTH_BITS, 0),
+            (glfw.STENCIL_BITS, 0),
+            (glfw.SAMPLES, 0),
+            (glfw.SRGB_CAPABLE, False),
+            (glfw.REFRESH_RATE, self.display.refresh_hz),
+        ):
+            glfw.window_hint(hint, value)
+        try:
+            window = glfw.create_window(self.display.width, self.display.height, "CroP", self._monitor, None)
+        except glfw.GLFWError as error:
+            raise DeviceError(
+                f"no picture on display {self.display}: {error}; check that OpenGL works (Debian: libgl1-mesa-dri)"
+            ) from error
+        glfw.set_input_mode(window, glfw.CURSOR, glfw.CURSOR_HIDDEN)
+        glfw.make_context_current(window)
+        return window
+
+    def _wait_until_full(self) -> None:
+        deadline = self._clock.monotonic() + OPENING_S
+        self._glfw.poll_events()
+        while not self._is_full():
+            if self._clock.monotonic() > deadline:
+                size = "×".join(str(side) for side in self._glfw.get_framebuffer_size(self._window))
+                raise DeviceError(
+                    f"the window came out as {size} at {self._glfw.get_window_pos(self._window)}, not as display "
+                    f"{self.display}; switch off desktop scaling for it"
+                )
+            self._clock.sleep(_LOOK_AGAIN_S)
+            self._glfw.poll_events()
+
+    def _is_full(self) -> bool:
+        glfw, display = self._glfw, self.display
+        if not glfw.get_window_monitor(self._window):
+            return False
+        size = (display.width, display.height)
+        return glfw.get_window_pos(self._window) == (display.x, display.y) and (
+            tuple(glfw.get_framebuffer_size(self._window)) == size
+        )
+
+    def _present(self, colour: Colour) -> None:
+        self._glfw.make_context_current(self._window)
+        self._fill(colour)
+        self._require(self._read_buffer(_GL_BACK), colour, "OpenGL drew")
+        self._glfw.swap_buffers(self._window)
+        self._gl.finish()
+        deadline = self._clock.monotonic() + CONFIRMING_S
+        while True:
+            try:
+                self._require(self._read_screen(), colour, "the screen shows")
+            except DeviceError:
+                if self._clock.monotonic() > deadline:
+                    raise
+                self._clock.sleep(_LOOK_AGAIN_S)
+            else:
+                return
+
+    def _fill(self, colour: Colour) -> None:
+        gl = self._gl
+        gl.viewport(0, 0, self.display.width, self.display.height)
+        gl.disable(_GL_DITHER)
+        # Fixed point keeps round(255 · c / 255), which single precision gives back as the code (OpenGL 2.1, 2.14.9).
+        gl.clear_colour(colour.red / 255, colour.green / 255, colour.blue / 255, 1.0)
+        gl.clear(_GL_COLOUR_BIT)
+
+    def _read_screen(self) -> npt.NDArray[np.uint32]:
+        if self._screen is None:
+            return self._read_buffer(_GL_FRONT)
+        display = self.display
+        return self._screen.read(display.x, display.y, display.width, display.height)
+
+    def _read_buffer(self, buffer: int) -> npt.NDArray[np.uint32]:
+        """Return a buffer of the window as (height, width) uint32, 0xRRGGBB, bottom row first."""
+        display = self.display
+        self._gl.read_buffer(buffer)
+        self._gl.read_pixels(0, 0, display.width, display.height, _GL_BGRA, _GL_8888_REVERSED, self._drawn.ctypes.data)
+        np.bitwise_and(self._drawn, np.uint32(0xFFFFFF), out=self._drawn)
+        return self._drawn
+
+    def _require(self, pixels: npt.NDArray[np.uint32], colour: Colour, subject: str) -> None:
+        expected = colour.red << 16 | colour.green << 8 | colour.blue
+        wrong = pixels != expected
+        if wrong.any():
+            first = int(pixels[wrong][0])
+            found = f"({first >> 16}, {first >> 8 & 255}, {first & 255})"
+            raise DeviceError(
+                f"{subject} {found} in place of ({colour.red}, {colour.green}, {colour.blue}) in "
+                f"{np.count_nonzero(wrong)} of {wrong.size} pixels of display {self.display}; "
+                "look for a window or notification in front, desktop scaling, or a colour filter"
+            )
+
+    def _bent_ramp(self) -> str:
+        try:
+            ramp = self._glfw.get_gamma_ramp(self._monitor)
+        except self._glfw.GLFWError:
+            # This display has none.
+            return ""
+        channels = [np.asarray(channel) for channel in ramp]
+        if any(_is_noise(values) for values in channels):
+            return ""
+        for name, values in zip(("red", "green", "blue"), channels, strict=True):
+            if not values.any():
+                # A server without a ramp of its own keeps zeros; a real one of zeros would be a black picture.
+                continue
+            off = values - np.linspace(0, 1, values.size)
+            worst = int(np.argmax(np.abs(off)))
+            if abs(off[worst]) > RAMP_TOLERANCE:
+                return f"{name} {worst / (values.size - 1):.2f} becomes {values[worst]:.2f}"
+        return ""
+
+    def _require_usable(self) -> None:
+        if not self._open:
+            raise DeviceError(f"display {self.display} was closed; open it again")
+        if threading.get_ident() != self._thread:
+            raise DeviceError(f"display {self.display} belongs to the thread that opened it; use it from there")
+
+
+def _profile_of(glfw: Any, monitor: Any) -> str:
+    """Return the root window's property for a display's profile (ICC Profiles in X Specification 0.4, section 2)."""
+    addresses = [ctypes.addressof(one.contents) for one in glfw.get_monitors()]
+    number = addresses.index(ctypes.addressof(monitor.contents))
+    return "_ICC_PROFILE" if number == 0 else f"_ICC_PROFILE_{number}"
+
+
+def _is_noise(ramp: npt.NDArray[np.float64]) -> bool:
+    """Return whether a gamma ramp goes up and down as none that somebody set: some X servers never write theirs."""
+    way = float(np.abs(np.diff(ramp)).sum())
+    return way > 2 * float(np.ptp(ramp)) and way > 0.1
+
+
+def identify_displays(seconds: float, clock: Clock = _SYSTEM_CLOCK) -> tuple[Display, ...]:
+    """Show on every display its number for a while, and return them.
+
+    Raises
+    ------
+    DeviceError
+        As `FullScreen`.
+    """
+    with contextlib.ExitStack() as opened:
+        displays = list_displays()
+        for display in displays:
+            screen = FullScreen(display.number, clock)
+            opened.callback(screen.close)
+            screen.identify()
+        clock.sleep(seconds)
+    return displays
+
+
+class _Gl:
+    """The functions of OpenGL that fill a window and read it, found at run time."""
+
+    def __init__(self, glfw: ModuleType) -> None:
+        kind: Callable[..., Any] = ctypes.WINFUNCTYPE if sys.platform == "win32" else ctypes.CFUNCTYPE
+        number, enum, real = ctypes.c_int, ctypes.c_uint, ctypes.c_float
+
+        def function(name: str, *arguments: type) -> Callable[..., None]:
+            address = glfw.get_proc_address(name)
+            if not address:
+                raise DeviceError(f"OpenGL has no {name} here; install the graphics driver (Debian: libgl1-mesa-dri)")
+            return kind(None, *arguments)(address)
+
+        self.clear = function("glClear", enum)
+        self.clear_colour = function("glClearColor", real, real, real, real)
+        self.disable = function("glDisable", enum)
+        self.enable = function("glEnable", enum)
+        self.finish = function("glFinish")
+        self.read_buffer = function("glReadBuffer", enum)
+        self.read_pixels = function("glReadPixels", number, number, number, number, enum, enum, ctypes.c_void_p)
+        self.scissor = function("glScissor", number, number, number, number)
+        self.viewport = function("glViewport", number, number, number, number)
+
+
+@contextlib.contextmanager
+def _running() -> Generator[ModuleType]:
+    """Keep GLFW running; it ends when the last who needs it is through."""
+    global _users
+    glfw = _library()
+    if not _users:
+        if sys.platform == "linux":
+            glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
+        try:
+            glfw.init()
+        except glfw.GLFWError as error:
+            raise DeviceError(
+                f"no desktop to show a picture on ({error}); run this on the machine that the projector is connected "
+                "to, logged in there, with DISPLAY set on Linux"
+            ) from error
+        if sys.platform == "linux":
+            outlive(glfw.get_x11_display())
+    _users += 1
+    try:
+        yield glfw
+    finally:
+        _users -= 1
+        if not _users:
+            glfw.terminate()
+
+
+def _library() -> ModuleType:
+    """Return GLFW's module, imported late: to load it asks another process for its version."""
+    if sys.platform == "linux":
+        # The wheel holds two libraries; only the one for X can be told to use it.
+        os.environ.setdefault("PYGLFW_LIBRARY_VARIANT", "x11")
+    try:
+        import glfw
+    except (ImportError, OSError) as error:
+        raise DeviceError(
+            f"GLFW cannot be loaded ({error}); reinstall with: pip install --force-reinstall glfw"
+        ) from error
+    glfw.ERROR_REPORTING = "exception"
+    return glfw
+
+
+def _displays(glfw: ModuleType) -> list[tuple[Display, Any]]:
+    found: list[tuple[int, int, str, Any]] = []
+    for monitor in glfw.get_monitors():
+        x, y = glfw.get_monitor_pos(monitor)
+        name = glfw.get_monitor_name(monitor)
+        found.append((x, y, name.decode("utf-8", "replace") if isinstance(name, bytes) else name, monitor))
+    displays: list[tuple[Display, Any]] = []
+    for number, (x, y, name, monitor) in enumerate(sorted(found, key=lambda one: one[:3]), 1):
+        mode = glfw.get_video_mode(monitor)
+        displays.append((Display(number, name, x, y, mode.size.width, mode.size.height, mode.refresh_rate), monitor))
+    return displays

@@ -1,0 +1,180 @@
+"""Plain colours from a JVC D-ILA projector's own flat field, over its network port.
+
+Laws that hold inside:
+
+- The projector makes the colour itself, 0 … 255 a channel, so no desktop, cable or scaler can change it.
+- A command is ``!``, the unit, text and LF; the projector acknowledges with 06, the unit, the text's first two letters
+  and LF. `show` returns when the raster and all three levels have been acknowledged: the projector says that it obeyed,
+  not what it shows.
+- The projector greets with PJ_OK, wants PJREQ within 5 s and answers PJACK; it serves one controller at a time. A
+  command that meets a connection lost meanwhile is sent once more over a new one.
+
+Not confirmed on hardware: that the raster (SSTP02) is the flat field on every model, that its levels (SSFR, SSFG, SSFB)
+are encoded as video is and pass the picture mode's gamma, and that they last through a lost connection; photograph a
+ramp once, before a session counts on it. Models that ask for a network password (NZ and later) are not served. Killed
+without `close`, the projector goes on showing its last colour: it needs no computer for that.
+
+Source: JVC external control specification for D-ILA projectors, the raster and flat level commands and the network
+handshake.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+
+from drivers.links.link import Link
+from drivers.presenter import BLACK, Colour
+from foundation.clock import Clock, SystemClock
+from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
+
+PORT = 20554
+TIMEOUT_S = 5.0
+GREETING, REQUEST, ACCEPTED, BUSY, REFUSED = b"PJ_OK", b"PJREQ", b"PJACK", b"PJ_NG", b"PJNAK"
+UNIT = b"\x89\x01"
+FLAT_FIELD = b"SSTP02"
+LEVELS = {"red": b"SSFR", "green": b"SSFG", "blue": b"SSFB"}
+MAX_COMMAND = 64
+
+_OPERATION, _ACKNOWLEDGED, _END = b"!", b"\x06", b"\n"
+_SYSTEM_CLOCK = SystemClock()
+
+
+def encode_operation(text: bytes) -> bytes:
+    """Return the bytes of a command that sets something."""
+    return _OPERATION + UNIT + text + _END
+
+
+def encode_acknowledgement(text: bytes) -> bytes:
+    """Return the bytes that acknowledge a command of this text."""
+    return _ACKNOWLEDGED + UNIT + text[:2] + _END
+
+
+def parse_operation(line: bytes) -> bytes:
+    """Return the text of a command, `line` being its bytes up to and with LF.
+
+    Raises
+    ------
+    ProtocolError
+        It is not one.
+    """
+    head = _OPERATION + UNIT
+    if not (line.startswith(head) and line.endswith(_END)):
+        raise ProtocolError(f"{line!r} is no command; expected {head!r}, text and LF")
+    return line[len(head) : -1]
+
+
+def encode_level(channel: str, code: int) -> bytes:
+    """Return the text that sets a channel's level: four hexadecimal digits, capitals."""
+    return LEVELS[channel] + f"{code:04X}".encode("ascii")
+
+
+class JvcFlatField:
+    """A `drivers.presenter.Presenter`; black from the moment it opens.
+
+    Parameters
+    ----------
+    connect
+        Opens a new cable to the network port (`PORT`); called again after the projector hung up.
+    timeout
+        Seconds to wait for each answer.
+    label
+        What messages call it.
+    clock
+        Measures `timeout` across the pieces of an answer.
+
+    Raises
+    ------
+    DeviceError
+        The projector cannot be reached, or does not obey.
+    """
+
+    def __init__(
+        self,
+        connect: Callable[[], Link],
+        timeout: float = TIMEOUT_S,
+        label: str = "the JVC projector",
+        clock: Clock = _SYSTEM_CLOCK,
+    ) -> None:
+        self._connect = connect
+        self._timeout = timeout
+        self._label = label
+        self._clock = clock
+        self._link: Link | None = None
+        self._waiting = b""
+        self._open = True
+        self.show(BLACK)
+
+    def show(self, colour: Colour) -> None:
+        """Fill the picture with exactly `colour`; returns when the projector has acknowledged all of it."""
+        if not self._open:
+            raise DeviceError(f"{self._label} was closed; open the rig again")
+        used = self._link is not None
+        try:
+            self._show(colour)
+        except LinkClosed:
+            if not used:
+                raise
+            # It hangs up on controllers that say nothing for a while.
+            self._show(colour)
+
+    def close(self) -> None:
+        """Leave the picture black and hang up; a second call does nothing."""
+        if not self._open:
+            return
+        # What cannot be reached cannot be darkened either.
+        with contextlib.suppress(DeviceError):
+            self.show(BLACK)
+        self._open = False
+        self._drop()
+
+    def _show(self, colour: Colour) -> None:
+        try:
+            if self._link is None:
+                self._greet()
+            self._operate(FLAT_FIELD)
+            for channel, code in (("red", colour.red), ("green", colour.green), ("blue", colour.blue)):
+                self._operate(encode_level(channel, code))
+        except (LinkError, ProtocolError, DeviceRefused):
+            self._drop()
+            raise
+
+    def _greet(self) -> None:
+        self._link = self._connect()
+        self._waiting = b""
+        self._expect(GREETING)
+        self._link.write(REQUEST, self._timeout)
+        self._expect(ACCEPTED)
+
+    def _operate(self, text: bytes) -> None:
+        assert self._link is not None
+        self._link.write(encode_operation(text), self._timeout)
+        try:
+            self._expect(encode_acknowledgement(text))
+        except LinkTimeout as error:
+            raise LinkTimeout(
+                f"{self._label} does not acknowledge {text.decode('ascii')} within {self._timeout:g} s; check that it "
+                "is on, and that its model knows the flat field"
+            ) from error
+
+    def _expect(self, answer: bytes) -> None:
+        assert self._link is not None
+        deadline = self._clock.monotonic() + self._timeout
+        while len(self._waiting) < len(answer):
+            remaining = deadline - self._clock.monotonic()
+            if remaining <= 0:
+                raise LinkTimeout(f"{self._label} has not finished its answer within {self._timeout:g} s")
+            self._waiting += self._link.read(MAX_COMMAND, remaining)
+        found, self._waiting = self._waiting[: len(answer)], self._waiting[len(answer) :]
+        if found == answer:
+            return
+        if found == BUSY:
+            raise DeviceRefused(f"{self._label} serves another controller; close that one")
+        if found == REFUSED:
+            raise DeviceRefused(f"{self._label} wants a network password, which is not supported; switch it off there")
+        raise ProtocolError(f"{self._label} answers {found!r} in place of {answer!r}; check that it is a JVC D-ILA")
+
+    def _drop(self) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()

@@ -1,0 +1,184 @@
+"""Plain colours from the test pattern generator of a TI LightCrafter 4500 (DLPC350), 6500 or 9000 (DLPC900).
+
+Laws that hold inside:
+
+- The controller makes the colour itself, so no desktop, cable or scaler can change it. It takes 10 bits a channel;
+  an 8-bit code c becomes round(c · 1023 / 255).
+- `show` returns when the controller gives back the colour, and says that it shows it.
+- After a fault of cable or protocol the connection is dropped; the next `show` makes a new one and sets everything up
+  again. An answer that comes late never meets a later question: every one carries its question's number.
+
+Not confirmed on hardware: the USB numbers of the DLPC900 boards, that the DLPC350 gives the pattern's colours back when
+asked, and whether the pattern passes the degamma of video mode (`Colour` is then encoded as video is, otherwise linear:
+photograph a ramp once, before a session counts on it). Killed without `close`, the projector goes on showing its last
+colour: it needs no computer for that.
+
+Sources: TI DLPU010 and DLPU018; see `drivers.display.lightcrafter_wire`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from drivers.display.lightcrafter_wire import (
+    MODE_VIDEO,
+    PATTERN_SOLID,
+    SOURCE_TEST_PATTERN,
+    Command,
+    Request,
+    encode_colour,
+    encode_request,
+    parse_colour,
+    parse_reply,
+)
+from drivers.links.hid import Reports, open_hid
+from drivers.presenter import BLACK, Colour
+from foundation.clock import Clock, SystemClock
+from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
+
+if TYPE_CHECKING:
+    from usb.backend import IBackend
+
+VENDOR = 0x0451
+PRODUCTS = {"DLPC350": 0x6401, "DLPC900": 0xC900}
+"""USB product numbers by controller."""
+TIMEOUT_S = 2.0
+SWITCHING_S = 3.0
+"""How long the controller may take to change its mode; DLPC900 takes about 0.3 s."""
+
+_LOOK_AGAIN_S = 0.05
+_STALE_REPLIES = 8
+_SETTLED = (
+    # What is set, to what, and which bits of the answer say so (the rest tells of other things).
+    (Command.TEST_PATTERN, PATTERN_SOLID, 0x0F),
+    (Command.INPUT_SOURCE, SOURCE_TEST_PATTERN, 0x07),
+    (Command.DISPLAY_MODE, MODE_VIDEO, 0x03),
+)
+_SYSTEM_CLOCK = SystemClock()
+
+
+def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = None) -> Reports:
+    """Open the one LightCrafter on USB, of whatever kind; `serial` tells it from its like.
+
+    Raises
+    ------
+    LinkClosed
+        There is none, or libusb is not installed.
+    InputError
+        There are several.
+    DeviceRefused
+        It may not be opened, or another program holds it.
+    """
+    for controller, product in PRODUCTS.items():
+        with contextlib.suppress(LinkClosed):
+            return open_hid(VENDOR, product, name=f"LightCrafter {controller}", serial=serial, backend=backend)
+    raise LinkClosed(
+        f"no LightCrafter{f' with serial number {serial}' if serial else ''} on USB "
+        f"({VENDOR:04x}:{' or '.join(f'{product:04x}' for product in PRODUCTS.values())}); "
+        "switch it on, check its cable, and that libusb is installed"
+    )
+
+
+class LightCrafter:
+    """A `drivers.presenter.Presenter`; black from the moment it opens.
+
+    Parameters
+    ----------
+    connect
+        Opens the cable, for instance `find_lightcrafter`; called again after a fault.
+    clock
+        Waits while the controller changes its mode.
+
+    Raises
+    ------
+    DeviceError
+        The controller cannot be reached, or does not do as it is told.
+    """
+
+    def __init__(self, connect: Callable[[], Reports], clock: Clock = _SYSTEM_CLOCK) -> None:
+        self._connect = connect
+        self._clock = clock
+        self._reports: Reports | None = None
+        self._sequence = 0
+        self._open = True
+        self.show(BLACK)
+
+    def show(self, colour: Colour) -> None:
+        """Fill the picture with exactly `colour`; returns when the controller confirms it."""
+        if not self._open:
+            raise DeviceError("the LightCrafter was closed; open the rig again")
+        try:
+            fresh = self._reports is None
+            if self._reports is None:
+                self._reports = self._connect()
+            # The colour comes first, so that nothing else is seen when the generator is switched to.
+            self._write(Command.PATTERN_COLOUR, encode_colour(colour))
+            if fresh:
+                for command, value, _ in _SETTLED:
+                    self._write(command, bytes([value]))
+            self._confirm(colour)
+        except (LinkError, ProtocolError):
+            self._drop()
+            raise
+
+    def close(self) -> None:
+        """Leave the picture black and release the cable; a second call does nothing."""
+        if not self._open:
+            return
+        # What cannot be reached cannot be darkened either.
+        with contextlib.suppress(DeviceError):
+            self.show(BLACK)
+        self._open = False
+        self._drop()
+
+    def _confirm(self, colour: Colour) -> None:
+        deadline = self._clock.monotonic() + SWITCHING_S
+        while True:
+            shown = parse_colour(self._read(Command.PATTERN_COLOUR))
+            expected = parse_colour(encode_colour(colour))
+            reason = f"colour {shown} in place of {expected} of 1023" if shown != expected else self._unsettled()
+            if not reason:
+                return
+            if self._clock.monotonic() > deadline:
+                raise DeviceError(
+                    f"the LightCrafter confirms {reason}; close other control programs, then switch it off and on"
+                )
+            self._clock.sleep(_LOOK_AGAIN_S)
+
+    def _unsettled(self) -> str:
+        for command, value, mask in _SETTLED:
+            answer = self._read(command)
+            if not answer:
+                raise ProtocolError(f"the LightCrafter answers nothing to {command:#06x}; expected a byte")
+            if answer[0] & mask != value:
+                return f"{answer[0] & mask} in place of {value} for {command.name.lower().replace('_', ' ')}"
+        return ""
+
+    def _write(self, command: Command, data: bytes) -> None:
+        self._exchange(command, data, reads=False)
+
+    def _read(self, command: Command) -> bytes:
+        return self._exchange(command, b"", reads=True)
+
+    def _exchange(self, command: Command, data: bytes, *, reads: bool) -> bytes:
+        assert self._reports is not None
+        self._sequence = (self._sequence + 1) % 256
+        self._reports.write(encode_request(Request(self._sequence, command, data, reads)), TIMEOUT_S)
+        for _ in range(_STALE_REPLIES):
+            reply = parse_reply(self._reports.read(TIMEOUT_S))
+            if reply.sequence != self._sequence:
+                continue
+            if reply.refused:
+                raise DeviceRefused(
+                    f"{self._reports.label} refuses command {command:#06x} ({command.name.lower()}); "
+                    "check that its firmware offers test patterns"
+                )
+            return reply.data
+        raise LinkTimeout(f"{self._reports.label} answers other questions than ours; close other control programs")
+
+    def _drop(self) -> None:
+        reports, self._reports = self._reports, None
+        if reports is not None:
+            reports.close()

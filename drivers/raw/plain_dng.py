@@ -1,0 +1,167 @@
+"""What a DNG states of its sensor, and the counts of one that holds them as memory does.
+
+Rules that hold inside:
+
+- `read_plainly` gives what LibRaw would, or None; what it is not sure of it leaves to LibRaw.
+- Rows and columns of colour filters and of black levels count from the active area's corner (DNG 1.7, ActiveArea).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.tiff.reading import CFA, Directory, Tag
+
+BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+
+
+@dataclass(frozen=True)
+class Area:
+    """A rectangle of photosites: first row and column, counted from 0, and how many of each."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+
+@dataclass(frozen=True, eq=False)
+class PlainDng:
+    """A DNG whose counts are in the file as in memory.
+
+    Attributes
+    ----------
+    sensor
+        (RH, RW) uint16, read-only, a view into the file's bytes.
+    active
+        Its visible area.
+    pattern
+        Colours of the 2×2 block at the visible top-left.
+    black
+        (2, 2) float64 counts for that block, read-only.
+    white_level
+        Counts.
+    iso, aperture, shutter_s
+        The exposure; None where it is not stated.
+    """
+
+    sensor: NDArray[np.uint16]
+    active: Area
+    pattern: str
+    black: NDArray[np.float64]
+    white_level: int
+    iso: int | None
+    aperture: float | None
+    shutter_s: float | None
+
+
+_PLAIN: dict[Tag, tuple[tuple[int, ...], ...]] = {
+    Tag.COMPRESSION: ((1,),),
+    Tag.PHOTOMETRIC: ((CFA,),),
+    Tag.BITS_PER_SAMPLE: ((16,),),
+    Tag.SAMPLES_PER_PIXEL: ((1,), ()),
+    Tag.CFA_REPEAT_DIM: ((2, 2),),
+    Tag.CFA_PLANE_COLOR: ((0, 1, 2), ()),
+    Tag.CFA_LAYOUT: ((1,), ()),
+    Tag.LINEARIZATION_TABLE: ((),),
+    Tag.TILE_OFFSETS: ((),),
+}
+"""What a plain file states, or does not state."""
+
+
+def read_plainly(data: bytes | memoryview, directories: Sequence[Directory]) -> PlainDng | None:
+    """Return what a plain DNG holds; None for any other file.
+
+    LibRaw copies such counts one by one, which takes longer than all that is done with a frame afterwards.
+
+    Parameters
+    ----------
+    data
+        The file's bytes.
+    directories
+        Its TIFF directories.
+    """
+    pixels = raw_pixels(directories)
+    if pixels is None or data[:2] != b"II" or sys.byteorder != "little":
+        return None
+    if any(pixels.integers(tag) not in allowed for tag, allowed in _PLAIN.items()):
+        return None
+    size, pattern = (*pixels.integers(Tag.LENGTH), *pixels.integers(Tag.WIDTH)), pixels.integers(Tag.CFA_PATTERN)
+    white, black, strips = pixels.integers(Tag.WHITE_LEVEL), stated_black(pixels), pixels.extents()
+    letters = "".join("RGB"[index] for index in pattern if index < 3)
+    if len(size) != 2 or letters not in BAYER_PATTERNS or len(white) != 1 or black is None or not strips:
+        return None
+    active, start = active_area(pixels, size), strips[0][0]
+    in_a_row = all(offset + length == following for (offset, length), (following, _) in pairwise(strips))
+    enough = sum(length for _, length in strips) == 2 * size[0] * size[1]
+    if active is None or not in_a_row or not enough or start % 2:
+        return None
+    sensor = np.frombuffer(data, dtype=np.uint16, count=size[0] * size[1], offset=start).reshape(size)
+    black = np.array(black)
+    black.setflags(write=False)
+    iso, aperture, shutter = (_exposure(directories, tag) for tag in (Tag.ISO, Tag.APERTURE, Tag.SHUTTER))
+    return PlainDng(
+        sensor,
+        active,
+        letters,
+        black,
+        white[0],
+        round(iso) if iso else None,
+        (round(aperture, 4) or None) if iso else None,
+        (shutter or None) if iso else None,
+    )
+
+
+def _exposure(directories: Sequence[Directory], tag: Tag) -> float:
+    """Return the first number of `tag` in any directory, 0 if none has it."""
+    found = (directory.numbers(tag) for directory in directories)
+    return next((numbers[0] for numbers in found if numbers), 0.0)
+
+
+def raw_pixels(directories: Sequence[Directory]) -> Directory | None:
+    """Return the directory that describes the raw pixels: the widest with a colour filter array, or CR2's own."""
+    found = [
+        directory
+        for directory in directories
+        if directory.integers(Tag.PHOTOMETRIC) == (CFA,) or directory.integers(Tag.CR2_SLICES)
+    ]
+    return max(found, key=lambda directory: directory.integers(Tag.WIDTH), default=None)
+
+
+def stated_black(pixels: Directory | None) -> NDArray[np.float64] | None:
+    """Return DNG's BlackLevel for the visible block, (2, 2) float64; None where LibRaw has to say it.
+
+    LibRaw cuts the level to an integer. The rows and columns of BlackLevel count from the active area's corner
+    (DNG 1.7, BlackLevel); deltas per row and column enter by their mean, as in LibRaw.
+    """
+    if pixels is None or not pixels.numbers(Tag.BLACK_LEVEL):
+        return None
+    levels = np.array(pixels.numbers(Tag.BLACK_LEVEL), dtype=np.float64)
+    shape = pixels.integers(Tag.BLACK_LEVEL_REPEAT_DIM) or (1, 1)
+    if shape not in ((1, 1), (1, 2), (2, 1), (2, 2)) or levels.size != shape[0] * shape[1]:
+        return None
+    deltas = [pixels.numbers(tag) for tag in (Tag.BLACK_LEVEL_DELTA_H, Tag.BLACK_LEVEL_DELTA_V)]
+    extra = sum(float(np.mean(delta)) for delta in deltas if delta)
+    return np.broadcast_to(levels.reshape(shape), (2, 2)) + extra
+
+
+def active_area(pixels: Directory | None, sensor: tuple[int, int]) -> Area | None:
+    """Return the visible area that a DNG states; LibRaw would make its top even for a Canon, dcraw does not."""
+    areas = stated_areas(pixels, Tag.ACTIVE_AREA, sensor)
+    return areas[0] if areas and min(areas[0].height, areas[0].width) >= 2 else None
+
+
+def stated_areas(pixels: Directory | None, tag: Tag, sensor: tuple[int, int]) -> tuple[Area, ...]:
+    """Return the rectangles of `tag`, told as top, left, bottom, right, that lie on the sensor."""
+    edges = () if pixels is None else pixels.integers(tag)
+    return tuple(
+        Area(top, left, bottom - top, right - left)
+        for top, left, bottom, right in zip(*(iter(edges),) * 4, strict=False)
+        if 0 <= top < bottom <= sensor[0] and 0 <= left < right <= sensor[1]
+    )

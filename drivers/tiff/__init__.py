@@ -1,0 +1,1 @@
+"""TIFF containers: directories and tags, read and written."""

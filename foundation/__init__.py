@@ -1,0 +1,1 @@
+"""What every package stands on: errors, time, the terminal, whole files, and numerics that belong to no floor."""

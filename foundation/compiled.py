@@ -1,0 +1,68 @@
+"""Machine code from Python functions: compiled for the processor at hand at the first call, kept on disk for the next.
+
+A fresh machine needs no compiler: numba brings LLVM with it (`docs/decisions/0010-compiled-kernel.md`). Compiled
+functions hold no state and no lock and release the interpreter's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import CellType, FunctionType
+from typing import Any, Final, TypeVar, cast
+
+import numba
+
+_ROOT: Final = Path(__file__).parents[1]
+_IMPORT: Final = re.compile(r"^from ([a-z_][.\w]*) import (\([^)]*\)|.*)", re.MULTILINE)
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def compiled(function: _Function) -> _Function:
+    """Compile `function`, keeping the machine code on disk where a folder for it can be written."""
+    marked = _marked(function)
+    try:
+        return numba.njit(nogil=True, error_model="numpy", cache=True)(marked)
+    except RuntimeError:
+        # Neither the package's folder nor the home folder is writable; compiling anew costs seconds a start.
+        return numba.njit(nogil=True, error_model="numpy")(marked)
+
+
+def _marked(function: _Function) -> _Function:
+    """Return `function` with a digest of all code it may contain as its closure.
+
+    numba knows kept machine code again by the function's own file and by what it closes over, not by the functions of
+    other files that were compiled into it. An unused cell with the digest of those files makes good for that.
+    """
+    code = function.__code__
+    if code.co_freevars:
+        raise ValueError(f"{function.__qualname__} closes over {code.co_freevars}; compile module functions only")
+    digest = hashlib.sha256()
+    for file in sorted(_files_behind(Path(code.co_filename), set())):
+        digest.update(file.read_bytes())
+    marked = FunctionType(
+        code.replace(co_freevars=("sources",)),
+        function.__globals__,
+        function.__name__,
+        function.__defaults__,
+        (CellType(digest.hexdigest()),),
+    )
+    marked.__module__, marked.__qualname__ = function.__module__, function.__qualname__
+    marked.__doc__ = function.__doc__
+    return cast("_Function", marked)
+
+
+def _files_behind(file: Path, found: set[Path]) -> set[Path]:
+    """Return `file` and the files of this software that it imports from, and so on."""
+    if file in found or not file.is_file():
+        return found
+    found.add(file)
+    for module, names in _IMPORT.findall(file.read_text(encoding="utf-8")):
+        folder = _ROOT.joinpath(*module.split("."))
+        _files_behind(folder.with_suffix(".py"), found)
+        for name in re.findall(r"\w+", names):
+            _files_behind(folder / f"{name}.py", found)
+    return found

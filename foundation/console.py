@@ -1,0 +1,154 @@
+"""The terminal's side of every command: errors become one sentence and an exit code.
+
+Commands are thin: parse, build, call, print. `run` is the one place where an error turns into text.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
+
+from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
+from foundation.files import remedy_of
+
+EXIT_CODES = (
+    "Exit codes: 0 done; 2 something given cannot be used; 3 a device failed; 4 the data are not good enough; "
+    "5 the disk is full or read-only; 130 interrupted."
+)
+
+
+def say_error(message: str) -> None:
+    """Print one error line to stderr; where nobody reads it any more, the exit code says enough."""
+    with suppress(OSError):
+        print(f"error: {message}", file=sys.stderr)
+
+
+def run(command: Callable[[], object]) -> int:
+    """Call `command` and return the exit code; a foreseeable fault is one line on stderr, no traceback."""
+    code = _outcome(command)
+    try:
+        # What is still to be printed fails here, where it can be judged, and not while the interpreter ends.
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _abandon_stdout()
+    except OSError as error:
+        say_error(f"cannot print: {error.strerror}; give the output another place and run again")
+        _abandon_stdout()
+        return code or StorageError.exit_code
+    return code
+
+
+def _outcome(command: Callable[[], object]) -> int:
+    try:
+        command()
+    except CropError as error:
+        say_error(str(error))
+        return error.exit_code
+    except KeyboardInterrupt:
+        return _interrupted()
+    except BrokenPipeError:
+        _abandon_stdout()
+        return 0
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EROFS, errno.EDQUOT):
+            say_error(f"cannot write {error.filename or 'to the disk'}: {error.strerror}; free space and run again")
+            return StorageError.exit_code
+        remedy = remedy_of(error)
+        if remedy is None or not isinstance(error.filename, str | bytes):
+            raise
+        say_error(f"cannot use {os.fsdecode(error.filename)}: {error.strerror}; {remedy}")
+        return InputError.exit_code
+    except MemoryError as error:
+        say_error(f"not enough memory ({str(error) or 'none is left'}); use fewer --workers, or smaller pictures")
+        return InputError.exit_code
+    except SystemExit as error:
+        if error.code == EXIT_INTERRUPTED:
+            return _interrupted()
+        return error.code if isinstance(error.code, int) else int(error.code is not None)
+    return 0
+
+
+def _abandon_stdout() -> None:
+    """Print into nothing from now on: the reader of our output left (head, a closed pager), which is no fault."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _interrupted() -> int:
+    say_error("interrupted; run the same command again to go on")
+    return EXIT_INTERRUPTED
+
+
+@contextmanager
+def orderly_end() -> Generator[None]:
+    """End as by Ctrl-C, devices closed, where the block is told to end: by `kill`, or by a terminal that went away.
+
+    A hang-up that is ignored already, as under `nohup`, stays ignored.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    told = False
+
+    def end(number: int, frame: object) -> None:
+        nonlocal told
+        told = True
+        raise KeyboardInterrupt
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    taken = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
+    for number in taken:
+        signal.signal(number, end)
+    try:
+        yield
+    except OSError as error:
+        if not told:
+            raise
+        # A terminal that went away does not take the last state of a bar either.
+        raise KeyboardInterrupt from error
+    finally:
+        for number, handler in taken.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def progress(unit: str) -> Generator[Callable[[int, int], None]]:
+    """Show a progress bar with the time left on stderr while the block runs.
+
+    Parameters
+    ----------
+    unit
+        What is counted: "frames".
+
+    Yields
+    ------
+    callable
+        Takes how many are done and how many there are.
+    """
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(unit),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    # What is printed meanwhile appears above the bar, but not on the terminal where standard output goes elsewhere.
+    with Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()) as bar:
+        task = bar.add_task(unit, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -1,0 +1,262 @@
+"""Files and folders that appear whole or not at all.
+
+Everything that CroP writes under a final name goes through here: written beside its place under a hidden name,
+flushed to the disk, then renamed. A crash leaves a hidden leftover, never a half file; nothing is ever overwritten
+that the caller did not mean to replace.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from io import BufferedRandom
+from pathlib import Path
+from typing import TypeGuard
+
+from foundation.errors import InputError, StorageError
+
+_PARTIAL = ".partial"
+_PART_IS_A_FILE = "a part of that path is a file, not a folder; name another"
+_REMEDIES = {
+    errno.EACCES: "ask its owner for permission, or name another place",
+    errno.EPERM: "ask its owner for permission, or name another place",
+    errno.EISDIR: "a folder is called so; name a file",
+    errno.ENOTDIR: _PART_IS_A_FILE,
+    errno.ENAMETOOLONG: "name it shorter",
+    errno.ELOOP: "links there lead in a circle; name the place that is meant",
+}
+_DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EACCES, errno.EPERM}
+
+
+def partial_path(path: Path) -> Path:
+    """Return the hidden name under which `path` is written before it is complete."""
+    return path.with_name(f".{path.name}{_PARTIAL}")
+
+
+def is_partial(path: Path) -> bool:
+    """Return whether `path` is a leftover of a write that never finished."""
+    return path.name.startswith(".") and path.name.endswith(_PARTIAL)
+
+
+def remedy_of(error: OSError) -> str | None:
+    """Return what helps against a fault of the path that was named; None if the fault is another."""
+    return _REMEDIES.get(error.errno or 0)
+
+
+def storage_error(path: Path, error: OSError) -> InputError | StorageError:
+    """Return what went wrong at `path` as one sentence with its remedy; an InputError if the name is to blame."""
+    remedy = remedy_of(error)
+    by_name = remedy is not None and not isinstance(error, PermissionError)
+    return (InputError if by_name else StorageError)(
+        f"cannot write {path}: {error.strerror or error}; "
+        f"{remedy or 'free space or choose another disk, then run the same command again'}"
+    )
+
+
+def _is_ours(error: BaseException, path: Path) -> TypeGuard[OSError]:
+    """Return whether `error` is about writing `path`, rather than about something that the caller read meanwhile."""
+    if not isinstance(error, OSError):
+        return False
+    if not isinstance(error.filename, str | bytes):
+        # A write to an open file does not say which one; these numbers are no fault of anything but a disk.
+        return error.errno in _DISK_FAULTS
+    about, partial = Path(os.fsdecode(error.filename)), partial_path(path)
+    return about in (path, partial, *path.parents) or partial in about.parents
+
+
+def make_folder(folder: Path, of: Path | None = None) -> None:
+    """Make a folder and those above it, where they are missing.
+
+    Parameters
+    ----------
+    folder
+        What to make.
+    of
+        What the folder is made for, named in the messages; the folder itself if None.
+
+    Raises
+    ------
+    InputError
+        The path cannot be a folder's: a part of it is a file, or it is too long.
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    path = folder if of is None else of
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
+    except OSError as error:
+        raise storage_error(path, error) from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in `folder` durable; does nothing where the system cannot."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(handle)
+    except OSError:
+        pass
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def whole_file(path: Path, final: Callable[[], Path] | None = None) -> Generator[BufferedRandom]:
+    """Open `path` for writing (and reading back) so that it appears complete, or not at all.
+
+    An existing file of that name is replaced at the very end.
+
+    Parameters
+    ----------
+    path
+        The final name, or what it begins with if `final` is given.
+    final
+        Called when the content is complete and on the disk; returns the final name, in the same folder. For names
+        that are known only by then, such as a raw file's suffix.
+
+    Raises
+    ------
+    InputError
+        `path` is a folder, too long, or below a file.
+    StorageError
+        The disk is full, read-only or gone. Nothing is left behind.
+    """
+    partial = partial_path(path)
+    make_folder(path.parent, path)
+    try:
+        with partial.open("w+b") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(final() if final else path)
+        sync_folder(path.parent)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        if _is_ours(error, path):
+            raise storage_error(path, error) from error
+        raise
+
+
+def read_whole(path: Path) -> memoryview:
+    """Return a large file's bytes, to be read only: for a `bytes` object the system clears each page of memory first.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    """
+    import numpy as np
+
+    with path.open("rb", buffering=0) as stream:
+        # Large arrays are of large pages, a five-hundredth of the faults.
+        room = np.empty(os.fstat(stream.fileno()).st_size, np.uint8).data
+        filled = 0
+        while filled < len(room) and (count := stream.readinto(room[filled:])):
+            filled += count
+        rest = stream.read()
+    return memoryview(bytes(room[:filled]) + rest) if rest else room[:filled].toreadonly()
+
+
+def write_whole(path: Path, data: bytes | str) -> None:
+    """Write `data` (text as UTF-8) to `path`, complete or not at all; see `whole_file`."""
+    with whole_file(path) as stream:
+        stream.write(data.encode() if isinstance(data, str) else data)
+
+
+def require_free(path: Path, what: str) -> None:
+    """Refuse when `path` exists and is not an empty folder.
+
+    Raises
+    ------
+    InputError
+        Something is there already; the message says how to go on.
+    """
+    if not path.is_dir() or any(path.iterdir()):
+        require_free_file(path, what)
+
+
+def require_free_file(path: Path, what: str) -> None:
+    """Refuse when `path` exists, be it an empty folder.
+
+    Raises
+    ------
+    InputError
+        Something is there already; the message says how to go on.
+    """
+    if path.exists() or path.is_symlink():
+        raise InputError(f"{path} already exists; name another place for {what}, or remove what is there")
+
+
+def publish_folder(folder: Path, path: Path, what: str) -> None:
+    """Give a folder that is complete its final name, durably.
+
+    Parameters
+    ----------
+    folder
+        Complete and on the disk, beside its final place.
+    path
+        The final name; must be free, or an empty folder.
+    what
+        What the folder holds, for the message.
+
+    Raises
+    ------
+    InputError
+        `path` is taken.
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    require_free(path, what)
+    try:
+        folder.replace(path)
+    except OSError as error:
+        raise storage_error(path, error) from error
+    sync_folder(path.parent)
+
+
+@contextmanager
+def whole_folder(path: Path, what: str) -> Generator[Path]:
+    """Build a folder under a hidden name and give it its final name when the block ends well.
+
+    Parameters
+    ----------
+    path
+        The final name; must be free, or an empty folder.
+    what
+        What the folder holds, for the message: "the table", "the dataset".
+
+    Yields
+    ------
+    Path
+        The hidden folder to fill.
+
+    Raises
+    ------
+    InputError
+        `path` is taken.
+    StorageError
+        The disk is full, read-only or gone. Nothing is left behind.
+    """
+    require_free(path, what)
+    partial = partial_path(path)
+    make_folder(path.parent, path)
+    try:
+        if partial.exists():
+            shutil.rmtree(partial)
+        partial.mkdir()
+        yield partial
+        publish_folder(partial, path, what)
+    except BaseException as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        if _is_ours(error, path):
+            raise storage_error(path, error) from error
+        raise

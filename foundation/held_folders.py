@@ -1,0 +1,135 @@
+"""Folders that one program works in at a time, whatever is made there: a session, a table, a dataset.
+
+The lock is advisory (`flock(2)`) and lies on the folder itself, so that a program that is killed leaves none behind.
+Network file systems refuse to lock a folder (`EBADF` on NFS, where `flock` needs write access); a file in it is locked
+there instead. Where the file system has no locks at all, the work goes on with a warning: nobody else may work there,
+and nothing can see to it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import logging
+import os
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Final
+
+from foundation.errors import InputError
+from foundation.files import make_folder, storage_error
+
+LOCK_FILE: Final = ".lock"
+"""Name of the file that is locked where a folder cannot be."""
+
+_NO_LOCKS: Final = {errno.ENOLCK, errno.EBADF, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
+"""What a file system answers that cannot lock what it was asked to."""
+
+_log = logging.getLogger(__name__)
+
+
+class FolderLock:
+    """The hold on a folder; given by `held_folder`.
+
+    Parameters
+    ----------
+    handle
+        Open file descriptor of what is locked; None where the file system has no locks.
+    """
+
+    def __init__(self, handle: int | None) -> None:
+        self._handle = handle
+
+    def share(self) -> None:
+        """Let others hold the folder too, who ask for no more than a share of it."""
+        if self._handle is not None:
+            with contextlib.suppress(OSError):
+                fcntl.flock(self._handle, fcntl.LOCK_SH)
+
+
+@contextmanager
+def held_folder(folder: Path, busy: str, share_if: Callable[[], bool] | None = None) -> Generator[FolderLock]:
+    """Hold a folder while the block runs; it is made if it is not there.
+
+    Parameters
+    ----------
+    folder
+        What to hold.
+    busy
+        The message where another program holds it.
+    share_if
+        Where given, another program's hold is waited for until it is shared (`FolderLock.share`), and joined if this
+        returns true then; if not, the attempt begins anew.
+
+    Raises
+    ------
+    InputError
+        Another program holds the folder, or its path cannot be one.
+    StorageError
+        The folder cannot be made or opened.
+    """
+    while True:
+        make_folder(folder)
+        with ExitStack() as opened:
+            try:
+                place = _opened(folder, os.O_RDONLY, opened)
+                handle, together = _locked(place, folder, share_if is not None, opened)
+            except FileNotFoundError:
+                continue  # Another program gave the folder its final name between two calls.
+            except BlockingIOError as error:
+                raise InputError(busy) from error
+            except OSError as error:
+                raise storage_error(folder, error) from error
+            if not _is_at(place, folder) or (together and share_if is not None and not share_if()):
+                continue
+            yield FolderLock(handle)
+            return
+
+
+def _opened(path: Path, flags: int, opened: ExitStack) -> int:
+    handle = os.open(path, flags, 0o666)
+    opened.callback(os.close, handle)
+    return handle
+
+
+def _locked(place: int, folder: Path, wait: bool, opened: ExitStack) -> tuple[int | None, bool]:
+    """Lock the open folder, else a file in it; return what is locked, and whether it is held together with others.
+
+    Raises
+    ------
+    BlockingIOError
+        Another program holds it, and it is not to be waited for.
+    """
+    for on_a_file in (False, True):
+        try:
+            handle = _opened(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, opened) if on_a_file else place
+            return handle, _lock(handle, wait)
+        except BlockingIOError:
+            raise
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+    _log.warning("%s: this file system has no locks; see to it that no other program works there", folder)
+    return None, False
+
+
+def _lock(handle: int, wait: bool) -> bool:
+    """Hold alone, or together with others where `wait`; return whether it is held together."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        if not wait:
+            raise
+        fcntl.flock(handle, fcntl.LOCK_SH)
+        return True
+    return False
+
+
+def _is_at(handle: int, folder: Path) -> bool:
+    """Return whether the open folder is still the one of that name; another program may have finished it."""
+    try:
+        return os.path.samestat(os.fstat(handle), folder.stat())
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,43 @@
+"""Scale and weights that a few outliers do not move.
+
+P. J. Huber, E. M. Ronchetti, *Robust Statistics*, 2nd edition, chapters 5 and 7.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+MAD_TO_SIGMA: Final = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation: 1 / Φ⁻¹(3/4)."""
+
+MEDIAN_ERROR: Final = 1.2533
+"""Standard error of the median of many normal values over that of their mean: √(π/2)."""
+
+_HUBER_SIGMAS: Final = 2.0
+"""Residuals up to twice their usual size keep full weight; 95 % of normal ones do."""
+
+
+def sigma_of(residual: npt.NDArray[np.floating]) -> float:
+    """Return the standard deviation of normal residuals about zero, of any shape, by the median of their sizes."""
+    return MAD_TO_SIGMA * float(np.median(np.abs(residual)))
+
+
+def huber_weights(size: npt.NDArray[np.float64], sigma: float) -> npt.NDArray[np.float64]:
+    """Return Huber's weights 0 … 1, of the shape of `size`.
+
+    Parameters
+    ----------
+    size
+        Absolute residuals.
+    sigma
+        Their usual size, > 0 (`sigma_of`); residuals beyond twice that weigh in inverse proportion to their size.
+    """
+    return np.minimum(1, _HUBER_SIGMAS * sigma / np.maximum(size, 1e-12))
+
+
+def biweight(size: npt.NDArray[np.float64], sigma: float, cut: float = 6.0) -> npt.NDArray[np.float64]:
+    """Return Tukey's biweights 0 … 1, of the shape of `size`; 0 beyond `cut` times sigma."""
+    return np.asarray(np.maximum(1 - (size / (cut * sigma)) ** 2, 0) ** 2, dtype=np.float64)

@@ -1,0 +1,157 @@
+"""The contact sheet: a page of tone-mapped previews, one row a source picture, one column a light."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.files import write_whole
+from generator.dataset.production.records import Entry, Light, Triple
+from generator.dataset.reader import Dataset
+from generator.lights.lighting import parse_mixture
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MAX_ROWS = 12
+MAX_COLUMNS = 8
+_PAPER = "#16171a"
+_INK = "#e8e6e1"
+_FAINT = "#8d8f96"
+
+
+def contact_sheet(dataset: Dataset, max_rows: int = MAX_ROWS, max_columns: int = MAX_COLUMNS) -> npt.NDArray[np.uint8]:
+    """Return the contact sheet of a dataset as a picture (H, W, 3) uint8.
+
+    Of more sources than `max_rows`, or more lights a source than `max_columns`, an even choice is shown.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(_draw(dataset, max_rows, max_columns))
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def save_contact_sheet(dataset: Dataset, path: Path, max_rows: int = MAX_ROWS, max_columns: int = MAX_COLUMNS) -> None:
+    """Write the contact sheet of a dataset as a PNG file."""
+    import cv2
+
+    sheet = contact_sheet(dataset, max_rows, max_columns)
+    write_whole(path, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
+
+
+def _even(count: int, most: int) -> list[int]:
+    """Return at most `most` numbers of 0 … count − 1, first and last among them, evenly spread."""
+    return sorted({round(place) for place in np.linspace(0, count - 1, min(count, most))})
+
+
+def _load(dataset: Dataset, entry: Entry) -> npt.NDArray[np.uint8]:
+    import cv2
+
+    preview = dataset.read_preview(entry)
+    if preview is not None:
+        picture = cv2.imdecode(np.frombuffer(preview, np.uint8), cv2.IMREAD_COLOR_RGB)
+        if picture is not None:
+            return np.asarray(picture, dtype=np.uint8)
+    from generator.pictures.preview import preview_of
+
+    return preview_of(dataset.read_image(entry), dataset.description.table.white_level)
+
+
+def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Circle
+
+    rows: dict[str, list[Entry]] = {}
+    for entry in dataset.entries:
+        rows.setdefault(entry.source, []).append(entry)
+    names = [list(rows)[place] for place in _even(len(rows), max_rows)]
+    columns = _even(max(len(rows[name]) for name in names), max_columns)
+    grid = [[rows[name][place] for place in columns if place < len(rows[name])] for name in names]
+    pictures = [[_load(dataset, entry) for entry in line] for line in grid]
+    lights = len({light for entry in dataset.entries for light in entry.lights})
+    table_lights = {light.illumination: light for light in dataset.description.lights}
+    named = {str(number): light.label for number, light in table_lights.items()}
+    shared = all([entry.lights for entry in line] == [entry.lights for entry in grid[0]] for line in grid)
+
+    # All in inches; a cell keeps the aspect of the widest picture and rows are as high as theirs need.
+    cell, gap, margin, caption = 1.75, 0.12, 0.4, 0.26
+    heights = [max(picture.shape[0] / picture.shape[1] for picture in line) * cell for line in pictures]
+    head = 1.0 + (0.42 if shared else 0.0)
+    below = gap + 0.2 if shared else gap + caption + 0.2
+    width = 2 * margin + len(columns) * cell + (len(columns) - 1) * gap
+    width = max(width, 5.2)
+    height = head + sum(heights) + len(heights) * below + 0.55
+    # Any: matplotlib's type hints leave keyword arguments open.
+    figure: Any = Figure(figsize=(width, height), dpi=150, facecolor=_PAPER)
+
+    def put(x: float, y: float, words: str, size: float, colour: str = _INK, **style: str) -> None:
+        figure.text(
+            x / width,
+            1 - y / height,
+            words,
+            # A name may hold dollar signs.
+            {"fontsize": size, "color": colour, "va": "baseline", "parse_math": False, **style},
+        )
+
+    def dot(x: float, y: float, light: str) -> None:
+        radius = 0.055
+        axes = figure.add_axes((x / width, 1 - (y + radius) / height, 2 * radius / width, 2 * radius / height))
+        axes.set_xlim(-1.15, 1.15)
+        axes.set_ylim(-1.15, 1.15)
+        axes.axis("off")
+        axes.add_patch(Circle((0, 0), 1, facecolor=_colour(light, table_lights), edgecolor=_FAINT, linewidth=0.4))
+
+    table = dataset.description.table
+    put(margin, 0.5, table.camera, 13, weight="bold")
+    put(
+        margin,
+        0.74,
+        f"{dataset.description.images} raw images of {len(rows)} pictures, "
+        f"{lights} light{'s' if lights > 1 else ''}, seed {dataset.description.seed}",
+        8,
+        _FAINT,
+    )
+    top = head
+    for row, (name, line, drawn) in enumerate(zip(names, grid, pictures, strict=True)):
+        for column, (entry, picture) in enumerate(zip(line, drawn, strict=True)):
+            left = margin + column * (cell + gap)
+            tall = picture.shape[0] / picture.shape[1] * cell
+            axes = figure.add_axes((left / width, 1 - (top + tall) / height, cell / width, tall / height))
+            axes.imshow(picture, interpolation="lanczos", aspect="auto")
+            axes.axis("off")
+            under_it = shared and row == 0
+            if under_it or not shared:
+                y = head - 0.2 if under_it else top + heights[row] + 0.15
+                for place, light in enumerate(entry.lights):
+                    dot(left + 0.13 * place, y, light)
+                words = _short(" and ".join(map(partial(_label, named), entry.lights, entry.truths)), 28)
+                size, ink = (8, _INK) if under_it else (7, _FAINT)
+                put(left + 0.05 + 0.13 * len(entry.lights), y + 0.04, words, size, ink)
+        under = top + heights[row] + (0.0 if shared else caption)
+        put(margin, under + 0.17, _short(name), 7, _FAINT, style="italic")
+        top += heights[row] + below
+    put(margin, height - 0.25, "Tone mapped with the Flash operator; camera RGB, no white balance", 6.5, _FAINT)
+    return figure
+
+
+def _label(named: Mapping[str, str], light: str, truth: Triple) -> str:
+    """Return what to call a light: as a person does, or for a mixture its chromaticity."""
+    return named.get(light) or "r {} b {}".format(*(f"{part:.2f}".lstrip("0") for part in truth[::2]))
+
+
+def _colour(light: str, lights: Mapping[int, Light]) -> Triple:
+    """Return the colour that a projector would show for a light or a mixture: codes add in linear light."""
+    mixture = parse_mixture(light)
+    codes = np.array([lights[number].codes for number in mixture.lights]) / 255
+    red, green, blue = (float(part) for part in (np.asarray(mixture.weights) @ codes**2.2) ** (1 / 2.2))
+    return red, green, blue
+
+
+def _short(name: str, most: int = 60) -> str:
+    return name if len(name) <= most else f"…{name[-most:]}"

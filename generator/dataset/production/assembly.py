@@ -1,0 +1,273 @@
+"""From the records of all shards to a dataset: its tables, its description, its hashes; and whether it is still so.
+
+Records are read one after the other and nothing of them is kept that grows with the dataset, so a million images take
+no more memory than a thousand.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from foundation.errors import FormatError
+from foundation.hashing import HashingWriter, stream_sha256
+from foundation.version import software
+from generator.dataset.production.records import (
+    SPLITS,
+    Description,
+    ImageRecord,
+    Light,
+    ShardRecord,
+    Skipped,
+    SourceRecord,
+    Table,
+    image_key,
+)
+from generator.dataset.production.workplace import Workplace
+from generator.dataset.store import DESCRIPTION, Store, open_store
+from generator.files.formats import suffix_of
+
+GROUND_TRUTH = "ground_truth.csv"
+GROUND_TRUTH_COLUMNS = ("image", "source", "illumination", "r", "g", "b")
+SOURCES = "sources.csv"
+SOURCE_COLUMNS = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile")
+TRUTHS = "gt.txt"
+SUMS = "SHA256SUMS"
+CARD = "README.md"
+
+
+class NothingMadeError(FormatError):
+    """None of the sources can be read, so there is no dataset."""
+
+
+class _ListedFile:
+    """A text file of the dataset that is written in order and hashed on the way."""
+
+    def __init__(self, stack: ExitStack, store: Store, name: str) -> None:
+        self.name = name
+        self._writer = HashingWriter(stack.enter_context(store.create(name)))
+
+    def write(self, text: str) -> None:
+        """Append a text, as UTF-8."""
+        self._writer.write(text.encode())
+
+    @property
+    def sum(self) -> str:
+        """The file's line in SHA256SUMS."""
+        return f"{self._writer.sha256}  {self.name}\n"
+
+
+def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
+    """Write what a dataset has beside its images, and give the dataset its name.
+
+    Parameters
+    ----------
+    place
+        Where it was made; every shard is done.
+    identity
+        Of its plan.
+
+    Raises
+    ------
+    NothingMadeError
+        None of the sources could be read.
+    FormatError
+        A source has changed while the dataset was made.
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    options = identity["options"]
+    folder = options["layout"] == "folder"
+    suffix = suffix_of(options["format"])
+    counts: Counter[str] = Counter()
+    splits: Counter[str] = Counter()
+    skipped: list[Skipped] = []
+    used: dict[int, Light] = {}
+    with ExitStack() as stack:
+        truths = _ListedFile(stack, place.files, TRUTHS)
+        table = _ListedFile(stack, place.files, GROUND_TRUTH)
+        listed = _ListedFile(stack, place.files, SOURCES)
+        parts = {
+            part: _ListedFile(stack, place.files, f"splits/{part}.txt")
+            for part in SPLITS
+            if options["split"] is not None
+        }
+        sums = stack.enter_context(place.files.create(SUMS))
+        table.write(_row(GROUND_TRUTH_COLUMNS))
+        listed.write(_row(SOURCE_COLUMNS))
+        for record, fresh, left_out in _records(place, int(identity["shards"])):
+            names = {source.position: source for source in record.sources}
+            for source in fresh:
+                listed.write(_source_row(source))
+                counts["sources"] += 1
+                counts["pixels"] += source.width * source.height
+                counts["replaced"] += source.replaced_pixels
+            skipped += left_out
+            for image in record.images:
+                source = names[image.position]
+                name = f"{image_key(image.number)}{suffix}"
+                table.write(_image_rows(name, source.name, image))
+                truths.write("{:.9f} {:.9f} {:.9f}\n".format(*image.truth))
+                if source.split is not None:
+                    parts[source.split].write(f"{name}\n")
+                    splits[source.split] += 1
+                counts["images"] += 1
+            for file in record.files:
+                sums.write(f"{file.sha256}  {file.name}\n".encode())
+            used.update((light.illumination, light) for light in record.lights)
+        if not counts["images"]:
+            raise NothingMadeError(
+                f"none of the {identity['sources']['count']} pictures can be read; name a folder of other pictures"
+            )
+        description = Description(
+            software=software(),
+            libraries=identity["libraries"],
+            table=Table.model_validate(identity["table"]),
+            seed=identity["seed"],
+            options=options,
+            planned=identity["images"],
+            images=counts["images"],
+            sources=counts["sources"],
+            pixels=counts["pixels"],
+            replaced_pixels=counts["replaced"],
+            splits={part: splits[part] for part in parts},
+            lights=[used[light] for light in sorted(used)],
+            skipped=skipped,
+        )
+        text = (description.model_dump_json(indent=2) + "\n").encode()
+        written = [table, truths, listed, *parts.values()]
+        if not folder:
+            card = _ListedFile(stack, place.files, CARD)
+            card.write(_card(description))
+            written.append(card)
+        for file in written:
+            sums.write(file.sum.encode())
+        sums.write(f"{hashlib.sha256(text).hexdigest()}  {DESCRIPTION}\n".encode())
+    names = [file.name for file in written]
+    place.files.settle([*names, SUMS])
+    # In an object store this makes it a dataset, so everything else is there.
+    place.files.put(DESCRIPTION, text)
+    place.files.settle([DESCRIPTION])
+    place.publish()
+
+
+def _records(place: Workplace, shards: int) -> Iterator[tuple[ShardRecord, list[SourceRecord], list[Skipped]]]:
+    """Yield each shard's record, and those of its sources that no shard before had."""
+    last: SourceRecord | Skipped | None = None
+    for shard in range(shards):
+        record = place.load(shard)
+        ordered = sorted((*record.sources, *record.skipped), key=lambda source: source.position)
+        if last is not None and ordered and ordered[0].position == last.position:
+            if ordered[0] != last:
+                raise FormatError(
+                    f"the picture {last.name} changed, or could be read only once, while the dataset was made; remove "
+                    f"{place.notes.place} with all beside it and begin again"
+                )
+            fresh = ordered[1:]
+        else:
+            fresh = ordered
+        if ordered:
+            last = ordered[-1]
+        yield (
+            record,
+            [source for source in fresh if isinstance(source, SourceRecord)],
+            [source for source in fresh if isinstance(source, Skipped)],
+        )
+
+
+def _row(fields: Iterable[object]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(fields)
+    return text.getvalue()
+
+
+def _source_row(source: SourceRecord) -> str:
+    known = (source.position, source.name, source.sha256 or "", source.width, source.height, source.replaced_pixels)
+    return _row((*known, source.split or "", source.profile or ""))
+
+
+def _image_rows(name: str, source: str, image: ImageRecord) -> str:
+    return "".join(
+        _row((name, source, light.illumination, *(f"{part:.9f}" for part in light.truth))) for light in image.lights
+    )
+
+
+def _card(description: Description) -> str:
+    """Return what Hugging Face `datasets` reads to find the files of each part, and a person to know what they are."""
+    ending = {"webdataset": "tar", "parquet": "parquet"}[description.options["layout"]]
+    parts = [part for part, images in description.splits.items() if images] or ["data"]
+    files = "".join(
+        f"  - split: {'train' if part == 'data' else part}\n    path: {part}/*.{ending}\n" for part in parts
+    )
+    return (
+        f"---\nconfigs:\n- config_name: default\n  data_files:\n{files}---\n\n"
+        f"{description.images} raw linear images of the {description.table.camera} with the ground truth of their "
+        f"light, made by {description.software}. Black is 0, saturation {description.table.white_level}; nothing is "
+        "white balanced.\n"
+    )
+
+
+def damage(place: str | Path, progress: Callable[[int, int], None] | None = None, *, workers: int = 1) -> Iterator[str]:
+    """Yield what of a dataset is not as it was made, each fault in words; reads every byte of it.
+
+    Parameters
+    ----------
+    place
+        Path or URL of the dataset.
+    progress
+        Told after each file how many were looked at, and how many there are.
+    workers
+        Threads that read and hash.
+
+    Raises
+    ------
+    FormatError
+        There is no dataset, or it has no list of hashes.
+    """
+    store = open_store(place)
+    if not store.has(DESCRIPTION):
+        raise FormatError(f"{place} is no dataset: it has no {DESCRIPTION}; make one with generate")
+    with store.open(SUMS) as listed:
+        total = sum(1 for _ in listed)
+    known: set[str] = {SUMS}
+    pending: deque[Future[str | None]] = deque()
+    looked_at = 0
+
+    def finished(most: int) -> Iterator[str]:
+        nonlocal looked_at
+        while len(pending) > most:
+            fault = pending.popleft().result()
+            if fault is not None:
+                yield fault
+            looked_at += 1
+            if progress is not None:
+                progress(looked_at, total)
+
+    with ThreadPoolExecutor(workers) as pool, store.open(SUMS) as listed:
+        for number, line in enumerate(listed, start=1):
+            digest, _, name = line.decode("utf-8", "replace").rstrip("\n").partition("  ")
+            if name:
+                known.add(name)
+                pending.append(pool.submit(_fault_of, store, name, digest))
+                yield from finished(4 * workers)
+            else:
+                yield f"{SUMS}, line {number}: expected a hash, two blanks and a name"
+        yield from finished(0)
+    for name in sorted(set(store.names()) - known):
+        yield f"{name} is no part of the dataset"
+
+
+def _fault_of(store: Store, name: str, digest: str) -> str | None:
+    try:
+        with store.open(name) as stream:
+            found = stream_sha256(stream)
+    except FormatError:
+        return f"{name} is missing or cannot be read"
+    return None if found == digest else f"{name} has changed"

@@ -1,0 +1,202 @@
+"""What is written down about a dataset: its description, its lights and sources, and the record of each shard.
+
+A shard is a range of planned image numbers that is made by one task. Its record is written when everything else of it
+is on the disk: a shard with a record is done, one without is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+FORMAT = "crop.dataset"
+VERSION = 2
+
+Triple = tuple[float, float, float]
+Layout = Literal["folder", "webdataset", "parquet"]
+Split = Literal["train", "validation", "test"]
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class Table(_Record):
+    """The table a dataset was made from; `sha256` as `calibration.table.lut.Lut.sha256`."""
+
+    sha256: str
+    camera: str
+    bits: int
+    samples: int
+    white_level: int
+    software: str
+
+
+class Light(_Record):
+    """A light of the table that was used; `codes` as projected, `white` the ground truth in linear camera RGB."""
+
+    illumination: int
+    kind: str
+    cct_k: float | None
+    codes: tuple[int, int, int]
+    white: Triple
+
+    @property
+    def label(self) -> str:
+        """Return what a person calls it: its temperature if a black body, else its codes."""
+        return f"{self.cct_k:.0f} K" if self.cct_k is not None else "{} {} {}".format(*self.codes)
+
+
+class SourceRecord(_Record):
+    """A source picture that was used.
+
+    Attributes
+    ----------
+    position
+        Place in the list of sources, from 0; the choice of its lights depends on it.
+    name, sha256
+        What it was called, and the hash of its file; no hash where it was made and not read.
+    profile
+        What was done about its colour profile, in words; None where it was made and not read.
+    width, height
+        Size of its images, px.
+    replaced_pixels
+        Pixels of colours that the table lists as unfit, which took the nearest fit colour.
+    split
+        The part of the dataset that its images belong to; None where it was not divided.
+    """
+
+    position: int
+    name: str
+    sha256: str | None
+    profile: str | None = None
+    width: int
+    height: int
+    replaced_pixels: int
+    split: Split | None = None
+
+
+class Skipped(_Record):
+    """A source picture that could not be read; its numbers are left free."""
+
+    position: int
+    name: str
+
+
+class LightRow(_Record):
+    """A light in an image: its number in the table, or what a mixture is called, and its ground truth of sum 1."""
+
+    illumination: str
+    truth: Triple
+
+
+class ImageRecord(_Record):
+    """An image that was made; `truth` is the mean of its lights over its pixels, of sum 1."""
+
+    number: int
+    position: int
+    truth: Triple
+    lights: list[LightRow]
+
+
+class FileSum(_Record):
+    """A file of the dataset and its SHA-256."""
+
+    name: str
+    sha256: str
+
+
+class ShardRecord(_Record):
+    """What a shard made; images and files in the order of their numbers, sources in that of their positions.
+
+    `lights` are those of the table that were used, alone or mixed.
+    """
+
+    shard: int
+    sources: list[SourceRecord]
+    skipped: list[Skipped]
+    images: list[ImageRecord]
+    files: list[FileSum]
+    lights: list[Light]
+
+
+class Description(_Record):
+    """The content of `dataset.json`.
+
+    Attributes
+    ----------
+    seed, options
+        What the dataset was asked to be; with the table and the sources, enough to make every byte again.
+    planned, images
+        Images planned and made; the numbers of the rest are free.
+    sources, pixels, replaced_pixels
+        Sources used, their pixels together, and those of them whose colour was replaced.
+    splits
+        Images in each part, where the dataset was divided.
+    lights
+        The lights of the table that were used, alone or mixed.
+    skipped
+        Sources that could not be read.
+    """
+
+    format: Literal["crop.dataset"] = FORMAT
+    version: Literal[2] = VERSION
+    software: str
+    libraries: dict[str, str]
+    table: Table
+    seed: int
+    options: dict[str, Any]
+    planned: int
+    images: int
+    sources: int
+    pixels: int
+    replaced_pixels: int
+    splits: dict[str, int] = {}
+    lights: list[Light]
+    skipped: list[Skipped]
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One image.
+
+    Attributes
+    ----------
+    image
+        Its file name, or in shards what it would be called as a file.
+    source
+        Its source's name.
+    lights
+        Number in the table, or name of the mixture, of each light in it.
+    truths
+        Ground truth (r, g, b) of sum 1 of each light.
+    truth
+        Mean of its lights over its pixels, of sum 1: the ground truth where there is one light.
+    split
+        The part of the dataset it belongs to.
+    """
+
+    image: str
+    source: str
+    lights: tuple[str, ...]
+    truths: tuple[Triple, ...]
+    truth: Triple
+    split: Split | None = None
+
+    @property
+    def illumination(self) -> str:
+        """The light's number in the table or its name; of several the first."""
+        return self.lights[0]
+
+
+def image_key(number: int) -> str:
+    """Return the number of an image as it stands in names: six digits, more where they are needed."""
+    return f"{number:06d}"
+
+
+def shard_key(shard: int) -> str:
+    """Return the number of a shard as it stands in names."""
+    return f"{shard:06d}"

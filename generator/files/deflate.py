@@ -1,0 +1,476 @@
+"""Deflate (RFC 1951) for the rows of a 16-bit RGB PNG, made for images drawn from a table.
+
+Two ways to pack a band of rows, whichever is smaller:
+
+    repeats     no filter; a pixel that came before as it is, anywhere in the 32 KiB that deflate looks back, becomes a
+                match of six bytes, or more where runs repeat. A table has only so many samples of a colour, so half
+                the pixels of a photograph find one. Matches of less than a pixel are not looked for.
+    neighbours  the difference to the pixel on the left (filter Sub), in Huffman codes alone. Smaller where a picture
+                is so smooth that few pixels share a colour.
+
+Every band is one block with its own codes, ends on a whole byte and looks back into no other, so bands can be packed
+at once by several threads and put one after the other.
+
+Which is smaller is tried on a few rows from the band's middle. Of a band that is not small, the codes of repeats come
+from every few rows: counting all of them takes a third as long as the packing, and saves a six-hundredth.
+
+A band is packed in one compiled call, in which the interpreter's lock is let go once: taking it back between steps of
+a millisecond costs several threads more than the steps.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from numba import uint16, uint32, uint64
+
+from foundation.compiled import compiled
+from generator.files.huffman import (
+    DISTANCES,
+    END,
+    LITERALS,
+    LONGEST,
+    code_lengths,
+    codes_of,
+    flush,
+    put,
+    put_head,
+)
+
+WIDEST: Final = 1 << 28
+"""Pixels of a row that positions are counted for."""
+
+_WINDOW: Final = 32768
+_WINDOW_PIXELS: Final = _WINDOW // 6
+_LONGEST_RUN: Final = 258 // 6
+"""Pixels of the longest match."""
+_PLACES: Final = 1 << 15
+"""Of the table of pixels seen: the last one with each hash."""
+_MIX: Final = 0x9E3779B97F4B
+"""Odd, so that multiplying modulo 2⁴⁸ gives every pixel a number of its own."""
+_TRIED: Final = 3 * _WINDOW_PIXELS
+_STEP: Final = 8
+"""Of a large band, one row of so many is counted."""
+_FEW_ROWS: Final = 4
+"""Rows that are counted at least."""
+_FEW: Final = 1 << 13
+"""Symbols from which the counted rows speak for the others."""
+_ROOMY: Final = 56
+"""Bits that a flush has room for beside the up to seven that wait."""
+_ROOM: Final = 1024
+"""Bytes for the head of a block, its end, and what a flush writes beyond; no byte of a row takes two, see `LONGEST`."""
+
+
+def _distance_symbol(distance: int) -> int:
+    """Return the symbol of a distance 1 … 32768 (RFC 1951, 3.2.5)."""
+    bits = (distance - 1).bit_length()
+    return distance - 1 if bits <= 2 else 2 * (bits - 1) + ((distance - 1) >> (bits - 2) & 1)
+
+
+def _length_symbol(length: int) -> tuple[int, int, int]:
+    """Return symbol, extra bits and their value of a match's length 3 … 258 bytes (RFC 1951, 3.2.5)."""
+    if length == 258:
+        return 285, 0, 0
+    bits = max((length - 3).bit_length() - 3, 0)
+    return 257 + 4 * bits + ((length - 3) >> bits), bits, (length - 3) & ((1 << bits) - 1)
+
+
+# Symbols of distances: of 1 … 256, then of every 128th.
+_DISTANCE_SYMBOLS: Final = np.array(
+    [_distance_symbol(distance) for distance in (*range(1, 257), *range(1, _WINDOW, 128))], dtype=np.uint8
+)
+_DISTANCE_BITS: Final = np.array([max(symbol // 2 - 1, 0) for symbol in range(DISTANCES)], dtype=np.int64)
+# Symbol, extra bits and their value of a run of so many pixels; extra bits of each symbol.
+_RUNS: Final = np.array([(0, 0, 0), *(_length_symbol(6 * run) for run in range(1, _LONGEST_RUN + 1))], dtype=np.int64)
+_ONE: Final = int(_RUNS[1, 0])
+"""The symbol of a match of one pixel."""
+_LENGTH_BITS: Final = np.zeros(LITERALS, np.int64)
+_LENGTH_BITS[_RUNS[:, 0]] = _RUNS[:, 1]
+
+
+@compiled
+def _split(image: Any, rows: Any) -> Any:
+    """Fill `rows` with the unfiltered bytes of `image`, upper before lower, a 0 before each row.
+
+    Returns
+    -------
+    int
+        Every sample's bits joined: no sample is larger.
+    """
+    joined = uint16(0)
+    for y in range(image.shape[0]):
+        samples, row = image[y].reshape(-1), rows[y]
+        row[0] = 0
+        # Joined by row, or the compiler makes no vectors of it.
+        of_row = uint16(0)
+        for i in range(len(samples)):
+            row[1 + 2 * i] = samples[i] >> 8
+            row[2 + 2 * i] = samples[i] & 255
+            of_row |= samples[i]
+        joined |= of_row
+    return joined
+
+
+@compiled
+def _subtract(rows: Any, filtered: Any) -> None:
+    """Fill `filtered` with `rows` after the filter Sub (ISO/IEC 15948, 9.2)."""
+    for y in range(rows.shape[0]):
+        left, row, target = rows[y, 1:], rows[y, 7:], filtered[y, 7:]
+        filtered[y, 0] = 1
+        for i in range(6):
+            filtered[y, 1 + i] = left[i]
+        for i in range(len(row)):
+            target[i] = row[i] - left[i]
+
+
+@compiled
+def _count_bytes(rows: Any, literals: Any) -> None:
+    # Four counters, so that equal bytes do not wait for each other.
+    counts = np.zeros((4, 256), np.uint32)
+    data = rows.reshape(-1)
+    whole = len(data) // 4 * 4
+    for i in range(0, whole, 4):
+        counts[0, data[i]] += 1
+        counts[1, data[i + 1]] += 1
+        counts[2, data[i + 2]] += 1
+        counts[3, data[i + 3]] += 1
+    for i in range(whole, len(data)):
+        counts[0, data[i]] += 1
+    for value in range(256):
+        for part in range(4):
+            literals[value] += counts[part, value]
+
+
+@compiled
+def find_repeats(image: Any, seen: Any, distances: Any) -> None:
+    """Fill `distances` (rows, columns) with the bytes back to the last equal pixel, 0 where there is none in reach.
+
+    `seen` holds for each hash of a pixel where it was last seen, in bytes, above the bits of the pixel that the
+    hash leaves open. As mixing is one to one, what agrees in both is the pixel itself.
+    """
+    left, turn = uint64(48) - uint64(15), uint64(64 - 48 + 15)
+    open_bits = (uint64(1) << left) - uint64(1)
+    for place in range(_PLACES):
+        seen[place] = 0
+    samples, backs = image.reshape(-1), distances.reshape(-1)
+    # Empty places lie out of reach of every pixel. Unsigned numbers everywhere, since one that may be negative makes
+    # every index a choice.
+    position = uint64(_WINDOW + 1)
+    at, pixels = uint64(0), uint64(0)
+    for _ in range(image.shape[0]):
+        position += uint64(1)
+        for _ in range(image.shape[1]):
+            pixel = (
+                uint64(samples[at])
+                | (uint64(samples[at + uint64(1)]) << uint64(16))
+                | (uint64(samples[at + uint64(2)]) << uint64(32))
+            )
+            mixed = pixel * uint64(_MIX)
+            place = (mixed >> left) & uint64(_PLACES - 1)
+            here = (position << left) | (mixed & open_bits)
+            gone = here - seen[place]
+            seen[place] = here
+            # The bytes back to the last pixel of this hash, and above them what is not 0 where that is another pixel.
+            # Whether a pixel repeats cannot be foreseen, so there is no branch on it.
+            back = (gone >> left) | (gone << turn)
+            backs[pixels] = uint16(back) if back - uint64(1) < uint64(_WINDOW) else uint16(0)
+            at += uint64(3)
+            pixels += uint64(1)
+            position += uint64(6)
+
+
+@compiled
+def _place_of(less: Any) -> Any:
+    """Return where `_DISTANCE_SYMBOLS` has the symbol of a distance, given one less than the distance."""
+    return less if less < uint64(256) else uint64(256) + (less >> uint64(7))
+
+
+@compiled
+def _symbol_of(distance: Any) -> Any:
+    """Return the symbol of a distance; some symbol where there is none."""
+    return _DISTANCE_SYMBOLS[_place_of((uint64(distance) - uint64(1)) & uint64(_WINDOW - 1))]
+
+
+@compiled
+def _count(rows: Any, distances: Any, step: int, literals: Any, backs: Any) -> None:
+    """Add the symbols of one row of every `step` to the frequencies of literals and distances."""
+    # Whether a pixel is a match cannot be foreseen, so there is no branch on it; each of a pixel's bytes has a counter
+    # of its own, so that equal ones do not wait for each other.
+    counts = np.zeros((6, 256), np.uint32)
+    matches = 0
+    for y in range(step // 2, rows.shape[0], step):
+        row, back = rows[y], distances[y]
+        literals[row[0]] += 1
+        run, before = 1, uint32(0)
+        for x in range(len(back)):
+            distance = uint32(back[x])
+            if distance == before and distance != uint32(0) and run < _LONGEST_RUN:
+                literals[_RUNS[run, 0]] -= 1
+                run += 1
+                literals[_RUNS[run, 0]] += 1
+                continue
+            run, before = 1, distance
+            literal = uint32(distance == uint32(0))
+            for i in range(6):
+                counts[i, row[1 + 6 * x + i]] += literal
+            match = np.int64(uint32(1) - literal)
+            backs[_symbol_of(distance)] += match
+            matches += match
+    literals[_ONE] += matches
+    for value in range(256):
+        for i in range(6):
+            literals[value] += counts[i, value]
+
+
+@compiled
+def _bits(literals: Any, backs: Any) -> int:
+    """Return the bits of symbols of such frequencies in their best codes."""
+    lengths, back_lengths = code_lengths(literals, LONGEST), code_lengths(backs, LONGEST)
+    total = 0
+    for symbol in range(LITERALS):
+        total += literals[symbol] * (lengths[symbol] + _LENGTH_BITS[symbol])
+    for symbol in range(DISTANCES):
+        total += backs[symbol] * (back_lengths[symbol] + _DISTANCE_BITS[symbol])
+    return total
+
+
+@compiled
+def _repeats_pay(image: Any, plain: Any, filtered: Any, distances: Any, seen: Any) -> bool:
+    """Return whether repeats pack the middle of a band into fewer bits than neighbours."""
+    height, width = distances.shape
+    tried = min(height, 1 + _TRIED // width)
+    top = (height - tried) // 2
+    # The first rows of a look back have nothing before them.
+    counted = top + min(tried - 1, _WINDOW_PIXELS // width)
+    end = top + tried
+    find_repeats(image[top:end], seen, distances[top:end])
+    literals, backs = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
+    _count(plain[counted:end], distances[counted:end], 1, literals, backs)
+    _subtract(plain[counted:end], filtered[counted:end])
+    differences = np.zeros(LITERALS, np.int64)
+    _count_bytes(filtered[counted:end], differences)
+    return _bits(literals, backs) <= _bits(differences, np.zeros(DISTANCES, np.int64))
+
+
+@compiled
+def _estimate(plain: Any, distances: Any, literals: Any, backs: Any) -> None:
+    """Fill the frequencies of a band's literals and distances, or near them and of none 0 that might occur."""
+    step = max(1, min(_STEP, len(distances) // _FEW_ROWS))
+    _count(plain, distances, step, literals, backs)
+    if step > 1 and literals.sum() < _FEW:
+        literals[:], backs[:], step = 0, 0, 1
+        literals[END] = 1
+        _count(plain, distances, step, literals, backs)
+    if step > 1:
+        for value in range(256):
+            literals[value] = step * literals[value] + 1
+        for symbol in range(END + 1, LITERALS):
+            literals[symbol] *= step
+        # Several runs share a symbol; that they add more than 1 does no harm.
+        for run in range(1, _LONGEST_RUN + 1):
+            literals[_RUNS[run, 0]] += 1
+        for symbol in range(DISTANCES):
+            backs[symbol] = step * backs[symbol] + 1
+
+
+@compiled
+def _join_codes(codes: Any, largest: Any, samples: Any) -> None:
+    """Fill `samples` with the code of both bytes of every sample up to `largest`, its length in the lowest eight bits.
+
+    So a word is the number of places to shift what follows it, and sums of words have the sum of lengths.
+    """
+    mask, length = uint32(0xFFFF), uint32(16)
+    for high in range((largest >> 8) + 1):
+        first = codes[high]
+        bits = first >> length
+        for low in range(256):
+            second = codes[low]
+            joined = (first & mask) | ((second & mask) << bits)
+            samples[256 * high + low] = (joined << uint32(8)) | (bits + (second >> length))
+
+
+@compiled
+def _run_codes(codes: Any) -> Any:
+    """Return the code and extra bits, 12 + 5 at most, of each run's length; (`_LONGEST_RUN` + 1,) uint64.
+
+    They stand from bit 8 on, their number in the lowest bits.
+    """
+    runs = np.zeros(_LONGEST_RUN + 1, np.uint64)
+    for run in range(1, _LONGEST_RUN + 1):
+        code, extra = uint64(codes[_RUNS[run, 0]]), uint64(_RUNS[run, 2])
+        bits = code >> uint64(16)
+        runs[run] = (((code & uint64(0xFFFF)) | (extra << bits)) << uint64(8)) | (bits + uint64(_RUNS[run, 1]))
+    return runs
+
+
+@compiled
+def _match_codes(single: Any, codes: Any) -> Any:
+    """Return the codes of a match of a `single` pixel for each entry of `_DISTANCE_SYMBOLS`; (N,) uint64.
+
+    They stand from bit 8 on, 12 each at most, their number in the lowest bits, that of all bits from bit 32 on, and a
+    mask of the distance's extra bits, 13 at most, from bit 48 on.
+    """
+    matches = np.zeros(len(_DISTANCE_SYMBOLS), np.uint64)
+    first = single & uint64(63)
+    for i in range(len(matches)):
+        symbol = _DISTANCE_SYMBOLS[i]
+        code, extra = uint64(codes[symbol]), uint64(_DISTANCE_BITS[symbol])
+        bits = first + (code >> uint64(16))
+        both = (single >> uint64(8)) | ((code & uint64(0xFFFF)) << first)
+        mask = (uint64(1) << extra) - uint64(1)
+        matches[i] = bits | (both << uint64(8)) | ((bits + extra) << uint64(32)) | (mask << uint64(48))
+    return matches
+
+
+@compiled
+def _match(matches: Any, distance: Any) -> Any:
+    """Return the bits of a match of one pixel, and their number; some where there is no distance."""
+    less = (distance - uint64(1)) & uint64(_WINDOW - 1)
+    match = matches[_place_of(less)]
+    extra = (less & (match >> uint64(48))) << (match & uint64(63))
+    return ((match >> uint64(8)) & uint64(0xFFFFFF)) | extra, (match >> uint64(32)) & uint64(63)
+
+
+@compiled
+def _put_bytes(out: Any, writer: Any, rows: Any, codes: Any) -> None:
+    """Write rows (height, 1 + 6 width) byte by byte."""
+    at, waiting, number = writer[0], writer[1], writer[2]
+    mask, length, one, two = uint64(0xFFFF), uint64(16), uint64(1), uint64(2)
+    data = rows.reshape(-1)
+    i = uint64(0)
+    for _ in range(rows.shape[0]):
+        code = uint64(codes[data[i]])
+        waiting |= (code & mask) << number
+        at, waiting, number = flush(out, at, waiting, number + (code >> length))
+        i += one
+        for _ in range(rows.shape[1] // 3):
+            first, second, third = uint64(codes[data[i]]), uint64(codes[data[i + one]]), uint64(codes[data[i + two]])
+            bits = (first >> length) + (second >> length)
+            joined = (first & mask) | ((second & mask) << (first >> length)) | ((third & mask) << bits)
+            waiting |= joined << number
+            at, waiting, number = flush(out, at, waiting, number + bits + (third >> length))
+            i += uint64(3)
+    writer[0], writer[1], writer[2] = at, waiting, number
+
+
+@compiled
+def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, back_codes: Any, joined: Any) -> None:
+    """Write rows as literals, from the `joined` codes of samples, and matches."""
+    at, waiting, number = writer[0], writer[1], writer[2]
+    zero, one, two, three, byte, low = uint64(0), uint64(1), uint64(2), uint64(3), uint64(8), uint64(63)
+    samples, backs = image.reshape(-1), distances.reshape(-1)
+    runs = _run_codes(codes)
+    single = runs[1] & low
+    matches = _match_codes(runs[1], back_codes)
+    width = uint64(image.shape[1])
+    row_code = uint64(codes[0])
+    x = zero
+    for _ in range(image.shape[0]):
+        waiting |= (row_code & uint64(0xFFFF)) << number
+        at, waiting, number = flush(out, at, waiting, number + (row_code >> uint64(16)))
+        end = x + width
+        while x < end:
+            distance = uint64(backs[x])
+            following = uint64(backs[x + one]) if x + one < end else zero
+            # Seldom the next pixel goes on with a match. One sign tells it: of two conditions LLVM makes two branches.
+            if (((following ^ distance) - one) & (zero - distance)) >> low:
+                run = two
+                while run < uint64(_LONGEST_RUN) and x + run < end and uint64(backs[x + run]) == distance:
+                    run += one
+                bits, length = _match(matches, distance)
+                bits, length = (bits >> single) << (runs[run] & low), length - single + (runs[run] & low)
+                waiting |= ((runs[run] >> byte) | bits) << number
+                at, waiting, number = flush(out, at, waiting, number + length)
+                x += run
+                continue
+            # Whether a pixel is a match cannot be foreseen: both ways are gone, which takes less than a wrong guess.
+            i = three * x
+            red, green = uint64(joined[samples[i]]), uint64(joined[samples[i + one]])
+            blue = uint64(joined[samples[i + two]])
+            both = red + green
+            most = (red >> byte) | ((green >> byte) << (red & low))
+            literal, literal_length = most | ((blue >> byte) << (both & low)), (both + blue) & uint64(255)
+            match, match_length = _match(matches, distance)
+            bits = literal if distance == zero else match
+            length = literal_length if distance == zero else match_length
+            if length > uint64(_ROOMY):
+                waiting |= most << number
+                at, waiting, number = flush(out, at, waiting, number + (both & low))
+                bits, length = blue >> byte, blue & low
+            waiting |= bits << number
+            at, waiting, number = flush(out, at, waiting, number + length)
+            x += one
+    writer[0], writer[1], writer[2] = at, waiting, number
+
+
+@compiled
+def _pack(image: Any, last: int, plain: Any, filtered: Any, distances: Any, seen: Any, joined: Any, out: Any) -> Any:
+    """Fill `out` with a packed band; return its bytes, and whether `filtered` are its rows, or else `plain`."""
+    largest = _split(image, plain)
+    repeats = _repeats_pay(image, plain, filtered, distances, seen)
+    literals, backs = np.zeros(LITERALS, np.int64), np.zeros(DISTANCES, np.int64)
+    literals[END] = 1
+    if repeats:
+        find_repeats(image, seen, distances)
+        _estimate(plain, distances, literals, backs)
+    else:
+        _subtract(plain, filtered)
+        _count_bytes(filtered, literals)
+    lengths, back_lengths = code_lengths(literals, LONGEST), code_lengths(backs, LONGEST)
+    codes = codes_of(lengths)
+    writer = np.zeros(3, np.uint64)
+    put_head(out, writer, lengths, back_lengths, last)
+    if repeats:
+        _join_codes(codes, largest, joined)
+        _put_repeats(out, writer, image, distances, codes, codes_of(back_lengths), joined)
+    else:
+        _put_bytes(out, writer, filtered, codes)
+    put(out, writer, codes[END] & 0xFFFF, codes[END] >> 16)
+    if not last:
+        # An empty stored block (RFC 1951, 3.2.4) ends on a whole byte.
+        put(out, writer, 0, 3)
+    put(out, writer, 0, (uint64(8) - writer[2]) & uint64(7))
+    if not last:
+        put(out, writer, 0xFFFF0000, 32)
+    return writer[0], not repeats
+
+
+class Packer:
+    """Packs bands, one at a time; keeps its working memory, since fresh pages take as long as the packing."""
+
+    def __init__(self) -> None:
+        self._seen = np.empty(_PLACES, np.uint64)
+        self._joined = np.empty(1 << 16, np.uint32)
+        self._bytes = np.empty((2, 0), np.uint8)
+        self._distances = np.empty(0, np.uint16)
+        self._out = np.empty(0, np.uint8)
+
+    def pack(self, image: npt.NDArray[np.uint16], *, last: bool) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+        """Return a band of an image as deflate data, and the bytes that they unpack to.
+
+        Parameters
+        ----------
+        image
+            (h, w, 3) uint16, contiguous, w at most `WIDEST`.
+        last
+            Whether no band follows.
+
+        Returns
+        -------
+        tuple
+            (n,) uint8, the bytes of whole blocks, the final one among them if `last`; and (h, 1 + 6 w) uint8, the rows
+            of a PNG, each led by its filter. Both are views of memory that the next band overwrites.
+        """
+        height, width, _ = image.shape
+        size = height * (1 + 6 * width)
+        if self._bytes.shape[1] < size:
+            self._bytes = np.empty((2, size), np.uint8)
+            # As many as any shape of that size can need.
+            self._distances = np.empty(size // 6, np.uint16)
+            self._out = np.empty(_ROOM + 2 * size, np.uint8)
+        plain, filtered = (part[:size].reshape(height, 1 + 6 * width) for part in self._bytes)
+        distances = self._distances[: height * width].reshape(height, width)
+        done, subtracted = _pack(image, int(last), plain, filtered, distances, self._seen, self._joined, self._out)
+        return self._out[: int(done)], filtered if subtracted else plain

@@ -1,0 +1,190 @@
+"""A 16-bit linear image as the bytes of a file, losslessly, and back; the small pictures beside them.
+
+    png     16-bit RGB; read by everything; the smallest of photographs
+    tiff    16-bit RGB, uncompressed: the fastest to write and to read
+    exr     OpenEXR, 32-bit float, which holds every 16-bit number (half does not); compressed by zip
+    jxl     JPEG XL, lossless, 16 bits: the smallest of smooth pictures
+    dng     a raw file: the Bayer mosaic of the image, two thirds of the values left out as by a sensor
+
+Every encoder lets go of the interpreter's lock while it computes (not while it copies uncompressed pixels into the
+file), and no byte depends on the number of threads. Beside image and file a PNG takes some megabytes, however large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.errors import FormatError, InputError
+from generator.files.shot import Shot
+
+__all__ = [
+    "FORMATS",
+    "Format",
+    "Shot",
+    "decode_image",
+    "encode_image",
+    "encode_pieces",
+    "encode_preview",
+    "libraries_of",
+    "smallest_side",
+    "suffix_of",
+]
+
+Format = Literal["png", "tiff", "exr", "jxl", "dng"]
+FORMATS: Final[tuple[Format, ...]] = get_args(Format)
+
+_LIBRARIES: Final[dict[Format, tuple[str, ...]]] = {
+    "png": (),
+    "tiff": (),
+    "exr": ("isal",),
+    "jxl": ("imagecodecs",),
+    "dng": ("rawpy",),
+}
+
+
+def suffix_of(form: Format) -> str:
+    """Return the end of the names of files of that format, ``.png``."""
+    return f".{form}"
+
+
+def libraries_of(form: Format) -> tuple[str, ...]:
+    """Return the distributions whose version may change the bytes of a file of that format; none where we write it."""
+    return _LIBRARIES[form]
+
+
+def smallest_side(form: Format) -> int:
+    """Return the least width and height, px, of an image in that format."""
+    if form != "dng":
+        return 1
+    from generator.files.dng import SMALLEST_SIDE
+
+    return SMALLEST_SIDE
+
+
+def encode_image(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> bytes:
+    """Return `image` as the bytes of a file.
+
+    Parameters
+    ----------
+    image
+        (H, W, 3) uint16, linear camera RGB.
+    form
+        The format; `dng` keeps one channel of each pixel, the others every bit.
+    shot
+        What is known of the image; written wherever the format has a place for it (not `jxl`), needed by `dng`.
+
+    Raises
+    ------
+    InputError
+        The image is not of that shape and type, or its size or the shot does not fit the format.
+    """
+    _check(image)
+    if form == "png":
+        from generator.files.png import encode_png
+
+        return encode_png(image, shot)
+    if form == "tiff":
+        from generator.files.tiff import encode_tiff
+
+        return encode_tiff(image, shot)
+    if form == "exr":
+        from generator.files.exr import encode_exr
+
+        return encode_exr(image, shot)
+    if form == "jxl":
+        from generator.files.jxl import encode_jxl
+
+        return encode_jxl(image)
+    from generator.files.dng import encode_dng
+
+    return encode_dng(image, shot)
+
+
+def encode_pieces(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> Iterable[bytes | memoryview]:
+    """Return the file of `encode_image` in pieces, whose memory may be used again for the next one.
+
+    Of a PNG they are encoded when they are asked for, so that a file of any size is written out of a cache's memory.
+
+    Raises
+    ------
+    InputError
+        As `encode_image`.
+    """
+    _check(image)
+    if form == "png":
+        from generator.files.png import png_pieces
+
+        return png_pieces(image, shot)
+    return (encode_image(image, form, shot),)
+
+
+def _check(image: npt.NDArray[np.uint16]) -> None:
+    if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise InputError(f"the image is {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
+
+
+def decode_image(data: bytes, form: Format, what: str) -> npt.NDArray[np.uint16]:
+    """Return the image that `encode_image` made a file of.
+
+    Parameters
+    ----------
+    data
+        The file's bytes.
+    form
+        Its format.
+    what
+        What messages call it, such as its path.
+
+    Returns
+    -------
+    ndarray
+        (H, W, 3) uint16, as it was encoded; of `dng` (H // 2, W // 2, 3), the half-size linear RGB of its mosaic: red,
+        the mean of both greens, rounded up, and blue of each 2×2 block.
+
+    Raises
+    ------
+    FormatError
+        The bytes are damaged or not a 16-bit RGB image of that format.
+    """
+    if form == "dng":
+        from drivers.raw.rawfile import decode_raw
+        from generator.files.dng import half_size
+
+        return half_size(decode_raw(data, Path(what)).counts)
+    try:
+        image = _decoded(data, form)
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise FormatError(f"{what} cannot be read as {form}: {reason}; make it again") from error
+    if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3:
+        raise FormatError(f"{what} holds {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
+    return image
+
+
+def _decoded(data: bytes, form: Format) -> npt.NDArray[np.uint16]:
+    import imagecodecs
+
+    if form == "png":
+        return np.asarray(imagecodecs.png_decode(data))
+    if form == "tiff":
+        return np.asarray(imagecodecs.tiff_decode(data))
+    if form == "jxl":
+        return np.asarray(imagecodecs.jpegxl_decode(data, numthreads=1))
+    from generator.files.exr import decode_exr
+
+    return decode_exr(data)
+
+
+def encode_preview(picture: npt.NDArray[np.uint8]) -> bytes:
+    """Return `picture` (H, W, 3) uint8, RGB, as the bytes of a JPEG file of quality 92."""
+    import cv2
+
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92])
+    if not done:
+        raise InputError(f"a preview of {picture.shape[1]}x{picture.shape[0]} px cannot be written as JPEG")
+    return data.tobytes()

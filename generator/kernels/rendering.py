@@ -1,0 +1,339 @@
+"""From source codes to linear camera RGB: each pixel becomes one of the table's samples of its colour.
+
+Paper, section 3.4. With n the table's bits (5 in the paper), a pixel R, G, B at (x, y) becomes
+
+    samples[((R >> (8 - n)) << 2n) | ((G >> (8 - n)) << n) | (B >> (8 - n)), choice(seed, image, x, y)]
+
+where the choice is that of `kernels/choice.py`. Here are whole images, as camera RGB and as Bayer mosaics;
+`kernels/planar.py` has crops for training and `kernels/mixing.py` several lights.
+
+Compiled loops are not split by numba's own threads: their pool cannot be entered from two Python threads at once and
+does not survive a fork. Rows are split by plain threads instead.
+"""
+
+from __future__ import annotations
+
+import operator
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from numba import uint32
+
+from foundation.compiled import compiled
+from foundation.errors import InputError
+from generator.kernels import streaming
+from generator.kernels.arguments import (
+    check_picture,
+    check_place,
+    check_samples,
+    check_target,
+    delivered,
+    packed,
+    readable,
+    share,
+    writable,
+)
+from generator.kernels.choice import AHEAD, SCRATCH, ask_group, choose_group, row_keys, slot
+from generator.kernels.drawing import choose_first, draw_groups
+from generator.kernels.palette import fit_picture
+from generator.kernels.streaming import line_at, line_room, pass_on
+from generator.kernels.vector import (
+    GROUP,
+    LANES,
+    LINE,
+    SAMPLE_BYTES,
+    choose,
+    copy2,
+    offset_at,
+    settle,
+)
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+
+WHOLE_LIGHT: Final = 1 << 20
+"""Pixels from which reading a light's samples in one go is cheaper than touching their pages at random."""
+
+_STRETCH: Final = 16
+"""Groups of pixels that are put together before they are streamed."""
+
+PATTERNS: Final = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
+"""The channel of each site of a 2x2 Bayer block, in reading order."""
+
+
+@compiled
+def _gather(
+    picture: int,
+    pitch: int,
+    width: int,
+    rows: int,
+    samples: int,
+    count: Any,
+    bits: Any,
+    seed: Any,
+    image: int,
+    first_row: int,
+    target: int,
+    target_pitch: int,
+    streamed: bool,
+    scratch: int,
+) -> None:
+    """Fill rows of 3-channel pixels; numbers are addresses, and bytes from row to row.
+
+    Picture and image leave the caches to the samples: the one is asked for as what is read once, the other, if
+    `streamed`, put together in scratch memory and written a line at a time.
+    """
+    groups = (width + GROUP - 1) // GROUP
+    lines = line_at(scratch + SCRATCH)
+    for y in range(rows):
+        keys = row_keys(first_row + y, 0, image, seed)
+        row, to = picture + y * pitch, target + y * target_pitch
+        begin, held = to, to & (LINE - 1)
+        choose_first(row, width, keys, count, bits, scratch, 0, groups)
+        done = 0
+        while done < groups:
+            end, base = groups, to
+            if streamed:
+                end, base = min(done + _STRETCH, groups), lines + held - SAMPLE_BYTES * GROUP * done
+            draw_groups(row, width, keys, samples, count, bits, scratch, done, end, groups, 0, 0, base)
+            if streamed:
+                stop = to + SAMPLE_BYTES * min(GROUP * end, width)
+                held = pass_on(lines, begin, stop, end == groups)
+                begin = stop - held
+            done = end
+    if streamed:
+        settle()
+
+
+@compiled
+def _gather_mosaic(
+    picture: int,
+    pitch: int,
+    width: int,
+    rows: int,
+    samples: int,
+    count: Any,
+    bits: Any,
+    seed: Any,
+    image: int,
+    first_row: int,
+    target: int,
+    target_pitch: int,
+    pattern: int,
+    scratch: int,
+) -> None:
+    """Fill rows of a mosaic; the pattern's four channels are two bits each."""
+    groups, whole = (width + GROUP - 1) // GROUP, width // GROUP
+    for y in range(rows):
+        keys = row_keys(first_row + y, 0, image, seed)
+        row, to = picture + y * pitch, target + y * target_pitch
+        channels = pattern >> (4 * ((first_row + y) & 1))
+        even, odd = samples + 2 * (channels & 3), samples + 2 * (channels >> 2 & 3)
+        group = 0
+        while group < groups + AHEAD:
+            while AHEAD <= group < whole:
+                source, word = row + 3 * GROUP * group, uint32(LANES * group)
+                ask_group(row, group)
+                choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, group))
+                offsets, begin = slot(scratch, group - AHEAD), to + 2 * GROUP * (group - AHEAD)
+                for i in range(0, GROUP, 2):
+                    copy2(even + offset_at(offsets + 4 * i), begin + 2 * i)
+                    copy2(odd + offset_at(offsets + 4 * i + 4), begin + 2 * i + 2)
+                group += 1
+            if group < groups:
+                choose_group(row, width, group, keys, count, bits, scratch, slot(scratch, group))
+            done = group - AHEAD
+            if done >= 0:
+                for i in range(min(GROUP, width - GROUP * done)):
+                    site = (odd if i & 1 else even) + offset_at(slot(scratch, done) + 4 * i)
+                    copy2(site, to + 2 * (GROUP * done + i))
+            group += 1
+
+
+def draw_samples(
+    samples: npt.NDArray[np.uint16],
+    picture: npt.NDArray[np.uint8],
+    *,
+    seed: int = 0,
+    image: int = 0,
+    first_row: int = 0,
+    threads: int = 1,
+    out: npt.NDArray[np.uint16] | None = None,
+) -> npt.NDArray[np.uint16]:
+    """Return the raw linear image of `picture` under one light; the rule stands at the head of this file.
+
+    Parameters
+    ----------
+    samples
+        (8**bits, S, 3) uint16, linear camera RGB of one light, S ≥ 1; for example `lut.samples[light]`.
+    picture
+        (H, W, 3) uint8 sRGB codes; the 8 − bits low bits of a code do not matter.
+    seed
+        0 … 2⁶⁴ − 1.
+    image
+        Number of the image in its dataset, 0 … 2³² − 1.
+    first_row
+        The row of the whole picture that `picture` begins with: a picture done in bands is the same picture.
+    threads
+        Threads that share the rows; no byte depends on it.
+    out
+        (H, W, 3) uint16 to fill instead of a new array.
+
+    Returns
+    -------
+    ndarray
+        (H, W, 3) uint16, linear camera RGB in the units of `samples`.
+
+    Raises
+    ------
+    InputError
+        A shape, type or number is not as above.
+    """
+    bits = check_samples(samples)
+    check_picture(picture)
+    target = check_target(out, picture.shape, np.uint16)
+    key = check_place(seed, image)
+    source, table, work = packed(picture), readable(samples), writable(target)
+
+    def fill(top: int, bottom: int) -> None:
+        scratch = np.empty(SCRATCH + line_room(SAMPLE_BYTES * GROUP * _STRETCH), np.uint8)
+        _gather(
+            source[top:].ctypes.data,
+            source.strides[0],
+            source.shape[1],
+            bottom - top,
+            table.ctypes.data,
+            np.uint32(samples.shape[1]),
+            np.uint32(bits),
+            key,
+            image,
+            first_row + top,
+            work[top:].ctypes.data,
+            work.strides[0],
+            work.nbytes >= streaming.STREAMED_BYTES,
+            scratch.ctypes.data,
+        )
+
+    share(fill, len(picture), threads)
+    return delivered(work, target)
+
+
+def draw_mosaic(
+    samples: npt.NDArray[np.uint16],
+    picture: npt.NDArray[np.uint8],
+    *,
+    pattern: str = "RGGB",
+    seed: int = 0,
+    image: int = 0,
+    first_row: int = 0,
+    threads: int = 1,
+    out: npt.NDArray[np.uint16] | None = None,
+) -> npt.NDArray[np.uint16]:
+    """Return the Bayer mosaic of `picture`: of each pixel of `draw_samples` the one channel that its site has.
+
+    A table's sample is half-size RGB, its green the mean of two photosites; a mosaic's green is therefore quieter than
+    that of a raw file, by √2 where the two greens do not share their noise.
+
+    Parameters
+    ----------
+    pattern
+        Channels of the picture's first 2x2 block in reading order: RGGB, BGGR, GRBG or GBRG. It belongs to the whole
+        picture: with an odd `first_row` the first row is the pattern's second.
+    samples, picture, seed, image, first_row, threads
+        As for `draw_samples`.
+    out
+        (H, W) uint16 to fill instead of a new array.
+
+    Returns
+    -------
+    ndarray
+        (H, W) uint16, in the units of `samples`.
+
+    Raises
+    ------
+    InputError
+        A shape, type or number is not as above, or the pattern is none of these.
+    """
+    bits = check_samples(samples)
+    check_picture(picture)
+    target = check_target(out, picture.shape[:2], np.uint16)
+    key = check_place(seed, image)
+    if pattern not in PATTERNS:
+        raise InputError(f"{pattern!r} is no Bayer pattern; expected {', '.join(PATTERNS)}")
+    channels = sum(channel << 2 * place for place, channel in enumerate(PATTERNS[pattern]))
+    source, table, work = packed(picture), readable(samples), writable(target)
+
+    def fill(top: int, bottom: int) -> None:
+        scratch = np.empty(SCRATCH, np.uint8)
+        _gather_mosaic(
+            source[top:].ctypes.data,
+            source.strides[0],
+            source.shape[1],
+            bottom - top,
+            table.ctypes.data,
+            np.uint32(samples.shape[1]),
+            np.uint32(bits),
+            key,
+            image,
+            first_row + top,
+            work[top:].ctypes.data,
+            work.strides[0],
+            channels,
+            scratch.ctypes.data,
+        )
+
+    share(fill, len(picture), threads)
+    return delivered(work, target)
+
+
+def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT) -> npt.NDArray[np.uint16]:
+    """Return the samples (8**bits, S, 3) uint16 of light number `light`, in memory if `pixels` are worth the copy.
+
+    Raises
+    ------
+    InputError
+        The table has no such light, or it is no whole number.
+    """
+    try:
+        number = operator.index(light)
+    except TypeError as error:
+        raise InputError(f"light {light!r} is no number of a light; give a whole one from 0") from error
+    if not 0 <= number < len(lut.samples):
+        raise InputError(f"there is no light {number}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
+    mapped = lut.samples[number]
+    return np.array(mapped) if pixels >= WHOLE_LIGHT else mapped
+
+
+def render(
+    lut: Lut, picture: npt.NDArray[np.uint8], light: int, *, seed: int = 0, image: int = 0, threads: int = 1
+) -> npt.NDArray[np.uint16]:
+    """Return the raw linear image of `picture` printed, lit by the table's light `light` and photographed.
+
+    Colours that the table lists as unfit are replaced by the nearest fit one; see `kernels.palette.fit_picture`.
+
+    Parameters
+    ----------
+    lut
+        A table, from `calibration.table.lut.open_lut`.
+    picture
+        (H, W, 3) uint8 sRGB codes, from `scene.read_picture` or any array.
+    light
+        Number of the light in the table.
+    seed, image, threads
+        As for `draw_samples`.
+
+    Returns
+    -------
+    ndarray
+        (H, W, 3) uint16, linear camera RGB, `lut.provenance.white_level` = saturation of the sensor.
+
+    Raises
+    ------
+    InputError
+        The table has no such light, or the picture is not of that shape and type.
+    """
+    check_picture(picture)
+    samples = read_light(lut, light, picture.shape[0] * picture.shape[1])
+    fit, _ = fit_picture(picture, lut.provenance)
+    return draw_samples(samples, fit, seed=seed, image=image, threads=threads)

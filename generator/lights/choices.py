@@ -1,0 +1,378 @@
+"""Which lights fall on which source picture.
+
+Every picture under the same listed lights, each under some drawn at random from the table or from a distribution, or
+each under the light of a ground truth of another data set (paper, section 4.3), the nearest of the table or one mixed
+to match; one at a time, or several together, each in its part of the picture. A choice depends on the picture's
+position in the list of sources, and on nothing else but its seed.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.errors import InputError
+from generator.kernels import philox
+from generator.lights.distributions import Distribution
+from generator.lights.gamut import Gamut, Match, Outside, OutsideGamutError, black_body, rgb_of
+from generator.lights.ground_truths import load_ground_truths
+from generator.lights.lighting import LightChoice, Lighting, Mixture, parse_mixture, plain
+from generator.lights.options import parse_numbers
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+    from generator.masks.making import MaskPlan
+
+__all__ = [
+    "DrawnLights",
+    "FollowedLights",
+    "LightChoice",
+    "ListedLights",
+    "RandomLights",
+    "TogetherLights",
+    "load_ground_truths",
+    "matched_lights",
+    "nearest_lights",
+    "parse_light",
+    "parse_lights",
+]
+
+_BATCH: Final = 32
+_BATCHES: Final = 2048
+_LEAST_WITHIN: Final = 1e-3
+"""Share of a distribution that must lie in the gamut; with less, drawing again and again would take for ever."""
+
+
+@dataclass(frozen=True)
+class ListedLights:
+    """The same lights for every picture: numbers of the table's lights, or mixtures of them."""
+
+    lights: tuple[int | Mixture, ...]
+
+    @property
+    def lights_each(self) -> int:
+        """Images for each picture."""
+        return len(self.lights)
+
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image; `position` does not matter."""
+        del position
+        mixtures = (light if isinstance(light, Mixture) else plain(light) for light in self.lights)
+        return tuple(Lighting((mixture,)) for mixture in mixtures)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the choice as plain values."""
+        lights = [light.label if isinstance(light, Mixture) else light for light in self.lights]
+        return {"choice": "listed", "lights": lights}
+
+
+@dataclass(frozen=True)
+class RandomLights:
+    """`count` distinct lights of `total` for each picture, every set equally likely; purpose 1 of `philox`."""
+
+    count: int
+    total: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= self.total:
+            raise InputError(
+                f"{self.count} random lights a picture were asked for; the table has {self.total}, expected 1 to that"
+            )
+
+    @property
+    def lights_each(self) -> int:
+        """Images for each picture."""
+        return self.count
+
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image of the picture at `position`."""
+        lights = philox.distinct(self.seed, self.count, self.total, position, philox.LIGHTS)
+        return tuple(Lighting((plain(light),)) for light in lights)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the choice as plain values."""
+        return {"choice": "random", "count": self.count}
+
+
+@dataclass(frozen=True)
+class FollowedLights:
+    """The lights of a list of ground truths one after another, `each` for a picture, starting over when it ends.
+
+    Attributes
+    ----------
+    way
+        How a light was found for a ground truth: ``nearest`` of the table's own, or a mixture to ``match`` it.
+    matches
+        For each ground truth the light, and how far it is.
+    file
+        What their origin is called.
+    each
+        Images for each picture.
+    """
+
+    way: Literal["nearest", "match"]
+    matches: tuple[Match, ...]
+    file: str
+    each: int = 1
+
+    @property
+    def lights_each(self) -> int:
+        """Images for each picture."""
+        return self.each
+
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image of the picture at `position`."""
+        first = position * self.each
+        return tuple(
+            Lighting((self.matches[number % len(self.matches)].mixture,)) for number in range(first, first + self.each)
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """Return the choice as plain values."""
+        return {
+            "choice": self.way,
+            "file": self.file,
+            "each": self.each,
+            "lights": [match.mixture.label for match in self.matches],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnLights:
+    """`count` lights for each picture, drawn from a distribution cut to what the table can make; purpose 4 of `philox`.
+
+    Light j of the picture at position p is the first of the draws 0, 1, 2 … that lies in the gamut, draw i made of
+    the words of place (i, j), number p.
+
+    Raises
+    ------
+    InputError
+        Fewer than one light is wanted, or hardly any of the distribution lies in the gamut.
+    """
+
+    gamut: Gamut
+    distribution: Distribution
+    count: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise InputError(f"{self.count} lights a picture were asked for, expected 1 or more")
+        within = np.mean([self._batch(trial, 0, 0)[1].mean() for trial in range(128)])
+        if within < _LEAST_WITHIN:
+            raise InputError(
+                f"{within:.1%} of the distribution lies within what {self.gamut.table} can make, expected "
+                f"{_LEAST_WITHIN:.1%} or more; choose one nearer to its lights, whose mean is "
+                "r={:.3f}, b={:.3f}".format(*self.gamut.rb.mean(axis=0))
+            )
+
+    @property
+    def lights_each(self) -> int:
+        """Images for each picture."""
+        return self.count
+
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image of the picture at `position`."""
+        return tuple(Lighting((self._light(position, light),)) for light in range(self.count))
+
+    def describe(self) -> dict[str, Any]:
+        """Return the choice as plain values."""
+        return {"choice": "drawn", "count": self.count, **self.distribution.describe()}
+
+    def _light(self, position: int, light: int) -> Mixture:
+        for batch in range(_BATCHES):
+            drawn, within = self._batch(batch, light, position)
+            if within.any():
+                return self.gamut.match(rgb_of(drawn[int(within.argmax())])).mixture
+        raise InputError(f"{_BATCH * _BATCHES} draws from the distribution all lie outside {self.gamut.table}")
+
+    def _batch(self, batch: int, light: int, position: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        places = np.arange(batch * _BATCH, (batch + 1) * _BATCH)
+        words = philox.words(self.seed, places, light, position, philox.CHROMATICITIES)
+        drawn = self.distribution.draw(words)
+        return drawn, self.gamut.contains(drawn)
+
+
+@dataclass(frozen=True)
+class TogetherLights:
+    """`together` lights of another choice at a time on one image, each where the masks let it fall.
+
+    Image i of a picture gets the lights i · together … of the other choice, and the masks of number
+    position · images + i.
+
+    Raises
+    ------
+    InputError
+        Fewer than two lights are to fall together, or the other choice has no whole number of such groups.
+    """
+
+    choice: LightChoice
+    together: int
+    masks: MaskPlan
+
+    def __post_init__(self) -> None:
+        if self.together < 2 or self.choice.lights_each % self.together:
+            raise InputError(
+                f"{self.choice.lights_each} lights for each picture cannot be shared out {self.together} to an image; "
+                "expected 2 or more to an image, and a whole number of images"
+            )
+
+    @property
+    def lights_each(self) -> int:
+        """Images for each picture."""
+        return self.choice.lights_each // self.together
+
+    def lightings_of(self, position: int) -> tuple[Lighting, ...]:
+        """Return the lighting of each image of the picture at `position`."""
+        mixtures = [mixture for lighting in self.choice.lightings_of(position) for mixture in lighting.mixtures]
+        return tuple(
+            Lighting(
+                tuple(mixtures[image * self.together : (image + 1) * self.together]),
+                self.masks.maker(position * self.lights_each + image),
+            )
+            for image in range(self.lights_each)
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """Return the choice as plain values."""
+        return {
+            "choice": "together",
+            "together": self.together,
+            "masks": self.masks.describe(),
+            "lights": self.choice.describe(),
+        }
+
+
+def parse_lights(text: str, total: int) -> ListedLights:
+    """Return the lights of a list such as `0,5,12-20`, or `all`; each once, in the order written.
+
+    Raises
+    ------
+    InputError
+        An entry is no number or range, or the table has no such light.
+    """
+    if text.strip().lower() == "all":
+        return ListedLights(tuple(range(total)))
+    lights: dict[int, None] = {}
+    for entry in text.split(","):
+        match = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", entry, re.ASCII)
+        if not match:
+            raise InputError(f"{entry.strip()!r} is no light; write numbers and ranges as in 0,5,12-20, or all")
+        first = int(match[1])
+        last = int(match[2]) if match[2] else first
+        if max(first, last) >= total:
+            raise InputError(f"there is no light {max(first, last)}; the table has lights 0 to {total - 1}")
+        if last < first:
+            raise InputError(f"{entry.strip()!r} runs backwards; write {last}-{first}")
+        lights.update(dict.fromkeys(range(first, last + 1)))
+    return ListedLights(tuple(lights))
+
+
+def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outside = "refuse") -> Mixture:
+    """Return the light that a text names.
+
+    ``12`` and ``12:0.25+40:0.75`` are lights of the table, ``cct=4500`` or ``4500K`` a black body in kelvin
+    (`lights.gamut.black_body`), ``r=.3,b=.25`` a chromaticity in linear RGB of the table's camera.
+
+    Parameters
+    ----------
+    text
+        What was written.
+    lut
+        The table.
+    gamut
+        The table's gamut, if it is at hand.
+    outside
+        What to do about a chromaticity that the table cannot make.
+
+    Raises
+    ------
+    InputError
+        It names none, or one that the table cannot make.
+    """
+    kelvin = re.fullmatch(r"(\d+(?:\.\d*)?)\s*[kK]", text.strip(), re.ASCII)
+    if kelvin:
+        text = f"cct={kelvin[1]}"
+    if "=" not in text:
+        mixture = parse_mixture(text.strip())
+        mixture.white(lut)
+        return mixture
+    numbers = parse_numbers(
+        text, {"cct": (1.0, 1e6), "r": (0.0, 1.0), "b": (0.0, 1.0)}, "a light, cct=4500 or r=.3,b=.25"
+    )
+    if numbers.keys() == {"cct"}:
+        return black_body(lut, numbers["cct"])
+    if numbers.keys() != {"r", "b"} or numbers["r"] + numbers["b"] > 1:
+        raise InputError(f"{text!r} is no light; write cct=4500, or r=.3,b=.25 with a sum of at most 1")
+    return (gamut or Gamut.of(lut)).match(rgb_of([numbers["r"], numbers["b"]]), outside).mixture
+
+
+def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", each: int = 1) -> FollowedLights:
+    """Return for each ground truth the table's light at the smallest angle; of several the lowest number.
+
+    Parameters
+    ----------
+    lut
+        The table.
+    truths
+        (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length.
+    file
+        What to call their origin.
+    each
+        Images for each picture.
+    """
+    table = lut.ground_truth / np.linalg.norm(lut.ground_truth, axis=1, keepdims=True)
+    wanted = truths / np.linalg.norm(truths, axis=1, keepdims=True)
+    cosine = np.clip(wanted @ table.T, -1.0, 1.0)
+    lights = cosine.argmax(axis=1)
+    angles = np.degrees(np.arccos(cosine[np.arange(len(lights)), lights]))
+    matches = (Match(plain(int(light)), float(angle)) for light, angle in zip(lights, angles, strict=True))
+    return FollowedLights("nearest", tuple(matches), file, each)
+
+
+def matched_lights(
+    gamut: Gamut,
+    truths: npt.NDArray[np.float64],
+    file: str = "",
+    each: int = 1,
+    outside: Outside = "refuse",
+) -> FollowedLights:
+    """Return for each ground truth the mixture of the table's lights that has it; see `gamut.Gamut.match`.
+
+    Parameters
+    ----------
+    gamut
+        What the table can make.
+    truths
+        (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length.
+    file
+        What to call their origin.
+    each
+        Images for each picture.
+    outside
+        What to do about ground truths that the table cannot make.
+
+    Raises
+    ------
+    InputError
+        The table cannot make some of them, and the nearest was not asked for.
+    """
+    matches: list[Match] = []
+    lost: list[tuple[int, OutsideGamutError]] = []
+    for number, truth in enumerate(truths):
+        try:
+            matches.append(gamut.match(truth, outside))
+        except OutsideGamutError as error:
+            lost.append((number, error))
+    if lost:
+        number, worst = max(lost, key=lambda item: item[1].angle)
+        raise InputError(
+            f"{len(lost)} of {len(truths)} ground truths{f' of {file}' if file else ''} cannot be made; "
+            f"the farthest is number {number + 1}: {worst}"
+        ) from worst
+    return FollowedLights("match", tuple(matches), file, each)

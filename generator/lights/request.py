@@ -1,0 +1,117 @@
+"""What a user asks of light, as it is written on a command line, and the choice of lights that it comes to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from foundation.errors import InputError
+from generator.lights.choices import (
+    DrawnLights,
+    ListedLights,
+    RandomLights,
+    TogetherLights,
+    matched_lights,
+    nearest_lights,
+    parse_light,
+    parse_lights,
+)
+from generator.lights.distributions import parse_distribution
+from generator.lights.gamut import Gamut, Outside
+from generator.lights.ground_truths import load_ground_truths
+from generator.lights.lighting import LightChoice
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+
+MASKS: Final = "smooth"
+"""The masks of several lights where none are named."""
+
+
+@dataclass(frozen=True)
+class LightRequest:
+    """Options about light, each None or empty where it was not given; named as on the command line.
+
+    Attributes
+    ----------
+    illuminations
+        Lights of the table for every picture: ``0,5,12-20`` or ``all``.
+    light
+        Lights for every picture, each as `illuminant.parse_light` reads it.
+    random
+        Images of each picture under lights of its own: of the table, or of `distribution`. One if not said.
+    distribution
+        Where those lights are drawn from; see `lights.distributions.parse_distribution`.
+    nearest, match
+        Files of ground truths, for which the table's nearest lights are taken, or mixtures that match them.
+    outside
+        What to do about chromaticities that the table cannot make.
+    lights_per_image
+        Lights that fall on one image: that many, in the order of the lists, share each image.
+    masks
+        Where each falls; see `masks.making.parse_masks`.
+    """
+
+    illuminations: str | None = None
+    light: tuple[str, ...] = ()
+    random: int | None = None
+    distribution: str | None = None
+    nearest: Path | None = None
+    match: Path | None = None
+    outside: Outside = "refuse"
+    lights_per_image: int | None = None
+    masks: str | None = None
+
+    def choose(self, lut: Lut, seed: int) -> LightChoice:
+        """Return the choice of lights.
+
+        Raises
+        ------
+        InputError
+            Options exclude one another, or one of them names what is not there.
+        """
+        together = self.lights_per_image or (1 if self.masks is None else 2)
+        if self.lights_per_image is not None and self.lights_per_image < 1:
+            raise InputError(f"{self.lights_per_image} lights an image were asked for, expected 1 or more")
+        if self.masks is not None and together == 1:
+            raise InputError(
+                f"--masks {self.masks} says where several lights fall, but each image has one; ask for more with "
+                "--lights-per-image"
+            )
+        choice = self._lights(lut, seed, together)
+        if together == 1:
+            return choice
+        from generator.masks.making import parse_masks
+
+        return TogetherLights(choice, together, parse_masks(self.masks or MASKS, together, seed))
+
+    def _lights(self, lut: Lut, seed: int, together: int) -> LightChoice:
+        """Return the choice of lights with as many for each picture as its images have together."""
+        ways = {
+            "--illuminations": self.illuminations is not None,
+            "--light": bool(self.light),
+            "--nearest": self.nearest is not None,
+            "--match": self.match is not None,
+            "--distribution": self.distribution is not None,
+            "--random": self.random is not None and self.distribution is None,
+        }
+        given = [name for name, is_given in ways.items() if is_given]
+        if len(given) > 1:
+            raise InputError(
+                f"{' and '.join(given)} were both given; choose lights in one way (--random may go with --distribution)"
+            )
+        count = together * (1 if self.random is None else self.random)
+        if self.illuminations is not None:
+            return parse_lights(self.illuminations, len(lut.white))
+        if self.light:
+            gamut = Gamut.of(lut)
+            return ListedLights(tuple(parse_light(text, lut, gamut, self.outside) for text in self.light))
+        if self.nearest is not None:
+            return nearest_lights(lut, load_ground_truths(self.nearest), self.nearest.name, together)
+        if self.match is not None:
+            truths = load_ground_truths(self.match)
+            return matched_lights(Gamut.of(lut), truths, self.match.name, together, self.outside)
+        if self.distribution is not None:
+            return DrawnLights(Gamut.of(lut), parse_distribution(self.distribution), count, seed)
+        return RandomLights(count, len(lut.white), seed)

@@ -1,0 +1,113 @@
+"""The Flash tone mapping operator and its inverse: linear images made fit to look at, and back.
+
+N. Banić, S. Lončarić, "Flash and Storm: fast and highly practical tone mapping based on Naka-Rushton equation",
+VISAPP 2018; used for the previews as the paper uses it in its figure of the generation process, and in its section 4.2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.errors import InputError
+
+DARK = 1e-9
+"""What stands for brightness 0 in the mean of logarithms; linear values are 0 … 1, so it is far below any signal."""
+
+
+_NOTHING = np.float32(1e-30)
+"""Has a logarithm and is still black."""
+
+
+@dataclass(frozen=True)
+class Flash:
+    """The operator with its parameters fixed to one image, so that it can be undone.
+
+    Attributes
+    ----------
+    k
+        Semi-saturation: a · exp(mean ln V) of the image it was fitted to.
+    scale
+        Code that the brightest value became, divided by that value: undone before anything else.
+    gamma
+        Display exponent g of y ** (1 / g); 1 for none.
+    """
+
+    k: float
+    scale: float
+    gamma: float
+
+    def apply(self, linear: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """Return codes (..., 3) float64 of `linear` (..., 3) ≥ 0; 255 is the brightest of the image fitted to."""
+        linear = np.asarray(linear, dtype=np.float64)
+        brightness = np.maximum(linear.max(axis=-1, keepdims=True), DARK)
+        return self.scale * (linear / (brightness + self.k)) ** (1 / self.gamma)
+
+    def invert(self, codes: npt.NDArray[np.floating] | npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
+        """Return the linear image (..., 3) float64 of codes (..., 3) 0 … 255, rounded ones too.
+
+        With y = x / (V + k) the largest channel W = V / (V + k), hence x = y k / (1 − W).
+        """
+        mapped = (np.asarray(codes, dtype=np.float64) / self.scale) ** self.gamma
+        largest = mapped.max(axis=-1, keepdims=True)
+        # A rounded-up brightest code may reach W = 1, which no finite brightness has.
+        return mapped * self.k / np.maximum(1 - largest, DARK)
+
+
+def fit_flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2.2) -> Flash:
+    """Return the operator fitted to an image.
+
+    Parameters
+    ----------
+    linear
+        (..., 3) float ≥ 0, linear RGB, 1 = saturation.
+    a
+        Strength, > 0; larger keeps the picture darker. 5 is the authors' value.
+    gamma
+        Display exponent, 1 for none.
+
+    Raises
+    ------
+    InputError
+        The image is empty, or a parameter not above 0.
+    """
+    if not linear.size or a <= 0 or gamma <= 0:
+        raise InputError(
+            f"tone mapping wants an image and parameters above 0; got {linear.shape}, a={a}, gamma={gamma}"
+        )
+    brightness = _brightness(np.asarray(linear))
+    return flash_of(float(np.log(brightness).mean(dtype=np.float64)), float(brightness.max()), a, gamma)
+
+
+def flash_of(mean_log: float, peak: float, a: float = 5.0, gamma: float = 2.2) -> Flash:
+    """Return the operator for an image of such brightness: the mean of its logarithm, and the largest."""
+    k = a * math.exp(mean_log)
+    return Flash(k, 255.0 / (peak / (peak + k)) ** (1 / gamma), gamma)
+
+
+def flash(linear: npt.NDArray[np.floating], a: float = 5.0, gamma: float = 2.2) -> npt.NDArray[np.uint8]:
+    """Return the picture (..., 3) uint8 of a linear image (..., 3) float, 1 = saturation; see `fit_flash`.
+
+    Computed in single precision: a code may differ by one from that of `Flash.apply` where that lies between two.
+    """
+    linear = np.asarray(linear, dtype=np.float32)
+    operator = fit_flash(linear, a, gamma)
+    mapped = linear / (_brightness(linear) + np.float32(operator.k))[..., None]
+    if gamma != 1:
+        # Through logarithms, which numpy computes several at once; a power takes ten times as long.
+        np.maximum(mapped, _NOTHING, out=mapped)
+        np.log(mapped, out=mapped)
+        mapped *= np.float32(1 / gamma)
+        np.exp(mapped, out=mapped)
+    mapped *= np.float32(operator.scale)
+    np.rint(mapped, out=mapped)
+    return np.clip(mapped, 0, 255, out=mapped).astype(np.uint8)
+
+
+def _brightness(linear: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """Return the largest channel (...) of `linear` (..., 3), never quite 0."""
+    largest = np.maximum(np.maximum(linear[..., 0], linear[..., 1]), linear[..., 2])
+    return np.maximum(largest, linear.dtype.type(DARK))

@@ -1,0 +1,1 @@
+"""Training crops drawn in memory, with or without PyTorch."""

@@ -1,0 +1,263 @@
+"""Training batches: crops of pictures under lights drawn afresh, with the ground truth of each.
+
+`Crops` is the endless set of items a table and a gallery allow. Which picture, window, light, mirror image, gain and
+samples item i of an epoch has is a pure function of (seed, epoch, i): the words of Philox4x32-10 with counter
+(i, epoch, k, 7), k = 0 picture, column, row, light; k = 1 mirror and gain; k = 2 the kernel's seed. So the items are
+the same however many workers share them.
+
+Needs no PyTorch; `CropDataset` and `CropStream`, which do, are loaded when they are first used::
+
+    from torch.utils.data import DataLoader
+    from generator.training.crops import CropDataset, Crops, collated
+
+    crops = Crops(lut, open_gallery(Path("gallery")), (128, 128), length=100_000, exposure=(0.5, 2.0))
+    for batch in DataLoader(CropDataset(crops), batch_size=64, shuffle=True, num_workers=2, collate_fn=collated):
+        batch["image"]          # (64, 3, 128, 128) float32, linear camera RGB, 1 = saturation
+        batch["illuminant"]     # (64, 3) float32, r + g + b = 1
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.errors import InputError
+from generator.kernels import philox
+from generator.kernels.palette import fit_picture
+from generator.kernels.planar import draw_batch
+from generator.lights.lighting import Mixture
+from generator.training.recycling import Recycled
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+    from generator.training.gallery import Gallery
+    from generator.training.torch_crops import CropDataset, CropStream, collated
+
+__all__ = ["Batch", "CropDataset", "CropStream", "Crops", "collated"]
+
+_HALF = np.uint64(32)
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """N items.
+
+    Attributes
+    ----------
+    images
+        (N, 3, height, width) float32, linear camera RGB, 0 … 1 = saturation of the sensor.
+    illuminants
+        (N, 3) float32, the ground truth, r + g + b = 1.
+    lights
+        (N,) int64, place of each item's light in `Crops.lights`.
+    pictures
+        (N,) int64, place of each item's picture in the gallery.
+    """
+
+    images: npt.NDArray[np.float32]
+    illuminants: npt.NDArray[np.float32]
+    lights: npt.NDArray[np.int64]
+    pictures: npt.NDArray[np.int64]
+
+
+class Crops:
+    """Crops of a gallery's pictures under a table's lights.
+
+    Parameters
+    ----------
+    lut
+        The table.
+    gallery
+        The pictures; see `gallery`. Every one must be as large as a crop. Where the table lists colours as unfit,
+        pictures that have them are copied to memory with the nearest fit ones instead.
+    size
+        Height and width of a crop, px.
+    length
+        Items of an epoch.
+    lights
+        What lights to draw from, each as likely: numbers of the table's lights, or mixtures of them, which take 5 MB
+        of memory each. None: all lights of the table.
+    exposure
+        Least and largest gain, > 0; drawn evenly in stops. What a gain above 1 takes past saturation is cut off there.
+    flip
+        Whether half of the items are mirrored.
+    seed
+        0 … 2⁶⁴ − 1.
+    epoch
+        0 … 2³² − 1; see `at_epoch`.
+    threads
+        Threads that share a batch; no value depends on it.
+
+    Raises
+    ------
+    InputError
+        A number is out of range, a light is not in the table, or a picture is smaller than a crop.
+    """
+
+    def __init__(
+        self,
+        lut: Lut,
+        gallery: Gallery,
+        size: tuple[int, int] = (128, 128),
+        *,
+        length: int = 1 << 20,
+        lights: Sequence[int | Mixture] | None = None,
+        exposure: tuple[float, float] = (1.0, 1.0),
+        flip: bool = True,
+        seed: int = 0,
+        epoch: int = 0,
+        threads: int = 1,
+    ) -> None:
+        height, width = size
+        if min(height, width) < 1:
+            raise InputError(f"crops of {height}x{width} px were asked for, expected 1 or more")
+        small = np.flatnonzero((gallery.sizes < (height, width)).any(axis=1))
+        if small.size:
+            tall, wide = gallery.sizes[small[0]]
+            raise InputError(
+                f"{small.size} of {len(gallery)} pictures are smaller than a crop of {height}x{width} px (height x "
+                f"width), the first is {gallery.names[small[0]]} of {tall}x{wide}; leave them out or cut smaller"
+            )
+        if not 1 <= length <= 1 << 32:
+            raise InputError(f"an epoch of {length} items was asked for, expected 1 to 2^32")
+        if not (0 < exposure[0] <= exposure[1] < np.inf):
+            raise InputError(f"the exposure is {exposure}, expected least and largest gain above 0")
+        philox.key_of(seed)
+        chosen = range(len(lut.samples)) if lights is None else lights
+        if not chosen:
+            raise InputError("there is no light to draw from; name some or leave the choice out")
+        mixtures = [light if isinstance(light, Mixture) else Mixture((light,), (1.0,)) for light in chosen]
+        whites = np.stack([mixture.white(lut) for mixture in mixtures])
+        self.lut = lut
+        self.gallery = gallery
+        self.size = size
+        self.length = length
+        self.lights = tuple(mixtures)
+        self.exposure = exposure
+        self.flip = flip
+        self.seed = seed
+        self.epoch = self._checked_epoch(epoch)
+        self.threads = threads
+        self._memory = Recycled()
+        self._truths = (whites / whites.sum(axis=1, keepdims=True)).astype(np.float32)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Map or make what a pickle leaves out."""
+        if all(len(mixture.lights) == 1 for mixture in self.lights):
+            self._tables = self.lut.samples
+            self._rows = np.array([mixture.lights[0] for mixture in self.lights], dtype=np.int64)
+        else:
+            self._tables = np.stack([mixture.samples(self.lut, self.seed) for mixture in self.lights])
+            self._rows = np.arange(len(self.lights))
+        self._pictures = [
+            fit_picture(self.gallery.picture(number), self.lut.provenance)[0] for number in range(len(self.gallery))
+        ]
+
+    def __getstate__(self) -> dict[str, Any]:
+        made = ("_tables", "_rows", "_pictures", "_memory")
+        kept = {name: value for name, value in vars(self).items() if name not in made}
+        # The table is gigabytes; its folder is enough to map it again.
+        kept["lut"] = self.lut.folder
+        return kept
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        from calibration.table.lut import open_lut
+
+        vars(self).update(state)
+        self.lut = open_lut(state["lut"])
+        self._memory = Recycled()
+        self._prepare()
+
+    @staticmethod
+    def _checked_epoch(epoch: int) -> int:
+        if not 0 <= epoch < 1 << 32:
+            raise InputError(f"the epoch is {epoch}, expected 0 to 2^32 - 1")
+        return epoch
+
+    def set_epoch(self, epoch: int) -> None:
+        """Make these the items of another epoch, as PyTorch's distributed samplers are told.
+
+        Raises
+        ------
+        InputError
+            The epoch is not 0 … 2³² − 1.
+        """
+        self.epoch = self._checked_epoch(epoch)
+
+    def __len__(self) -> int:
+        """Return the items of an epoch."""
+        return self.length
+
+    def batch(self, items: npt.ArrayLike, out: npt.NDArray[np.float32] | None = None) -> Batch:
+        """Return items by their numbers.
+
+        Parameters
+        ----------
+        items
+            (N,) int, 0 … length − 1, in any order, N ≥ 1.
+        out
+            (N, 3, height, width) float32 to fill: the batch's images. None: memory of a former batch of which nothing
+            is left, or new memory.
+
+        Raises
+        ------
+        InputError
+            There is no such item, or `out` is of another shape or type.
+        """
+        numbers = np.asarray(items, dtype=np.int64)
+        if numbers.ndim != 1 or not numbers.size or numbers.min() < 0 or numbers.max() >= self.length:
+            raise InputError(f"items {items} were asked for, expected a list of numbers from 0 to {self.length - 1}")
+        words = philox.words(self.seed, numbers, self.epoch, np.arange(3)[:, None], philox.ITEMS)
+        (which, mirror, low), (across, stops, high), (down, _, _), (light, _, _) = words
+        pictures = _below(which, len(self.gallery))
+        height, width = self.size
+        free = self.gallery.sizes[pictures] - self.size + 1
+        windows = np.empty((numbers.size, 4), np.int64)
+        windows[:, 0], windows[:, 1] = _below(across, free[:, 1]), _below(down, free[:, 0])
+        windows[:, 2:] = width, height
+        lights = _below(light, len(self.lights))
+        least, most = np.log2(self.exposure)
+        images = draw_batch(
+            self._tables,
+            self._rows[lights],
+            [self._pictures[place] for place in map(int, pictures)],
+            windows,
+            white_level=self.lut.provenance.white_level,
+            flips=(mirror >> 31).astype(bool) & self.flip,
+            gains=np.exp2(least + (most - least) * (stops / 2.0**32)),
+            seeds=low.astype(np.uint64) | high.astype(np.uint64) << _HALF,
+            threads=self.threads,
+            out=self._memory.array((numbers.size, 3, height, width)) if out is None else out,
+        )
+        return Batch(images, self._truths[lights], lights, pictures)
+
+    def __getitem__(self, item: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Return the image (3, height, width) float32 and the illuminant (3,) float32 of one item.
+
+        Raises
+        ------
+        IndexError
+            There is no such item, as Python's loops want to be told.
+        """
+        if not 0 <= item < self.length:
+            raise IndexError(f"item {item} of {self.length}")
+        batch = self.batch([item])
+        return batch.images[0], batch.illuminants[0]
+
+
+def _below(words: npt.NDArray[np.uint32], bound: int | npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return numbers from 0 up to bounds, from random words."""
+    return (words.astype(np.uint64) * np.asarray(bound, dtype=np.uint64) >> _HALF).astype(np.int64)
+
+
+def __getattr__(name: str) -> object:
+    if name in ("CropDataset", "CropStream", "collated"):
+        from generator.training import torch_crops as torch_batches
+
+        return getattr(torch_batches, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

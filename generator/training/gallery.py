@@ -1,0 +1,190 @@
+"""Many pictures unpacked once, so that training can cut crops from them without decoding.
+
+A gallery is a folder of two files: `codes.u8`, the sRGB codes of all pictures one after another, row by row, R, G, B;
+and `gallery.json`, which says where each begins. It is memory-mapped, so workers share one copy and what is not looked
+at costs no memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from foundation.errors import FormatError, InputError
+from foundation.files import storage_error, whole_folder, write_whole
+from generator.pictures.picture import Picture
+from generator.pictures.sources import Source
+
+FORMAT = "crop.gallery"
+VERSION = 1
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    name: str
+    sha256: str | None
+    width: int
+    height: int
+
+
+class _Head(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    format: Literal["crop.gallery"] = FORMAT
+    version: Literal[1] = VERSION
+    pictures: list[_Entry]
+    skipped: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Gallery:
+    """Pictures in one flat array.
+
+    Attributes
+    ----------
+    names
+        What each picture is called, P of them.
+    codes
+        (N,) uint8, all pictures' codes.
+    sizes
+        (P, 2) int64, height and width, px.
+    offsets
+        (P,) int64, where each picture begins in `codes`.
+    folder
+        Where it is kept; None for one in memory.
+    """
+
+    names: tuple[str, ...]
+    codes: npt.NDArray[np.uint8]
+    sizes: npt.NDArray[np.int64]
+    offsets: npt.NDArray[np.int64]
+    folder: Path | None = None
+
+    def __len__(self) -> int:
+        """Return the number of pictures."""
+        return len(self.names)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A worker maps the file anew rather than being sent what may be gigabytes.
+        if self.folder is not None:
+            return open_gallery, (self.folder,)
+        return Gallery, (self.names, self.codes, self.sizes, self.offsets)
+
+    def picture(self, number: int) -> Picture:
+        """Return a picture (H, W, 3) uint8, sRGB codes; a view."""
+        height, width = (int(side) for side in self.sizes[number])
+        start = int(self.offsets[number])
+        return self.codes[start : start + 3 * height * width].reshape(height, width, 3)
+
+
+def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) -> Gallery:
+    """Return a gallery in memory.
+
+    Parameters
+    ----------
+    pictures
+        (H, W, 3) uint8 each, sRGB codes.
+    names
+        What they are called; numbers if None.
+
+    Raises
+    ------
+    InputError
+        There is none, one is of another shape or type, or there are not as many names.
+    """
+    if not pictures:
+        raise InputError("a gallery wants pictures, none were given")
+    if names is not None and len(names) != len(pictures):
+        raise InputError(f"{len(pictures)} pictures of a gallery have {len(names)} names, expected one each")
+    for picture in pictures:
+        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
+            raise InputError(f"a picture is {picture.dtype} {picture.shape}, expected uint8 (height, width, 3)")
+    sizes = np.array([picture.shape[:2] for picture in pictures], dtype=np.int64)
+    codes = np.concatenate([picture.reshape(-1) for picture in pictures])
+    chosen = [str(number) for number in range(len(pictures))] if names is None else names
+    return Gallery(tuple(chosen), codes, sizes, _offsets(sizes))
+
+
+def _offsets(sizes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    return np.concatenate([[0], np.cumsum(3 * sizes.prod(axis=1))[:-1]]).astype(np.int64)
+
+
+def save_gallery(
+    sources: Sequence[Source], folder: Path, on_skip: Callable[[Source, str], None] | None = None
+) -> Gallery:
+    """Read pictures and keep them unpacked in a new folder.
+
+    Parameters
+    ----------
+    sources
+        The pictures; see `scene.find_pictures`. One that cannot be read is passed over and listed.
+    folder
+        Where the gallery is to be; must be free. It appears when it is complete.
+    on_skip
+        Called with each source that cannot be read, and the reason.
+
+    Raises
+    ------
+    InputError
+        The folder is taken.
+    FormatError
+        No source can be read.
+    StorageError
+        The disk is full or gone; nothing is left behind.
+    """
+    entries: list[_Entry] = []
+    skipped: list[str] = []
+    with whole_folder(folder, "the gallery") as partial:
+        path = partial / "codes.u8"
+        try:
+            with path.open("wb") as stream:
+                for source in sources:
+                    try:
+                        scene = source.read()
+                    except FormatError as error:
+                        skipped.append(source.name)
+                        if on_skip:
+                            on_skip(source, str(error))
+                        continue
+                    height, width = scene.picture.shape[:2]
+                    entries.append(_Entry(name=source.name, sha256=scene.sha256, width=width, height=height))
+                    stream.write(np.ascontiguousarray(scene.picture).data)
+        except OSError as error:
+            raise storage_error(path, error) from error
+        if not entries:
+            raise FormatError(f"none of the {len(sources)} pictures can be read; name other pictures")
+        head = _Head(pictures=entries, skipped=skipped)
+        write_whole(partial / "gallery.json", head.model_dump_json(indent=2) + "\n")
+    return open_gallery(folder)
+
+
+def open_gallery(folder: Path | str) -> Gallery:
+    """Map a gallery that `save_gallery` made.
+
+    Raises
+    ------
+    FormatError
+        The folder is none, or its files disagree.
+    """
+    folder = Path(folder)
+    path = folder / "gallery.json"
+    try:
+        head = _Head.model_validate_json(path.read_bytes())
+        codes = np.memmap(folder / "codes.u8", np.uint8, "r")
+    except (OSError, ValueError) as error:
+        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise FormatError(f"{folder} is no gallery of pictures: {reason}; make one with save_gallery") from error
+    sizes = np.array([(entry.height, entry.width) for entry in head.pictures], dtype=np.int64)
+    wanted = int(3 * sizes.prod(axis=1).sum())
+    if codes.size != wanted:
+        raise FormatError(
+            f"{folder / 'codes.u8'} has {codes.size} bytes, expected {wanted}; it is damaged, make the gallery again"
+        )
+    return Gallery(tuple(entry.name for entry in head.pictures), codes, sizes, _offsets(sizes), folder)

@@ -1,0 +1,112 @@
+"""Training batches as PyTorch takes them; the only file that imports it, and nobody imports this one unasked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from foundation.errors import InputError
+from generator.training.crops import Batch, Crops
+
+
+class TorchMissingError(InputError, ImportError):
+    """PyTorch is not installed: one sentence for who runs a command, an ImportError for who asks by one."""
+
+
+try:
+    import torch
+    from torch.utils.data import Dataset, IterableDataset, get_worker_info
+except ImportError as error:
+    raise TorchMissingError("training batches for PyTorch need it: pip install 'croplab[torch]'") from error
+
+Item = dict[str, Any]
+"""``image`` (3, height, width) float32 and ``illuminant`` (3,) float32, r + g + b = 1; of a batch with N before."""
+
+
+def _tensors(batch: Batch) -> Item:
+    return {"image": torch.from_numpy(batch.images), "illuminant": torch.from_numpy(batch.illuminants)}
+
+
+class CropDataset(Dataset[Item]):
+    """The items of an epoch by number, for any sampler.
+
+    With ``collate_fn=collated`` the loader's batches are made in one go, without a copy of each item.
+    """
+
+    def __init__(self, crops: Crops) -> None:
+        self.crops = crops
+
+    def __len__(self) -> int:
+        """Return the items of an epoch."""
+        return len(self.crops)
+
+    def __getitem__(self, item: int) -> Item:
+        """Return one item."""
+        if not 0 <= item < len(self):
+            raise IndexError(f"item {item} of {len(self)}")
+        return {name: tensor[0] for name, tensor in _tensors(self.crops.batch([item])).items()}
+
+    def __getitems__(self, items: Sequence[int]) -> _Made:
+        """Return a batch of items, as a sequence that `collated` takes apart for nothing."""
+        return _Made(_tensors(self.crops.batch(items)))
+
+
+class _Made(Sequence[Item]):
+    """A batch that looks like a list of its items, which is what a loader expects."""
+
+    def __init__(self, whole: Item) -> None:
+        self.whole = whole
+
+    def __len__(self) -> int:
+        return len(self.whole["image"])
+
+    def __getitem__(self, at: Any) -> Any:
+        if not -len(self) <= at < len(self):
+            raise IndexError(at)
+        return {name: tensor[at] for name, tensor in self.whole.items()}
+
+
+def collated(made: Any) -> Item:
+    """Return the batch that `CropDataset` made; give it to a loader as ``collate_fn``."""
+    if isinstance(made, _Made):
+        return made.whole
+    return torch.utils.data.default_collate(made)
+
+
+class CropStream(IterableDataset[Item]):
+    """Whole batches in the order of their items; give it to a loader with ``batch_size=None``.
+
+    The loader asks its workers in turn, and worker w of W makes batches w, w + W, …: their order is that of one worker.
+
+    Parameters
+    ----------
+    crops
+        The items; the last batch of an epoch may be smaller.
+    batch
+        Items of a batch, ≥ 1.
+
+    Raises
+    ------
+    InputError
+        The batch is smaller than 1.
+    """
+
+    def __init__(self, crops: Crops, batch: int) -> None:
+        if batch < 1:
+            raise InputError(f"batches of {batch} items were asked for, expected 1 or more")
+        self.crops = crops
+        self.items = batch
+
+    def __len__(self) -> int:
+        """Return the batches of an epoch."""
+        return -(-len(self.crops) // self.items)
+
+    def __iter__(self) -> Iterator[Item]:
+        """Give this worker's batches."""
+        worker = get_worker_info()
+        first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        for number in range(first, len(self), step):
+            start = number * self.items
+            yield _tensors(self.crops.batch(np.arange(start, min(start + self.items, len(self.crops)))))

@@ -1,0 +1,1 @@
+"""The simulated ends of a camera's cables: USB, USB/IP, PTP/IP, memory."""

@@ -1,0 +1,54 @@
+"""The other end of PTP: what a simulated device asks to be, whatever cable serves it.
+
+`sim.camera.eos` is one; `sim.buses.usb`, `sim.buses.ptpip_server` and `sim.buses.usbip` put it on a cable. A responder
+knows operations and state; it knows neither containers nor packets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from drivers.ptp.messages import Event, Request, Response
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A response, and the data phase before it; None where there is none (an empty one is b"")."""
+
+    response: Response
+    data: bytes | None = None
+
+
+class NoAnswer(Exception):
+    """Raised instead of answering: the device says nothing, and the initiator waits in vain."""
+
+
+class Responder(Protocol):
+    """A device that answers one request at a time."""
+
+    def takes_data(self, request: Request) -> bool:
+        """Return whether the initiator sends a data phase with this operation."""
+        ...
+
+    def answer(self, request: Request, data: bytes | None) -> Answer:
+        """Carry out a request; `data` is the initiator's data phase.
+
+        Raises
+        ------
+        NoAnswer
+            The device has hung itself up.
+        """
+        ...
+
+    def events(self) -> tuple[Event, ...]:
+        """Return the events that have come up since the last call."""
+        ...
+
+    def cancelled(self, transaction: int) -> None:
+        """Note that the initiator gave up a transaction."""
+        ...
+
+    def unplugged(self) -> None:
+        """Note that the cable was pulled or reset: the session is over."""
+        ...

@@ -1,0 +1,1 @@
+"""The simulated projectors and screens, each speaking its own protocol."""

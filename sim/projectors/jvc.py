@@ -1,0 +1,103 @@
+"""The simulated JVC projector's network port: bytes in, bytes out, and a flat field on the simulated screen.
+
+Laws that hold inside:
+
+- It knows the raster and the three levels; anything else gets no answer, as from the real one.
+- Until the flat field is chosen its video input is seen, which is white.
+"""
+
+from __future__ import annotations
+
+from drivers.display import jvc
+from drivers.links.tcp import TcpLink, TcpServer
+from drivers.presenter import WHITE, Colour
+from foundation.errors import LinkTimeout, ProtocolError
+from sim.projectors.screen import Screen
+
+_PATIENCE_S = 5.0
+_CHANNELS = {text: channel for channel, text in jvc.LEVELS.items()}
+
+
+class JvcPeer:
+    """The far side of the network port; keeps the contract of `drivers.links.memory.Peer`."""
+
+    def __init__(self, screen: Screen) -> None:
+        self._screen = screen
+        self._levels = dict.fromkeys(jvc.LEVELS, 255)
+        self._flat = False
+        self._show()
+        self.connect()
+
+    def connect(self) -> bytes:
+        """Begin a new connection and return the greeting; the picture stays."""
+        self._waiting = b""
+        self._greeted = False
+        self._closed = False
+        return jvc.GREETING
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has hung up: on whoever does not ask to be let in."""
+        return self._closed
+
+    def hang_up(self) -> None:
+        """Close the connection, as the projector does with one that is idle."""
+        self._closed = True
+
+    def receive(self, data: bytes) -> bytes:
+        """Take the next bytes and return the answers to the commands that they complete."""
+        self._waiting += data
+        answer = b""
+        if not self._greeted:
+            if len(self._waiting) < len(jvc.REQUEST):
+                return b""
+            if not self._waiting.startswith(jvc.REQUEST):
+                self._closed = True
+                return jvc.REFUSED
+            self._waiting = self._waiting[len(jvc.REQUEST) :]
+            self._greeted = True
+            answer = jvc.ACCEPTED
+        while b"\n" in self._waiting:
+            line, _, self._waiting = self._waiting.partition(b"\n")
+            answer += self._obey(line + b"\n")
+        return answer
+
+    def _obey(self, line: bytes) -> bytes:
+        try:
+            text = jvc.parse_operation(line)
+            if text == jvc.FLAT_FIELD:
+                self._flat = True
+            else:
+                level = int(text[4:], 16)
+                if len(text) != 8 or level > 255:
+                    return b""
+                self._levels[_CHANNELS[text[:4]]] = level
+        except (ProtocolError, KeyError, ValueError):
+            return b""
+        self._show()
+        return jvc.encode_acknowledgement(text)
+
+    def _show(self) -> None:
+        self._screen.colour = Colour(**self._levels) if self._flat else WHITE
+
+
+def serve_jvc(peer: JvcPeer, port: int = 0) -> TcpServer:
+    """Return a running server on loopback that speaks for `peer`; close it, or use it in a `with` block.
+
+    Raises
+    ------
+    LinkClosed
+        The port is taken.
+    """
+
+    def handle(link: TcpLink) -> None:
+        link.write(peer.connect(), _PATIENCE_S)
+        while not peer.closed:
+            try:
+                answer = peer.receive(link.read(4096, _PATIENCE_S))
+            except LinkTimeout:
+                continue
+            if answer:
+                link.write(answer, _PATIENCE_S)
+
+    return TcpServer(handle, port)

@@ -1,0 +1,176 @@
+"""The simulated LightCrafter: a controller that shows its test pattern, and its HID interface on the simulated bus.
+
+Laws that hold inside:
+
+- `Controller` is the device: registers, and what they put on the screen. `LightCrafterUsb` speaks reports for it.
+- Found as it is switched on: showing its video input, which is white.
+- It changes its display mode with delay, as the real one: only after `lag` further questions does it say so.
+"""
+
+from __future__ import annotations
+
+import errno
+import struct
+from array import array
+from collections import deque
+
+import usb.core
+
+from drivers.display import lightcrafter_wire as wire
+from drivers.display.lightcrafter import PRODUCTS, VENDOR
+from drivers.display.lightcrafter_wire import Command, Reply
+from drivers.presenter import WHITE, Colour
+from foundation.errors import ProtocolError
+from sim.buses.usb import Handle, SimulatedBus
+from sim.buses.usb_device import Setup, Stalled
+from sim.projectors.screen import Screen
+
+REPORT_IN, REPORT_OUT = 0x81, 0x01
+"""The endpoints' addresses, those of the real boards."""
+VIDEO_INPUT = WHITE
+
+
+class Controller:
+    """A DLPC350 or DLPC900 as far as plain colours go; `lag` is how many reads its mode trails behind."""
+
+    def __init__(self, screen: Screen, lag: int = 2) -> None:
+        self._screen = screen
+        self._lag = lag
+        self._behind = 0
+        self._mode = bytes([1])
+        self.registers: dict[int, bytes] = {
+            Command.TEST_PATTERN: bytes([8]),
+            Command.PATTERN_COLOUR: struct.pack("<6H", *(wire.FULL,) * 3, 0, 0, 0),
+            Command.INPUT_SOURCE: bytes([0]),
+            Command.DISPLAY_MODE: bytes([1]),
+        }
+        self._show()
+
+    def write(self, command: int, data: bytes) -> bool:
+        """Set a register; False where there is no such register, or it does not take that."""
+        if len(data) != len(self.registers.get(command, b"")):
+            return False
+        if command == Command.PATTERN_COLOUR:
+            try:
+                wire.parse_colour(data)
+            except ProtocolError:
+                return False
+        if command == Command.DISPLAY_MODE and data != self.registers[command]:
+            self._behind = self._lag
+        self.registers[command] = data
+        self._show()
+        return True
+
+    def read(self, command: int) -> bytes | None:
+        """Return a register, None where there is no such one."""
+        if command != Command.DISPLAY_MODE:
+            return self.registers.get(command)
+        if self._behind:
+            self._behind -= 1
+        else:
+            self._mode = self.registers[command]
+            self._show()
+        return self._mode
+
+    def _show(self) -> None:
+        registers = self.registers
+        generates = (
+            self._mode[0] == wire.MODE_VIDEO
+            and registers[Command.INPUT_SOURCE][0] & 7 == wire.SOURCE_TEST_PATTERN
+            and registers[Command.TEST_PATTERN][0] == wire.PATTERN_SOLID
+        )
+        if generates:
+            codes = wire.parse_colour(registers[Command.PATTERN_COLOUR])
+            self._screen.colour = Colour(*(wire.eight_bits(code) for code in codes))
+        else:
+            self._screen.colour = VIDEO_INPUT
+
+
+class LightCrafterUsb:
+    """A controller's USB side, at full speed, for `HidBus`."""
+
+    def __init__(self, controller: Controller, product: int = PRODUCTS["DLPC350"], serial: str = "LCR4500") -> None:
+        self._controller = controller
+        self._product = product
+        self._serial = serial
+        self._replies: deque[bytes] = deque()
+
+    def device_descriptor(self) -> bytes:
+        """Return the 18 bytes that name the device."""
+        return struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0110, 0, 0, 0, 64, VENDOR, self._product, 0x0100, 1, 2, 3, 1)
+
+    def configuration_descriptor(self) -> bytes:
+        """Return the descriptors of the configuration, its HID interface and the two endpoints."""
+        body = struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 2, 3, 0, 0, 0)
+        body += struct.pack("<BBHBBBH", 9, 0x21, 0x0111, 0, 1, 0x22, 36)
+        body += struct.pack("<BBBBHB", 7, 5, REPORT_IN, 3, wire.REPORT, 1)
+        body += struct.pack("<BBBBHB", 7, 5, REPORT_OUT, 3, wire.REPORT, 1)
+        return struct.pack("<BBHBBBBB", 9, 2, 9 + len(body), 1, 1, 0, 0xC0, 50) + body
+
+    def control(self, setup: Setup, data: bytes = b"") -> bytes:
+        """Answer the standard requests that pyusb makes."""
+        match setup.request_type, setup.request, setup.value >> 8:
+            case 0x80, 6, 3 if setup.value & 0xFF <= 3:
+                texts = ("", "Texas Instruments", "DLPC350", self._serial)
+                index = setup.value & 0xFF
+                body = texts[index].encode("utf-16-le") if index else struct.pack("<H", 0x0409)
+                return bytes([2 + len(body), 3]) + body
+            case 0x80, 8, _:
+                return b"\x01"
+            case _, 9, _:
+                return b""
+            case _:
+                raise Stalled
+
+    def report_out(self, report: bytes) -> None:
+        """Take a report from the host."""
+        try:
+            request = wire.parse_request(report)
+        except ProtocolError as error:
+            raise Stalled from error
+        if request.reads:
+            answer = self._controller.read(request.command)
+            reply = Reply(request.sequence, answer or b"", refused=answer is None)
+        else:
+            reply = Reply(request.sequence, refused=not self._controller.write(request.command, request.data))
+        self._replies.append(wire.encode_reply(reply, reads=request.reads))
+
+    def interrupt_in(self, limit: int) -> bytes | None:
+        """Return the next report to the host, None where there is none."""
+        return self._replies.popleft() if self._replies else None
+
+    def bulk_out(self, data: bytes) -> None:
+        """Refuse: there is no such pipe."""
+        raise Stalled
+
+    def bulk_in(self, limit: int) -> bytes | None:
+        """Refuse: there is no such pipe."""
+        raise Stalled
+
+    def unplugged(self) -> None:
+        """Forget what was not fetched; the picture stays."""
+        self._replies.clear()
+
+
+class HidBus(SimulatedBus):
+    """A simulated bus whose devices have interrupt pipes both ways."""
+
+    def intr_read(self, dev_handle: Handle, ep: int, intf: int, buff: array[int], timeout: int) -> int:
+        """Read a report."""
+        self._check_transfer(dev_handle, ep, REPORT_IN)
+        report = dev_handle.device.interrupt_in(len(buff))
+        if report is None:
+            raise usb.core.USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)
+        memoryview(buff)[: len(report)] = report
+        return len(report)
+
+    def intr_write(self, dev_handle: Handle, ep: int, intf: int, data: array[int], timeout: int) -> int:
+        """Send a report."""
+        self._check_transfer(dev_handle, ep, REPORT_OUT)
+        device = dev_handle.device
+        assert isinstance(device, LightCrafterUsb)
+        try:
+            device.report_out(data.tobytes())
+        except Stalled as error:
+            raise usb.core.USBError("Pipe error", -9, errno.EPIPE) from error
+        return len(data)

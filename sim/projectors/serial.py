@@ -1,0 +1,345 @@
+"""The simulated projector on a serial cable: one peer a language, bytes in and bytes out.
+
+Rules that hold inside:
+
+- A peer knows bytes and no physics; what they do happens in `sim.projectors.pjlink.SimulatedProjector`.
+- A serial cable has no connections: a peer goes on where it was when its cable is opened again, and forgets only a
+  half-heard command.
+- `receive` with no bytes asks what a peer has to say by now: a late answer, or news. Whoever joins a peer to a cable
+  asks often.
+- Where the manuals leave open what a projector does, a peer does what is harder on the driver: it falls silent, or
+  refuses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from drivers.links.memory import Peer, PeerLink
+from drivers.links.tcp import TcpLink, TcpServer
+from drivers.projector import Power, Severity
+from drivers.serial_projectors import benq, epson, nec, optoma
+from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
+from sim.projectors.pjlink import SimulatedProjector
+
+SERIAL_NUMBER = "CROP0000001"
+POLLING_S = 0.02
+"""How often a peer on a real cable is asked what it has to say by now."""
+
+_ON_THE_WAY = (Power.WARMING, Power.COOLING)
+
+
+class _Listener:
+    """What all of them have: a projector, and what was heard of a command that is not whole yet."""
+
+    def __init__(self, projector: SimulatedProjector) -> None:
+        self._projector = projector
+        self._heard = b""
+
+    @property
+    def closed(self) -> bool:
+        """Never: a serial cable is not hung up."""
+        return False
+
+    def connect(self) -> bytes:
+        """Forget a half-heard command."""
+        self._heard = b""
+        return b""
+
+
+class EpsonPeer(_Listener):
+    """An Epson: ESC/VP21, after the handshake of ESC/VP.net if `network` says so."""
+
+    def __init__(self, projector: SimulatedProjector, network: bool = False) -> None:
+        super().__init__(projector)
+        self._network = network
+        self._greeted = not network
+        self._switching_to: Power | None = None
+
+    def connect(self) -> bytes:
+        """Forget a half-heard command, and that it has been greeted."""
+        self._greeted = not self._network
+        return super().connect()
+
+    def receive(self, data: bytes) -> bytes:
+        """Take the next bytes and return the answers to them, and to what has been carried out by now."""
+        said = self._late_answer()
+        if self._switching_to is not None:
+            # It accepts no command until it has carried out the one that it has.
+            return said
+        self._heard += data
+        if not self._greeted:
+            if len(self._heard) < len(epson.HELLO):
+                return said
+            self._greeted = self._heard.startswith(epson.HELLO)
+            self._heard = self._heard[len(epson.HELLO) :]
+            said += epson.encode_welcome(epson.WELCOME if self._greeted else 0x40)
+        while self._switching_to is None and (taken := epson.take_command(self._heard)) is not None:
+            command, length = taken
+            self._heard = self._heard[length:]
+            said += self._answer(command)
+        return said
+
+    def _late_answer(self) -> bytes:
+        if self._switching_to is None or (power := self._projector.power()) in _ON_THE_WAY:
+            return b""
+        reached = power is self._switching_to
+        self._switching_to, self._heard = None, b""
+        return epson.encode_reply("" if reached else epson.REFUSAL)
+
+    def _answer(self, command: str) -> bytes:
+        try:
+            return self._done(command)
+        except (DeviceRefused, DeviceFault, ValueError):
+            return epson.encode_reply(epson.REFUSAL)
+
+    def _done(self, command: str) -> bytes:
+        projector = self._projector
+        power = projector.power()
+        match command.upper():
+            case "":
+                return epson.encode_reply()
+            case "PWR?":
+                return epson.encode_reply(f"PWR={epson.format_power(power)}")
+            case _ if power in _ON_THE_WAY:
+                raise DeviceRefused("busy")
+            case "PWR ON":
+                projector.switch_on()
+                self._switching_to = Power.ON
+                return self._late_answer()
+            case "PWR OFF":
+                projector.switch_off()
+                self._switching_to = Power.STANDBY
+                return self._late_answer()
+            case "MUTE?":
+                return epson.encode_reply(f"MUTE={'ON' if projector.muted() else 'OFF'}")
+            case "MUTE ON":
+                projector.set_muted(True)
+            case "MUTE OFF":
+                projector.set_muted(False)
+            case "LAMP?":
+                return epson.encode_reply("LAMP=" + " ".join(str(lamp.hours) for lamp in projector.lamps()))
+            case "ERR?":
+                errors = [fault for fault in projector.faults() if fault.severity is Severity.ERROR]
+                code = epson.format_fault(errors[0].part) if errors else "00"
+                return epson.encode_reply(f"ERR={code}")
+            case "SNO?":
+                return epson.encode_reply(f"SNO={SERIAL_NUMBER}")
+            case _:
+                raise ValueError(command)
+        return epson.encode_reply()
+
+
+class BenqPeer(_Listener):
+    """A BenQ: it echoes what it hears and ends with a prompt, as on a serial cable; not so if `network` says so."""
+
+    def __init__(self, projector: SimulatedProjector, network: bool = False) -> None:
+        super().__init__(projector)
+        self._network = network
+
+    def receive(self, data: bytes) -> bytes:
+        """Take the next bytes and return the answers to the lines that they complete."""
+        self._heard += data
+        said = b""
+        while (taken := benq.take_command(self._heard)) is not None:
+            line, length = taken
+            self._heard = self._heard[length:]
+            if line:
+                echo = b"" if self._network else line.encode("ascii", "replace") + b"\r\n"
+                said += echo + benq.encode_answer(self._answer(line))
+            if not self._network:
+                said += benq.PROMPT
+        return said
+
+    def _answer(self, line: str) -> str:
+        name, equals, value = line.lower().removeprefix("*").removesuffix("#").partition("=")
+        if not (line.startswith("*") and line.endswith("#") and equals):
+            return benq.ILLEGAL
+        try:
+            return f"{name.upper()}={self._done(name, value)}"
+        except (DeviceRefused, DeviceFault):
+            return benq.BLOCKED
+        except ValueError:
+            return benq.UNSUPPORTED
+
+    def _done(self, name: str, value: str) -> str:
+        projector = self._projector
+        if projector.power() in _ON_THE_WAY:
+            raise DeviceRefused("busy")
+        match name, value:
+            case "pow", "?":
+                return "ON" if projector.power() is Power.ON else "OFF"
+            case "pow", "on":
+                projector.switch_on()
+            case "pow", "off":
+                projector.switch_off()
+            case "blank", "?":
+                return "ON" if projector.muted() else "OFF"
+            case "blank", "on" | "off":
+                projector.set_muted(value == "on")
+            case "ltim", "?":
+                return str(projector.lamps()[0].hours)
+            case "modelname", "?":
+                return projector.identity().model
+            case _:
+                raise ValueError(name)
+        return value.upper()
+
+
+class OptomaPeer(_Listener):
+    """An Optoma: it answers, and says unasked when its power state changes or a part fails.
+
+    Parameters
+    ----------
+    tells_mute
+        Whether its model can be asked if it is muted.
+    """
+
+    MODEL = "1"
+
+    def __init__(self, projector: SimulatedProjector, tells_mute: bool = True) -> None:
+        super().__init__(projector)
+        self._tells_mute = tells_mute
+        self._told_power = projector.power()
+        self._told_faults: frozenset[str] = frozenset()
+
+    def receive(self, data: bytes) -> bytes:
+        """Take the next bytes and return the answers to the lines that they complete, and the news."""
+        said = self._news()
+        self._heard += data
+        while (taken := optoma.take_command(self._heard)) is not None:
+            command, length = taken
+            self._heard = self._heard[length:]
+            if command is not None and command.projector == optoma.EVERYBODY:
+                said += optoma.encode_message(self._answer(command)) + self._news()
+        return said
+
+    def _news(self) -> bytes:
+        power = self._projector.power()
+        broken = frozenset(fault.part for fault in self._projector.faults() if fault.severity is Severity.ERROR)
+        news = [optoma.info_of_fault(part) for part in sorted(broken - self._told_faults)]
+        if power is not self._told_power:
+            news.append(optoma.info_of_power(power))
+        self._told_power, self._told_faults = power, broken
+        return b"".join(optoma.encode_message(info) for info in news if info is not None)
+
+    def _answer(self, command: optoma.Command) -> optoma.Message:
+        try:
+            return self._done(command)
+        except (DeviceRefused, DeviceFault, ValueError):
+            return optoma.Done(False)
+
+    def _done(self, command: optoma.Command) -> optoma.Message:
+        projector = self._projector
+        match command.number, command.value:
+            case optoma.POWER, "1":
+                projector.switch_on()
+            case optoma.POWER, "0" | "2":
+                projector.switch_off()
+            case optoma.AV_MUTE, "0" | "1" | "2":
+                projector.set_muted(command.value == "1")
+            case optoma.LAMP_HOURS, "1":
+                return optoma.Value(f"{projector.lamps()[0].hours:04d}")
+            case optoma.POWER_STATE, "1":
+                return optoma.Value("1" if projector.power() is Power.ON else "0")
+            case optoma.MODEL, "1":
+                return optoma.Value(self.MODEL)
+            case optoma.AV_MUTE_STATE, "1" if self._tells_mute:
+                return optoma.Value("1" if projector.muted() else "0")
+            case _:
+                raise ValueError(command)
+        return optoma.Done(True)
+
+
+class NecPeer(_Listener):
+    """A NEC: a binary answer to every command; what is no command is not answered."""
+
+    def receive(self, data: bytes) -> bytes:
+        """Take the next bytes and return the answers to the commands that they complete."""
+        self._heard += data
+        said = b""
+        try:
+            while (taken := nec.take_command(self._heard)) is not None:
+                command, length = taken
+                self._heard = self._heard[length:]
+                said += nec.encode_reply(self._answer(command))
+        except ProtocolError:
+            self._heard = b""
+        return said
+
+    def _answer(self, command: nec.Command) -> nec.Reply:
+        try:
+            return nec.Reply(command.kind, command.code, self._done(command))
+        except DeviceRefused:
+            return nec.Reply(command.kind, command.code, failed=nec.POWER_IS_OFF)
+        except DeviceFault:
+            return nec.Reply(command.kind, command.code, failed=nec.EXECUTION_FAILED)
+        except ValueError:
+            return nec.Reply(command.kind, command.code, failed=nec.UNKNOWN_COMMAND)
+
+    def _done(self, command: nec.Command) -> bytes:
+        projector = self._projector
+        match command:
+            case nec.POWER_ON:
+                projector.switch_on()
+            case nec.POWER_OFF:
+                projector.switch_off()
+            case nec.MUTE_ON:
+                projector.set_muted(True)
+            case nec.MUTE_OFF:
+                projector.set_muted(False)
+            case nec.RUNNING:
+                return nec.format_running(projector.power())
+            case nec.MUTES:
+                return bytes([projector.power() is Power.ON and projector.muted()]).ljust(16, b"\0")
+            case nec.MODEL:
+                return projector.identity().model.encode("ascii")[:31].ljust(32, b"\0")
+            case nec.ERRORS:
+                return nec.format_errors(projector.faults())
+            case nec.INFORMATION:
+                return nec.format_information(projector.identity().name, projector.lamps()[0].hours * 3600)
+            case _:
+                raise ValueError(command)
+        return b""
+
+
+class _PeerOf(Protocol):
+    def __call__(self, projector: SimulatedProjector) -> Peer: ...
+
+
+PEERS: Mapping[str, _PeerOf] = {"benq": BenqPeer, "epson": EpsonPeer, "nec": NecPeer, "optoma": OptomaPeer}
+"""The far side for each of `drivers.serial_projectors.LANGUAGES`."""
+
+
+class SerialPeerLink(PeerLink):
+    """A cable to a peer in the same thread, which hears before each read what the peer has to say by now."""
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        """Return up to `limit` bytes of what the peer has said."""
+        if self._open:
+            self._incoming += self._peer.receive(b"")
+        return super().read(limit, timeout)
+
+
+def serve_network(peer: Callable[[], Peer], port: int = 0) -> TcpServer:
+    """Return a running server that gives each connection a peer of its own; close it, or use it in a `with` block.
+
+    Raises
+    ------
+    LinkClosed
+        The port is taken.
+    """
+
+    def handle(link: TcpLink) -> None:
+        there = peer()
+        said = there.connect()
+        while True:
+            if said:
+                link.write(said, 5.0)
+            try:
+                said = there.receive(link.read(4096, POLLING_S))
+            except LinkTimeout:
+                said = there.receive(b"")
+
+    return TcpServer(handle, port)

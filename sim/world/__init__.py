@@ -1,0 +1,1 @@
+"""The simulated room: print, light, lens and sensor noise."""

@@ -1,0 +1,249 @@
+"""Commands end with one line and a code, whatever happens."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import signal
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from foundation import errors
+from foundation.console import EXIT_CODES, orderly_end, run
+
+
+def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(lambda: None) == 0
+    assert run(lambda: 7) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_messages_name_the_first_of_many() -> None:
+    assert errors.first_of(range(3)) == "0, 1, 2"
+    assert errors.first_of(["a", "b", "c"], 2) == "a, b …"
+    assert errors.first_of(range(10)) == "0, 1, 2, 3, 4, 5, 6, 7, 8, 9"
+
+
+# The tree in the docstring of foundation.errors.
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (errors.InputError, 2),
+        (errors.ConfigurationError, 2),
+        (errors.FormatError, 2),
+        (errors.DeviceError, 3),
+        (errors.LinkError, 3),
+        (errors.LinkTimeout, 3),
+        (errors.LinkClosed, 3),
+        (errors.ProtocolError, 3),
+        (errors.DeviceRefused, 3),
+        (errors.DeviceFault, 3),
+        (errors.QualityError, 4),
+        (errors.RegistrationError, 4),
+        (errors.StorageError, 5),
+    ],
+)
+def test_every_error_has_its_code(error: type[errors.CropError], code: int, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail() -> None:
+        raise error("lab.toml: shutter_s is -1, more than 0 was expected; correct it")
+
+    assert run(fail) == code
+    assert capsys.readouterr() == ("", "error: lab.toml: shutter_s is -1, more than 0 was expected; correct it\n")
+
+
+def test_interruption_is_130(capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    assert run(interrupt) == 130
+    assert capsys.readouterr().err == "error: interrupted; run the same command again to go on\n"
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])
+def test_a_disk_fault_that_nobody_translated_is_5(number: int, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail() -> None:
+        raise OSError(number, "No space left on device", "/disk/samples.npy")
+
+    assert run(fail) == 5
+    assert capsys.readouterr().err == (
+        "error: cannot write /disk/samples.npy: No space left on device; free space and run again\n"
+    )
+
+
+@pytest.mark.parametrize("name", ["/theirs/dataset.json", b"/theirs/dataset.json"])
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.EACCES, "ask its owner for permission, or name another place"),
+        (errno.EPERM, "ask its owner for permission, or name another place"),
+        (errno.EISDIR, "a folder is called so; name a file"),
+        (errno.ENOTDIR, "a part of that path is a file, not a folder; name another"),
+        (errno.ENAMETOOLONG, "name it shorter"),
+        (errno.ELOOP, "links there lead in a circle; name the place that is meant"),
+    ],
+)
+def test_a_path_that_cannot_be_used_is_2(
+    number: int, remedy: str, name: str | bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        raise OSError(number, os.strerror(number), name)
+
+    assert run(fail) == 2
+    assert capsys.readouterr().err == f"error: cannot use /theirs/dataset.json: {os.strerror(number)}; {remedy}\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [(MemoryError(), "none is left"), (MemoryError("Unable to allocate 9 TiB"), "Unable to allocate 9 TiB")],
+)
+def test_no_memory_is_2(error: MemoryError, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail() -> None:
+        raise error
+
+    assert run(fail) == 2
+    assert capsys.readouterr().err == (
+        f"error: not enough memory ({reason}); use fewer --workers, or smaller pictures\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.EINVAL, "odd"),
+        OSError(errno.EBADF, "odd", "file"),
+        PermissionError(errno.EACCES, "of what?"),
+        ValueError("our mistake"),
+        AssertionError(),
+    ],
+)
+def test_our_own_mistakes_are_not_hidden(error: Exception) -> None:
+    def fail() -> None:
+        raise error
+
+    with pytest.raises(type(error)):
+        run(fail)
+
+
+@pytest.mark.parametrize(("given", "code"), [(0, 0), (2, 2), (None, 0), ("words", 1)])
+def test_exits_keep_their_code(given: int | str | None, code: int) -> None:
+    assert run(lambda: sys.exit(given)) == code
+
+
+def test_the_help_names_every_code() -> None:
+    for code in (0, 2, 3, 4, 5, 130):
+        assert f"{code} " in EXIT_CODES
+
+
+def ended(program: str, output: int) -> tuple[int, str]:
+    """Return code and stderr of a program that prints to `output`."""
+    # Buffered, as a user has it, whatever the surroundings of this test.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    text = f"from foundation.console import run\nimport sys\n{program}"
+    done = subprocess.run(
+        [sys.executable, "-c", text],
+        stdout=output,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        timeout=60,
+        env=environment,
+    )
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        "raise SystemExit(run(lambda: [print('x' * 99) for _ in range(10_000)]))",
+        "raise SystemExit(run(lambda: print('one line, still in the buffer when the command is done')))",
+        "raise SystemExit(run(lambda: (print('as typer does'), sys.exit(0))))",
+    ],
+)
+def test_a_reader_that_left_is_no_fault(program: str) -> None:
+    pipe = subprocess.Popen([sys.executable, "-c", ""], stdin=subprocess.PIPE)
+    with pipe:
+        assert pipe.stdin is not None
+        pipe.wait()
+        assert ended(program, pipe.stdin.fileno()) == (0, "")
+
+
+@pytest.mark.parametrize("lines", [1, 10_000])
+def test_a_full_device_under_stdout_is_5(lines: int) -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("this system has no /dev/full")
+    with full.open("wb") as stream:
+        code, error = ended(f"raise SystemExit(run(lambda: [print('x') for _ in range({lines})]))", stream.fileno())
+    assert code == 5
+    assert error.startswith("error: cannot ")
+    assert "No space left" in error
+
+
+MEANWHILE = """
+from foundation.console import progress
+with progress("files") as told:
+    told(1, 2)
+    print("found")
+"""
+
+
+def test_what_is_printed_beside_a_bar_on_the_terminal_goes_where_standard_output_goes() -> None:
+    pty = pytest.importorskip("pty")
+    terminal, end = pty.openpty()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", MEANWHILE],
+            env={**os.environ, "TERM": "xterm"},
+            stdout=subprocess.PIPE,
+            stderr=end,
+            check=True,
+        )
+        os.close(end)
+        assert b"1/2" in os.read(terminal, 1 << 16)
+    finally:
+        os.close(terminal)
+    assert done.stdout.splitlines() == [b"found"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_hang_up_that_is_ignored_stays_ignored(number: int) -> None:
+    """As under nohup, which starts a program that way."""
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        with orderly_end():
+            os.kill(os.getpid(), number)
+        assert signal.getsignal(number) == signal.SIG_IGN
+    finally:
+        signal.signal(number, before)
+
+
+def test_a_terminal_that_went_away_takes_no_last_line() -> None:
+    def draw() -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    def hang_up() -> None:
+        with orderly_end(), ExitStack() as stack:
+            stack.callback(draw)
+            os.kill(os.getpid(), signal.SIGHUP)
+
+    with pytest.raises(KeyboardInterrupt):
+        hang_up()
+    with pytest.raises(OSError, match="Input/output error"), orderly_end():
+        draw()
+
+
+def test_nobody_reads_the_error_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Gone(io.StringIO):
+        def write(self, text: str, /) -> int:
+            raise OSError(errno.EIO, "Input/output error")
+
+    def refuse() -> None:
+        raise errors.InputError("no such lab")
+
+    monkeypatch.setattr(sys, "stderr", Gone())
+    assert run(refuse) == 2

@@ -1,0 +1,297 @@
+"""Files and folders that appear whole or not at all, on disks that fill up, close and break."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+from io import BufferedRandom
+from pathlib import Path
+
+import pytest
+
+from foundation import files as storage
+from foundation.errors import InputError, StorageError
+from foundation.files import (
+    is_partial,
+    partial_path,
+    read_whole,
+    require_free,
+    require_free_file,
+    whole_file,
+    whole_folder,
+    write_whole,
+)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@contextmanager
+def small_disk(limit: int) -> Generator[None]:
+    """Let no file grow beyond `limit` bytes: the kernel answers EFBIG where a full disk would answer ENOSPC."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+
+
+class TestWholeFile:
+    def test_appears_at_the_end_and_whole(self, tmp_path: Path) -> None:
+        path = tmp_path / "new" / "frame.dng"
+        with whole_file(path) as stream:
+            stream.write(b"first half, ")
+            stream.flush()
+            assert names(path.parent) == [".frame.dng.partial"]
+            stream.write(b"second half")
+        assert path.read_bytes() == b"first half, second half"
+        assert names(path.parent) == ["frame.dng"]
+
+    def test_can_be_read_back_before_it_is_named(self, tmp_path: Path) -> None:
+        def named() -> Path:
+            assert partial_path(tmp_path / "frame").read_bytes() == b"raw"
+            return tmp_path / "frame.CR2"
+
+        with whole_file(tmp_path / "frame", named) as stream:
+            stream.write(b"raw")
+            stream.seek(0)
+            assert stream.read() == b"raw"
+        assert names(tmp_path) == ["frame.CR2"]
+
+    def test_replaces_only_at_the_end(self, tmp_path: Path) -> None:
+        path = tmp_path / "frames.csv"
+        write_whole(path, "old")
+        with whole_file(path) as stream:
+            stream.write(b"new")
+            stream.flush()
+            assert path.read_text() == "old"
+        assert path.read_text() == "new"
+
+    @pytest.mark.parametrize("error", [ValueError("ours"), KeyboardInterrupt()])
+    def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(
+        self, tmp_path: Path, error: BaseException
+    ) -> None:
+        path = tmp_path / "a.csv"
+        write_whole(path, "old")
+        with pytest.raises(type(error)), whole_file(path) as stream:  # noqa: PT012
+            stream.write(b"new")
+            raise error
+        assert path.read_text() == "old"
+        assert names(tmp_path) == ["a.csv"]
+
+    def test_a_full_disk_is_one_sentence_and_leaves_nothing(self, tmp_path: Path) -> None:
+        path = tmp_path / "big.dng"
+        with pytest.raises(StorageError, match=r"cannot write .*big\.dng: .*free space"), small_disk(10_000):  # noqa: SIM117
+            with whole_file(path) as stream:
+                stream.write(bytes(50_000))
+        assert names(tmp_path) == []
+
+    def test_a_disk_that_fills_at_the_last_flush(self, tmp_path: Path) -> None:
+        path = tmp_path / "small.csv"
+        with pytest.raises(StorageError), small_disk(10), whole_file(path) as stream:
+            stream.write(b"stays in the buffer until the end")
+        assert names(tmp_path) == []
+
+    @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS])
+    def test_each_fault_of_a_disk(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+        def fail(handle: int) -> None:
+            raise OSError(number, os.strerror(number))
+
+        path = tmp_path / "a.csv"
+        write_whole(path, "old")
+        monkeypatch.setattr(storage.os, "fsync", fail)
+        with pytest.raises(StorageError, match=os.strerror(number)) as caught:
+            write_whole(path, "new")
+        assert isinstance(caught.value.__cause__, OSError)
+        assert path.read_text() == "old"
+        assert names(tmp_path) == ["a.csv"]
+
+    def test_a_name_below_a_file_is_told(self, tmp_path: Path) -> None:
+        write_whole(tmp_path / "file", "x")
+        for path in (tmp_path / "file" / "a", tmp_path / "file" / "deeper" / "a"):
+            with pytest.raises(InputError, match=r"cannot write .* a part of that path is a file"):
+                write_whole(path, "x")
+        assert (tmp_path / "file").read_text() == "x"
+
+    @pytest.mark.parametrize(
+        ("name", "message"),
+        [
+            ("taken", r"cannot write .*taken: Is a directory; a folder is called so; name a file$"),
+            ("x" * 300, r"cannot write .*xxx: File name too long; name it shorter$"),
+        ],
+    )
+    def test_a_name_that_cannot_be_a_file_is_told(self, tmp_path: Path, name: str, message: str) -> None:
+        (tmp_path / "taken").mkdir()
+        with pytest.raises(InputError, match=message):
+            write_whole(tmp_path / name, "x")
+        assert names(tmp_path) == ["taken"]
+
+    @pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])
+    def test_a_place_where_nobody_may_write_keeps_its_code(self, tmp_path: Path, number: int) -> None:
+        error = storage.storage_error(tmp_path, OSError(number, os.strerror(number)))
+        assert isinstance(error, StorageError)
+        assert str(error).endswith("; ask its owner for permission, or name another place")
+
+    @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+    def test_a_folder_without_permission(self, tmp_path: Path) -> None:
+        tmp_path.chmod(0o500)
+        try:
+            with pytest.raises(StorageError, match="Permission denied"):
+                write_whole(tmp_path / "a", "x")
+        finally:
+            tmp_path.chmod(0o700)
+
+    def test_a_fault_of_something_read_meanwhile_is_not_blamed_on_the_disk(self, tmp_path: Path) -> None:
+        with pytest.raises(FileNotFoundError), whole_file(tmp_path / "out") as stream:
+            stream.write((tmp_path / "source").read_bytes())
+        with pytest.raises(PermissionError), whole_file(tmp_path / "out"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "source"))
+        with pytest.raises(ConnectionResetError), whole_file(tmp_path / "out"):
+            raise ConnectionResetError(errno.ECONNRESET, "the camera left")
+        assert names(tmp_path) == []
+
+    def test_a_killed_writer_leaves_only_a_hidden_leftover(self, tmp_path: Path) -> None:
+        write_whole(tmp_path / "a", "old")
+        program = (
+            "import os, sys, pathlib; from foundation.files import whole_file\n"
+            "with whole_file(pathlib.Path(sys.argv[1])) as stream:\n"
+            "    stream.write(b'half'); stream.flush(); os.kill(os.getpid(), 9)\n"
+        )
+        done = subprocess.run([sys.executable, "-c", program, str(tmp_path / "a")], check=False)
+        assert done.returncode == -signal.SIGKILL
+        assert (tmp_path / "a").read_text() == "old"
+        assert [is_partial(tmp_path / name) for name in names(tmp_path)] == [True, False]
+        write_whole(tmp_path / "a", "new")
+        assert names(tmp_path) == ["a"]
+
+
+class TestWholeFolder:
+    def test_appears_at_the_end_and_whole(self, tmp_path: Path) -> None:
+        path = tmp_path / "deep" / "lut"
+        with whole_folder(path, "the table") as folder:
+            (folder / "samples.npy").write_bytes(b"1")
+            assert not path.exists()
+            assert is_partial(folder)
+        assert names(path) == ["samples.npy"]
+        assert names(path.parent) == ["lut"]
+
+    def test_takes_an_empty_folder(self, tmp_path: Path) -> None:
+        (tmp_path / "lut").mkdir()
+        with whole_folder(tmp_path / "lut", "the table") as folder:
+            write_whole(folder / "a", "1")
+        assert names(tmp_path / "lut") == ["a"]
+
+    def test_never_overwrites(self, tmp_path: Path) -> None:
+        (tmp_path / "full").mkdir()
+        write_whole(tmp_path / "full" / "mine", "precious")
+        write_whole(tmp_path / "file", "precious")
+        (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+        for name in ("full", "file", "link"):
+            with pytest.raises(InputError, match=f"{name} already exists; .*the table"):  # noqa: SIM117
+                with whole_folder(tmp_path / name, "the table"):
+                    pytest.fail("the block must not begin")
+        assert (tmp_path / "full" / "mine").read_text() == "precious"
+
+    def test_a_place_taken_meanwhile_is_left_alone(self, tmp_path: Path) -> None:
+        path = tmp_path / "lut"
+        with pytest.raises(InputError), whole_folder(path, "the table") as folder:  # noqa: PT012
+            write_whole(folder / "a", "ours")
+            path.mkdir()
+            write_whole(path / "a", "theirs")
+        assert (path / "a").read_text() == "theirs"
+        assert names(tmp_path) == ["lut"]
+
+    @pytest.mark.parametrize("error", [ValueError("ours"), KeyboardInterrupt()])
+    def test_a_block_that_fails_leaves_nothing(self, tmp_path: Path, error: BaseException) -> None:
+        with pytest.raises(type(error)), whole_folder(tmp_path / "lut", "the table") as folder:  # noqa: PT012
+            write_whole(folder / "deep" / "a", "1")
+            raise error
+        assert names(tmp_path) == []
+
+    def test_a_full_disk_is_one_sentence_and_leaves_nothing(self, tmp_path: Path) -> None:
+        path = tmp_path / "lut"
+        with pytest.raises(StorageError, match=r"cannot write .*lut: "), small_disk(1000):  # noqa: SIM117
+            with whole_folder(path, "the table") as folder:
+                (folder / "samples.npy").write_bytes(bytes(5000))
+        assert names(tmp_path) == []
+
+    def test_a_leftover_is_cleared(self, tmp_path: Path) -> None:
+        leftover = partial_path(tmp_path / "lut")
+        leftover.mkdir()
+        write_whole(leftover / "stale", "x")
+        with whole_folder(tmp_path / "lut", "the table") as folder:
+            write_whole(folder / "fresh", "x")
+        assert names(tmp_path / "lut") == ["fresh"]
+
+    def test_a_name_below_a_file_is_told(self, tmp_path: Path) -> None:
+        write_whole(tmp_path / "file", "x")
+        with pytest.raises(InputError, match="is a file"), whole_folder(tmp_path / "file" / "lut", "the table"):
+            pytest.fail("the block must not begin")
+
+    def test_a_fault_of_a_source_is_not_blamed_on_the_disk(self, tmp_path: Path) -> None:
+        with pytest.raises(FileNotFoundError), whole_folder(tmp_path / "lut", "the table"):
+            (tmp_path / "source").read_bytes()
+
+
+def test_partial_names_are_told_from_others() -> None:
+    assert partial_path(Path("frames/a.CR2")) == Path("frames/.a.CR2.partial")
+    assert is_partial(Path("frames/.a.CR2.partial"))
+    assert not is_partial(Path("frames/a.CR2.partial"))
+    assert not is_partial(Path("frames/.hidden"))
+
+
+def test_require_free(tmp_path: Path) -> None:
+    require_free(tmp_path / "new", "the session")
+    require_free(tmp_path, "the session")
+    write_whole(tmp_path / "x", "")
+    with pytest.raises(InputError, match="already exists"):
+        require_free(tmp_path, "the session")
+
+
+def test_an_empty_folder_is_no_free_file(tmp_path: Path) -> None:
+    require_free_file(tmp_path / "new", "the lights")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for path in (tmp_path, tmp_path / "link"):
+        with pytest.raises(InputError, match="already exists; name another place for the lights"):
+            require_free_file(path, "the lights")
+
+
+def test_whole_file_yields_a_stream_that_can_be_sized(tmp_path: Path) -> None:
+    with whole_file(tmp_path / "a") as stream:
+        assert isinstance(stream, BufferedRandom)
+        stream.write(b"123")
+        assert stream.tell() == 3
+
+
+@pytest.mark.parametrize("size", [0, 1, 70_000, 5 << 20])
+def test_a_file_is_read_whole_and_cannot_be_written_through(tmp_path: Path, size: int) -> None:
+    written = os.urandom(size)
+    (tmp_path / "frame").write_bytes(written)
+    data = read_whole(tmp_path / "frame")
+    assert data == written
+    assert data.readonly
+    assert bool(data) == bool(written)
+
+
+@pytest.mark.parametrize("told", [0, 5, 20])
+def test_a_file_of_another_size_than_the_system_told_is_read_to_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: int
+) -> None:
+    (tmp_path / "frame").write_bytes(b"ten bytes.")
+
+    def fstat(handle: int) -> os.stat_result:
+        del handle
+        return os.stat_result((0,) * 6 + (told, 0, 0, 0))
+
+    monkeypatch.setattr(storage.os, "fstat", fstat)
+    assert read_whole(tmp_path / "frame") == b"ten bytes."
