@@ -87,7 +87,29 @@ def write_commands(app: Sphinx) -> None:
         (folder / f"{command}.md").write_text("\n".join(parts), encoding="utf-8")
 
 
+def keep_modules_out_of_the_tree(_: Sphinx, page: str, source: list[str]) -> None:
+    """Let the tree of all pages name packages and rooms only; a room's page lists its modules.
+
+    With each of the modules in it, the tree is too long to read and costs most of the time of a build.
+    """
+    if not page.startswith(f"{autoapi_root}/"):
+        return
+    place = ROOT.joinpath(*page.removeprefix(f"{autoapi_root}/").split("/")[:-1])
+    if not place.is_dir():
+        source[0] = ":orphan:\n\n" + source[0]
+    rooms: list[str] = []
+    modules: list[str] = []
+    for name in re.findall(rf"^   /{autoapi_root}/(.*)/index$", source[0], re.MULTILINE):
+        (rooms if (ROOT / name).is_dir() else modules).append(name)
+    named = "".join(f"   /{autoapi_root}/{name}/index\n" for name in rooms)
+    listed = "".join(f"* :doc:`/{autoapi_root}/{name}/index`\n" for name in modules)
+    tree = f".. toctree::\n   :maxdepth: 1\n\n{named}\n" if rooms else ""
+    both = r"^\.\. toctree::\n   :maxdepth: 1\n+(   /.*\n+)+"
+    source[0] = re.sub(both, f"{tree}{listed}\n", source[0], flags=re.MULTILINE)
+
+
 def setup(app: Sphinx) -> None:
     """Register the role and the pages."""
     app.add_role("name", NameRole())
     app.connect("builder-inited", write_commands)
+    app.connect("source-read", keep_modules_out_of_the_tree)

@@ -5,7 +5,7 @@ Laws that hold inside:
 - A figure within `accept` is well; between `accept` and `refuse` it is a remark; beyond `refuse` there is no table.
 - A limit without `refuse` can only be remarked on: what it tells about does not make the table wrong.
 - Where a measurement refuses by itself (`calibration.registration.register`), the number stands there and is repeated
-here.
+  here.
 """
 
 from __future__ import annotations

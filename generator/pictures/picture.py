@@ -1,6 +1,6 @@
 """A picture file becomes 8-bit sRGB codes, as a printer would be given them.
 
-What is done to a file's values, in this order, so that one picture always gives the same codes:
+What is done to a file's values, in this order, so that one picture always gives the same codes::
 
     channels      the first three as R, G, B; a single one as grey; of several images in a file the first
     depth         8-bit codes as they are; 16-bit codes v become ⌊(v + 128) / 257⌋; floating-point values are linear
