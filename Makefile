@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 DEMO := build/demo
 ROOMS := foundation drivers sim acquisition calibration generator evaluation
 
-.PHONY: demo test lint bench full-session lock clean
+.PHONY: demo test quick lint docs bench full-session lock clean
 
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed, this is " + sys.version.split()[0] + "; name one with make PYTHON=python3.12 ...")'
@@ -37,11 +37,20 @@ demo: $(READY)
 test: $(READY) lint
 	$(BIN)/python -m pytest -n auto
 
+# What most mistakes are caught by: every test that takes no longer than two seconds. Under a minute on two cores.
+quick: $(READY)
+	$(BIN)/python -m pytest -n auto -m "not slow"
+
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/basedpyright
+
+# The site: tutorial, how-to, reference from the docstrings, explanation; a warning is an error. Needs no network.
+docs: $(READY)
+	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --jobs auto --quiet --doctree-dir build/doctrees docs build/site
+	@echo "The site: $(CURDIR)/build/site/index.html"
 
 bench: $(READY)
 	@for file in benchmarks/[!_]*.py; do $(BIN)/python -m benchmarks.$$(basename $$file .py) || exit 1; done
@@ -54,7 +63,7 @@ full-session: $(READY)
 lock:
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet uv
-	$(BIN)/uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \
+	$(BIN)/uv pip compile pyproject.toml --extra dev --extra docs --universal --python-version 3.11 --generate-hashes \
 		--no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
 		--quiet --upgrade --output-file requirements.lock
 

@@ -64,7 +64,7 @@ class Displacement:
     def fitted(self, points_mm: _Array, information: _Array, pull: _Array) -> Displacement:
         """Return the smooth displacement most likely for measured places.
 
-        Minimises Σ ½ dᵀ A d − pullᵀ d + ½ |second differences|² / roughness².
+        Minimises ``Σ ½ dᵀ A d − pullᵀ d + ½ |second differences|² / roughness²``.
 
         Parameters
         ----------

@@ -1,7 +1,7 @@
 """The Gray-Edge framework: the light is the Minkowski mean of an image or of its derivatives.
 
 J. van de Weijer, T. Gevers, A. Gijsenij, "Edge-based color constancy", IEEE Transactions on Image Processing 16(9),
-2007, equation 13: e ∝ (∫ |∂ⁿ f_σ / ∂xⁿ|ᵖ dx)^(1/p) for each channel. With n = 0 and σ = 0 it is Gray-world (p = 1),
+2007, equation 13: ``e ∝ (∫ |∂ⁿ f_σ / ∂xⁿ|ᵖ dx)^(1/p)`` for each channel. With n = 0 and σ = 0 it is Gray-world (p = 1),
 White-Patch (p = ∞) and Shades-of-Gray; with n = 0 general Gray-world. Filters and exclusions follow the authors'
 program: Gaussian kernels cut at 3σ, edges continued by their last pixel, order 2 as √(f_xx² + 4 f_xy² + f_yy²).
 """

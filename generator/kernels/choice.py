@@ -1,7 +1,7 @@
 """Which of a colour's samples a pixel gets: a pure function of (seed, image number, light's place, x, y).
 
 Tiles, threads and workers cannot change a choice. The rule is part of the dataset format
-(`docs/decisions/0010-compiled-kernel.md` says why it is this one); all arithmetic is modulo 2³² but for p and q:
+(`docs/decisions/0010-compiled-kernel.md` says why it is this one); all arithmetic is modulo 2³² but for p and q::
 
     keys     k0, k1, k2: the first words of Philox4x32-10 with counter (y, place, image, 0) and the seed as key
     word     i = 8 ⌊x/16⌋ + x mod 8,  h = (i ⊕ k0) · 0x21F0AAAD ⊕ k1,  h = (h ⊕ ⌊h/2¹⁶⌋) · 0x735A2D97 ⊕ k2,

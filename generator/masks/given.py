@@ -1,6 +1,6 @@
 """Masks that a user gives as image files.
 
-A folder of masks holds one set for each image, in the order of the names, starting over when they end:
+A folder of masks holds one set for each image, in the order of the names, starting over when they end::
 
     NAME_1.png … NAME_K.png    K grey masks, one a light; the numbers, of three digits at most, give the order and may
                                begin anywhere

@@ -1,6 +1,6 @@
 """A picture file becomes 8-bit sRGB codes, as a printer would be given them.
 
-These steps turn a file's values into codes, in this order, so that one picture always gives the same codes:
+These steps turn a file's values into codes, in this order, so that one picture always gives the same codes::
 
     channels      the first three as R, G, B; a single one as grey; of several images in a file the first
     depth         8-bit codes are kept; 16-bit codes v become ⌊(v + 128) / 257⌋; floating-point values are linear

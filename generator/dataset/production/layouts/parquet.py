@@ -1,5 +1,7 @@
 """Parquet shards that Hugging Face `datasets` reads: one row an image, the file's bytes in it.
 
+The columns::
+
     image     struct of bytes and path, feature Image that is not decoded by itself: Pillow, with which `datasets` would
               decode, keeps 8 of a 16-bit image's bits
     preview   the same, decoded; where there are previews

@@ -1,0 +1,361 @@
+"""Draw the figures of docs/architecture.md from what they show: the import contracts, the imports, the table of states.
+
+`python docs/figures.py` writes docs/images/rooms.svg and docs/images/step.svg anew; `tests/house/test_figures.py` fails
+when they are no longer what is drawn here.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import grimp
+
+ROOT = Path(__file__).resolve().parents[1]
+IMAGES = ROOT / "docs" / "images"
+
+INK, GREY, LINE, PAPER, BOX, WALL = "#1f2933", "#52606d", "#7b8794", "#ffffff", "#eef2f6", "#b42318"
+FONT = "font-family='Helvetica, Arial, sans-serif'"
+ROW, BOX_HEIGHT, GAP = 44, 26, 14
+BAND_WIDTH, DATA_LEFT, WIDTH = 740, 790, 1010
+
+DATA = {
+    "evaluation": ("errors of methods, tables",),
+    "generator": ("dataset/: raw images, ground truth",),
+    "calibration": ("lut/: samples of every colour, ground truth",),
+    "acquisition": ("session/: raw frames, journal", "chart/, illuminations.csv"),
+    "sim": ("a room, a print, a sensor",),
+    "drivers": ("camera, projector, display: bytes on cables, raw files",),
+}
+"""What each package makes, the way of the data upwards; `foundation` handles no data of its own."""
+
+SIMULATED = "sim"
+"""The package that stands in for hardware, beside the way of the data."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The house as `pyproject.toml` and the source have it.
+
+    Attributes
+    ----------
+    packages
+        The floors, highest first, as the contract of the tower has them.
+    forbidden
+        Package to the modules that a contract forbids to it.
+    excepted
+        Package to those of its modules for which that does not hold.
+    commands
+        Package to its console commands.
+    imports
+        Room to the rooms that it imports; a room is a package's sub-package or a module beside them.
+    """
+
+    packages: tuple[str, ...]
+    forbidden: Mapping[str, Set[str]]
+    excepted: Mapping[str, Set[str]]
+    commands: Mapping[str, Sequence[str]]
+    imports: Mapping[str, Set[str]]
+
+    def rooms(self, package: str) -> list[str]:
+        """Return the rooms of a package, in alphabetical order."""
+        return sorted(room for room in self.imports if room.startswith(f"{package}."))
+
+
+def read_plan() -> Plan:
+    """Return the house as it is."""
+    project: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    contracts: list[dict[str, Any]] = project["tool"]["importlinter"]["contracts"]
+    roots: list[str] = project["tool"]["importlinter"]["root_packages"]
+    layers = next(c["layers"] for c in contracts if c["type"] == "layers" and set(c["layers"]) == set(roots))
+    forbidden: dict[str, set[str]] = {package: set() for package in roots}
+    excepted: dict[str, set[str]] = {package: set() for package in roots}
+    for contract in (one for one in contracts if one["type"] == "forbidden"):
+        for source in contract["source_modules"]:
+            forbidden[source.split(".")[0]] |= set(contract["forbidden_modules"])
+        for ignored in contract.get("ignore_imports", ()):
+            module = ignored.split(" -> ")[0]
+            excepted[module.split(".")[0]].add(module)
+    commands: dict[str, list[str]] = {package: [] for package in roots}
+    for command, place in project["project"]["scripts"].items():
+        commands[place.split(".")[0]].append(command)
+    graph = grimp.build_graph(*roots, cache_dir=None)
+    imports: dict[str, set[str]] = {}
+    for module in graph.modules:
+        room = room_of(module)
+        imported = {room_of(one) for one in graph.find_modules_directly_imported_by(module)}
+        imports[room] = imports.get(room, set()) | imported - {room}
+    return Plan(tuple(layers), forbidden, excepted, commands, imports)
+
+
+def room_of(module: str) -> str:
+    """Return the room that a module is in: the first two parts of its name."""
+    return ".".join(module.split(".")[:2])
+
+
+def reach(imports: Mapping[str, Set[str]], room: str) -> set[str]:
+    """Return the rooms that a room imports, itself or through others."""
+    found, waiting = set[str](), [room]
+    while waiting:
+        for one in imports.get(waiting.pop(), ()):
+            if one not in found:
+                found.add(one)
+                waiting.append(one)
+    return found
+
+
+def heights(rooms: Sequence[str], imports: Mapping[str, Set[str]]) -> dict[str, int]:
+    """Return the row of each room, 0 at the bottom: above all that it imports; rooms in a circle share one."""
+    inside = {room: set(imports[room]) & set(rooms) for room in rooms}
+    below = {room: {one for one in reach(inside, room) if room not in reach(inside, one)} for room in rooms}
+    rows: dict[str, int] = {}
+    for room in sorted(rooms, key=lambda room: (len(below[room]), room)):
+        rows[room] = max((rows[one] + 1 for one in below[room]), default=0)
+    return {room: max(rows[one] for one in rooms if one == room or circle(inside, one, room)) for room in rooms}
+
+
+def circle(imports: Mapping[str, Set[str]], one: str, other: str) -> bool:
+    """Return whether two rooms import each other, directly or through others."""
+    return other in reach(imports, one) and one in reach(imports, other)
+
+
+def shown_imports(rooms: Sequence[str], imports: Mapping[str, Set[str]]) -> list[tuple[str, str]]:
+    """Return the imports among rooms, without those that other imports shown imply."""
+    inside = {room: set(imports[room]) & set(rooms) for room in rooms}
+    return [
+        (room, one)
+        for room in rooms
+        for one in sorted(inside[room])
+        if circle(inside, room, one)
+        or not any(
+            one in reach(inside, other) and not circle(inside, one, other) and not circle(inside, room, other)
+            for other in inside[room] - {one}
+        )
+    ]
+
+
+def text(
+    x: float, y: float, words: str, size: int = 12, fill: str = INK, anchor: str = "start", bold: bool = False
+) -> str:
+    """Return a line of text."""
+    weight = " font-weight='bold'" if bold else ""
+    place = f"x='{x:.0f}' y='{y:.0f}' text-anchor='{anchor}'"
+    return f"<text {place} font-size='{size}' fill='{fill}'{weight}>{escape(words)}</text>"
+
+
+def box(x: float, y: float, width: float, words: str, fill: str = BOX, height: float = BOX_HEIGHT) -> str:
+    """Return a labelled box; `x` and `y` are its top-left corner."""
+    place = f"x='{x:.0f}' y='{y:.0f}' width='{width:.0f}' height='{height:.0f}'"
+    frame = f"<rect {place} rx='4' fill='{fill}' stroke='{LINE}'/>"
+    return frame + text(x + width / 2, y + height / 2 + 4, words, anchor="middle")
+
+
+def arrow(points: Iterable[tuple[float, float]], dashed: bool = False, colour: str = LINE, head: bool = True) -> str:
+    """Return an arrow along points, or a line without a head."""
+    path = " ".join(f"{x:.0f},{y:.0f}" for x, y in points)
+    dash = " stroke-dasharray='5 4'" if dashed else ""
+    end = f" marker-end='url(#{'wall' if colour == WALL else 'head'})'" if head else ""
+    return f"<polyline points='{path}' fill='none' stroke='{colour}'{dash}{end}/>"
+
+
+def wrapped(words: str, width: int) -> list[str]:
+    """Return words broken into lines of at most `width` characters."""
+    lines = [""]
+    for word in words.split():
+        if len(lines[-1]) + len(word) >= width and lines[-1]:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    return lines
+
+
+def picture(width: float, height: float, title: str, parts: Sequence[str]) -> str:
+    """Return a whole SVG file."""
+    head = "<marker id='{}' viewBox='0 0 8 8' refX='7' refY='4' markerWidth='7' markerHeight='7' orient='auto'>"
+    head += "<path d='M0,0 L8,4 L0,8 z' fill='{}'/></marker>"
+    size = f"width='{width:.0f}' height='{height:.0f}' viewBox='0 0 {width:.0f} {height:.0f}'"
+    return "\n".join(
+        (
+            f"<svg xmlns='http://www.w3.org/2000/svg' {size} role='img' {FONT}>",
+            f"<title>{escape(title)}</title>",
+            f"<defs>{head.format('head', LINE)}{head.format('wall', WALL)}</defs>",
+            f"<rect width='100%' height='100%' fill='{PAPER}'/>",
+            *parts,
+            "</svg>\n",
+        )
+    )
+
+
+def opening(package: str) -> str:
+    """Return the first sentence of a package's docstring."""
+    docstring = ast.get_docstring(ast.parse((ROOT / package / "__init__.py").read_text(encoding="utf-8"))) or ""
+    return docstring.splitlines()[0]
+
+
+def draw_rooms(plan: Plan) -> str:
+    """Return the drawing of the house: a band for each package, its rooms, what it stands on, and what it makes."""
+    parts: list[str] = []
+    bands: dict[str, tuple[float, float]] = {}
+    top = 20.0
+    for package in plan.packages:
+        rooms = plan.rooms(package)
+        rows = heights(rooms, plan.imports)
+        notes = notes_of(plan, package)
+        head = 44 + 15 * len(notes)
+        height = head + ROW * (max(rows.values()) + 1) + 6
+        parts.append(
+            f"<rect x='10' y='{top:.0f}' width='{BAND_WIDTH}' height='{height:.0f}' rx='6' fill='none' stroke='{INK}'/>"
+        )
+        parts.append(text(22, top + 21, package, 15, bold=True))
+        parts.append(text(22, top + 38, opening(package), 12, GREY))
+        for number, (note, colour) in enumerate(notes):
+            parts.append(text(22, top + 54 + 15 * number, note, 11, colour))
+        parts += draw_band(package, rooms, rows, plan.imports, top + head)
+        bands[package] = (top, top + height)
+        top += height + GAP
+    parts += draw_data(plan, bands)
+    return picture(WIDTH, top, "The packages of CroP, their rooms, their imports, and the way of the data", parts)
+
+
+def notes_of(plan: Plan, package: str) -> list[tuple[str, str]]:
+    """Return the lines below a package's name: what it imports of other packages, and what is forbidden to it."""
+    imported: dict[str, set[str]] = {}
+    for room in [package, *plan.rooms(package)]:
+        for one in plan.imports.get(room, ()):
+            other, _, name = one.partition(".")
+            if other != package:
+                imported.setdefault(other, set()).add(name)
+    named = [
+        other if other == plan.packages[-1] else f"{other} ({', '.join(sorted(filter(None, imported[other])))})"
+        for other in plan.packages
+        if other in imported
+    ]
+    lines = wrapped("imports " + ", ".join(named), 122) if named else []
+    walls = sorted(plan.forbidden[package])
+    doors = sorted(plan.excepted[package])
+    but = f"; {', '.join(doors)} may" if doors else ""
+    barred = wrapped(f"must not import {', '.join(walls)}{but}", 122) if walls else []
+    return [(line, GREY) for line in lines] + [(line, WALL) for line in barred]
+
+
+def draw_band(
+    package: str, rooms: Sequence[str], rows: Mapping[str, int], imports: Mapping[str, Set[str]], top: float
+) -> list[str]:
+    """Return the rooms of a package in rows, highest first, and the imports among them."""
+    places: dict[str, tuple[float, float, float]] = {}
+    highest = max(rows.values())
+    inside = {room: set(imports[room]) & set(rooms) for room in rooms}
+    group = {room: min(one for one in rooms if one == room or circle(inside, one, room)) for room in rooms}
+    for row in range(highest, -1, -1):
+        named = sorted((room for room in rooms if rows[room] == row), key=lambda room: (group[room], room))
+        widths = [7 * len(room.partition(".")[2]) + 18 for room in named]
+        # Odd rows are moved aside, so that imports past a row are seen beside its boxes.
+        space = (BAND_WIDTH - 60 - sum(widths)) / (len(named) + 1)
+        x = 10 + space + (25 if row % 2 else 0)
+        for room, width in zip(named, widths, strict=True):
+            places[room] = (x, top + ROW * (highest - row), width)
+            x += width + space
+    parts: list[str] = []
+    for room, one in shown_imports(rooms, imports):
+        (x, y, width), (to_x, to_y, to_width) = places[room], places[one]
+        if y == to_y:
+            ends = ((x + width, y + 13), (to_x, y + 13)) if x < to_x else ((x, y + 13), (to_x + to_width, y + 13))
+        else:
+            ends = ((x + width / 2, y + BOX_HEIGHT), (to_x + to_width / 2, to_y))
+        parts.append(arrow(ends, colour=WALL if circle(inside, room, one) else LINE))
+    parts += [
+        box(x, y, width, room.partition(".")[2], BOX if (ROOT / room.replace(".", "/")).is_dir() else PAPER)
+        for room, (x, y, width) in places.items()
+    ]
+    return parts
+
+
+def draw_data(plan: Plan, bands: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Return what each package makes, beside its band (top, bottom), with the way of the data from one to the next."""
+    parts: list[str] = []
+    above: tuple[float, str] | None = None
+    simulated: float | None = None
+    for package in (package for package in plan.packages if package in DATA):
+        left = DATA_LEFT + (40 if package == SIMULATED else 0)
+        centre, way = (left + WIDTH - 10) / 2, DATA_LEFT + 20
+        lines = [line for words in DATA[package] for line in wrapped(words, 30 if left == DATA_LEFT else 24)]
+        middle, half = sum(bands[package]) / 2, 8 * len(lines) + 6
+        frame = f"x='{left}' y='{middle - half:.0f}' width='{WIDTH - left - 10}' height='{2 * half}'"
+        parts.append(f"<rect {frame} rx='12' fill='{PAPER}' stroke='{INK}'/>")
+        parts += [text(centre, middle - half + 19 + 16 * n, line, anchor="middle") for n, line in enumerate(lines)]
+        if package == SIMULATED:
+            simulated = middle + half
+            continue
+        if above is not None:
+            bottom, user = above
+            parts.append(arrow(((way, middle - half), (way, bottom))))
+            parts.append(text(way + 8, bottom + 18, " ".join(plan.commands[user]), 12, GREY, bold=True))
+        if simulated is not None:
+            parts.append(arrow(((centre + 20, simulated), (centre + 20, middle - half)), dashed=True))
+            parts.append(text(centre + 12, simulated + 18, "the cables\u2019 far end", 11, GREY, anchor="end"))
+            simulated = None
+        above = middle + half, package
+    return parts
+
+
+def draw_step() -> str:
+    """Return the drawing of what a step of a session goes through."""
+    sys.path.insert(0, str(ROOT))
+    from acquisition.session.states import ENDS, TRANSITIONS, UNDER_WAY, StepState
+
+    wide, left, right, lane = 112, 340, 680, 830
+    path = [StepState.PLANNED, *UNDER_WAY, StepState.ACCEPTED]
+    aside = {StepState.FAILED: 2.0, StepState.INTERRUPTED: 4.5, StepState.REFUSED: 6.2}
+    places = {state: (left, 30.0 + 66 * row) for row, state in enumerate(path)}
+    places |= {state: (right, 30 + 66 * row) for state, row in aside.items()}
+    if set(places) != set(StepState) or set(ENDS) != {StepState.ACCEPTED, *aside}:
+        raise ValueError("the table has states that the drawing has no place for")
+    interruptions = [line for line in TRANSITIONS if line.after is StepState.INTERRUPTED]
+    if {line.before for line in interruptions} != set(UNDER_WAY):
+        raise ValueError("an interruption is drawn as one arrow from all states under way; the table says otherwise")
+    parts: list[str] = []
+    bracket, top, bottom = left + wide + 14, places[UNDER_WAY[0]][1], places[UNDER_WAY[-1]][1] + BOX_HEIGHT
+    parts.append(
+        arrow(((bracket - 8, top), (bracket, top), (bracket, bottom), (bracket - 8, bottom)), True, head=False)
+    )
+    x, y = places[StepState.INTERRUPTED]
+    parts.append(arrow(((bracket, y + 13), (x, y + 13)), dashed=True))
+    parts.append(text(bracket + 12, y + 7, interruptions[0].cause, 11, GREY))
+    for line in (line for line in TRANSITIONS if line not in interruptions):
+        (x, y), (to_x, to_y) = places[line.before], places[line.after]
+        if x == to_x and to_y > y:
+            parts.append(arrow(((x + 40, y + BOX_HEIGHT), (x + 40, to_y))))
+            parts.append(text(x + 30, (y + BOX_HEIGHT + to_y) / 2 + 4, line.cause, 11, GREY, anchor="end"))
+        elif x == to_x:
+            parts.append(arrow(((x, y + 13), (20, y + 13), (20, to_y + 13), (x, to_y + 13)), dashed=True))
+            parts.append(text(30, y + 7, line.cause, 11, GREY))
+        elif to_x > x:
+            parts.append(arrow(((x + wide, y + 13), (to_x, to_y + 13))))
+            share, aside_px = 0.25, -6 if to_y >= y else 16
+            along = (x + wide + share * (to_x - x - wide) + 6, y + 13 + share * (to_y - y) + aside_px)
+            parts.append(text(*along, line.cause, 11, GREY))
+        else:
+            high, end = to_y - 8, to_x + wide - 20
+            points = ((x + wide, y + 13), (lane, y + 13), (lane, high), (end, high), (end, to_y))
+            parts.append(arrow(points, dashed=True))
+            lines = wrapped(line.cause, 24)
+            parts += [text(x, y + BOX_HEIGHT + 14 + 14 * n, words, 11, GREY) for n, words in enumerate(lines)]
+    fills = {StepState.ACCEPTED: "#d7f0dd", StepState.REFUSED: "#fbe3c8", StepState.FAILED: "#f8d4d0"}
+    parts += [box(x, y, wide, state.value, fills.get(state, BOX)) for state, (x, y) in places.items()]
+    return picture(850, 30 + 66 * len(path), "What a step of a session goes through", parts)
+
+
+def figures() -> dict[Path, str]:
+    """Return the files of the figures with their content."""
+    return {IMAGES / "rooms.svg": draw_rooms(read_plan()), IMAGES / "step.svg": draw_step()}
+
+
+if __name__ == "__main__":
+    for file, content in figures().items():
+        file.write_text(content, encoding="utf-8")
+        print(file.relative_to(ROOT))

@@ -1,0 +1,86 @@
+"""The worked examples of CONTRIBUTING.md work: what stands there is done in a copy of the repository."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+COPIED = ("foundation", "drivers", "sim", "acquisition", "calibration", "generator", "evaluation", "tests", "examples")
+
+
+@dataclass(frozen=True)
+class Example:
+    """One worked example: new files, changed files, and the command that tries it."""
+
+    title: str
+    text: str
+
+    def files(self) -> dict[str, str]:
+        """Return the new files by path."""
+        return dict(re.findall(r"^```python (\S+)\n(.*?)^```$", self.text, re.MULTILINE | re.DOTALL))
+
+    def changes(self) -> list[tuple[str, str, str]]:
+        """Return path, what stands there and what shall stand there, hunk by hunk."""
+        found: list[tuple[str, str, str]] = []
+        for block in re.findall(r"^```diff\n(.*?)^```$", self.text, re.MULTILINE | re.DOTALL):
+            for part in re.split(r"^--- ", block, flags=re.MULTILINE)[1:]:
+                path, _, hunks = part.partition("\n")
+                for hunk in re.split(r"^@@\n", hunks, flags=re.MULTILINE):
+                    lines = hunk.splitlines(keepends=True)
+                    before = "".join(line[1:] for line in lines if line[0] in " -")
+                    found.append((path, before, "".join(line[1:] for line in lines if line[0] in " +")))
+        return found
+
+    def command(self) -> list[str]:
+        """Return the words of the command that tries it."""
+        (command,) = re.findall(r"^    python (-m pytest .*)$", self.text, re.MULTILINE)
+        return [sys.executable, *shlex.split(command), "-q", "-p", "no:cacheprovider"]
+
+
+EXAMPLES = [Example(*part.split("\n", 1)) for part in PAGE.partition("## Worked examples\n")[2].split("\n### ")[1:]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.title)
+def test_a_worked_example_works(example: Example, tmp_path: Path) -> None:
+    for name in COPIED:
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "data"))
+        for data in (ROOT / name).rglob("data"):
+            (tmp_path / data.relative_to(ROOT)).symlink_to(data)
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    for path, text in example.files().items():
+        (tmp_path / path).write_text(text, encoding="utf-8")
+    for path, before, after in example.changes():
+        text = (tmp_path / path).read_text(encoding="utf-8")
+        assert text.count(before) == 1, f"{path} has this {text.count(before)} times, 1 expected:\n{before}"
+        (tmp_path / path).write_text(text.replace(before, after), encoding="utf-8")
+    changed = sorted({*example.files(), *(path for path, _, _ in example.changes() if path.endswith(".py"))})
+    # The order of imports is ruff's to mend.
+    ruff = [sys.executable, "-m", "ruff", "check", "--no-cache"]
+    run(tmp_path, [*ruff, "--fix", "--select", "I", *changed])
+    run(tmp_path, [*ruff, *changed])
+    run(tmp_path, [sys.executable, "-m", "ruff", "format", "--no-cache", "--check", *changed])
+    run(
+        tmp_path,
+        [sys.executable, "-c", "from importlinter.cli import lint_imports_command as run; run()", "--no-cache"],
+    )
+    said = run(tmp_path, example.command())
+    assert re.search(r"\b[1-9]\d* passed", said), said
+
+
+def run(folder: Path, words: list[str]) -> str:
+    """Run a command in a folder, whose modules it finds first, and return what it prints."""
+    settings = os.environ | {"PYTHONPATH": str(folder)}
+    done = subprocess.run(words, cwd=folder, env=settings, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{' '.join(words)}:\n{done.stdout[-4000:]}{done.stderr[-2000:]}"
+    return done.stdout
