@@ -14,10 +14,12 @@ from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings
 from acquisition.lights.illuminations import Illumination
 from acquisition.run import sequencer
-from acquisition.run.rig import open_rig
-from acquisition.run.sequencer import Devices, take_session
-from acquisition.session import folder as journal
-from acquisition.session.folder import Session, Step, plan_steps
+from acquisition.run.devices import Devices
+from acquisition.run.rig.opening import open_rig
+from acquisition.run.sequencer import take_session
+from acquisition.session import journal
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep, plan_steps
 from acquisition.session.states import ENDS, TRANSITIONS, StepState, may_follow, may_lead_to
 from drivers.camera import Camera, CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour, Presenter
@@ -106,6 +108,9 @@ class WatchedCamera:
     def configure(self, settings: ExposureSettings) -> None:
         self.camera.configure(settings)
 
+    def shutter_speeds(self) -> tuple[float, ...]:
+        return self.camera.shutter_speeds()
+
     def capture(self, into: BinaryIO) -> CapturedFrame:
         captured = self.camera.capture(into)
         self.watch.enter(StepState.EXPOSED)
@@ -127,7 +132,7 @@ def session(tmp_path: Path) -> Generator[Session]:
 
 @contextmanager
 def watched(session: Session, watch: Watch, patch: pytest.MonkeyPatch) -> Generator[Devices]:
-    """Yield the simulated lab's devices, and let session and sequencer tell `watch` of what they do."""
+    """Yield the simulated lab's devices, and let `watch` follow what session and sequencer do."""
 
     def after(method: Callable[..., Any], enter: Callable[..., None]) -> Callable[..., Any]:
         def call(*given: Any, **named: Any) -> Any:
@@ -137,7 +142,7 @@ def watched(session: Session, watch: Watch, patch: pytest.MonkeyPatch) -> Genera
 
         return call
 
-    def begun(step: Step, *_: object) -> None:
+    def begun(step: SessionStep, *_: object) -> None:
         watch.step = step.number
         watch.enter(StepState.BEGUN)
 
@@ -145,11 +150,11 @@ def watched(session: Session, watch: Watch, patch: pytest.MonkeyPatch) -> Genera
         watch.enter(StepState(verdict))
 
     with patch.context() as patched, open_rig(SETTINGS, session.chart, session) as devices:
-        patched.setattr(session, "begin", after(session.begin, begun))
+        patched.setattr(session.journal, "begin", after(session.journal.begin, begun))
         patched.setattr(session, "receive", after(session.receive, lambda *_: watch.enter(StepState.SAVED)))
         patched.setattr(sequencer, "judge_file", after(sequencer.judge_file, lambda *_: watch.enter(StepState.JUDGED)))
         patched.setattr(session, "commit", after(session.commit, committed))
-        patched.setattr(session, "fail", after(session.fail, lambda *_: watch.enter(StepState.FAILED)))
+        patched.setattr(session.journal, "fail", after(session.journal.fail, lambda *_: watch.enter(StepState.FAILED)))
         yield replace(
             devices,
             camera=WatchedCamera(devices.camera, watch),
@@ -183,7 +188,7 @@ def journalled(session: Session) -> set[tuple[StepState, StepState]]:
     """Return the transitions that the journal shows."""
     seen: set[tuple[StepState, StepState]] = set()
     state: dict[int, StepState] = {}
-    for attempt in session.attempts():
+    for attempt in session.journal.attempts():
         end = StepState.INTERRUPTED if attempt.verdict is None else StepState(attempt.verdict)
         seen |= {(state.get(attempt.step, StepState.PLANNED), StepState.BEGUN), (StepState.BEGUN, end)}
         state[attempt.step] = end
