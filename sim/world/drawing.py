@@ -50,7 +50,7 @@ class Print:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawing:
+class LabelMap:
     """A print as a map of labels between lines.
 
     Attributes
@@ -69,7 +69,7 @@ class Drawing:
     codes: NDArray[np.int64]
 
 
-def drawing_of(sheet: Print) -> Drawing:
+def label_map(sheet: Print) -> LabelMap:
     """Return the map of a print; what of a rectangle lies off the page is left out."""
     codes, label = np.unique(np.concatenate([sheet.rgb.astype(np.int64), [PAPER]]), axis=0, return_inverse=True)
     boxes = np.concatenate([sheet.rectangles_mm, [[0, 0, *sheet.page_mm]]])
@@ -80,7 +80,7 @@ def drawing_of(sheet: Print) -> Drawing:
     # The page, which comes last, lies under everything.
     for k in (len(label) - 1, *range(len(label) - 1)):
         labels[top[k] + 1 : bottom[k] + 1, left[k] + 1 : right[k] + 1] = label[k]
-    return Drawing(x_lines, y_lines, labels, codes)
+    return LabelMap(x_lines, y_lines, labels, codes)
 
 
 def _lines(ends: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:

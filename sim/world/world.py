@@ -28,7 +28,7 @@ from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from foundation.processors import processor_count
 from foundation.srgb import decode_srgb
-from sim.world.drawing import PAPER, Print, drawing_of
+from sim.world.drawing import PAPER, Print, label_map
 from sim.world.geometry import Folded, View, Waviness
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import Body
@@ -303,7 +303,7 @@ class World:
         from sim.world.rendering import light
 
         visible, room = self.body.visible, self.room
-        drawing = drawing_of(self.sheet)
+        drawing = label_map(self.sheet)
         backdrop = np.full((1, len(self._sensitivities)), _BACKDROP_REFLECTANCE)
         reflectance = np.concatenate([print_reflectance(drawing.codes), backdrop])
         table = self._signals(reflectance).astype(np.float32)
