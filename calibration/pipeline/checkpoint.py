@@ -114,7 +114,6 @@ class UnfinishedTable:
         require_free(self._out, "the table")
         try:
             (self.folder / CHECKPOINT).unlink(missing_ok=True)
-            (self.folder / LOCK_FILE).unlink(missing_ok=True)
             sync_folder(self.folder)
         except OSError as error:
             raise storage_error(self._out, error) from error

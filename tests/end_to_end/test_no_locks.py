@@ -17,14 +17,14 @@ def flock(handle, operation):
     raise OSError(errno.EOPNOTSUPP, "Operation not supported")
 
 fcntl.flock = flock
-module, *sys.argv = sys.argv[1:]
-sys.exit(importlib.import_module(module).main())
+module, *arguments = sys.argv[1:]
+sys.exit(importlib.import_module(module).main(arguments))
 """
 
 
 def warnings_of(module: str, *arguments: object) -> int:
     """Run a command where `flock` is not supported; return how often it warned."""
-    command = [sys.executable, "-c", COMMAND, module, module, *map(str, arguments)]
+    command = [sys.executable, "-c", COMMAND, module, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stderr.replace("\n", " ").count(WARNING)

@@ -6,7 +6,6 @@ import csv
 import hashlib
 import importlib
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,12 +37,7 @@ def run() -> Run:
     """Return a function that runs a command as the shell would and returns its exit code."""
 
     def call(module: str, *arguments: object) -> int:
-        before = sys.argv
-        sys.argv = [module, *map(str, arguments)]
-        try:
-            return importlib.import_module(module).main()
-        finally:
-            sys.argv = before
+        return importlib.import_module(module).main([*map(str, arguments)])
 
     return call
 
