@@ -1,8 +1,9 @@
-"""`acquire`: designs the experiment, takes it, and tells how far it is. Parse, build, call, print; nothing else."""
+"""`acquire`: design the experiment, take it, and show how far it is. Parse, build, call, print; nothing else."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from enum import Enum
 from pathlib import Path
@@ -29,9 +30,9 @@ class Arrangement(Enum):
     PAPER = "paper"
 
 
-def main() -> int:
-    """Run `acquire` and return its exit code."""
-    return console.run(app)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `acquire` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
+    return console.run(lambda: app(args=argv, prog_name="acquire"))
 
 
 @app.command(epilog=EXIT_CODES)
@@ -59,7 +60,8 @@ def chart(
 
     Reads no file. Writes OUT/chart.json (what calibration reads), chart.pdf (vector), chart.tif (600 dpi), preview.png,
     proof.pdf (an A4 page to try the printer with) and PRINTING.txt. Print the PDF or the TIFF with the printer's colour
-    management off, at 100 %, on matte paper. A line on stderr tells when cells are too small for the paper's cameras.
+    management off, at 100 %, on matte paper. A line on stderr warns when cells are too small for the paper's
+    cameras.
     """
     from acquisition.chart.layout import design_chart, paper_chart
     from acquisition.chart.printing import save_pdf, save_preview, save_tiff
@@ -109,7 +111,7 @@ def illuminations(
         str, typer.Option(help="Black bodies as FIRST:LAST:STEP in kelvin, or a list K,K,…; empty for none.")
     ] = "2000:10000:200",
 ) -> None:
-    """Make the lights: uniformly spread chromaticities and black bodies; 707 unless said otherwise.
+    """Make the lights: uniformly spread chromaticities and black bodies; 707 by default.
 
     Reads no file. Writes OUT (index, kind, cct_k, red, green, blue) and a plot of the rb-chromaticities beside it.
     """
@@ -141,7 +143,7 @@ def devices(
 
     Reads and writes no file.
     """
-    from acquisition.run.rig import attached_devices, identify_displays
+    from acquisition.run.rig.attached import attached_devices, identify_displays
 
     for attached in attached_devices(search):
         print(f"{attached.kind}:")
@@ -162,7 +164,7 @@ def check(
         tuple[str, str, str, str] | None,
         typer.Option(
             metavar="X,Y X,Y X,Y X,Y",
-            help="As in build-lut: the corners of the field of a chart without tags that is not found by itself.",
+            help="As in build-lut: the corners of the field of a chart without tags that is not found automatically.",
             show_default=False,
         ),
     ] = None,
@@ -170,23 +172,23 @@ def check(
     """Talk to every device, find the chart, judge focus, framing and exposure; records nothing.
 
     Reads LAB.toml, the chart and the lights it names. Writes nothing unless asked with --picture. Ends with 4 when the
-    frame would not do.
+    frame is not good enough.
     """
     from acquisition.config import load_lab
     from acquisition.run.checking import check_lab
 
     settings = load_lab(lab)
-    told = None
+    given = None
     if corners is not None:
         from acquisition.framing.corners import parse_corners
 
-        told = parse_corners(corners)
+        given = parse_corners(corners)
     if identify:
-        from acquisition.run.rig import identify_displays
+        from acquisition.run.rig.attached import identify_displays
 
         identify_displays(10.0)
     with orderly_end():
-        report = check_lab(settings, picture, lambda sentence: print(sentence, file=sys.stderr), told)
+        report = check_lab(settings, picture, lambda sentence: print(sentence, file=sys.stderr), given)
     for line in report.lines:
         print(line)
     if report.faults:
@@ -205,7 +207,7 @@ def run(
     refused; the next run tries those again.
     """
     from acquisition.config import load_lab
-    from acquisition.run.taking import run_session
+    from acquisition.run.run import run_session
     from foundation.console import progress
 
     settings = load_lab(lab)
@@ -220,7 +222,7 @@ def run(
 
 @app.command(epilog=EXIT_CODES)
 def status(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
-    """Tell how far a session is, how long it will take, and what was refused.
+    """Show how far a session is, how long it will take, and what was refused.
 
     Reads SESSION, also while it is being taken; writes nothing.
     """
@@ -276,7 +278,7 @@ def import_(
         print(f"  {line}")
     if imported.left:
         raise QualityError(
-            f"{session}: without an accepted frame are {len(imported.left)}: {first_of(imported.left)}; list other "
+            f"{session}: {len(imported.left)} are without an accepted frame: {first_of(imported.left)}; list other "
             "files and import them into a new folder"
         )
 

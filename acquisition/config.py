@@ -17,9 +17,6 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 from drivers.camera import ExposureSettings
 from foundation.errors import ConfigurationError
 
-MAX_TURN_ERROR = 0.005
-"""How far a shutter time may lie from whole turns of the colour wheel, as a share: shutters are no more exact."""
-
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -243,28 +240,6 @@ def parse_lab(text: str, where: str) -> LabSettings:
             raise ConfigurationError(f"{where}: {key} is missing; add it") from error
         raise ConfigurationError(f"{where}: {key} = {first['input']!r}: {first['msg']}") from error
     return settings.read_from(where)
-
-
-def require_whole_turns(camera: CameraSettings, projector: ProjectorCable) -> None:
-    """Require that an exposure holds whole turns of the colour wheel, or whole pictures where there is no wheel.
-
-    A DLP projector shows its primaries one after another; a frame that catches part of a turn has a colour of its own.
-    With 0.5 ms of jitter the standard deviation of R/G is 7 % at one turn of 1/60 s, 0.24 % at 0.5 s, 0.11 % at 1 s.
-
-    Raises
-    ------
-    ConfigurationError
-        The shutter time is no whole multiple; the message names the nearest ones.
-    """
-    rate = projector.colour_wheel_hz or projector.refresh_hz
-    turns = camera.shutter_s * rate
-    if turns < 1 or abs(turns - round(turns)) > MAX_TURN_ERROR * max(turns, 1):
-        below, above = max(1, int(turns)) / rate, (int(turns) + 1) / rate
-        raise ConfigurationError(
-            f"camera.shutter_s = {camera.shutter_s:g} is {turns:.2f} turns of {rate:g} a second; a frame must "
-            f"hold whole turns: {below:.4g} or {above:.4g} s, better 0.5 or more; or correct "
-            "lab.projector.colour_wheel_hz"
-        )
 
 
 def _known_keys(location: tuple[int | str, ...]) -> Iterable[str]:

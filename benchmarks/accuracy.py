@@ -25,14 +25,14 @@ from acquisition.chart.layout import design_chart
 from acquisition.chart.model import Chart
 from acquisition.config import LabSettings, SequenceSettings, SimulatedSettings
 from acquisition.lights.illuminations import Illumination, plan_illuminations, save_illuminations
-from acquisition.run.rig import sheet, simulated_body, simulated_room
-from acquisition.run.taking import run_session
+from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
+from acquisition.run.run import run_session
 from acquisition.session.folder import Session
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut
 from drivers.camera import ExposureSettings
 from foundation.angles import angles_deg
-from sim.camera.sensors import BODIES, Body
+from sim.world.sensors import BODIES, Body
 from sim.world.world import World
 
 WELL_LIT_DN = 300
@@ -189,7 +189,8 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
     world = World(sheet(chart), simulated_body(settings), simulated_room(settings))
     exposure, cells = settings.camera.exposure, chart.centres_mm[chart.cell_of_colour]
 
-    offset = np.linalg.norm(result.registration.to_pixels(chart.centres_mm) - world.project(chart.centres_mm), axis=1)
+    found = result.figures.registration.to_pixels(chart.centres_mm)
+    offset = np.linalg.norm(found - world.project(chart.centres_mm), axis=1)
     report(f"{case}: cell centres, RMS", float(np.sqrt((offset**2).mean())), "px", "World.project")
     report(f"{case}: cell centres, worst of {len(offset)}", float(offset.max()), "px", "World.project")
 
@@ -203,7 +204,7 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
     )
     report(f"{case}: ground truth, worst angle", float(degrees.max()), "degrees", f"World.white, {len(lights)} lights")
 
-    frames = {frame.record.illumination: frame for frame in result.frames if frame.record.kind == "light"}
+    frames = {frame.record.illumination: frame for frame in result.figures.frames if frame.record.kind == "light"}
     fields = [frames[number].paper.field.at(cells) for number in range(len(lights))]
     held = hold(lut, world, chart, fields, exposure)
     against = "World.reflected over World.white, noise by EMVA 1288 taken out"

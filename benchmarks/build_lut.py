@@ -30,16 +30,20 @@ from acquisition.chart.layout import design_chart
 from acquisition.chart.printing import drawing
 from acquisition.framing.planes import frame_black
 from acquisition.lights.illuminations import plan_illuminations
-from acquisition.session.folder import ACCEPTED, Session, plan_steps
+from acquisition.session.folder import Session
+from acquisition.session.journal import ACCEPTED
+from acquisition.session.plan import plan_steps
 from calibration.pipeline.build import build
-from calibration.pipeline.frames import threads
+from calibration.pipeline.prefetching import threads
 from calibration.registration.register import register
 from calibration.sampling.samples import gather_values, sites_at
 from drivers.raw.rawfile import read_raw
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
-from sim.world.world import REFERENCE_EXPOSURE, Print, Room, World
-from tests.drivers.raw_files import write_cr2
+from sim.world.drawing import Print
+from sim.world.room import REFERENCE_EXPOSURE, Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
+from tests.drivers.raw.raw_files import write_cr2
 
 RUNS = 4
 ROUNDS = 3
@@ -80,7 +84,7 @@ def take(folder: Path, body: str = "EOS 550D", cr2: bool = False, lights: int = 
             write_dng(stream, counts, world.body, settings=REFERENCE_EXPOSURE, taken_at=at)
             data = stream.getvalue()
         at += timedelta(seconds=4)
-        attempt = session.begin(step, file, at)
+        attempt = session.journal.begin(step, file, at)
         (folder / file).write_bytes(data)
         session.commit(
             attempt,

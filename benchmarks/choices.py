@@ -2,7 +2,7 @@
 
 Chi-square of the 25 samples, of each place that shares a word, and of all 625 pairs of two pixels: at distances along a
 row near and at powers of two, where weak functions show; above each other; in images and seeds that follow each other;
-and with neighbours swapped between two seeds. Each statistic is told as its distance from what chance expects, in
+and with neighbours swapped between two seeds. Each statistic is reported as its distance from what chance expects, in
 standard deviations of the normal distribution that Wilson and Hilferty's cube root makes of it; LIMIT is passed by
 chance once in 10⁵ runs of all of them. Ends with exit code 1 if one is.
 """

@@ -21,14 +21,14 @@ import numpy.typing as npt
 import skimage.data
 
 from benchmarks.generator import in_turns, natural_picture, noisy_table, report
-from generator.files.formats import FORMATS, Shot, encode_image
+from generator.files.formats import FORMATS, ImageMetadata, encode_image
 from generator.files.png import encode_png
 from generator.kernels.rendering import draw_samples
 
 REPEATS = 3
 GRAIN = 2.0
 """Standard deviation of the grain, codes of 8 bits."""
-SHOT = Shot(12000, (4000.0, 4000.0, 4000.0), "Canon EOS 550D")
+METADATA = ImageMetadata(12000, (4000.0, 4000.0, 4000.0), "Canon EOS 550D")
 
 
 def photograph(width: int, height: int) -> npt.NDArray[np.uint8]:
@@ -58,18 +58,18 @@ def main() -> None:
     for (name, picture), form in itertools.product(pictures.items(), FORMATS):
         image = draw_samples(samples, picture)
         usual = cv2.imencode(".png", image[..., ::-1])[1].size
-        size = len(encode_image(image, form, SHOT))
+        size = len(encode_image(image, form, METADATA))
         report(f"{form}, {name}, size", size / image.nbytes, "ratio", "the image in memory")
         report(f"{form}, {name}, size", size / usual, "ratio", "PNG by cv2.imencode")
         with ThreadPoolExecutor(2) as pool:
-            ours = partial(encode_image, image, form, SHOT)
+            ours = partial(encode_image, image, form, METADATA)
             calls: dict[str, Callable[[], object]] = {
                 "cv2": partial(cv2.imencode, ".png", image),
                 "ours": ours,
                 "two": partial(at_once, pool, [ours, ours]),
             }
             if form == "png":
-                calls["shared"] = partial(encode_png, image, SHOT, threads=2)
+                calls["shared"] = partial(encode_png, image, METADATA, threads=2)
             took = in_turns(calls, time.perf_counter, REPEATS if picture.size > 10**7 else 20)
         pixels = picture.size / 3e6
         report(f"{form}, {name}, one thread", pixels / took["ours"], "Mpx/s")

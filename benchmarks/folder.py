@@ -4,7 +4,7 @@ Against the program that first comes to mind (OpenCV reads and writes, numpy dra
 encoder alone on the finished images with as many threads: once with the writing of its files, which is what a folder
 takes however its images came about, and once in memory, where what is encoded is thrown away. Neither of the two
 hashes, nor waits for the disk, as a dataset does. Where every processor is busy, nothing but waiting can be hidden
-behind an encoder, so its share of the processor time is told too: no arrangement of the same work goes beyond. The
+behind an encoder, so its share of the processor time is reported too: no arrangement of the same work goes beyond. The
 faster the encoder, the less there is to hide behind, so the fastest in our libraries, ISA-L's deflate at level 1 of the
 same bytes unfiltered, is measured beside it.
 
@@ -26,14 +26,14 @@ import numpy as np
 import numpy.typing as npt
 from isal import isal_zlib
 
-from benchmarks.encode import SHOT, at_once, photograph
+from benchmarks.encode import METADATA, at_once, photograph
 from benchmarks.generator import SAMPLES, noisy_table, report
 from calibration.table.lut import Lut
 from foundation.processors import processor_count
-from generator.dataset.reader import generate_dataset
-from generator.dataset.store import LocalStore
+from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.files.formats import encode_pieces
 from generator.pictures.sources import find_pictures
+from generator.stores.store import LocalStore
 
 LARGE_REPEATS = 3
 SMALL_REPEATS = 5
@@ -86,7 +86,7 @@ def by_isal(image: npt.NDArray[np.uint16]) -> int:
 
 def encode_away(image: npt.NDArray[np.uint16]) -> None:
     """Encode an image and keep nothing."""
-    for _ in encode_pieces(image, "png", SHOT):
+    for _ in encode_pieces(image, "png", METADATA):
         pass
 
 
@@ -103,7 +103,9 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
 
     def by_suite(previews: bool = False) -> None:
         shutil.rmtree(ours, ignore_errors=True)
-        generate_dataset(lut, ours, find_pictures([sources]), [0], previews=previews, workers=workers)
+        generate_dataset(
+            lut, ours, find_pictures([sources]), [0], options=DatasetOptions(previews=previews), workers=workers
+        )
 
     by_suite()
     images = images_of(ours)
@@ -124,7 +126,7 @@ def compare(scratch: Path, lut: Lut, name: str, pictures: list[npt.NDArray[np.ui
             at_once(
                 pool,
                 [
-                    lambda number=number, image=image: put(f"{number:04d}.png", encode_pieces(image, "png", SHOT))
+                    lambda number=number, image=image: put(f"{number:04d}.png", encode_pieces(image, "png", METADATA))
                     for number, image in enumerate(images)
                 ],
             )

@@ -30,15 +30,17 @@ import numpy as np
 import numpy.typing as npt
 import skimage.data
 
-from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from foundation.compiled import compiled
-from generator.kernels.choice import SCRATCH, choose_group, row_keys
+from generator.kernels.choice import SCRATCH_BYTES, choose_group, row_keys
 from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_planar
 from generator.kernels.rendering import draw_mosaic, draw_samples
 from generator.kernels.vector import GROUP, LINE, copy8, offset_at, prefetch_once
-from generator.masks.making import parse_masks
+from generator.masks.request import parse_masks
 
 SAMPLES = 25
 REPEATS = 7
@@ -107,7 +109,7 @@ def photograph(width: int, height: int) -> npt.NDArray[np.uint8]:
 
 
 def by_numpy(samples: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint16]:
-    """Return a raw image in the way that first comes to mind."""
+    """Return a raw image in the most obvious manner."""
     colour = (picture >> 3).astype(np.int64) @ np.array([1024, 32, 1])
     choice = np.random.default_rng(0).integers(0, SAMPLES, colour.shape)
     return np.take(samples.reshape(-1, 3), colour * SAMPLES + choice, axis=0)
@@ -140,7 +142,7 @@ def fetching(tables: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> 
     """Return a call that loads the samples of a picture's pixels from each table; the width must be whole groups."""
     height, width = picture.shape[:2]
     places = np.zeros((len(tables), height, width), np.uint32)
-    scratch = np.empty(SCRATCH, np.uint8)
+    scratch = np.empty(SCRATCH_BYTES, np.uint8)
     numbers = np.uint32(SAMPLES), np.uint32(5)
     for light, its in enumerate(places):
         _choose_all(picture.ctypes.data, width, height, light, *numbers, its.ctypes.data, scratch.ctypes.data)

@@ -21,11 +21,13 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from calibration.table.lut import Lut, LutWriter, Provenance, open_lut
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from foundation.console import run
 from foundation.errors import DeviceError
-from generator.dataset.reader import generate_dataset
+from generator.dataset.making import DatasetOptions, Workers, generate_dataset
 from generator.lights.choices import RandomLights
 from generator.pictures.sources import random_scenes
 
@@ -64,11 +66,8 @@ def make(lut: Lut, out: Path, images: int, engine: str, workers: int) -> None:
         scenes,
         RandomLights(LIGHTS, 8, 5),
         seed=5,
-        previews=False,
-        split=(0.8, 0.1, 0.1),
-        shard_images=100,
-        engine=engine,
-        workers=workers,
+        options=DatasetOptions(previews=False, split=(0.8, 0.1, 0.1), shard_images=100),
+        workers=Workers(engine, workers),
     )
 
 

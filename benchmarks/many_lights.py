@@ -1,8 +1,8 @@
-"""An image under two lights, with the maps that tell where each falls: `python -m benchmarks.many_lights`.
+"""An image under two lights, with the maps of where each falls: `python -m benchmarks.many_lights`.
 
 Prints one JSON object a line. The usual program makes the same of the same picture: a soft edge, samples of both lights
 mixed with their noise, the light of each pixel, and four PNG files in memory, with numpy and OpenCV. Calls take turns,
-the fastest counts, and the time is the processor's with one thread. What each step takes is told as its share.
+the fastest counts, and the time is the processor's with one thread. The time of each step is reported as its share.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.encode import SHOT, photograph
+from benchmarks.encode import METADATA, photograph
 from benchmarks.generator import SAMPLES, WHITE, in_turns, mask_weights, noisy_table, report
 from calibration.table.lut import Lut
 from generator.files.formats import encode_pieces
 from generator.kernels.mixing import mix_samples
 from generator.lights.lighting import Lighting, plain
-from generator.masks.files import encode_maps
-from generator.masks.making import parse_masks
+from generator.masks.maps import encode_maps
+from generator.masks.request import parse_masks
 
 KINDS = ("half-plane", "soft-edge", "spots", "smooth", "window")
 FULL = 65535
 
 
 def usual(lut: Lut, picture: npt.NDArray[np.uint8]) -> None:
-    """Make image and maps in the way that first comes to mind."""
+    """Make image and maps in the most obvious manner."""
     height, width, _ = picture.shape
     y, x = np.mgrid[:height, :width].astype(np.float32)
     along = np.clip((0.8 * (x / width - 0.5) + 0.6 * (y / height - 0.5)) / 0.4 + 0.5, 0, 1)
@@ -60,8 +60,8 @@ def measure(name: str, lut: Lut, picture: npt.NDArray[np.uint8], repeats: int) -
         its = lighting.weights_of(height, width)
         calls[f"{kind}, masks"] = lambda lighting=lighting: lighting.weights_of(height, width)
         calls[f"{kind}, mixing"] = lambda its=its: mix_samples(lut.samples, picture, its, white_level=WHITE)
-        calls[f"{kind}, maps"] = lambda its=its, lighting=lighting: encode_maps(lut, lighting, its)
-    calls["image"] = lambda: sum(len(piece) for piece in encode_pieces(image, "png", SHOT))
+        calls[f"{kind}, maps"] = lambda its=its, lighting=lighting: encode_maps(its, lighting.whites(lut))
+    calls["image"] = lambda: sum(len(piece) for piece in encode_pieces(image, "png", METADATA))
     seconds = in_turns(calls, time.thread_time, repeats)
     for kind in KINDS:
         steps = {step: seconds[f"{kind}, {step}"] for step in ("masks", "mixing", "maps")} | {"image": seconds["image"]}

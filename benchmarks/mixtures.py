@@ -28,7 +28,7 @@ import numpy.typing as npt
 from acquisition.chart.layout import A_SERIES_MM, design_chart
 from acquisition.config import LabSettings, SimulatedSettings
 from acquisition.lights.illuminations import Illumination, plan_illuminations, save_illuminations
-from acquisition.run.taking import run_session
+from acquisition.run.run import run_session
 from acquisition.session.folder import Session
 from calibration.pipeline.build import build
 from calibration.table.lut import Lut, open_lut

@@ -20,7 +20,8 @@ from collections.abc import Generator
 from typing import Any
 
 from acquisition.lights.illuminations import plan_illuminations
-from drivers.display.fullscreen import FullScreen, list_displays
+from drivers.display.displays import list_displays
+from drivers.display.fullscreen import FullScreen
 
 SIZE = "1920x1080"
 

@@ -17,7 +17,7 @@ from drivers.links.tcp import LOOPBACK
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import Operation, ResponseCode
 from drivers.ptp.ip_transport import IpTransport
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.transport import Transport
 from drivers.ptp.usb_transport import UsbTransport
 from foundation.clock import SystemClock
@@ -37,14 +37,14 @@ TIMEOUT_S = 10.0
 class Store:
     """A device that holds one object and answers everything else with success."""
 
-    def takes_data(self, request: Request) -> bool:
+    def takes_data(self, request: PtpRequest) -> bool:
         return False
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         given = OBJECT if request.code == Operation.GET_OBJECT else None
-        return Answer(Response(ResponseCode.OK, request.transaction), given)
+        return Answer(PtpResponse(ResponseCode.OK, request.transaction), given)
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         return ()
 
     def cancelled(self, transaction: int) -> None: ...
@@ -110,13 +110,13 @@ def download(transport: Transport) -> None:
         nonlocal taken
         taken += len(piece)
 
-    transport.transact(Request(Operation.GET_OBJECT, 1, (1,)), receive=take, timeout=TIMEOUT_S)
+    transport.transact(PtpRequest(Operation.GET_OBJECT, 1, (1,)), receive=take, timeout=TIMEOUT_S)
     assert taken == len(OBJECT)
 
 
 def operate(transport: Transport) -> None:
     for number in range(OPERATIONS):
-        transport.transact(Request(Operation.EOS_KEEP_DEVICE_ON, number), timeout=TIMEOUT_S)
+        transport.transact(PtpRequest(Operation.EOS_KEEP_DEVICE_ON, number), timeout=TIMEOUT_S)
 
 
 def report(name: str, value: float, unit: str, against: str) -> None:

@@ -26,16 +26,20 @@ from acquisition.chart.model import Chart
 from acquisition.chart.printing import drawing
 from acquisition.framing.planes import frame_black
 from benchmarks.accuracy import WELL_LIT_DN, sample_variance
-from calibration.registration.register import Registration, register
+from calibration.registration.register import register
+from calibration.registration.registration import Registration
 from calibration.sampling.samples import gather, sites_at
-from calibration.verdict.verdict import bleed, judge
+from calibration.sampling.windows import bleed
+from calibration.verdict.verdict import judge
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import CropError
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
-from sim.world.world import Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
 
 SILENT_PX = 1.0
 """A cell this far off lies beyond what its samples' window allows for, 0.25 px, by enough to hold another colour."""

@@ -19,13 +19,16 @@ import numpy as np
 from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings
 from acquisition.lights.illuminations import Illumination
-from acquisition.run.sequencer import Devices, judge_file, take_session
-from acquisition.session.folder import Session, plan_steps
+from acquisition.run.devices import Devices
+from acquisition.run.judging import judge_file
+from acquisition.run.sequencer import take_session
+from acquisition.session.folder import Session
+from acquisition.session.plan import plan_steps
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
 from sim.clock import SimulatedClock
+from sim.world.sensors import BODIES
 
 LIGHTS = 12
 BODY = BODIES["EOS 550D"]
@@ -58,6 +61,10 @@ class PreparedCamera:
 
     def configure(self, settings: ExposureSettings) -> None:
         """Do nothing."""
+
+    def shutter_speeds(self) -> tuple[float, ...]:
+        """Offer none: nobody asks."""
+        return ()
 
     def capture(self, into: BinaryIO) -> CapturedFrame:
         """Write a file."""

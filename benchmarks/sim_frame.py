@@ -16,8 +16,10 @@ import numpy as np
 
 from drivers.presenter import WHITE
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
-from sim.world.world import REFERENCE_EXPOSURE, Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import REFERENCE_EXPOSURE, Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
 
 PAGE_MM = (1189.0, 841.0)
 CELLS = (221, 155)

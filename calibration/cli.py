@@ -1,8 +1,8 @@
-"""`build-lut`: makes the table of a session, judges it, tells of it, verifies it. Parse, call, print; nothing else."""
+"""`build-lut`: makes the table of a session, judges it, describes it, verifies it. Parse, call, print; nothing else."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,15 +15,28 @@ from foundation.errors import FormatError, InputError
 
 if TYPE_CHECKING:
     from acquisition.session.folder import Session
-    from calibration.pipeline.options import Choices
-    from calibration.pipeline.result import BuildResult, Growth
+    from calibration.pipeline.build import TableProgress
+    from calibration.pipeline.options import BuildOptions
+    from calibration.verdict.result import BuildResult
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
-def main() -> int:
-    """Run `build-lut` and return its exit code."""
-    return console.run(app)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `build-lut` and return its exit code.
+
+    Parameters
+    ----------
+    argv
+        The arguments; those of the process if None.
+
+    Returns
+    -------
+    int
+        0 done, 2 something given cannot be used, 4 the data are not good enough, 5 the disk is full or read-only,
+        130 interrupted.
+    """
+    return console.run(lambda: app(args=None if argv is None else list(argv)))
 
 
 def _version(asked: bool) -> None:
@@ -39,10 +52,10 @@ def _version(asked: bool) -> None:
     help="Build the look-up table of a session: samples of every colour under every light, and the ground truth.\n\n"
     "Reads SESSION (chart.json, illuminations.csv, journal.sqlite, frames/) and checks each frame's SHA-256. Finds the "
     "chart once, follows it if it moves, divides the light's unevenness out, and writes LUT: samples.npy, "
-    "illuminations.csv with the ground truth, lut.json, frames.csv, report.html. LUT appears whole or not at all; a "
-    "build that was stopped goes on when the same command is run again.\n\n"
-    "Every figure is held against its limit: accept, accept with remarks, or refuse. A refused table is not written; "
-    "its report is then in LUT.refused/, and the exit code 4.\n\n"
+    "illuminations.csv with the ground truth, references.csv, lut.json, frames.csv, report.html and report.json. LUT "
+    "appears whole or not at all; a build that was stopped goes on when the same command is run again.\n\n"
+    "Every figure is compared with its limit: accept, accept with remarks, or refuse. A refused table is not written; "
+    "its report is then in LUT.refused/, and the exit code is 4.\n\n"
     "With --check, finds the chart in the session's best frame, judges it, and writes nothing. With --append, takes in "
     "the frames that have come so far of a session that is being taken; LUT appears with the last of them. With "
     "--info, --verify and --match, reads a table and writes nothing. With --publish and --fetch, copies a table to a "
@@ -102,7 +115,9 @@ def build_lut(
     ] = None,
     info: Annotated[
         Path | None,
-        typer.Option("--info", metavar="LUT", help="Tell what a table is and came from.", show_default=False),
+        typer.Option(
+            "--info", metavar="LUT", help="Print what a table is and what it was made of.", show_default=False
+        ),
     ] = None,
     verify: Annotated[
         Path | None,
@@ -118,7 +133,7 @@ def build_lut(
         typer.Option(
             "--match",
             metavar="LUT LUT",
-            help="Tell whether colours and lights of two tables, of two cameras perhaps, correspond number by number.",
+            help="Check whether colours and lights of two tables, of two cameras perhaps, correspond number by number.",
             show_default=False,
         ),
     ] = None,
@@ -144,7 +159,7 @@ def build_lut(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
     ] = False,
 ) -> None:
-    """Build, check or read; what the command does is told by its help text."""
+    """Build, check or read a table; the help text says what the command does."""
     reading = {"--info": info, "--verify": verify, "--match": match, "--publish": publish, "--fetch": fetch}
     asked = {"--check": check, "--append": append, **reading}
     given = [name for name, value in asked.items() if value]
@@ -158,13 +173,13 @@ def build_lut(
     }
     if any(reading.values()) and any(made.values()):
         raise InputError(
-            f"{next(name for name, value in made.items() if value)} tells how a table is made, and {given[0]} reads "
+            f"{next(name for name, value in made.items() if value)} is about how a table is made, and {given[0]} reads "
             "one; leave one of them out"
         )
     if (lut if verify else session if any(reading.values()) else None) is not None:
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
     if info is not None:
-        _tell_table(info)
+        _print_table(info)
     elif verify is not None:
         _verify(verify, session)
     elif match is not None:
@@ -175,13 +190,15 @@ def build_lut(
         _fetch(*fetch)
     else:
         from acquisition.framing.corners import parse_corners
-        from calibration.pipeline.options import Choices
+        from calibration.pipeline.options import BuildOptions
 
         if picture is not None and not check:
             raise InputError("--picture goes with --check; a table that is built has its report")
-        told = None if corners is None else parse_corners(corners)
-        choices = Choices(5 if window is None else window, subtract_dark, told)
-        _make(session, lut, check, append, choices, linearity, picture)
+        from calibration.sampling.samples import WINDOW
+
+        places = None if corners is None else parse_corners(corners)
+        options = BuildOptions(WINDOW if window is None else window, subtract_dark, places)
+        _make(session, lut, check, append, options, linearity, picture)
 
 
 def _make(
@@ -189,7 +206,7 @@ def _make(
     lut: Path | None,
     check: bool,
     append: bool,
-    choices: Choices,
+    options: BuildOptions,
     linearity: Path | None,
     picture: Path | None,
 ) -> None:
@@ -197,60 +214,72 @@ def _make(
         raise InputError(f"--check writes nothing, so a table's folder ({lut}) is not expected; leave one of them out")
     if session is None:
         raise InputError("a session is expected: build-lut SESSION LUT; see build-lut --help")
-    if not check and lut is None:
-        raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
     from acquisition.session.folder import Session
 
+    if check:
+        with Session.open(session) as opened:
+            _check(opened, options, linearity, picture)
+        return
+    if lut is None:
+        raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
+    from calibration.pipeline.build import TableProgress
+
     with Session.open(session) as opened:
-        if lut is None:
-            from calibration.pipeline.build import check as judge
-
-            result = judge(opened, choices, linearity, picture)
-        else:
-            result = _build(opened, lut, append, choices, linearity)
-    from calibration.pipeline.result import Growth
-
-    if isinstance(result, Growth):
+        result = _build(opened, lut, append, options, linearity)
+    if isinstance(result, TableProgress):
         print(
-            f"{lut}: {result.lights} of {result.of} lights, {result.new_frames} frames taken in now, {result.frames} "
-            "in all; run the same command again when more have come"
+            f"{lut}: {result.lights} of {result.lights_planned} lights, {result.new_frames} frames taken in now, "
+            f"{result.frames} in all; run the same command again when more have come"
         )
         return
-    _tell(result)
-    if lut is None and (verdict := result.verdict).refused:
-        from calibration.verdict.verdict import refusal
+    _print_result(result)
+    print(f"{lut}: {result.figures.session.lights} lights, {result.figures.session.camera}; see {lut / 'report.html'}")
+
+
+def _check(session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None) -> None:
+    from calibration.pipeline.build import check
+
+    result = check(session, options, linearity, picture)
+    _print_result(result)
+    if result.verdict.refused:
+        from calibration.verdict.wording import refusal
         from foundation.errors import QualityError
 
-        raise QualityError(f"{result.session}: {refusal(verdict, result)}")
+        raise QualityError(f"{session.folder}: {refusal(result.verdict, result.figures)}")
+    print(f"{session.folder}: the chart is found and is the one expected; a table can be built")
 
 
-def _build(opened: Session, lut: Path, growing: bool, choices: Choices, linearity: Path | None) -> BuildResult | Growth:
+def _build(
+    session: Session, lut: Path, so_far: bool, options: BuildOptions, linearity: Path | None
+) -> BuildResult | TableProgress:
     from calibration.pipeline.build import append, build
     from calibration.report.report import write_report
 
-    with _bar("finding the chart") as told:
-        return (append if growing else build)(opened, lut, told, write_report, choices, linearity)
+    with _bar("finding the chart") as progress:
+        return (append if so_far else build)(session, lut, progress, write_report, options, linearity)
 
 
-def _tell_table(folder: Path) -> None:
-    from calibration.table.lut import open_lut, summary
+def _print_table(folder: Path) -> None:
+    from calibration.table.description import describe
+    from calibration.table.lut import open_lut
 
-    for name, value in summary(open_lut(folder)):
+    for name, value in describe(open_lut(folder)):
         print(f"{name + ':':17}{value}")
 
 
 def _verify(folder: Path, session: Path | None) -> None:
-    from calibration.table.lut import damage, open_lut
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import find_faults
 
     lut = open_lut(folder)
-    with _bar("reading the samples") as told:
-        faults = damage(lut, lambda done, total: told(done, total, "reading the samples"))
+    with _bar("reading the samples") as progress:
+        faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
     if session is not None:
         from acquisition.session.folder import Session
         from calibration.pipeline.frames import lost_frames
 
-        with Session.open(session) as opened, _bar("reading the frames") as told:
-            faults += lost_frames(lut, opened, told)
+        with Session.open(session) as opened, _bar("reading the frames") as progress:
+            faults += lost_frames(lut, opened, progress)
     for fault in faults:
         print(fault)
     if faults:
@@ -262,7 +291,8 @@ def _verify(folder: Path, session: Path | None) -> None:
 
 
 def _match(one: Path, other: Path) -> None:
-    from calibration.table.lut import open_lut, require_match
+    from calibration.table.lut import open_lut
+    from calibration.table.verification import require_match
 
     tables = open_lut(one), open_lut(other)
     require_match(*tables)
@@ -275,22 +305,22 @@ def _publish(folder: Path, url: str) -> None:
     from calibration.table.zarr_store import publish
 
     lut = open_lut(folder)
-    with _bar("writing lights") as told:
-        publish(lut, url, lambda done, total: told(done, total, "writing lights"))
+    with _bar("writing lights") as progress:
+        publish(lut, url, lambda done, total: progress(done, total, "writing lights"))
     print(f"{url}: {len(lut.samples)} lights of {folder}; others get them by build-lut --fetch {url} LUT")
 
 
 def _fetch(url: str, folder: Path) -> None:
     from calibration.table.zarr_store import fetch
 
-    with _bar("reading lights") as told:
-        lut = fetch(url, folder, lambda done, total: told(done, total, "reading lights"))
+    with _bar("reading lights") as progress:
+        lut = fetch(url, folder, lambda done, total: progress(done, total, "reading lights"))
     print(f"{folder}: {len(lut.samples)} lights, {lut.provenance.camera}; every byte is as it was published")
 
 
 @contextmanager
 def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
-    """Show a bar of progress on stderr; yields what is to be called with done, total, and what is being done."""
+    """Show a bar of progress on stderr; yields what is to be called with done, total, and the present work."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -300,41 +330,24 @@ def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(beginning, total=None)
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(beginning, total=None)
 
-        def told(done: int, total: int, what: str) -> None:
-            progress.update(task, completed=done, total=total, description=what)
-
-        yield told
+        yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
 
 
-def _tell(result: BuildResult) -> None:
-    from calibration.report.report import summary
-    from calibration.verdict.verdict import with_place
+def _print_result(result: BuildResult) -> None:
+    """Print the figures that matter most, the remarks, and the verdict."""
+    from calibration.report.summary import summary
+    from calibration.verdict.wording import remark
 
-    names = {
-        "Tags found",
-        "Blocks of cells",
-        "Colours agree",
-        "Chart moved",
-        "White drift",
-        "Ground truth",
-        "Cells unfit",
-    }
-    for name, value, note in summary(result):
-        if name in names:
-            print(f"{name + ':':17}{value}" + (f"  ({note})" if note else ""))
-    verdict = result.verdict
-    for row in verdict.remarks:
-        print(f"remark: {with_place(row, result)}; {row.threshold.remedy}")
-    print(f"{'Verdict:':17}{verdict.outcome}")
-    if verdict.refused:
-        return
-    if result.lut is None:
-        print(f"{result.session}: the chart is found and is the one expected; a table can be built")
-    else:
-        print(f"{result.lut}: {result.lights} lights, {result.camera}; see {result.lut / 'report.html'}")
+    rows = [row for row in summary(result.figures) if row.brief]
+    width = max(len(row.name) for row in rows) + 2
+    for row in rows:
+        print(f"{row.name + ':':{width}}{row.value}" + (f"  ({row.note})" if row.note else ""))
+    for judged in result.verdict.remarks:
+        print(f"remark: {remark(judged, result.figures)}")
+    print(f"{'Verdict:':{width}}{result.verdict.outcome}")
 
 
 if __name__ == "__main__":

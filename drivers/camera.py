@@ -37,7 +37,7 @@ class CapturedFrame:
     Attributes
     ----------
     name
-        The camera's own name for the file, e.g. ``IMG_0042.CR2``; its suffix tells the format.
+        The camera's own name for the file, e.g. ``IMG_0042.CR2``; its suffix names the format.
     size
         Bytes written.
     released_at
@@ -66,6 +66,16 @@ class Camera(Protocol):
         """
         ...
 
+    def shutter_speeds(self) -> tuple[float, ...]:
+        """Return the shutter times that the body offers now, as engraved, seconds, rising; empty if it lists none.
+
+        Raises
+        ------
+        DeviceError
+            It cannot be reached.
+        """
+        ...
+
     def capture(self, into: BinaryIO) -> CapturedFrame:
         """Release the shutter without autofocus and write the raw file, whole and unchanged, to `into`.
 
@@ -83,7 +93,7 @@ class Camera(Protocol):
 
 @runtime_checkable
 class Patient(Protocol):
-    """A camera that wants to be spoken to in long pauses: to stay awake, and to be rid of what it has to tell."""
+    """A camera that must be asked for events in long pauses: to stay awake, and to empty its queue."""
 
     def idle(self) -> None:
         """Keep the camera awake and empty its queue of events; call it every few seconds of a pause."""

@@ -80,6 +80,18 @@ class Gphoto2Camera:
             self._apply(camera, settings)
         self._settings = settings
 
+    def shutter_speeds(self) -> tuple[float, ...]:
+        """Return the shutter times in libgphoto2's list, seconds, rising; empty if it shows none.
+
+        Raises
+        ------
+        DeviceError
+            The body cannot be reached.
+        """
+        with self._speaking() as camera:
+            numbers = (_number(label) for label in _choices(camera, "shutterspeed"))
+            return tuple(sorted({number for number in numbers if number is not None}))
+
     def capture(self, into: BinaryIO) -> CapturedFrame:
         """Release the shutter and write the raw file, whole and unchanged, to `into`.
 

@@ -43,9 +43,9 @@ class Presenter(Protocol):
 
 
 @runtime_checkable
-class SelfDoubting(Protocol):
-    """A presenter that knows what may change the light behind the codes that it shows."""
+class ReportsWarnings(Protocol):
+    """A presenter that can report what changes, or may change, the light behind the codes that it shows."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what does, or may do so, one sentence each with its remedy; empty when nothing does."""
+        """Return a sentence with its remedy for each such cause, a gamma ramp for one; empty when there is none."""
         ...

@@ -63,11 +63,11 @@ class Projector(Protocol):
         ...
 
     def switch_on(self) -> None:
-        """Begin to switch on; returns at once, `power` tells when it is done."""
+        """Begin to switch on; returns at once, `power` shows when it is done."""
         ...
 
     def switch_off(self) -> None:
-        """Begin to switch off; returns at once, `power` tells when it is done."""
+        """Begin to switch off; returns at once, `power` shows when it is done."""
         ...
 
     def muted(self) -> bool:
@@ -92,9 +92,9 @@ class Projector(Protocol):
 
 
 @runtime_checkable
-class PictureWitness(Protocol):
-    """A projector that can tell, beyond `Projector`, whether its picture is the one that is sent to it."""
+class ReportsPictureFault(Protocol):
+    """A projector that can report, beyond `Projector`, that its picture is not the one that is sent to it."""
 
     def picture_fault(self) -> str | None:
-        """Return why the picture does not follow the signal, or None when it does, or nobody knows."""
+        """Return why the picture does not follow the signal (frozen, no signal); None if it does, or is not known."""
         ...

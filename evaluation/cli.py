@@ -14,15 +14,16 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from evaluation.experiments import Result
-    from evaluation.methods import Method
+    from evaluation.methods.method import Method
     from evaluation.metrics import ErrorKind
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 _CAUSES = "too small for it, clipped, black or even"
+"""Why an image has no usable pixel for a method."""
 
 _WIDE = 10_000
-"""More columns than a table of methods has."""
+"""Columns of a terminal that no table of methods fills: the table is measured as wide as it likes to be."""
 
 _HELP = f"""Estimate the light of every image of a dataset and sum up the errors.
 
@@ -91,7 +92,7 @@ def evaluate(
 
 
 def _name_of(dataset: str) -> str:
-    """Return what to call a dataset: the last part of its URL, or of its folder's whole path."""
+    """Return the name of a dataset: the last part of its URL, or of its folder's absolute path."""
     return dataset.rstrip("/").rpartition("/")[2] if "://" in dataset else Path(dataset).resolve().name
 
 
@@ -107,7 +108,7 @@ def _require_free(csv: Path | None, images: Path | None) -> None:
 
 
 def _print_table(results: Sequence[Result], error: ErrorKind) -> None:
-    """Print the summaries; where the terminal is narrow names are folded, numbers never cut."""
+    """Print the summaries; in a narrow terminal names are folded, numbers never cut."""
     from rich.console import Console
     from rich.table import Table
 
@@ -120,13 +121,13 @@ def _print_table(results: Sequence[Result], error: ErrorKind) -> None:
         table.add_row(result.method, *(f"{number:.2f}" for number in result.summary(error).as_tuple()))
     console = Console()
     needed = Console(width=_WIDE).measure(table)
-    # What is not a terminal has no width, but rich would ask the terminal that stdin or stderr is.
+    # A file or pipe has no width, but rich would take that of the terminal on stdin or stderr.
     console.width = max(console.width, needed.minimum) if console.is_terminal else needed.maximum
     console.print(table)
 
 
 def _choose(text: str) -> list[Method]:
-    from evaluation.methods import standard_methods
+    from evaluation.methods.standard import standard_methods
     from foundation.errors import InputError
 
     known = standard_methods()
@@ -139,9 +140,9 @@ def _choose(text: str) -> list[Method]:
     return [known[name] for name in dict.fromkeys(names)]
 
 
-def main() -> int:
-    """Run the command; see `foundation.console.EXIT_CODES` for what is returned."""
-    return run(lambda: app(prog_name="evaluate"))
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command with `argv`, by default the process's own, and return one of `foundation.console.EXIT_CODES`."""
+    return run(lambda: app(None if argv is None else list(argv), prog_name="evaluate"))
 
 
 if __name__ == "__main__":

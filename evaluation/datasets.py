@@ -1,4 +1,4 @@
-"""The datasets that methods are evaluated on: images with the light they were taken under."""
+"""Datasets to evaluate methods on: images, each with the light that it was taken under."""
 
 from __future__ import annotations
 
@@ -10,30 +10,33 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods import Image
+from evaluation.methods.method import Image
 from generator.dataset.reader import Dataset, Entry, open_dataset
 
 
 class Scene(Protocol):
-    """One image of a dataset; read when it is needed."""
+    """One image of a dataset with its ground truth; the image is read from its file by `read`."""
 
     @property
     def name(self) -> str:
-        """What the dataset calls it."""
+        """The image's name in its dataset."""
         ...
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64, linear camera RGB of any length."""
+        """The light (3,) float64, linear camera RGB of any length: the ground truth."""
         ...
 
     @property
     def saturation(self) -> float | None:
-        """Return the value from which a pixel is clipped, None if none is."""
+        """Value of the image from which a pixel is clipped; None if none is."""
         ...
 
     def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
-        """Return the image (H, W, 3), linear camera RGB, and its mask (H, W) bool, True = not to be used."""
+        """Return the image (H, W, 3), linear camera RGB with black subtracted, and its mask.
+
+        The mask is (H, W) bool, True where a pixel must not be used, or None if every pixel may be.
+        """
         ...
 
 
@@ -51,26 +54,31 @@ class GeneratedScene:
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64, r + g + b = 1."""
+        """The light (3,) float64, linear camera RGB, r + g + b = 1."""
         return np.array(self.entry.truth)
 
     @property
     def saturation(self) -> float:
-        """The table's saturation level."""
+        """White level of the table that the image was made with, in the units of the image."""
         return float(self.dataset.description.table.white_level)
 
     def read(self) -> tuple[npt.NDArray[np.uint16], None]:
-        """Return the image (H, W, 3) uint16; nothing in it is masked."""
+        """Return the image (H, W, 3) uint16, linear camera RGB, and no mask."""
         return self.dataset.read_image(self.entry), None
 
 
 def open_scenes(place: Path | str) -> Sequence[GeneratedScene]:
-    """Return the scenes of a dataset, from its folder or its URL on a store that fsspec knows.
+    """Return the scenes of a dataset made by `generate`; images are read when they are evaluated.
+
+    Parameters
+    ----------
+    place
+        The dataset's folder, or its URL on a store that fsspec knows.
 
     Raises
     ------
     FormatError
-        There is no dataset.
+        There is no dataset in that place.
     """
     dataset = open_dataset(place)
     return tuple(GeneratedScene(dataset, entry) for entry in dataset.entries)

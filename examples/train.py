@@ -24,8 +24,8 @@ from calibration.table.lut import open_lut
 from evaluation.methods import standard_methods
 from evaluation.metrics import recovery_error, summarise
 from generator.pictures.sources import find_pictures
-from generator.training.crops import CropDataset, Crops, collated
-from generator.training.gallery import Gallery, gallery_of
+from generator.training import Crops, Gallery, gallery_of
+from generator.training.torch_crops import CropDataset, collated
 
 SIDE = 64
 BATCH = 64

@@ -85,7 +85,7 @@ def _interrupted() -> int:
 
 @contextmanager
 def orderly_end() -> Generator[None]:
-    """End as by Ctrl-C, devices closed, where the block is told to end: by `kill`, or by a terminal that went away.
+    """End as by Ctrl-C, devices closed, where the process is asked to end: by `kill`, or by a terminal that went away.
 
     A hang-up that is ignored already, as under `nohup`, stays ignored.
     """
@@ -93,11 +93,11 @@ def orderly_end() -> Generator[None]:
         yield
         return
 
-    told = False
+    asked = False
 
     def end(number: int, frame: object) -> None:
-        nonlocal told
-        told = True
+        nonlocal asked
+        asked = True
         raise KeyboardInterrupt
 
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
@@ -107,7 +107,7 @@ def orderly_end() -> Generator[None]:
     try:
         yield
     except OSError as error:
-        if not told:
+        if not asked:
             raise
         # A terminal that went away does not take the last state of a bar either.
         raise KeyboardInterrupt from error

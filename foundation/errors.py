@@ -12,7 +12,7 @@ The tree says whose move it is::
     │   │   └── LinkClosed        the other side hung up; a new connection is needed
     │   ├── ProtocolError         the device said something that its standard does not allow
     │   ├── DeviceRefused         the device understood and said no
-    │   └── DeviceFault           the device is ill: lamp, temperature, fan, cover
+    │   └── DeviceFault           the device reports a defect: lamp, temperature, fan, cover
     ├── QualityError          4   the data are not good enough to go on
     │   └── RegistrationError     the chart cannot be found, or is not the one expected
     └── StorageError          5   the disk: full, read-only, gone
@@ -31,7 +31,7 @@ EXIT_INTERRUPTED = 130
 
 
 class CropError(Exception):
-    """Root of the tree: a foreseeable fault, told in one sentence."""
+    """Root of the tree: a foreseeable fault, described in one sentence."""
 
     exit_code = 1
 
@@ -77,7 +77,7 @@ class DeviceRefused(DeviceError):
 
 
 class DeviceFault(DeviceError):
-    """A device reports that it is ill."""
+    """A device reports a defect of its own."""
 
 
 class QualityError(CropError):

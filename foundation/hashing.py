@@ -12,7 +12,13 @@ _BLOCK: Final = 1 << 20
 
 
 def sha256_of(data: Any) -> str:
-    """Return the SHA-256 of `data`: bytes, or an object with a contiguous buffer such as a C-ordered array."""
+    """Return the SHA-256 of `data`: bytes, or an object with a contiguous buffer such as a C-ordered array.
+
+    Raises
+    ------
+    ValueError
+        The buffer does not lie in one piece.
+    """
     return hashlib.sha256(data).hexdigest()
 
 
@@ -42,7 +48,7 @@ class HashingWriter(io.RawIOBase):
     Parameters
     ----------
     stream
-        Takes the bytes; it is not closed by this one.
+        Takes all bytes of every write, as a buffered file does; it is not closed by this one.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -55,11 +61,12 @@ class HashingWriter(io.RawIOBase):
         return True
 
     def write(self, data: Any) -> int:
-        """Write bytes; return their number."""
+        """Write bytes, or an object with a contiguous buffer; return the number of bytes."""
+        size = memoryview(data).nbytes
         self._digest.update(data)
         self._stream.write(data)
-        self._written += len(data)
-        return len(data)
+        self._written += size
+        return size
 
     def tell(self) -> int:
         """Return the number of bytes written."""

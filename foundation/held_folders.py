@@ -2,8 +2,8 @@
 
 The lock is advisory (`flock(2)`) and lies on the folder itself, so that a program that is killed leaves none behind.
 Network file systems refuse to lock a folder (`EBADF` on NFS, where `flock` needs write access); a file in it is locked
-there instead. Where the file system has no locks at all, the work goes on with a warning: nobody else may work there,
-and nothing can see to it.
+there instead, and removed by the last who holds it. Where the file system has no locks at all, the work goes on with a
+warning: nobody else may work there, and nothing can see to it.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from foundation.files import make_folder, storage_error
 LOCK_FILE: Final = ".lock"
 """Name of the file that is locked where a folder cannot be."""
 
-_NO_LOCKS: Final = {errno.ENOLCK, errno.EBADF, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
-"""What a file system answers that cannot lock what it was asked to."""
+_NO_LOCKS: Final = {errno.ENOLCK, errno.EBADF, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL}
+"""What a file system answers that cannot lock what it was asked to (flock(2); NFS, Lustre, FUSE, SMB, macOS)."""
 
 _log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ def held_folder(folder: Path, busy: str, share_if: Callable[[], bool] | None = N
         make_folder(folder)
         with ExitStack() as opened:
             try:
-                place = _opened(folder, os.O_RDONLY, opened)
+                place = _opened(folder, opened)
                 handle, together = _locked(place, folder, share_if is not None, opened)
             except FileNotFoundError:
                 continue  # Another program gave the folder its final name between two calls.
@@ -88,8 +88,8 @@ def held_folder(folder: Path, busy: str, share_if: Callable[[], bool] | None = N
             return
 
 
-def _opened(path: Path, flags: int, opened: ExitStack) -> int:
-    handle = os.open(path, flags, 0o666)
+def _opened(folder: Path, opened: ExitStack) -> int:
+    handle = os.open(folder, os.O_RDONLY)
     opened.callback(os.close, handle)
     return handle
 
@@ -101,18 +101,54 @@ def _locked(place: int, folder: Path, wait: bool, opened: ExitStack) -> tuple[in
     ------
     BlockingIOError
         Another program holds it, and it is not to be waited for.
+    OSError
+        The file cannot be made: the folder is read-only, or gone.
     """
-    for on_a_file in (False, True):
-        try:
-            handle = _opened(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, opened) if on_a_file else place
-            return handle, _lock(handle, wait)
-        except BlockingIOError:
+    with _lockless_suppressed():
+        return place, _lock(place, wait)
+    while True:
+        file = os.open(LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666, dir_fd=place)
+        opened.callback(os.close, file)
+        together = None
+        with _lockless_suppressed():
+            together = _lock(file, wait)
+        if together is None:
+            _remove_lock_file(place)
+            _log.warning("%s: this file system has no locks; see to it that no other program works there", folder)
+            return None, False
+        if _is_lock_file(file, place):
+            opened.callback(_leave_lock_file, file, place)
+            return file, together
+
+
+@contextmanager
+def _lockless_suppressed() -> Generator[None]:
+    """Suppress the errors of a file system that cannot lock what it was asked to."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
             raise
-        except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                raise
-    _log.warning("%s: this file system has no locks; see to it that no other program works there", folder)
-    return None, False
+
+
+def _is_lock_file(file: int, place: int) -> bool:
+    """Return whether the locked file is still the one in the folder; who held it last has removed it."""
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(LOCK_FILE, dir_fd=place))
+    except FileNotFoundError:
+        return False
+
+
+def _leave_lock_file(file: int, place: int) -> None:
+    """Remove the locked file, wherever its folder is by now, unless others hold it too."""
+    with contextlib.suppress(OSError):
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _remove_lock_file(place)
+
+
+def _remove_lock_file(place: int) -> None:
+    with contextlib.suppress(OSError):
+        os.unlink(LOCK_FILE, dir_fd=place)
 
 
 def _lock(handle: int, wait: bool) -> bool:

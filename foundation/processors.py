@@ -8,6 +8,7 @@ import os
 def processor_count() -> int:
     """Return the number of processors this process may run on, at least 1.
 
-    A scheduler or a container may allow fewer than the machine has; systems that cannot say count all of them.
+    A scheduler or a container may bind a process to fewer than the machine has; where the system binds none, all are
+    counted. A container's share of processor time is not looked at.
     """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

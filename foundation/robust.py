@@ -39,5 +39,15 @@ def huber_weights(size: npt.NDArray[np.float64], sigma: float) -> npt.NDArray[np
 
 
 def biweight(size: npt.NDArray[np.float64], sigma: float, cut: float = 6.0) -> npt.NDArray[np.float64]:
-    """Return Tukey's biweights 0 … 1, of the shape of `size`; 0 beyond `cut` times sigma."""
+    """Return Tukey's biweights 0 … 1, of the shape of `size`.
+
+    Parameters
+    ----------
+    size
+        Absolute residuals.
+    sigma
+        Their usual size, > 0 (`sigma_of`).
+    cut
+        Sigmas beyond which a residual has no weight.
+    """
     return np.asarray(np.maximum(1 - (size / (cut * sigma)) ** 2, 0) ** 2, dtype=np.float64)

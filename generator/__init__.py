@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.dataset.reader import generate_dataset, open_dataset
-    from generator.kernels.mixing import mix_samples, mixed_table
+    from generator.dataset.making import Callbacks, DatasetOptions, Workers, generate_dataset
+    from generator.dataset.reader import open_dataset
+    from generator.kernels.mixed_table import mixed_table
+    from generator.kernels.mixing import mix_samples
     from generator.kernels.planar import draw_batch, draw_planar
     from generator.kernels.rendering import draw_mosaic, draw_samples, render
     from generator.pictures.picture import read_picture
@@ -27,6 +29,9 @@ if TYPE_CHECKING:
     from generator.pictures.tonemap import flash
 
 __all__ = [
+    "Callbacks",
+    "DatasetOptions",
+    "Workers",
     "draw_batch",
     "draw_mosaic",
     "draw_planar",
@@ -43,15 +48,18 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Callbacks": "generator.dataset.making",
+    "DatasetOptions": "generator.dataset.making",
+    "Workers": "generator.dataset.making",
     "draw_batch": "generator.kernels.planar",
     "draw_mosaic": "generator.kernels.rendering",
     "draw_planar": "generator.kernels.planar",
     "draw_samples": "generator.kernels.rendering",
     "find_pictures": "generator.pictures.sources",
     "flash": "generator.pictures.tonemap",
-    "generate_dataset": "generator.dataset.reader",
+    "generate_dataset": "generator.dataset.making",
     "mix_samples": "generator.kernels.mixing",
-    "mixed_table": "generator.kernels.mixing",
+    "mixed_table": "generator.kernels.mixed_table",
     "open_dataset": "generator.dataset.reader",
     "read_picture": "generator.pictures.picture",
     "render": "generator.kernels.rendering",
@@ -59,7 +67,14 @@ _HOMES = {
 
 
 def open_lut(folder: Path | str) -> Lut:
-    """Open a table; see `calibration.table.lut.open_lut`."""
+    """Return the table in a folder; see `calibration.table.lut.open_lut`.
+
+    Examples
+    --------
+    >>> lut = open_lut("lut")
+    >>> lut.samples.shape, lut.samples.dtype, lut.ground_truth.shape
+    ((4, 64, 25, 3), dtype('uint16'), (4, 3))
+    """
     from calibration.table.lut import open_lut
 
     return open_lut(Path(folder))

@@ -1,1 +1,1 @@
-"""The laboratory without hardware: a dark room in which what is shown decides what is seen."""
+"""The laboratory without hardware: a room in which what is shown decides what is photographed."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,8 +14,8 @@ from foundation import console
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
-    from sim.projectors.pjlink import SimulatedProjector
-    from sim.world.world import Print
+    from sim.projectors.projector import SimulatedProjector
+    from sim.world.drawing import Print
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -24,9 +25,9 @@ app = typer.Typer(
 )
 
 
-def main() -> int:
-    """Run `sim` and return its exit code."""
-    return console.run(app)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
+    return console.run(lambda: app(args=argv, prog_name="sim"))
 
 
 @app.callback()
@@ -58,10 +59,10 @@ def projector(
     from drivers.pjlink.wire import MAX_PASSWORD
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError, InputError
-    from sim.projectors.pjlink import SimulatedProjector
+    from sim.projectors.projector import SimulatedProjector
 
     if (pjlink is None) == (serial is None):
-        raise ConfigurationError("one projector hangs on one cable: either --pjlink PORT or --serial LANGUAGE")
+        raise ConfigurationError("one projector has one cable: either --pjlink PORT or --serial LANGUAGE")
     if pjlink is None and (password, udp, notify) != (None, None, None):
         raise ConfigurationError("--password, --udp and --notify are PJLink's; a serial cable has none of them")
     if password is not None and not 1 <= len(password) <= MAX_PASSWORD:
@@ -78,7 +79,8 @@ def projector(
 def _serve_network(
     device: SimulatedProjector, pjlink: int, password: str | None, udp: int | None, controller: tuple[str, int] | None
 ) -> None:
-    from sim.projectors.pjlink import ProjectorDatagrams, serve_pjlink
+    from sim.projectors.pjlink import serve_pjlink
+    from sim.projectors.pjlink_notices import ProjectorDatagrams
 
     with ExitStack() as served:
         host, port = served.enter_context(serve_pjlink(device, pjlink, password)).address
@@ -95,7 +97,7 @@ def _serve_serial(device: SimulatedProjector, name: str) -> None:
 
     spoken = language(name)
     try:
-        from sim.projectors.pty import PseudoTerminal
+        from sim.buses.pty import PseudoTerminal
     except ImportError as error:
         raise ConfigurationError("this system has no pseudo-terminals; --serial needs Linux or macOS") from error
     from sim.projectors.serial import PEERS
@@ -136,18 +138,19 @@ def camera(
     from sim.camera.eos import SimulatedEos
     from sim.camera.eos_bodies import EOS_BODIES
     from sim.camera.film import WorldFilm
-    from sim.camera.sensors import BODIES
-    from sim.world.world import REFERENCE_EXPOSURE, Room, World
+    from sim.world.room import REFERENCE_EXPOSURE, Room
+    from sim.world.sensors import BODIES
+    from sim.world.world import World
 
     if (port is None) == (usbip is None):
-        raise ConfigurationError("one camera hangs on one cable: either --port N for PTP/IP or --usbip N for USB/IP")
+        raise ConfigurationError("one camera has one cable: either --port N for PTP/IP or --usbip N for USB/IP")
     if model not in EOS_BODIES:
         raise ConfigurationError(f"--model {model!r}: known are {', '.join(sorted(EOS_BODIES))}")
     # A lamp that ages would be dark by now: its drift counts from the day when the simulated lab opened.
     world = World(_grey_squares(), BODIES[model], Room(lamp_drift_per_hour=0))
     film = WorldFilm(world, lambda: WHITE, lambda: 1.0, "0000000001", {})
-    with ThreadPoolExecutor(1, "darkroom") as darkroom:
-        eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, darkroom=darkroom)
+    with ThreadPoolExecutor(1, "developing") as executor:
+        eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, executor=executor)
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))
         if port is not None:
             with serve_ptpip(eos, port, name=eos.body.model) as server:
@@ -162,7 +165,7 @@ def _grey_squares() -> Print:
     """Return an A4 sheet with five by three squares from black to paper white."""
     import numpy as np
 
-    from sim.world.world import Print
+    from sim.world.drawing import Print
 
     column, row = (grid.ravel() for grid in np.meshgrid(np.arange(5), np.arange(3)))
     left, top = 18 + 54.0 * column, 21 + 60.0 * row

@@ -27,12 +27,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import PAPER_WHITE, Chart, Reference, Tag
+from acquisition.chart.model import PAPER_WHITE, TAG_MODULES, Chart, Reference, Tag
+from acquisition.chart.pixels import DESIGN_DPI, PX_MM
 from foundation.errors import InputError
 from foundation.version import software
 
-DESIGN_DPI = 600
 SLOT_PX = 125
+"""Usual side of a slot, 5.29 mm: the largest at which A0 holds 32 768 colours, tags and references."""
+
 SLOT_STEP_PX = 5
 """Slots are multiples of it, because a tag's ten modules are four slots."""
 
@@ -41,14 +43,17 @@ LEAST_SLOT_PX = 25
 
 TAG_FAMILY = "36h11"
 TAG_SLOTS = 4
-TAG_MODULES = 8
-"""Modules along a tag's black square: 6 of data and a black border of one; the white rim comes on top."""
+"""Slots along a tag with its white rim: its ten modules are then 2/5 of a slot, whole pixels at 600 dpi."""
 
 TAG_SPACING_SLOTS = 38
+"""Largest distance between tags: 35 tags on A0, seven by five."""
+
 TAG_IDS = 587
 """Codes in the family 36h11."""
 
 MARGIN_MM = 8.0
+"""Least white margin: printers leave 3 to 5 mm, and rulers and targets need the rest."""
+
 PAPER_BLOCKS = {1: (2, 1), 2: (2, 2), 3: (4, 2), 4: (4, 4), 5: (8, 4)}
 """Columns and rows of blocks in the paper's grid, for each number of bits: one block for each level of blue."""
 
@@ -79,11 +84,11 @@ exposed. None is a colour of the chart: its low bits are not zero.
 """
 
 LEAST_WHITES = 18
-"""White references from which on calibration sees the light fall towards the corners; fewer tell a slope alone."""
+"""White references from which on calibration sees the light fall towards the corners; from fewer, a slope alone."""
 
 LARGEST_PAGE_MM = 10_000.0
+"""Longest side of a page: no printer has wider rolls, and a larger number is a mistake of units."""
 
-_PX_MM = 25.4 / DESIGN_DPI
 _Slots = npt.NDArray[np.bool_]
 
 
@@ -98,8 +103,8 @@ class _Grid:
 
     @classmethod
     def on(cls, page_mm: tuple[float, float], slot_px: int = SLOT_PX) -> _Grid:
-        page_px = [math.floor(side / _PX_MM) for side in page_mm]
-        margin_px = math.ceil(MARGIN_MM / _PX_MM)
+        page_px = [math.floor(side / PX_MM) for side in page_mm]
+        margin_px = math.ceil(MARGIN_MM / PX_MM)
         columns, rows = (max(0, side - 2 * margin_px) // slot_px for side in page_px)
         x0, y0 = ((side - count * slot_px) // 2 for side, count in zip(page_px, (columns, rows), strict=True))
         return cls(columns, rows, slot_px, (x0, y0))
@@ -107,7 +112,7 @@ class _Grid:
     @property
     def cell_mm(self) -> tuple[float, float]:
         """Width and height of a slot."""
-        return self.slot_px * _PX_MM, self.slot_px * _PX_MM
+        return self.slot_px * PX_MM, self.slot_px * PX_MM
 
     @property
     def tag_slots(self) -> list[tuple[int, int]]:
@@ -128,7 +133,7 @@ class _Grid:
     def mm(self, column: float, row: float) -> tuple[float, float]:
         """Place on the print of a point of the slot grid."""
         x0, y0 = self.origin_px
-        return (x0 + column * self.slot_px) * _PX_MM, (y0 + row * self.slot_px) * _PX_MM
+        return (x0 + column * self.slot_px) * PX_MM, (y0 + row * self.slot_px) * PX_MM
 
 
 def _tag_starts(slots: int) -> list[int]:
@@ -155,7 +160,7 @@ def smallest_page(bits: int, slot_px: int = SLOT_PX) -> str:
         if _Grid.on(A_SERIES_MM[name], slot_px).holds(bits):
             return name
     raise InputError(
-        f"no A page holds {8**bits} cells of {slot_px * _PX_MM:.2f} mm; choose smaller cells (--cell-mm) or give the "
+        f"no A page holds {8**bits} cells of {slot_px * PX_MM:.2f} mm; choose smaller cells (--cell-mm) or give the "
         "page's size in mm (--page)"
     )
 
@@ -168,10 +173,10 @@ def slot_of(cell_mm: float) -> int:
     InputError
         The size is no length, or smaller than can be printed.
     """
-    slot = round(cell_mm / _PX_MM / SLOT_STEP_PX) * SLOT_STEP_PX if math.isfinite(cell_mm) else 0
+    slot = round(cell_mm / PX_MM / SLOT_STEP_PX) * SLOT_STEP_PX if math.isfinite(cell_mm) else 0
     if slot < LEAST_SLOT_PX:
         raise InputError(
-            f"a cell of {cell_mm:g} mm cannot be printed evenly; {LEAST_SLOT_PX * _PX_MM:.2f} mm "
+            f"a cell of {cell_mm:g} mm cannot be printed evenly; {LEAST_SLOT_PX * PX_MM:.2f} mm "
             f"({LEAST_SLOT_PX} px at {DESIGN_DPI} dpi) is the least"
         )
     return slot
@@ -254,12 +259,12 @@ def _choose_grid(
         name = next(name for name in reversed(A_SERIES_MM) if _Grid.on(A_SERIES_MM[name], LEAST_SLOT_PX).holds(bits))
         width, height = A_SERIES_MM[name]
         raise InputError(
-            f"{text} even with cells of {LEAST_SLOT_PX * _PX_MM:.2f} mm, the smallest that can be printed; the "
+            f"{text} even with cells of {LEAST_SLOT_PX * PX_MM:.2f} mm, the smallest that can be printed; the "
             f"smallest page that holds it is {name} ({width:g} × {height:g} mm), at its best size {smallest_page(bits)}"
         )
     if cell_mm is not None:
         raise InputError(
-            f"{text} in cells of {wanted * _PX_MM:.2f} mm; {fitting.cell_mm[0]:.2f} mm fit: give that, or leave the "
+            f"{text} in cells of {wanted * PX_MM:.2f} mm; {fitting.cell_mm[0]:.2f} mm fit: give that, or leave the "
             "cell's size to the program"
         )
     return fitting, page_mm
@@ -292,8 +297,8 @@ def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) ->
     if bits not in PAPER_BLOCKS:
         raise InputError(f"a chart has 1 to 5 bits a channel, not {bits}")
     page_mm = _page_mm("A0" if page is None else page)
-    margin_px = math.ceil(MARGIN_MM / _PX_MM)
-    page_px = [math.floor(side / _PX_MM) for side in page_mm]
+    margin_px = math.ceil(MARGIN_MM / PX_MM)
+    page_px = [math.floor(side / PX_MM) for side in page_mm]
     across, down = PAPER_BLOCKS[bits]
     levels = 1 << bits
     counts = (levels * across, levels * down)
@@ -301,7 +306,7 @@ def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) ->
     if min(cell_w, cell_h) < LEAST_SLOT_PX:
         raise InputError(
             f"a page of {page_mm[0]:g} × {page_mm[1]:g} mm is too small for {counts[0]} × {counts[1]} cells of "
-            f"{LEAST_SLOT_PX * _PX_MM:.2f} mm, the smallest that can be printed; choose a larger one, A0 at best"
+            f"{LEAST_SLOT_PX * PX_MM:.2f} mm, the smallest that can be printed; choose a larger one, A0 at best"
         )
     x0, y0 = ((side - count * cell) // 2 for side, count, cell in zip(page_px, counts, (cell_w, cell_h), strict=True))
     row, column = (places.ravel() for places in np.indices((counts[1], counts[0]), dtype=np.int64))
@@ -314,8 +319,8 @@ def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) ->
     return Chart(
         page_mm=page_mm,
         bits=bits,
-        cell_mm=(cell_w * _PX_MM, cell_h * _PX_MM),
-        centres_mm=_PX_MM * np.array([x0 + (column + 0.5) * cell_w, y0 + (row + 0.5) * cell_h], dtype=np.float64).T,
+        cell_mm=(cell_w * PX_MM, cell_h * PX_MM),
+        centres_mm=PX_MM * np.array([x0 + (column + 0.5) * cell_w, y0 + (row + 0.5) * cell_h], dtype=np.float64).T,
         colours=(red << 2 * bits) | (green << bits) | blue,
         tags=(),
         references=tuple(_margin_whites(field)),
@@ -326,15 +331,13 @@ def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) ->
 def _margin_whites(field_px: tuple[int, int, int, int]) -> list[Reference]:
     """Return patches of bare paper around a field, a margin's clear 1.5 mm away from it."""
     left, top, right, bottom = field_px
-    side, away, step = 118, 35 + 59, PAPER_REFERENCE_MM / _PX_MM
+    side, away, step = 118, 35 + 59, PAPER_REFERENCE_MM / PX_MM
     sides = ((left, right), (top, bottom))
     across, down = (max(PAPER_REFERENCES, math.ceil((high - low) / step)) for low, high in sides)
     places = [(x, y) for y in (top - away, bottom + away) for x in (left - away, right + away)]
     places += [(left + round(k * (right - left) / across), top - away) for k in range(1, across)]
     places += [(right + away, top + round(k * (bottom - top) / down)) for k in range(1, down)]
-    return [
-        Reference("white", PAPER_WHITE, (x * _PX_MM, y * _PX_MM), (side * _PX_MM, side * _PX_MM)) for x, y in places
-    ]
+    return [Reference("white", PAPER_WHITE, (x * PX_MM, y * PX_MM), (side * PX_MM, side * PX_MM)) for x, y in places]
 
 
 def _page_mm(page: str | tuple[float, float]) -> tuple[float, float]:
@@ -441,7 +444,7 @@ def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
 
 
 def _nearness(count: int, sigma: float) -> npt.NDArray[np.float64]:
-    """(count, count): how near a slot (column) is to a place (row); near an edge the same crowd weighs more."""
+    """Return how near each slot (column) is to each place (row), (count, count) float64, rows of sum 1."""
     places = np.arange(count)
     weights = np.exp(-0.5 * ((places[:, None] - places[None, :]) / sigma) ** 2)
     # A place at the edge has neighbours on one side only; without this all would gather at the edges.

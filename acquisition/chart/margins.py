@@ -22,14 +22,17 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-PX_MM = 25.4 / 600
-"""Millimetres of a pixel of the design."""
+from acquisition.chart.pixels import PX_MM, Boxes
 
 GAP_PX = 35
 """Bare paper around the field: 1.5 mm are three half-size pixels of the EOS 550D, more than its blur reaches."""
 
 CROP_PX, CROP_STROKE_PX = 120, 5
+"""Length and width of a crop mark's strokes, 5 mm and 0.2 mm: long enough to lay a rule along, and visible."""
+
 TICK_PX = 4
+"""Width of a ruler's tick: 0.17 mm, as on a steel rule."""
+
 TICKS_PX = ((100, 60), (10, 47), (5, 36), (1, 24))
 """A ruler's ticks: their distance in mm and their length."""
 
@@ -43,29 +46,32 @@ The EOS 550D's half-size image of an A0 sheet ends at 0.97, a 600-dpi print at 1
 """
 
 BAR_LENGTH_PX = 75
+"""Length of the bars, 3.2 mm: several pixels of a half-size image of A0 to average along."""
+
 STAR_PX, STAR_CYCLES = 120, 12
+"""Diameter and spokes of the Siemens star: 0.75 line pairs a millimetre at its rim, finer inwards; a half-size image of
+the EOS 550D resolves the rim."""
+
 EDGE_STEPS, EDGE_RUN_PX, EDGE_DEPTH_PX = 24, 12, 60
 """The slanted edge of ISO 12233: 24 steps of one pixel in twelve, 4.8 degrees."""
 
 _DOT_PX = 2
+"""Pixels of a dot of text: capitals of 15 dots are 1.3 mm high."""
+
 _LINE_PX = 48
+"""From line to line of text, 2 mm."""
+
 _AIR_PX = 20
+"""Bare paper around whatever is put into a margin, 0.85 mm."""
+
 _SEARCH_PX = 24
+"""Steps in which a free place along a margin is looked for, 1 mm."""
 
 Side = Literal["left", "top", "right", "bottom"]
-Boxes = npt.NDArray[np.int64]
-"""(N, 4) int64: left, top, right, bottom, px at 600 dpi."""
-
-
-def whole_px(boxes_mm: npt.ArrayLike) -> Boxes:
-    """Return (N, 4) boxes in mm as the smallest ones of whole pixels that hold them."""
-    # A millionth of a pixel is what a file's six decimals may be off.
-    exact = np.asarray(boxes_mm, dtype=np.float64).reshape(-1, 4) / PX_MM
-    return np.concatenate([np.floor(exact[:, :2] + 1e-3), np.ceil(exact[:, 2:] - 1e-3)], axis=1).astype(np.int64)
 
 
 def text_boxes(text: str, dot_px: int = _DOT_PX) -> Boxes:
-    """Return a line of ASCII as black boxes from (0, 0) on; capitals are 15 dots high (1.3 mm at 2 px a dot)."""
+    """Return a line of ASCII as black boxes (N, 4) int64 px from (0, 0) on; capitals are 15 dots high."""
     import cv2
 
     font, scale, stroke = cv2.FONT_HERSHEY_SIMPLEX, 0.7, 2
@@ -95,7 +101,7 @@ def _boxes_of(bitmap: npt.NDArray[np.bool_]) -> Boxes:
 
 
 def star_boxes() -> Boxes:
-    """Return a Siemens star of 12 black spokes, 5.1 mm across: 0.75 line pairs a millimetre at its rim, finer inwards.
+    """Return a Siemens star of 12 black spokes, 5.1 mm across, as boxes (N, 4) int64 px from (0, 0) on.
 
     Source: ISO 15775; the radius at which the spokes run together is where print or lens ends.
     """
@@ -106,7 +112,7 @@ def star_boxes() -> Boxes:
 
 
 def edge_boxes() -> Boxes:
-    """Return a black field whose lower edge falls by one pixel in twelve: for the slanted-edge method of ISO 12233."""
+    """Return a black field whose lower edge falls by one pixel in twelve (slanted edge, ISO 12233): (24, 4) int64."""
     step = np.arange(EDGE_STEPS)
     # Each box reaches to the end below the next: parts that only touch can show a hairline between them.
     return np.stack(
@@ -115,7 +121,7 @@ def edge_boxes() -> Boxes:
 
 
 def bar_boxes() -> Boxes:
-    """Return groups of three bars across u, from the widest of `BARS_PX` to the finest."""
+    """Return groups of three bars across u, from the widest of `BARS_PX` to the finest: (36, 4) int64 px."""
     boxes: list[tuple[int, int, int, int]] = []
     start = 0
     for width in BARS_PX:
@@ -160,7 +166,7 @@ class Margins:
 
     @property
     def boxes(self) -> Boxes:
-        """Everything that was put into the margins."""
+        """(N, 4) int64 px: everything that was put into the margins."""
         return np.concatenate([np.empty((0, 4), dtype=np.int64), *self._placed])
 
     def length(self, side: Side) -> int:
@@ -169,12 +175,12 @@ class Margins:
         return right - left if side in {"top", "bottom"} else bottom - top
 
     def put(self, side: Side, boxes: Boxes) -> bool:
-        """Put boxes given as (u, v) into a margin if all of it is free, and return whether it was."""
+        """Put boxes (N, 4) int64 px, given as (u, v), into a margin if all of it is free; return whether it was."""
         there = self._on_sheet(side, boxes)
         return self._put(there, boxes[:, 1].min() >= GAP_PX)
 
     def put_somewhere(self, side: Side, boxes: Boxes, start: int) -> bool:
-        """Put boxes at the first free place along a margin from u = `start` on, within the field's extent."""
+        """Put boxes (N, 4) int64 px at the first free place along a margin from u = `start` on, within the field."""
         extent = int(boxes[:, 2].max())
         return any(
             self.put(side, boxes + np.array([u, 0, u, 0]))
@@ -267,7 +273,7 @@ class Margins:
 
 
 def target_boxes() -> Boxes:
-    """Return star, slanted edge and bars side by side along u, 52 mm long, clear of the field."""
+    """Return star, slanted edge and bars side by side along u, 52 mm long, clear of the field: (N, 4) int64 px."""
     parts: list[Boxes] = []
     start = 0
     for part in (star_boxes(), edge_boxes(), bar_boxes()):

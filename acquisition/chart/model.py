@@ -23,7 +23,13 @@ from foundation.files import write_whole
 
 FORMAT = "crop.chart"
 VERSION = 1
+"""`format` and `version` of the `chart.json` that this software writes and reads (docs/formats.md)."""
+
 PAPER_WHITE = (255, 255, 255)
+"""Printed code of bare paper: no ink."""
+
+TAG_MODULES = 8
+"""Modules along the black square of a tag 36h11: 6 of data and a black border of one; the white rim comes on top."""
 
 
 def colour_of_index(index: npt.ArrayLike, bits: int) -> npt.NDArray[np.uint8]:
@@ -90,7 +96,7 @@ class Chart:
     tags, references
         Fiducials and achromatic patches; a print without fiducials has none.
     seed, software
-        What the chart was designed with and by, if its file tells; printed in the margin.
+        What the chart was designed with and by, if its file states it; printed in the margin.
     """
 
     page_mm: tuple[float, float]

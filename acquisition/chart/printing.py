@@ -27,22 +27,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.margins import PX_MM, Boxes, margin_marks, whole_px
-from acquisition.chart.model import PAPER_WHITE, Chart, Tag
+from acquisition.chart.margins import margin_marks
+from acquisition.chart.model import PAPER_WHITE, TAG_MODULES, Chart, Tag
+from acquisition.chart.pixels import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, whole_px
 from foundation.errors import InputError
 from foundation.files import whole_file, write_whole
 
 if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
 
-PRINT_DPI = 600
-MM_PER_INCH = 25.4
 POINTS_PER_MM = 72 / MM_PER_INCH
+"""Points of a PDF's user space, 72 to the inch (ISO 32000-1, 8.3.2.3)."""
+
 _STRIP_ROWS = 64
+"""Rows of a strip of the TIFF: 5 MB of an A0 sheet at 600 dpi, little to hold and long enough to compress."""
+
 _SUPERSAMPLING = 8
+"""Pixels along each side of a preview's pixel: edges are then good to 1/8 of it."""
+
 _LAP_PX, _INSET_PX = 0.2, 0.01
-TAG_MODULES = 8
-"""Modules along the black square of a tag 36h11: 6 of data inside a black border of one."""
+"""How far a cell of the PDF reaches below its neighbours, so that no hairline of paper shows between them, and how much
+smaller than its box each part is drawn, so that rounding does not paint the next pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +140,7 @@ def _part_boxes(chart: Chart) -> npt.NDArray[np.float64]:
 
 
 def field_px(chart: Chart) -> Boxes:
-    """Return (4,) int64: the box of all tags and cells, whole pixels at 600 dpi."""
+    """Return the box of all tags and cells, (4,) int64 px at 600 dpi: left, top, right, bottom."""
     boxes = whole_px(_part_boxes(chart)[: len(chart.tags) + len(chart.centres_mm)])
     return np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
 
@@ -188,7 +193,7 @@ def _tag_rectangles(tag: Tag) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.u
 
 
 def label_lines(chart: Chart) -> tuple[str, str]:
-    """Return the two lines printed in the margin: what tells this sheet from another, and how to print it."""
+    """Return the two lines printed in the margin: what distinguishes this sheet from others, and how to print it."""
     width, height = chart.page_mm
     bits = "1 bit" if chart.bits == 1 else f"{chart.bits} bits"
     parts = [f"CroP chart, {bits}, {width:g} x {height:g} mm", f"chart.json {chart.sha256[:16]}"]
@@ -255,7 +260,7 @@ def _even_resolutions(lengths: list[float]) -> str:
     return " or ".join(even) or "another number of"
 
 
-def save_tiff(chart: Chart, path: Path, dpi: int = PRINT_DPI) -> None:
+def save_tiff(chart: Chart, path: Path, dpi: int = DESIGN_DPI) -> None:
     """Write the sheet as an RGB TIFF at true size: 8 bits, deflate, no colour profile.
 
     An A0 sheet at 600 dpi is 28 087 × 19 866 pixels.

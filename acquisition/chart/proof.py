@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.margins import PX_MM, Boxes, margin_marks, text_boxes, whole_px
+from acquisition.chart.margins import margin_marks, text_boxes
 from acquisition.chart.model import Chart
+from acquisition.chart.pixels import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, whole_px
 from acquisition.chart.printing import (
     POINTS_PER_MM,
-    PRINT_DPI,
     Drawing,
     field_drawing,
     field_px,
@@ -32,13 +32,23 @@ if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
 
 PAGE_MM = (297.0, 210.0)
+"""A4, landscape (ISO 216): every printer takes it."""
+
 WINDOW_MM = (262.0, 107.0)
+"""Room for the piece of the field: what rulers, targets, greys and text leave of the page."""
+
 CORNER_PX = (360, 330)
 """Left and top of the piece of the field."""
 
 WEDGE_TOP_MM, WEDGE_HEIGHT_MM, WEDGE_STEP_MM = 137.0, 12.0, 8.0
+"""Place and size of the greys: below the piece of the field, and about as wide."""
+
 WEDGE_CODES = (*range(0, 256, 8), 255)
+"""The 32 levels of a channel that the chart's colours have, and bare paper."""
+
 TEXT_TOP_MM, TEXT_LINE_MM, TEXT_DOT_PX = 154.0, 4.8, 3
+"""Place of the text, from line to line, and its dots: capitals are 1.9 mm high."""
+
 
 LOOK_FOR = (
     "1 Scale: each 100 mm of both rulers measure 100 mm with a steel rule, to 0.3 mm. Else something scaled the page.",
@@ -128,12 +138,12 @@ def save_proof(chart: Chart, path: Path) -> None:
 
 
 def instructions(chart: Chart, tiff: bool = True) -> str:
-    """Return what to tell the print shop, with the sheet's own sizes; `tiff` says whether there is one."""
+    """Return instructions for the print shop, with the sheet's own sizes; `tiff` is whether there is one."""
     width, height = chart.page_mm
     left, top, right, bottom = (field_px(chart) * PX_MM).tolist()
     across, down = (math.floor((end - start) / 100) * 100 for start, end in ((left, right), (top, bottom)))
-    pixels = " × ".join(f"{round(side / 25.4 * PRINT_DPI)}" for side in chart.page_mm)
-    raster = f" or chart.tif ({pixels} pixels, {PRINT_DPI} dpi); both show the same" if tiff else ""
+    pixels = " × ".join(f"{round(side / MM_PER_INCH * DESIGN_DPI)}" for side in chart.page_mm)
+    raster = f" or chart.tif ({pixels} pixels, {DESIGN_DPI} dpi); both show the same" if tiff else ""
     scale = (
         f"Marks 0 and {across} below the field are {across} mm apart, 0 and {down} on its left {down} mm."
         if min(across, down) > 0

@@ -1,6 +1,6 @@
-"""A frame as a picture for the eye: what of the chart was found on it, or what was looked for and not found.
+"""A frame as a picture to look at: what of the chart was found on it, or what was looked for and not found.
 
-Along the border stand raw pixels, the ones in which corners are told by hand (`acquisition.framing.corners`).
+The ticks along the border count raw pixels, in which corners are given by hand (`acquisition.framing.corners`).
 """
 
 from __future__ import annotations
@@ -10,15 +10,17 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
+from acquisition.framing.finding import Framing
 from acquisition.framing.homography import project
-from acquisition.framing.outline import View
+from acquisition.framing.outline import PreparedPicture
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of, strongest_plane
-from acquisition.framing.tags import Framing, find_tags
+from acquisition.framing.tags import find_tags
 from drivers.raw.rawfile import Mosaic
 
 _GREEN, _RED, _AMBER, _GREY = (60, 200, 60), (40, 40, 255), (40, 200, 255), (200, 200, 200)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _TICK_RAW_PX = 500
+"""Raw pixels from tick to tick along the border."""
 
 _Image = npt.NDArray[np.uint8]
 _Points = npt.NDArray[np.float64]
@@ -63,7 +65,7 @@ def _draw_missing_tags(image: _Image, plane: Plane, chart: Chart) -> None:
 
 
 def _draw_rectangles(image: _Image, planes: list[Plane], chart: Chart) -> None:
-    quads = View.of(planes).quads()
+    quads = PreparedPicture.of(planes).quads()
     for quad in quads:
         _draw_outline(image, quad, _AMBER, 1)
     _draw_text(

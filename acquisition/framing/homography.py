@@ -1,4 +1,8 @@
-"""A plane seen by a pinhole: points mapped by a homography, and the homography through pairs of points."""
+"""A plane seen by a pinhole: points mapped by a homography, and the homography through pairs of points.
+
+Source: R. Hartley and A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., chapter 4 (direct linear
+transform, algorithm 4.1, and its robust estimate by RANSAC, algorithm 4.6), as OpenCV's `findHomography` has them.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +14,36 @@ _Points = npt.NDArray[np.float64]
 
 
 def project(homography: npt.NDArray[np.float64], points: npt.ArrayLike) -> _Points:
-    """Return points (N, 2) mapped by a homography (3, 3)."""
+    """Return points (N, 2) float64 mapped by a homography (3, 3) float64, in the units that it maps to."""
     points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
     return mapped[:, :2] / mapped[:, 2:]
 
 
 def rms(vectors: npt.NDArray[np.float64]) -> float:
-    """Return the root of the mean squared length of vectors (..., 2)."""
+    """Return the root of the mean squared length of vectors (..., 2) float64, in their unit; 0 of none."""
     return float(np.sqrt((vectors**2).sum() * vectors.shape[-1] / max(vectors.size, 1)))
 
 
 def robust_homography(
     chart_points: _Points, frame_points: _Points, tolerance_px: float
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    """Return the homography and which points lie within the tolerance, wide enough for distortion and waviness."""
+    """Return the homography through most pairs of points, and which pairs it fits.
+
+    Parameters
+    ----------
+    chart_points, frame_points
+        (N, 2) float64, from (mm on the print) and to (half-size px).
+    tolerance_px
+        How far a place may lie from its point's image: wide enough for lens distortion and the print's waviness.
+
+    Returns
+    -------
+    homography
+        (3, 3) float64, least squares over the pairs that fit; the identity where there is none.
+    fits
+        (N,) bool, which pairs lie within the tolerance.
+    """
     homography = fit_homography(chart_points, frame_points, tolerance_px)
     if homography is None:
         return np.eye(3), np.zeros(len(chart_points), dtype=np.bool_)

@@ -20,16 +20,30 @@ from foundation.robust import biweight, sigma_of
 CORNER_REACH_PX = 24.0
 """How far from a guess the field's outline is looked for."""
 
-_VIEW_PX = 640
+_SMALL_WIDTH_PX = 640
+"""Width of the small raster on which outlines are looked for: cells of a few pixels close into one dark field there."""
+
 SAME_PX = 3.0
+"""Half-size pixels by which corners of the same outline may differ when it is reached from different guesses."""
+
 _LEAST_AREA = 0.1
+"""Share of the picture that a field takes at least; what is smaller cannot be sampled."""
+
 _LEAST_LIGHT, _MUCH_LIGHT = 0.03, 0.2
 """Light of a colour over that of the strongest: to be looked at for colours, and for edges."""
 
 _THRESHOLDS = (0.35, 0.45, 0.55, 0.65, 0.75, 0.85)
+"""Of paper: levels at which outlines are looked for, since nobody knows how dark the cells at the edge are."""
+
 _SIDE_POINTS = 160
+"""Places along a side at which the edge is looked for: many times the six coefficients of its curve."""
+
 _PROFILE_STEP_PX = 0.5
+"""Step of the profiles across an edge: half a half-size pixel, a photosite."""
+
 _EDGE_SIGMA_PX = 1.0
+"""σ by which profiles are smoothed before their steepest rise is looked for: the blur of a picture just usable."""
+
 _ROUNDS = ((CORNER_REACH_PX, 2, 1e3), (CORNER_REACH_PX / 2, 5, 12.0), (6.0, 5, 6.0))
 """How far from the guess the edge is looked for, the order of the curve drawn through it, and how well it is known."""
 
@@ -41,18 +55,20 @@ _REFINE_ACROSS_PX = np.arange(-3.5, 2.1, 0.5)
 """Around a place of the edge: one cell inwards, and outwards not as far as marks in the margin begin."""
 
 _REFINE_STEPS = 6
+"""Rounds of the fit of a blurred step; each moves it by half a pixel at most, and three pixels are looked at."""
+
 _INTERPOLATION_PX = 0.4
 """σ that linear interpolation adds to an edge."""
 
 _CLEAR_EDGE = 0.15
-"""Of paper: a lower step from cells to margin does not tell its place to a tenth of a pixel."""
+"""Of paper: a lower step from cells to margin does not give its place to a tenth of a pixel."""
 
 _Float = npt.NDArray[np.float32]
 _Points = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PreparedPicture:
     """A picture prepared for the search.
 
     Attributes
@@ -82,10 +98,10 @@ class View:
     paleness: _Float
 
     @classmethod
-    def of(cls, planes: Sequence[Plane]) -> View:
+    def of(cls, planes: Sequence[Plane]) -> PreparedPicture:
         """Prepare the planes of red, green and blue."""
         height, width = planes[0].values.shape
-        factor = max(1, round(width / _VIEW_PX))
+        factor = max(1, round(width / _SMALL_WIDTH_PX))
         size = (width // factor, height // factor)
         brightest = [paper_level(plane) for plane in planes]
         used = [k for k, level in enumerate(brightest) if level >= max(MIN_SIGNAL, _LEAST_LIGHT * max(brightest))]
@@ -107,11 +123,11 @@ class View:
         return cls(smooth, tuple(used), tuple(levels), bright, shape, factor, paleness.astype(np.float32))
 
     def small(self, places_px: _Points) -> _Points:
-        """Return places on the small raster."""
+        """Return places (..., 2) float64 half-size px as places on the small raster."""
         return (places_px - (self.factor - 1) / 2) / self.factor
 
     def pale_at(self, places_px: _Points) -> _Float:
-        """Return the paleness (…) at places (…, 2) px of the full raster."""
+        """Return the paleness (...) float32, 1 for paper, at places (..., 2) float64 half-size px."""
         x, y = (np.ascontiguousarray(places_px[..., axis], dtype=np.float32) for axis in (0, 1))
         near = self.small(places_px).astype(np.float32)
         found = np.full(x.shape, np.inf, dtype=np.float32)
@@ -125,7 +141,12 @@ class View:
         return found
 
     def quads(self) -> list[_Points]:
-        """Return the large quadrilaterals (4, 2) px, clockwise, that outlines in the picture come near to."""
+        """Return large quadrilaterals, (4, 2) float64 half-size px, clockwise, that outlines in the picture resemble.
+
+        Outlines at several thresholds (S. Suzuki and K. Abe, "Topological structural analysis of digitized binary
+        images by border following", 1985, as OpenCV's `findContours` has it); their convex hulls are reduced to four
+        corners.
+        """
         found: list[_Points] = []
         area = float(self.paleness.size)
         for threshold in _THRESHOLDS:
@@ -168,7 +189,7 @@ class Outline:
 
 
 def alike(one: _Points, other: _Points, tolerance: float) -> bool:
-    """Return whether two quadrilaterals are one, whichever corner they begin with."""
+    """Return whether two quadrilaterals (4, 2) agree to a tolerance in their unit, whichever corner they begin with."""
     return any(np.abs(one - np.roll(other, turn, axis=0)).max() < tolerance for turn in range(4))
 
 
@@ -178,8 +199,20 @@ def _outwards(start: _Points, end: _Points) -> _Points:
     return np.array([y, -x])
 
 
-def follow(view: View, corners_px: _Points) -> Outline | None:
-    """Return the edge between cells and paper near a quadrilateral; None where there is none along one of its sides."""
+def follow(picture: PreparedPicture, corners_px: _Points) -> Outline | None:
+    """Return the edge between cells and paper near a quadrilateral; None where there is none along one of its sides.
+
+    In rounds of shrinking reach (`_ROUNDS`) the steepest rise to paper is looked for across each side, and a curve, a
+    Legendre series over the side, is fitted through most of the places found (iterated reweighted least squares with
+    Tukey's biweight).
+
+    Parameters
+    ----------
+    picture
+        The picture, prepared.
+    corners_px
+        (4, 2) float64 half-size px, clockwise as seen, to `CORNER_REACH_PX`.
+    """
     corners = np.asarray(corners_px, dtype=np.float64)
     curves = [np.zeros(1)] * 4
     along = (np.arange(_SIDE_POINTS) + 0.5) / _SIDE_POINTS
@@ -196,7 +229,7 @@ def follow(view: View, corners_px: _Points) -> Outline | None:
             normal = _outwards(start, end)
 
             middle = _bent(along, curves[side], start, end)
-            off, strength = _edges(view.pale_at(middle[:, None] + across[None, :, None] * normal), across, known)
+            off, strength = _edges(picture.pale_at(middle[:, None] + across[None, :, None] * normal), across, known)
             seen = strength > _MIN_EDGE
             if seen.mean() < 0.4:
                 return None
@@ -214,7 +247,7 @@ def follow(view: View, corners_px: _Points) -> Outline | None:
 def refined(
     planes: Sequence[Plane], places_px: _Points, normals: _Points, blur_px: float
 ) -> tuple[_Points, npt.NDArray[np.bool_]]:
-    """Return places (N, 2) px of the edge, anew where it is clear, and whether (N,) it is.
+    """Return places of the edge, (N, 2) float64 half-size px, found anew where it is clear, and where it is, (N,) bool.
 
     A blurred step is fitted to the colour in which it is highest. Farther than a mark in the margin begins nothing is
     looked at: a ruler's ticks would draw the edge by a tenth of a pixel.
@@ -224,9 +257,9 @@ def refined(
     planes
         Of red, green and blue, as measured.
     places_px, normals
-        (N, 2) places known to a pixel, and directions outwards.
+        (N, 2) float64 half-size px, places known to a pixel, and unit vectors outwards.
     blur_px
-        σ of the picture's edges.
+        σ of the picture's edges, half-size px.
     """
     tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=-1)
     grid = places_px[:, None, None] + _REFINE_ALONG_PX[None, :, None, None] * tangents[:, None, None]

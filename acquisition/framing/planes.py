@@ -20,6 +20,9 @@ from drivers.raw.rawfile import Mosaic
 Channel = Literal["R", "G", "B"]
 CHANNELS: tuple[Channel, Channel, Channel] = ("R", "G", "B")
 
+CLIPPING_SHARE = 0.98
+"""Counts above this share of saturation are treated as clipped (judgement: the knee of the response lies above)."""
+
 MIN_SIGNAL = 12.0
 """Counts above black that the brightest parts of the strongest plane must have for a chart to be looked for."""
 
@@ -59,7 +62,7 @@ def frame_black(mosaic: Mosaic) -> npt.NDArray[np.float64]:
 
 
 def plane_of(mosaic: Mosaic, channel: Channel, black: npt.NDArray[np.float64] | None = None) -> Plane:
-    """Return one colour of a mosaic above black; `black` (2, 2) counts is measured from the frame if not given."""
+    """Return one colour of a mosaic above `black`, (2, 2) float64 counts, by default measured from the frame."""
     black = frame_black(mosaic) if black is None else black
     places = phases(mosaic)[channel]
     blocks = mosaic.block_planes()
@@ -73,7 +76,7 @@ def plane_of(mosaic: Mosaic, channel: Channel, black: npt.NDArray[np.float64] | 
 
 
 def strongest_plane(mosaic: Mosaic, black: npt.NDArray[np.float64] | None = None) -> Plane:
-    """Return the colour with the brightest paper; `black` as in `plane_of`."""
+    """Return the colour with the brightest paper; `black` (2, 2) float64 counts as in `plane_of`."""
     black = frame_black(mosaic) if black is None else black
     blocks = mosaic.block_planes()[:, :, ::8, ::8]
     levels = [

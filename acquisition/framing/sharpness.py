@@ -7,12 +7,22 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.chart.model import TAG_MODULES
+from acquisition.framing.finding import Framing
 from acquisition.framing.planes import Plane
-from acquisition.framing.tagless_field import Field
-from acquisition.framing.tags import TAG_MODULES, FoundTag, Framing
+from acquisition.framing.tagless_field import FoundField
+from acquisition.framing.tags import FoundTag
+
+MAX_BLUR_PX = 1.0
+"""σ of the print's edges up to which cells of any size are found to a few hundredths of a pixel; beyond it the 25
+samples of a cell of 10 px take in more than 1 % of light from its neighbours."""
 
 _BLURS = np.geomspace(0.15, 4, 48)
+"""σ that are tried, half-size px: from less than a photosite's own to far beyond use, 7 % apart."""
+
 _OUTLINE_PLACES = 80
+"""Places of the field's outline at which blur is measured: enough for a median that marks in the margin do not move."""
+
 _INWARDS_PX, _OUTWARDS_PX, _ALONG_PX = 5.0, 2.5, 3.0
 """How much around a place of the field's outline is looked at: one cell, and not the marks in the margin."""
 
@@ -63,7 +73,7 @@ def _edge_blurs(plane: Plane, tag: FoundTag) -> npt.NDArray[np.float64]:
     return found
 
 
-def _outline_blurs(plane: Plane, field: Field) -> npt.NDArray[np.float64]:
+def _outline_blurs(plane: Plane, field: FoundField) -> npt.NDArray[np.float64]:
     """Return the σ of the field's edge at places all round; none where the picture ends."""
     height, width = plane.values.shape
     reach = int(np.ceil(_INWARDS_PX + _ALONG_PX))

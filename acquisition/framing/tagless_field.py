@@ -1,12 +1,12 @@
-"""A chart without tags in a picture: the field of its cells is found by its outline, and known by its colours.
+"""A chart without tags in a picture: the field of its cells is found by its outline, and recognised by its colours.
 
 Laws that hold inside:
 
-- What may be the field is guessed from the outlines in the picture (the field against its white margin, the sheet
-  against what is behind), or told by its corners; each guess is drawn onto the edge between cells and paper, and the
+- Candidates for the field come from the outlines in the picture (the field against its white margin, the sheet
+  against what is behind), or from corners given by hand; each is drawn onto the edge between cells and paper, and the
   one whose cells have the chart's colours is the field. A rectangle of other colours is not.
-- Which way up the chart hangs is decided by its colours: each guess is tried in all four turns, and mirrored. Where the
-  light cannot tell turns apart (a single colour, on a chart whose order is alike both ways), that is said, not guessed.
+- The orientation of the chart is decided by its colours: each candidate is tried in all four turns, and mirrored. Where
+  the light does not distinguish turns (a single colour, on a chart whose order is the same both ways), it is an error.
 - Faults of the picture are a `RegistrationError` that says what was looked for, what was found, and what helps.
 
 Places are half-size pixels. Knows the chart and planes of counts; nothing of lenses, which bend the outline: an outline
@@ -25,7 +25,7 @@ import numpy.typing as npt
 from acquisition.chart.model import Chart
 from acquisition.framing.corners import corners_text, require_corners
 from acquisition.framing.homography import fit_homography, project
-from acquisition.framing.outline import SAME_PX, Outline, View, alike, follow
+from acquisition.framing.outline import SAME_PX, Outline, PreparedPicture, alike, follow
 from acquisition.framing.planes import MIN_SIGNAL, Plane, paper_level
 from foundation.errors import InputError, RegistrationError
 from foundation.robust import huber_weights, sigma_of
@@ -34,16 +34,20 @@ MIN_EXPLAINED = 0.5
 """Share of the cells' variation that the chart's colours must explain; another order of cells explains none."""
 
 MIN_ADVANTAGE = 1.3
-"""How many times better than the second best the best way up must fit, in standard deviations of what is left."""
+"""How many times better than the second best the best orientation must fit, in standard deviations of the residual."""
+
+MIRRORED = 4
+"""Of the eight orientations of a rectangle the first that is mirrored."""
 
 _TRIED_CELLS = 1500
+"""Cells whose colours are compared, chosen at random: a hundred for each parameter of the fit, at little cost."""
 
 _Float = npt.NDArray[np.float32]
 _Points = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class FoundField:
     """The field of cells in a picture.
 
     Attributes
@@ -53,7 +57,7 @@ class Field:
     homography
         (3, 3) float64, millimetres on the print to half-size px, lens distortion not included.
     outline_mm, outline_px
-        (N, 2) float64, points of the outline on the print and places seen there; along the outline a place may be off.
+        (N, 2) float64, points of the outline on the print and where they are seen; they may be off along the outline.
     normals
         (N, 2) float64, directions across the outline, outwards, in which the places are measured.
     explained
@@ -69,7 +73,7 @@ class Field:
 
 
 def field_mm(chart: Chart) -> _Points:
-    """Return the corners (4, 2) mm of the field of cells, clockwise from its top-left."""
+    """Return the corners of the field of cells, (4, 2) float64 mm, clockwise from its top-left."""
     half = np.array(chart.cell_mm) / 2
     left, top = chart.centres_mm.min(axis=0) - half
     right, bottom = chart.centres_mm.max(axis=0) + half
@@ -82,7 +86,7 @@ def find_field(
     what: str,
     corners_px: npt.ArrayLike | None = None,
     near_px: npt.ArrayLike | None = None,
-) -> Field:
+) -> FoundField:
     """Return where the field of a chart's cells lies in a picture.
 
     Parameters
@@ -94,19 +98,19 @@ def find_field(
     what
         The frame's name for messages.
     corners_px
-        (4, 2) the field's corners if they are known, clockwise from the printed top-left, to some 20 px; their order
-        says which way up the chart hangs.
+        (4, 2) half-size px, the field's corners if they are given by hand, clockwise from the printed top-left, to some
+        20 px; their order gives the orientation of the chart.
     near_px
-        (4, 2) the field's corners in another frame of the session, in the same order: they say which way up the chart
-        hangs, and it may lie elsewhere.
+        (4, 2) half-size px, the field's corners in another frame of the session, in the same order: they give the
+        orientation, and the field may lie elsewhere.
 
     Raises
     ------
     InputError
-        The corners told cannot be such, or begin at another corner.
+        The corners given cannot be those of a field, or begin at another corner.
     RegistrationError
-        The frame is dark; no field is found; its colours are not the chart's; it is mirrored, or it cannot be told
-        which way up it hangs.
+        The frame is dark; no field is found; its colours are not the chart's; it is mirrored, or its orientation is not
+        certain.
     """
     white = max(paper_level(plane) for plane in planes)
     if white < MIN_SIGNAL:
@@ -114,48 +118,49 @@ def find_field(
             f"{what} is dark: its brightest parts are {max(white, 0.0):.0f} counts above black, at least "
             f"{MIN_SIGNAL:.0f} expected; switch the projector on, open its shutter, expose longer"
         )
-    view = View.of(planes)
+    picture = PreparedPicture.of(planes)
     looked_for = f"the field of {chart.colour_count} cells, a rectangle of colours on white paper,"
     if corners_px is not None:
-        return _told_field(view, chart, np.asarray(corners_px, dtype=np.float64), what)
+        return _given_field(picture, chart, np.asarray(corners_px, dtype=np.float64), what)
     tries: list[tuple[float, float, int, _Placed]] = []
     outlines: list[Outline] = []
-    for quad in view.quads():
+    for quad in picture.quads():
         for start in _starts(quad, chart):
             if any(alike(start, known.corners_px, SAME_PX) for known in outlines):
                 continue
-            outline = follow(view, start)
+            outline = follow(picture, start)
             if outline is None or any(alike(outline.corners_px, known.corners_px, SAME_PX) for known in outlines):
                 continue
             outlines.append(outline)
-            for way, placed in _ways(outline, chart, near_px):
-                tries.append((*_misfit(view, placed, chart), way, placed))
+            for turn, placed in _orientations(outline, chart, near_px):
+                tries.append((*_misfit(picture, placed, chart), turn, placed))
     if not tries:
         raise RegistrationError(
             f"{what}: {looked_for} was looked for, and no large rectangle was found; point the camera at the chart, "
-            "light all of it, or tell where its corners are"
+            "light all of it, or give its corners by hand (--corners)"
         )
     tries.sort(key=lambda tried: tried[0])
-    misfit, unexplained, way, placed = tries[0]
+    misfit, unexplained, turn, placed = tries[0]
     if 1 - unexplained < MIN_EXPLAINED:
         raise RegistrationError(
-            f"{what}: {looked_for} was looked for, and the rectangle likest to it has its corners at "
+            f"{what}: {looked_for} was looked for, and the most similar rectangle has its corners at "
             f"{corners_text(placed.corners_px)}, but the chart's colours explain {max(1 - unexplained, 0):.0%} of "
-            f"what is seen there, {MIN_EXPLAINED:.0%} expected; name the chart.json of this print, uncover it, or tell "
-            "its corners"
+            f"the brightness seen there, at least {MIN_EXPLAINED:.0%} expected; name the chart.json of this print, "
+            "uncover it, or give its corners by hand (--corners)"
         )
     near = 0.05 * float(np.ptp(placed.corners_px, axis=0).max())
     rivals = [
         other[0]
         for other in tries
-        if other[2] != way and np.abs(other[3].corners_px.mean(axis=0) - placed.corners_px.mean(axis=0)).max() < near
+        if other[2] != turn and np.abs(other[3].corners_px.mean(axis=0) - placed.corners_px.mean(axis=0)).max() < near
     ]
     if min(rivals, default=1.0) < MIN_ADVANTAGE * misfit:
         raise RegistrationError(
-            f"{what}: a field of cells has its corners at {corners_text(placed.corners_px)}, but this light does not "
-            "tell which way up it hangs; take a white frame, or tell its corners, clockwise from the printed top-left"
+            f"{what}: a field of cells has its corners at {corners_text(placed.corners_px)}, but under this light "
+            "it is not certain which way up it hangs; take a white frame, or give its corners by hand (--corners), "
+            "clockwise from the printed top-left"
         )
-    if way >= 4:
+    if turn >= MIRRORED:
         raise RegistrationError(
             f"{what} is mirrored: the chart's colours fit only in a mirror; "
             "take the frame without a mirror, or print the chart unmirrored"
@@ -163,47 +168,47 @@ def find_field(
     return placed.field(1 - unexplained)
 
 
-def _told_field(view: View, chart: Chart, corners_px: _Points, what: str) -> Field:
-    """Return the field whose corners are told."""
-    require_corners(corners_px, view.shape)
+def _given_field(picture: PreparedPicture, chart: Chart, corners_px: _Points, what: str) -> FoundField:
+    """Return the field whose corners (4, 2) half-size px are given by hand."""
+    require_corners(corners_px, picture.shape)
     text = corners_text(corners_px)
-    outline = follow(view, corners_px)
+    outline = follow(picture, corners_px)
     if outline is None:
         raise RegistrationError(
-            f"{what}: near the corners told, {text}, no edge is seen between cells and bare paper on all four sides; "
+            f"{what}: near the corners given, {text}, no edge is seen between cells and bare paper on all four sides; "
             "give the corners of the field of cells (not of the sheet) to some 40 pixels, and uncover its margin"
         )
-    ways = [_Placed.of(outline, chart, way) for way in range(8)]
-    misfits = [_misfit(view, placed, chart) for placed in ways]
+    placings = [_Placed.of(outline, chart, turn) for turn in range(8)]
+    misfits = [_misfit(picture, placed, chart) for placed in placings]
     explained = 1 - misfits[0][1]
     likely = int(np.argmin([misfit for misfit, _ in misfits]))
     other = likely > 0 and MIN_ADVANTAGE * misfits[likely][0] < misfits[0][0]
     if explained >= MIN_EXPLAINED and not other:
-        return ways[0].field(explained)
+        return placings[0].field(explained)
     if 1 - misfits[likely][1] < MIN_EXPLAINED or not other:
         raise RegistrationError(
-            f"{what}: within the corners told, {text}, the chart's colours explain {max(explained, 0):.0%} of what "
-            f"is seen, {MIN_EXPLAINED:.0%} expected; give the corners of the field of cells (not of the sheet) "
-            "clockwise from the printed top-left, and name the chart.json of this print"
+            f"{what}: within the corners given, {text}, the chart's colours explain {max(explained, 0):.0%} of the "
+            f"brightness seen, at least {MIN_EXPLAINED:.0%} expected; give the corners of the field of cells (not of "
+            "the sheet) clockwise from the printed top-left, and name the chart.json of this print"
         )
-    if likely >= 4:
+    if likely >= MIRRORED:
         raise RegistrationError(
-            f"{what} is mirrored: within the corners told, {text}, the chart's colours fit only in a mirror; "
+            f"{what} is mirrored: within the corners given, {text}, the chart's colours fit only in a mirror; "
             "take the frame without a mirror, or print the chart unmirrored"
         )
     raise InputError(
-        f"{what}: the corners told, {text}, do not begin at the printed top-left: the chart's colours fit if they are "
+        f"{what}: the corners given, {text}, do not begin at the printed top-left: the chart's colours fit if they are "
         f"{corners_text(np.roll(corners_px, -likely, axis=0))}; give them in this order"
     )
 
 
-def _ways(outline: Outline, chart: Chart, near_px: npt.ArrayLike | None) -> list[tuple[int, _Placed]]:
-    """Return the chart laid into an outline in all eight ways, or in the one that is turned as it was elsewhere."""
-    ways = [(way, _Placed.of(outline, chart, way)) for way in range(8)]
+def _orientations(outline: Outline, chart: Chart, near_px: npt.ArrayLike | None) -> list[tuple[int, _Placed]]:
+    """Return the chart laid into an outline in all eight orientations, or in the one nearest to the corners (4, 2)."""
+    placings = [(turn, _Placed.of(outline, chart, turn)) for turn in range(8)]
     if near_px is None:
-        return ways
+        return placings
     near = np.asarray(near_px, dtype=np.float64)
-    return [min(ways[:4], key=lambda way: float(np.abs(way[1].corners_px - near).sum()))]
+    return [min(placings[:MIRRORED], key=lambda placing: float(np.abs(placing[1].corners_px - near).sum()))]
 
 
 def _starts(quad: _Points, chart: Chart) -> Generator[_Points]:
@@ -234,10 +239,10 @@ class _Placed:
     normals: tuple[_Points, ...]
 
     @classmethod
-    def of(cls, outline: Outline, chart: Chart, way: int) -> _Placed:
-        """Lay the chart into an outline in one of eight ways: four turns, and from 4 on the same mirrored."""
-        order = np.roll(np.arange(4), -way)
-        if way >= 4:
+    def of(cls, outline: Outline, chart: Chart, turn: int) -> _Placed:
+        """Lay the chart into an outline in one of eight orientations: 0 … 3 quarter turns, 4 … 7 the same mirrored."""
+        order = np.roll(np.arange(4), -turn)
+        if turn >= MIRRORED:
             order = order[::-1]
         corners_mm, corners_px = field_mm(chart), outline.corners_px[order]
         homography = fit_homography(corners_mm, corners_px)
@@ -272,13 +277,13 @@ class _Placed:
                 places[:, axis] += weight * np.interp(at, known, off[:, axis])
         return places
 
-    def field(self, explained: float) -> Field:
-        """Return what is told of the field."""
+    def field(self, explained: float) -> FoundField:
+        """Return the field that lies as the chart does here."""
         mm, px, normals = (np.concatenate(parts) for parts in (self.sides_mm, self.sides_px, self.normals))
-        return Field(self.corners_px, self.homography, mm, px, normals, explained)
+        return FoundField(self.corners_px, self.homography, mm, px, normals, explained)
 
 
-def _misfit(view: View, placed: _Placed, chart: Chart) -> tuple[float, float]:
+def _misfit(picture: PreparedPicture, placed: _Placed, chart: Chart) -> tuple[float, float]:
     """Return how badly the chart's colours fit what is seen, and the share of its variation that they leave, 0 … 1.
 
     The former is the product, over the colours that carry light, of what is left over what there was, in standard
@@ -288,7 +293,7 @@ def _misfit(view: View, placed: _Placed, chart: Chart) -> tuple[float, float]:
     chosen = np.random.default_rng(1).permutation(chart.colour_count)[:_TRIED_CELLS]
     points = chart.centres_mm[chosen]
     places = placed.to_pixels(points)
-    height, width = view.shape
+    height, width = picture.shape
     inside = np.asarray(((places >= 0) & (places <= (width - 1, height - 1))).all(axis=1))
     if inside.mean() < 0.9:
         return 1.0, 1.0
@@ -300,7 +305,7 @@ def _misfit(view: View, placed: _Placed, chart: Chart) -> tuple[float, float]:
     colour = np.column_stack([codes, *(codes[:, i] * codes[:, j] for i, j in pairs)])
     product = 1.0
     left: list[float] = []
-    for channel, plane in zip(view.channels, view.planes, strict=True):
+    for channel, plane in zip(picture.channels, picture.planes, strict=True):
         x, y = (places - plane.offset_px).astype(np.float32).T
         seen = cv2.remap(plane.values, x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0].astype(np.float64)
         value = np.log(np.maximum(seen, 0.01 * float(np.median(np.abs(seen)) + 1e-9)))

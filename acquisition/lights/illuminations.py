@@ -26,8 +26,13 @@ from foundation.srgb import encode_srgb
 Kind = Literal["uniform", "blackbody"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")
 GRID = 35
+"""Steps along an edge of the chromaticity triangle: 666 points, which with 41 black bodies are the paper's 707."""
+
 CCTS_K = tuple(range(2000, 10001, 200))
+"""Black bodies of the plan, kelvin: from candle light to blue sky."""
+
 MOST_CCTS = 10_000
+"""Most temperatures that a text may name: more are a mistake in the step."""
 
 
 @dataclass(frozen=True)
@@ -41,21 +46,21 @@ class Illumination:
 
 
 def shown_colour(linear: npt.ArrayLike) -> Colour:
-    """Return the codes that show a linear RGB light (3,) ≥ 0 at the brightest its chromaticity allows."""
+    """Return the codes that show a linear RGB light (3,) float ≥ 0 at the brightest that its chromaticity allows."""
     linear = np.maximum(np.asarray(linear, dtype=np.float64), 0.0)
     codes = np.rint(255 * encode_srgb(linear / linear.max())).astype(int)
     return Colour(*(int(code) for code in codes))
 
 
 def uniform_lights(grid: int = GRID) -> list[npt.NDArray[np.float64]]:
-    """Return the (grid+1)(grid+2)/2 points of the triangular grid as linear (r, g, b) of sum 1."""
+    """Return the (grid+1)(grid+2)/2 points of the triangular grid as linear (r, g, b), (3,) float64 of sum 1."""
     return [
         np.array([i, grid - i - j, j], dtype=np.float64) / grid for i in range(grid + 1) for j in range(grid + 1 - i)
     ]
 
 
 def blackbody_light(cct_k: float) -> npt.NDArray[np.float64]:
-    """Return the linear sRGB (3,) of a black body, its brightest channel 1.
+    """Return the linear sRGB of a black body, (3,) float64, its brightest channel 1.
 
     Planck's law at `cct_k` kelvin, CIE 1931 2° observer, sRGB primaries (IEC 61966-2-1); what lies outside the
     gamut is clipped to it.
@@ -167,28 +172,28 @@ def parse_ccts(text: str) -> tuple[float, ...]:
         The text is neither, its steps lead away from LAST or are too many, or a temperature is not within
         1000 … 100 000 K.
     """
-    said = f"black bodies {text!r}"
+    given = f"black bodies {text!r}"
     try:
         named = [float(part) for part in text.split(":" if ":" in text else ",") if part.strip()]
     except ValueError as error:
-        raise InputError(f"{said}: expected FIRST:LAST:STEP or K,K,… in kelvin") from error
+        raise InputError(f"{given}: expected FIRST:LAST:STEP or K,K,… in kelvin") from error
     if ":" in text:
         if len(named) != 3:
-            raise InputError(f"{said}: expected FIRST:LAST:STEP or K,K,… in kelvin")
+            raise InputError(f"{given}: expected FIRST:LAST:STEP or K,K,… in kelvin")
         first, last, step = named
-        _require_kelvin((first, last), said)
+        _require_kelvin((first, last), given)
         steps = (last - first) / step if step else math.nan
         if not 0 <= steps < MOST_CCTS:
             raise InputError(
-                f"{said}: steps of {step:g} K do not lead from {first:g} to {last:g} K in at most {MOST_CCTS} "
+                f"{given}: steps of {step:g} K do not lead from {first:g} to {last:g} K in at most {MOST_CCTS} "
                 "temperatures; a fall has a step below 0"
             )
         return tuple(first + step * number for number in range(int(steps + 1e-9) + 1))
-    _require_kelvin(named, said)
+    _require_kelvin(named, given)
     return tuple(named)
 
 
-def _require_kelvin(ccts: Sequence[float], said: str) -> None:
+def _require_kelvin(ccts: Sequence[float], given: str) -> None:
     for cct_k in ccts:
         if not 1000 <= cct_k <= 100_000:
-            raise InputError(f"{said}: {cct_k:g} K is not within 1000 … 100 000 K")
+            raise InputError(f"{given}: {cct_k:g} K is not within 1000 … 100 000 K")

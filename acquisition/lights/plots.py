@@ -18,6 +18,7 @@ from foundation.srgb import decode_srgb
 
 FORMATS = ("png", "pdf", "svg")
 _NAMED_CCTS_K = (2000, 3000, 4000, 6000, 10000)
+"""Temperatures that the figure names, kelvin: few enough for their names not to touch."""
 
 
 def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:

@@ -18,8 +18,10 @@ from typing import BinaryIO
 from acquisition.chart.model import load_chart
 from acquisition.config import LabSettings
 from acquisition.lights.illuminations import Illumination, load_illuminations
-from acquisition.run.sequencer import judge_file
-from acquisition.session.folder import ACCEPTED, FRAME_COLUMNS, REFUSED, FrameKind, Session, Step
+from acquisition.run.judging import judge_file
+from acquisition.session.folder import FRAME_COLUMNS, Session
+from acquisition.session.journal import ACCEPTED, REFUSED
+from acquisition.session.plan import FrameKind, SessionStep
 from drivers.camera import CapturedFrame
 from drivers.presenter import BLACK, WHITE
 from foundation.errors import FormatError
@@ -152,7 +154,7 @@ def import_session(
                 if reason:
                     refused.append(f"{frame.path.name}: {reason}")
                 observe(step.number + 1, len(frames))
-            session.note(datetime.now(UTC), "import", f"{len(frames)} frames from {frame_list.name}")
+            session.journal.note(datetime.now(UTC), "import", f"{len(frames)} frames from {frame_list.name}")
         except BaseException:
             session.close()
             shutil.rmtree(folder)
@@ -171,14 +173,16 @@ def _left(session: Session) -> list[str]:
     ]
 
 
-def _step(number: int, frame: ListedFrame, lights: tuple[Illumination, ...]) -> Step:
+def _step(number: int, frame: ListedFrame, lights: tuple[Illumination, ...]) -> SessionStep:
     colour = WHITE if frame.kind == "white" else BLACK
     if frame.illumination is not None:
         colour = lights[frame.illumination].colour
-    return Step(number, frame.kind, frame.illumination, colour)
+    return SessionStep(number, frame.kind, frame.illumination, colour)
 
 
-def _take_over(session: Session, step: Step, frame: ListedFrame, settings: LabSettings) -> tuple[str | None, str]:
+def _take_over(
+    session: Session, step: SessionStep, frame: ListedFrame, settings: LabSettings
+) -> tuple[str | None, str]:
     """Copy and judge a frame; return why it is refused, None if it is not, and the SHA-256 of its file."""
 
     def copy(into: BinaryIO) -> CapturedFrame:
@@ -186,7 +190,7 @@ def _take_over(session: Session, step: Step, frame: ListedFrame, settings: LabSe
             shutil.copyfileobj(stream, into, 1 << 20)
         return CapturedFrame(frame.path.name, frame.path.stat().st_size, frame.taken_at)
 
-    attempt = session.begin(step, f"frames/{step.stem}", frame.taken_at)
+    attempt = session.journal.begin(step, f"frames/{step.stem}", frame.taken_at)
     received = session.receive(step.stem, copy)
     if frame.verdict:
         listed = frame.verdict.removeprefix(REFUSED).removeprefix(":").strip() or "for no reason that is listed"

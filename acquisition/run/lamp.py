@@ -1,9 +1,9 @@
-"""The projector's part in a run: light before the first frame, and a pause while there is none or it is in doubt.
+"""The projector in a run: made ready before the first frame, its health checked before and after each.
 
 Rules that hold inside:
 
-- A lamp that burnt when it was first asked is taken as warm; one that was lit meanwhile gets its minutes.
-- Whatever a projector says, or does not say, instead of being well is a complaint: a sentence, and a pause.
+- A lamp that was lit when it was first asked for is taken as warm; one that was lit meanwhile gets its warm-up.
+- A projector that reports a fault, shows no picture or does not answer is unhealthy: the run pauses.
 - A projector that was out of reach for as long as a lamp takes to light may have lost its power meanwhile.
 """
 
@@ -12,18 +12,18 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from acquisition.config import SequenceSettings
-from drivers.projector import PictureWitness, Power, Projector, Severity
+from drivers.projector import Power, Projector, ReportsPictureFault, Severity
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused, LinkError
 
 POWER_LIMIT_S = 300.0
 """How long a lamp may take to light; makers state up to 130 s with repeated ignition."""
 IDLE_S = 8.0
-"""Between two words to a camera in a long wait; libgphoto2 keeps bodies awake every 10 s."""
+"""Between two messages to a camera in a long wait; libgphoto2 keeps bodies awake every 10 s."""
 PAUSE_S = 5.0
-"""Between two looks at a projector that complains."""
+"""Between two questions to an unhealthy projector; an operator who mends it does not notice so short a wait."""
 RELIGHT_S = 15.0
-"""No lamp is struck again, and its projector back on the network, in less."""
+"""No lamp is lit again, and its projector back on the network, in less."""
 
 
 def make_ready(
@@ -31,7 +31,7 @@ def make_ready(
     clock: Clock,
     sequence: SequenceSettings,
     idle: Callable[[], None] = lambda: None,
-    tell: Callable[[str, str], None] = lambda what, sentence: None,
+    report: Callable[[str, str], None] = lambda what, sentence: None,
 ) -> None:
     """Switch the lamp on if need be, wait until it burns steadily, and require good health.
 
@@ -39,7 +39,7 @@ def make_ready(
     ----------
     idle
         Called every few seconds of the wait, for the other devices.
-    tell
+    report
         Called with a word and a sentence when a long wait begins.
 
     Raises
@@ -47,7 +47,7 @@ def make_ready(
     DeviceFault
         It reports an error, or the lamp does not light within `POWER_LIMIT_S`.
     DeviceRefused, LinkError, ProtocolError
-        It does not do what it is told, or cannot be reached.
+        It does not carry out a command, or cannot be reached.
     """
     begun = clock.monotonic()
     found_lit, switched = True, False
@@ -57,21 +57,21 @@ def make_ready(
             projector.switch_on()
             switched = True
         if clock.monotonic() - begun > POWER_LIMIT_S:
-            state = "out of reach" if power is None else f"in {power.value}"
+            state = "does not answer" if power is None else f"is still in {power.value}"
             raise DeviceFault(
-                f"the projector is still {state} after {POWER_LIMIT_S:g} s; look at its lamp and its display"
+                f"the projector {state} {POWER_LIMIT_S:g} s after it was switched on; look at its lamp and its display"
             )
         clock.sleep(1.0)
     try:
         muted = projector.muted()
     except DeviceRefused:
-        # Some cannot tell before they were told.
+        # Some do not know it before mute was first set.
         muted = True
     if muted:
         projector.set_muted(False)
     require_healthy(projector)
     if not found_lit:
-        _warm_up(clock, sequence, idle, tell)
+        _warm_up(clock, sequence, idle, report)
 
 
 def require_healthy(projector: Projector) -> None:
@@ -84,23 +84,25 @@ def require_healthy(projector: Projector) -> None:
     """
     errors = [fault.part for fault in projector.faults() if fault.severity is Severity.ERROR]
     if errors:
-        raise DeviceFault(f"the projector reports an error of its {', '.join(errors)}; look at its display and mend it")
+        raise DeviceFault(
+            f"the projector reports an error of its {', '.join(errors)}; look at its display and have it repaired"
+        )
     power = projector.power()
     if power is not Power.ON:
-        raise DeviceFault(f"the projector went to {power.value} during the session; switch it on")
+        raise DeviceFault(f"the projector is in {power.value} in the midst of the session; switch it on")
     if projector.muted():
         raise DeviceFault("the projector's picture is muted; release mute on its remote control")
-    if isinstance(projector, PictureWitness) and (fault := projector.picture_fault()):
+    if isinstance(projector, ReportsPictureFault) and (fault := projector.picture_fault()):
         raise DeviceFault(fault)
 
 
-def complaint_of(projector: Projector | None) -> DeviceError | None:
-    """Return what keeps the projector from being known to be well now, or None."""
+def health_fault(projector: Projector | None) -> DeviceError | None:
+    """Return why the projector is not known to be healthy now, as `require_healthy` raises it; None where it is."""
     try:
         if projector is not None:
             require_healthy(projector)
-    except DeviceError as complaint:
-        return complaint
+    except DeviceError as fault:
+        return fault
     return None
 
 
@@ -109,52 +111,52 @@ def await_health(
     clock: Clock,
     sequence: SequenceSettings,
     idle: Callable[[], None],
-    tell: Callable[[str, str], None],
+    report: Callable[[str, str], None],
 ) -> None:
-    """Pause while the projector complains; go on when it is well, and warm, again.
+    """Pause while the projector is unhealthy; return when it is healthy, and warm, again.
 
     Parameters
     ----------
     idle
         Called every few seconds of the wait, for the other devices.
-    tell
+    report
         Called with a word and a sentence when the pause begins, when the lamp warms up again, and when it is over.
 
     Raises
     ------
     DeviceError
-        What it still complains of after `sequence.patience_s`.
+        The fault that lasts after `sequence.patience_s`.
     """
-    complaint = complaint_of(projector)
-    if complaint is None:
+    fault = health_fault(projector)
+    if fault is None:
         return
-    tell("paused", f"{complaint} (the run goes on by itself; it waits for {sequence.patience_s:g} s)")
-    begun = heard = clock.monotonic()
+    report("paused", f"{fault} (the run waits for up to {sequence.patience_s:g} s, and goes on by itself)")
+    begun = answered = clock.monotonic()
     went_out = False
-    while complaint is not None:
-        if not isinstance(complaint, LinkError):
-            heard = clock.monotonic()
+    while fault is not None:
+        if not isinstance(fault, LinkError):
+            answered = clock.monotonic()
             went_out = went_out or not _is_lit(projector)
         if clock.monotonic() - begun >= sequence.patience_s:
-            raise type(complaint)(
-                f"{complaint}; the run waited {sequence.patience_s:g} s for that: then run again"
-            ) from complaint
+            raise type(fault)(
+                f"{fault}; the run waited {sequence.patience_s:g} s for that and ended: then run the same command again"
+            ) from fault
         clock.sleep(min(PAUSE_S, sequence.patience_s))
         idle()
-        complaint = complaint_of(projector)
-        went_out = went_out or clock.monotonic() - heard >= RELIGHT_S
+        fault = health_fault(projector)
+        went_out = went_out or clock.monotonic() - answered >= RELIGHT_S
     paused_s = clock.monotonic() - begun
     if went_out:
-        _warm_up(clock, sequence, idle, tell)
-    tell("resumed", f"the projector is well again after {paused_s:.0f} s")
+        _warm_up(clock, sequence, idle, report)
+    report("resumed", f"the projector is ready again after a pause of {paused_s:.0f} s")
 
 
 def _power(projector: Projector, patiently: bool) -> Power | None:
-    """Return the power state; None where a projector that is `patiently` asked does not tell now."""
+    """Return the power state; None where a projector that is `patiently` asked does not answer now."""
     try:
         return projector.power()
     except (LinkError, DeviceRefused):
-        # Some hear nothing while the lamp is struck.
+        # Some do not answer while the lamp is being lit.
         if not patiently:
             raise
     return None
@@ -168,11 +170,11 @@ def _is_lit(projector: Projector) -> bool:
 
 
 def _warm_up(
-    clock: Clock, sequence: SequenceSettings, idle: Callable[[], None], tell: Callable[[str, str], None]
+    clock: Clock, sequence: SequenceSettings, idle: Callable[[], None], report: Callable[[str, str], None]
 ) -> None:
     if not sequence.warm_up_s:
         return
-    tell("warming up", f"the lamp was just lit and gets {sequence.warm_up_s:g} s until its colour is steady")
+    report("warming up", f"the lamp was just lit; waiting {sequence.warm_up_s:g} s until its colour is steady")
     until = clock.monotonic() + sequence.warm_up_s
     while (left := until - clock.monotonic()) > 0:
         clock.sleep(min(left, IDLE_S))

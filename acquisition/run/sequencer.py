@@ -1,4 +1,4 @@
-"""Walks the plan: shows each light, settles, releases, saves, judges, and writes all of it down.
+"""Take the frames of a plan, one after another: show the light, settle, release, save, judge, and journal it.
 
 Knows devices by contract only. The plan is a value, why a run ended is a value; what has been taken stays taken
 whatever happens, and a second call goes on where the first stopped.
@@ -8,31 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 from acquisition.config import LabSettings
-from acquisition.run.exposure import disagreement, measure_exposure, refusal
-from acquisition.run.lamp import await_health, complaint_of, make_ready
-from acquisition.session.folder import ACCEPTED, REFUSED, FrameKind, Session, Step
-from drivers.camera import Camera, keep_awake
-from drivers.presenter import Presenter
-from drivers.projector import Projector
-from drivers.raw.rawfile import read_raw
-from foundation.clock import Clock
-from foundation.errors import DeviceError, DeviceFault, DeviceRefused, FormatError
+from acquisition.run.devices import Devices
+from acquisition.run.judging import judge_file
+from acquisition.run.lamp import await_health, health_fault, make_ready
+from acquisition.session.folder import Session
+from acquisition.session.journal import ACCEPTED, REFUSED
+from acquisition.session.plan import SessionStep
+from drivers.camera import keep_awake
+from foundation.errors import DeviceError, DeviceFault, DeviceRefused
 
 REFUSED_IN_A_ROW = 3
 """Steps refused one after another that end a run: something lasting is wrong."""
-
-
-@dataclass(frozen=True)
-class Devices:
-    """What a session is taken with; `projector` is None where its lamp is not under control."""
-
-    camera: Camera
-    presenter: Presenter
-    projector: Projector | None
-    clock: Clock
 
 
 @dataclass(frozen=True)
@@ -53,7 +41,7 @@ def take_session(
     session: Session,
     devices: Devices,
     settings: LabSettings,
-    observe: Callable[[Step, bool], None] = lambda step, accepted: None,
+    observe: Callable[[SessionStep, bool], None] = lambda step, accepted: None,
     announce: Callable[[str], None] = lambda sentence: None,
 ) -> Outcome:
     """Take every step of the session's plan that has no accepted frame yet.
@@ -80,35 +68,35 @@ def _take(
     session: Session,
     devices: Devices,
     settings: LabSettings,
-    observe: Callable[[Step, bool], None],
+    observe: Callable[[SessionStep, bool], None],
     announce: Callable[[str], None],
 ) -> Outcome:
     clock = devices.clock
     for stray in session.set_aside_strays():
-        session.note(clock.now(), "stray", f"{stray.name}: complete but never counted; kept, not used")
+        session.journal.note(clock.now(), "stray", f"{stray.name}: complete, but not in the journal; kept, not used")
     steps = session.steps
     done = session.done_steps()
     open_steps = [step for step in steps if step.number not in done]
     if not open_steps:
         return Outcome(len(steps), 0, ())
-    session.note(clock.now(), "start", f"{len(open_steps)} of {len(steps)} frames to take")
+    session.journal.note(clock.now(), "start", f"{len(open_steps)} of {len(steps)} frames to take")
     devices.camera.configure(settings.camera.exposure)
 
-    def tell(what: str, sentence: str) -> None:
-        session.note(clock.now(), what, sentence)
+    def report(what: str, sentence: str) -> None:
+        session.journal.note(clock.now(), what, sentence)
         announce(f"{what}: {sentence}")
 
     if devices.projector is not None:
-        make_ready(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), tell)
+        make_ready(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), report)
     refused: list[str] = []
     taken = 0
     in_a_row = 0
     for step in open_steps:
-        reason = _take_step(session, step, devices, settings, tell)
+        reason = _take_step(session, step, devices, settings, report)
         observe(step, reason is None)
         if reason is None:
             taken += 1
-            if step.kind != "dark":  # a dark frame is well taken in a dark room, too
+            if step.kind != "dark":  # a dark frame is accepted where no light reaches the chart, too
                 in_a_row = 0
             continue
         refused.append(f"{_name(step)}: {reason}")
@@ -118,45 +106,34 @@ def _take(
     outcome = Outcome(len(steps), len(open_steps) - taken, tuple(refused))
     if outcome.complete and settings.sequence.switch_off and devices.projector is not None:
         devices.projector.switch_off()
-    session.note(clock.now(), "complete" if outcome.complete else "incomplete", f"{outcome.left} frames left")
+    session.journal.note(clock.now(), "complete" if outcome.complete else "incomplete", f"{outcome.left} frames left")
     return outcome
 
 
-def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None:
-    """Decode a raw file and return why it cannot be used, or None when it can."""
-    try:
-        mosaic = read_raw(path)
-    except FormatError as error:
-        return str(error)
-    # Of frames taken by other means nobody here knows what was asked for.
-    differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
-    return differs or refusal(measure_exposure(mosaic), kind, settings.limits)
-
-
 def _take_step(
-    session: Session, step: Step, devices: Devices, settings: LabSettings, tell: Callable[[str, str], None]
+    session: Session, step: SessionStep, devices: Devices, settings: LabSettings, report: Callable[[str, str], None]
 ) -> str | None:
     """Try a step until its frame is accepted; return None then, else the last refusal."""
     clock = devices.clock
     reason: str | None = None
     for remaining in reversed(range(settings.sequence.attempts)):
         if devices.projector is not None:
-            await_health(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), tell)
-        kept = session.kept_files(step)
+            await_health(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), report)
+        kept = session.journal.kept_files(step)
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
-        attempt = session.begin(step, f"frames/{stem}", clock.now())
+        attempt = session.journal.begin(step, f"frames/{stem}", clock.now())
         try:
             devices.presenter.show(step.colour)
             clock.sleep(settings.sequence.settle_s)
             received = session.receive(stem, devices.camera.capture)
         except DeviceError as error:
-            session.fail(attempt, clock.now(), str(error))
+            session.journal.fail(attempt, clock.now(), str(error))
             if remaining == 0 or isinstance(error, DeviceFault | DeviceRefused):
                 raise
-            tell("retry", f"{_name(step)}: {error}")
+            report("retry", f"{_name(step)}: {error}")
             continue
-        complaint = complaint_of(devices.projector)
-        reason = judge_file(received.path, step.kind, settings) or (None if complaint is None else str(complaint))
+        fault = health_fault(devices.projector)
+        reason = judge_file(received.path, step.kind, settings) or (None if fault is None else str(fault))
         session.commit(
             attempt,
             file=f"frames/{received.path.name}",
@@ -173,5 +150,5 @@ def _take_step(
     return reason
 
 
-def _name(step: Step) -> str:
+def _name(step: SessionStep) -> str:
     return f"light {step.illumination}" if step.illumination is not None else f"{step.kind} frame {step.number}"

@@ -11,7 +11,8 @@ import json
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-from acquisition.session.folder import Event, Session
+from acquisition.session.folder import Session
+from acquisition.session.journal import SessionEvent
 from acquisition.session.progress import Progress, duration_text, session_progress
 from foundation.errors import CropError, InputError
 
@@ -37,10 +38,10 @@ dt {{ color: #666; }} dd {{ margin: 0; }}
 """
 
 
-def read_state(folder: Path) -> tuple[Progress, list[Event]]:
+def read_state(folder: Path) -> tuple[Progress, list[SessionEvent]]:
     """Return a session's progress and its newest events."""
     with Session.open(folder) as session:
-        return session_progress(session), session.events()[-20:]
+        return session_progress(session), session.journal.events()[-20:]
 
 
 def page(folder: Path) -> str:
@@ -69,7 +70,10 @@ def page(folder: Path) -> str:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    folder: Path
+
+    def __init__(self, folder: Path, port: int) -> None:
+        self.folder = folder
+        super().__init__(("127.0.0.1", port), _Handler)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -97,7 +101,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: the terminal belongs to the user."""
+        """Log nothing: the terminal is the user's."""
 
 
 def open_monitor(folder: Path, port: int) -> ThreadingHTTPServer:
@@ -112,8 +116,6 @@ def open_monitor(folder: Path, port: int) -> ThreadingHTTPServer:
     """
     read_state(folder)
     try:
-        server = _Server(("127.0.0.1", port), _Handler)
+        return _Server(folder, port)
     except OSError as error:
         raise InputError(f"cannot serve on port {port}: {error.strerror}; name another with --port") from error
-    server.folder = folder
-    return server

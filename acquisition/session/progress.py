@@ -6,7 +6,8 @@ import statistics
 from dataclasses import asdict, dataclass
 from datetime import datetime
 
-from acquisition.session.folder import ACCEPTED, FAILED, REFUSED, Session
+from acquisition.session.folder import Session
+from acquisition.session.journal import ACCEPTED, FAILED, REFUSED
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def session_progress(session: Session) -> Progress:
     """Return how far `session` is on its plan."""
     steps = session.steps
     done = session.done_steps()
-    attempts = session.attempts()
+    attempts = session.journal.attempts()
     durations = [
         (attempt.ended_at - attempt.started_at).total_seconds()
         for attempt in attempts

@@ -1,1 +1,1 @@
-"""Checks of frames against each other and against their codes."""
+"""Checks of the print, of frames against each other, and of lights against their codes."""

@@ -1,16 +1,16 @@
 """Stains, folds and shadows on the print: cells whose colour is not that of their code.
 
-A stain keeps its cells of one colour each, so neither rim nor noise of a cell tells it, and the table would hold the
-colours of a dirty print. What tells it is that a whole neighbourhood is off at once, while its codes, which are strewn
-at random, are right everywhere else on the sheet.
+A stain leaves its cells of one colour each, so that neither rim nor noise of a cell shows it, and the table would hold
+the colours of a dirty print. It is recognised by a whole neighbourhood that deviates at once, while the same codes,
+which lie at random over the sheet, are right everywhere else.
 
 Laws that hold inside:
 
-- What a code gives is predicted from the codes next to it in colour, which hang elsewhere on the sheet: no model of
-  ink or paper, and next to nothing in common with the cell's own place.
-- A cell is judged by its neighbourhood: one deviating cell is the prediction's error or noise. Beside a stain it is
-  judged alone as well, for a neighbourhood sees a stain's rim but half.
-- Of charts of less than `LEAST_BITS` nothing is told: between four levels of a code curvature does not change slowly.
+- What a code gives is predicted from the codes next to it in colour, which lie elsewhere on the sheet: no model of ink
+  or paper, and next to nothing in common with the cell's own place.
+- A cell is judged by its neighbourhood: one deviating cell is the prediction's error or noise. Next to a stain it is
+  judged alone as well, for only half of the neighbourhood of a cell at a stain's rim is stained.
+- Charts of less than `LEAST_BITS` cannot be judged: between four levels of a code curvature does not change slowly.
 - A deviation must be significant and large enough to matter. What is found is listed, never corrected.
 """
 
@@ -37,14 +37,23 @@ SIGNIFICANT = 6.0
 """Standard errors that it must be, too; by chance one neighbourhood in 5·10⁸."""
 
 RIM_SIGMA = 4.0
-"""Usual deviations of single cells that one beside a stain must be off to belong to it."""
+"""Usual deviations of single cells that a cell next to a stain must deviate by to belong to it."""
 
 LEAST_COUNTS = 30.0
-"""Darker cells tell nothing: a count of stray light is 3 % of them."""
+"""Darker cells are not judged: a count of stray light is 3 % of them."""
 
 LEAST_BITS = 3
+"""Bits of a channel: with 2, curvature changes too fast between the four levels of a code to be predicted."""
 
 _ROUNDS = 3
+"""Repetitions at most, each without the stained cells of the one before in the predictions."""
+
+_LEAST_KNOWN = 9
+"""Codes of the 25 across an axis that must be known for their median to be a curvature."""
+
+_LEAST_NEIGHBOURS = 5
+"""Cells of a neighbourhood that must be known for its mean to count."""
+
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
 
@@ -56,7 +65,7 @@ class Stains:
     Attributes
     ----------
     deviation
-        (C, 3) float64, of each cell's neighbourhood, seen over expected less 1; NaN where it cannot be told.
+        (C, 3) float64, of each cell's neighbourhood, seen over expected less 1; NaN where it is not known.
     error
         (C, 3) float64, its standard error.
     alone
@@ -72,19 +81,19 @@ class Stains:
 
     @property
     def doubtful(self) -> _Mask:
-        """(C,) cells in neighbourhoods that are off by a per cent or more: a fold's flanks, a faint stain, a shadow."""
+        """(C,) bool, cells in neighbourhoods that deviate by 1 % or more: a fold's flanks, a faint stain, a shadow."""
         return _beyond(self.deviation, self.error, DOUBTFUL)
 
     @property
-    def tells(self) -> bool:
-        """Whether anything can be told of the print."""
+    def known(self) -> bool:
+        """Whether anything is known of the print."""
         return bool(np.isfinite(self.deviation).any())
 
-    def largest(self) -> _Array:
-        """Return (C,) the deviation, with its sign, of the channel that deviates most; 0 where it cannot be told."""
+    def largest_deviation(self) -> _Array:
+        """Return (C,) float64 the signed deviation of the channel that deviates most; 0 where it is not known."""
         return _largest(self.deviation)
 
-    def told(self, cell: int) -> float:
+    def deviation_of(self, cell: int) -> float:
         """Return a stained cell's deviation, with its sign: of its neighbourhood, or its own where that is larger."""
         both = np.array([_largest(self.deviation[[cell]])[0], _largest(self.alone[[cell]])[0]])
         return float(both[np.abs(both).argmax()])
@@ -105,11 +114,11 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
         (8**bits, 3) float64, mean counts above black of each colour under even light, in the order of colour indices,
         the field divided out; best the mean of all white frames.
     centres_mm
-        (8**bits, 2) where each colour hangs.
+        (8**bits, 2) mm, where each colour lies on the sheet.
     bits
         Bits of each channel of a code.
     usable
-        (8**bits,) bool, cells whose level means anything: not covered, cut off or clipped.
+        (8**bits,) bool, cells whose level means anything: not covered, cut off or clipped; all if not given.
     """
     if bits < LEAST_BITS:
         unknown = np.full(level.shape, np.nan)
@@ -118,26 +127,26 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     near = np.asarray(cKDTree(centres_mm).query(centres_mm, k=min(NEIGHBOURS, len(level)))[1])
     near = near.reshape(len(level), -1)
     trusted = usable.copy()
-    deviation, error, aside = (np.full(level.shape, np.nan) for _ in range(3))
+    deviation, error, log_ratios = (np.full(level.shape, np.nan) for _ in range(3))
     stained = np.zeros(len(level), dtype=np.bool_)
     # A stain spoils the predictions that rest on its cells, too; without them, its rim and depth are sharper.
     for _ in range(_ROUNDS):
-        aside = _aside(np.where(trusted[:, None], level, np.nan), level, usable, bits)
-        deviation, error = _of_neighbourhoods(aside, near)
+        log_ratios = _log_ratios(np.where(trusted[:, None], level, np.nan), level, usable, bits)
+        deviation, error = _of_neighbourhoods(log_ratios, near)
         found = _beyond(deviation, error, STAINED)
         if (found == stained).all():
             break
         stained = found
         trusted = usable & ~stained
     with np.errstate(invalid="ignore"):
-        off = (np.abs(np.expm1(aside)) > np.maximum(RIM_SIGMA * _usual(aside), STAINED)).any(axis=1)
-    return Stains(deviation, error, np.expm1(aside), stained | (off & stained[near].any(axis=1)))
+        off = (np.abs(np.expm1(log_ratios)) > np.maximum(RIM_SIGMA * _usual(log_ratios), STAINED)).any(axis=1)
+    return Stains(deviation, error, np.expm1(log_ratios), stained | (off & stained[near].any(axis=1)))
 
 
-def _usual(aside: _Array) -> _Array:
+def _usual(log_ratios: _Array) -> _Array:
     """Return (3,) the standard deviation of single cells, by the median of their sizes."""
-    there = np.isfinite(aside)
-    return np.array([sigma_of(aside[there[:, c], c]) if there[:, c].any() else 0 for c in range(3)])
+    there = np.isfinite(log_ratios)
+    return np.array([sigma_of(log_ratios[there[:, c], c]) if there[:, c].any() else 0 for c in range(3)])
 
 
 def _beyond(deviation: _Array, error: _Array, least: float) -> _Mask:
@@ -145,7 +154,7 @@ def _beyond(deviation: _Array, error: _Array, least: float) -> _Mask:
     return np.asarray((np.abs(deviation) > np.maximum(SIGNIFICANT * error, least)).any(axis=1))
 
 
-def _aside(trusted: _Array, level: _Array, usable: _Mask, bits: int) -> _Array:
+def _log_ratios(trusted: _Array, level: _Array, usable: _Mask, bits: int) -> _Array:
     """Return (C, 3) log of each cell over what its neighbours in colour predict, NaN where they cannot.
 
     Along each axis of the code the mean of both neighbours' logarithms predicts the cell's, but for the curvature,
@@ -188,15 +197,15 @@ def _beside(cube: _Array, axis: int) -> _Array:
     ranked = np.sort(around, axis=0)
     low, high = (np.maximum(known - 1, 0) // 2)[None], (known // 2)[None]
     middle = 0.5 * (np.take_along_axis(ranked, low, axis=0) + np.take_along_axis(ranked, high, axis=0))[0]
-    return np.where(known >= 9, middle, np.nan)
+    return np.where(known >= _LEAST_KNOWN, middle, np.nan)
 
 
-def _of_neighbourhoods(aside: _Array, near: npt.NDArray[np.intp]) -> tuple[_Array, _Array]:
-    """Return the mean (C, 3) over each neighbourhood and its standard error; NaN where too few cells can tell."""
-    there = np.isfinite(aside)
-    spread = _usual(aside)
-    # A single cell may be far off; in a neighbourhood it weighs no more than four usual deviations beyond the median.
-    values = aside[near]
+def _of_neighbourhoods(log_ratios: _Array, near: npt.NDArray[np.intp]) -> tuple[_Array, _Array]:
+    """Return the mean (C, 3) over each neighbourhood and its standard error; NaN where too few cells are known."""
+    there = np.isfinite(log_ratios)
+    spread = _usual(log_ratios)
+    # A single cell may be far off; in a neighbourhood it weighs no more than four usual log_ratios beyond the median.
+    values = log_ratios[near]
     with np.errstate(invalid="ignore"):
         known = there[near]
         count = known.sum(axis=1)
@@ -205,5 +214,5 @@ def _of_neighbourhoods(aside: _Array, near: npt.NDArray[np.intp]) -> tuple[_Arra
         mean = np.where(known, bounded, 0).sum(axis=1) / np.maximum(count, 1)
         inside = np.where(known, (bounded - mean[:, None]) ** 2, 0).sum(axis=1) / np.maximum(count - 1, 1)
         error = np.sqrt(np.maximum(inside, spread**2) / np.maximum(count, 1))
-    enough = count >= 5
+    enough = count >= _LEAST_NEIGHBOURS
     return np.where(enough, np.expm1(mean), np.nan), np.where(enough, error, np.nan)

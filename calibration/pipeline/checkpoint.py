@@ -1,12 +1,12 @@
-"""A table in the making: its hidden folder, and how far it has come.
+"""An unfinished table: its hidden folder, and the checkpoint from which a later program goes on.
 
 Laws that hold inside:
 
 - The folder stands beside the table's place under a hidden name until the table is complete, so that under the final
   name there is never a table that lacks a light.
-- A checkpoint is one file, replaced whole. It tells which frames were taken in, in what order, and all that the next
-  frame needs to know of them. It is believed only if what it was made of is what is asked for now, and if the samples
-  on the disk have the hashes it tells; otherwise the work begins anew.
+- A checkpoint is one file, replaced whole. It holds which frames were taken in, in what order, and all that the next
+  frame depends on. It is used only if it was made of what is asked for now, and if the samples on the disk have the
+  hashes that it holds; otherwise the work begins anew.
 - One program makes a table at a time.
 """
 
@@ -32,6 +32,7 @@ from foundation.held_folders import LOCK_FILE, held_folder
 CHECKPOINT = "checkpoint.npz"
 
 _TEXT = "text"
+"""Name of the array that holds all that is no array, as JSON."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,23 +42,27 @@ class Checkpoint:
     Attributes
     ----------
     identity
-        What it is made of and by what; two checkpoints of one identity can go on from each other.
+        What it is made of and by what; a build goes on from a checkpoint of the same identity only.
     frames
-        Hash of each frame taken in, in their order.
-    told
-        Anything JSON can hold; numbers come back to the last bit.
+        What names each frame taken in, in their order.
+    values
+        Anything JSON can hold; numbers are restored to the last bit.
     arrays
         Arrays of plain numbers, by name.
     """
 
     identity: dict[str, Any]
     frames: list[str]
-    told: dict[str, Any]
+    values: dict[str, Any]
     arrays: dict[str, npt.NDArray[Any]]
 
+    def fits(self, identity: dict[str, Any], frames: list[str]) -> bool:
+        """Return whether a build of that identity can go on from here: these are the first of its `frames`."""
+        return self.identity == identity and bool(self.frames) and self.frames == frames[: len(self.frames)]
 
-class Growing:
-    """The hidden folder of a table in the making; made by `growing`."""
+
+class UnfinishedTable:
+    """The hidden folder of a table that is being made; made by `unfinished_table`."""
 
     def __init__(self, folder: Path, out: Path) -> None:
         self.folder = folder
@@ -65,19 +70,19 @@ class Growing:
         self._keep = True
 
     def load(self) -> Checkpoint | None:
-        """Return how far an earlier program came, or None where there is nothing that can be read."""
+        """Return how far an earlier program came; None where there is no checkpoint that can be read."""
         try:
             with np.load(self.folder / CHECKPOINT, allow_pickle=False) as stored:
                 arrays: dict[str, npt.NDArray[Any]] = {name: stored[name] for name in stored.files}
             text = json.loads(arrays.pop(_TEXT).tobytes())
-            return Checkpoint(text["identity"], text["frames"], text["told"], arrays)
+            return Checkpoint(text["identity"], text["frames"], text["values"], arrays)
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
             return None
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Replace the checkpoint."""
-        told = {"identity": checkpoint.identity, "frames": checkpoint.frames, "told": checkpoint.told}
-        text = np.frombuffer(json.dumps(told).encode(), dtype=np.uint8)
+        content = {"identity": checkpoint.identity, "frames": checkpoint.frames, "values": checkpoint.values}
+        text = np.frombuffer(json.dumps(content).encode(), dtype=np.uint8)
         stream = io.BytesIO()
         np.savez(stream, allow_pickle=False, **{**checkpoint.arrays, _TEXT: text})
         write_whole(self.folder / CHECKPOINT, stream.getvalue())
@@ -97,11 +102,18 @@ class Growing:
         self._keep = False
 
     def publish(self) -> None:
-        """Give the table its final name."""
+        """Give the table its final name.
+
+        Raises
+        ------
+        InputError
+            The name is taken.
+        StorageError
+            The disk is full or read-only.
+        """
         require_free(self._out, "the table")
         try:
             (self.folder / CHECKPOINT).unlink(missing_ok=True)
-            (self.folder / LOCK_FILE).unlink(missing_ok=True)
             sync_folder(self.folder)
         except OSError as error:
             raise storage_error(self._out, error) from error
@@ -114,7 +126,7 @@ class Growing:
 
 
 @contextmanager
-def growing(out: Path) -> Generator[Growing]:
+def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
     """Open, or make, the hidden folder of the table `out`; what is not published stays if it holds a checkpoint.
 
     Raises
@@ -127,10 +139,10 @@ def growing(out: Path) -> Generator[Growing]:
     require_free(out, "the table")
     folder = partial_path(out)
     with held_folder(folder, f"{out} is being made by another program; wait for it, or name another place"):
-        making = Growing(folder, out)
+        unfinished = UnfinishedTable(folder, out)
         try:
-            yield making
+            yield unfinished
         finally:
-            if folder.is_dir() and not making.worth_keeping:
+            if folder.is_dir() and not unfinished.worth_keeping:
                 with contextlib.suppress(OSError):
                     shutil.rmtree(folder)

@@ -2,45 +2,43 @@
 
 Laws that hold inside:
 
-- Every frame is read once, its SHA-256 checked against the journal before one of its counts is believed.
+- A frame's SHA-256 is checked against the journal before one of its counts is used.
 - The last accepted frame of a light counts.
-- Dark frames stand where they were taken: what is learnt from one holds for those after it.
+- Dark frames stand where they were taken: what is measured in one holds for the frames after it.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections import deque
-from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.planes import CHANNELS, Channel, frame_black, phases
-from acquisition.session.folder import FrameRecord, Session
-from calibration.radiometry.paper import saturation
+from acquisition.session.folder import Session
+from acquisition.session.journal import FrameRecord
 from calibration.radiometry.primaries import pure_lights
-from calibration.table.lut import Frame, Lut, frames_sha256
+from calibration.radiometry.sensor_range import saturation
+from calibration.table.lut import Lut
+from calibration.table.source_frames import SourceFrame, frames_sha256
 from drivers.raw.rawfile import Mosaic, decode_raw
 from foundation.errors import FormatError
 from foundation.files import read_whole
 from foundation.hashing import file_sha256
-from foundation.processors import processor_count
-
-MOST_THREADS = 8
-"""Each thread holds a raw file and its counts, 110 MB for a 6D Mark II: more would not stay below 2 GB."""
 
 _Array = npt.NDArray[np.float64]
-_Result = TypeVar("_Result")
 Progress = Callable[[int, int, str], None]
 """Called with frames done, frames in all, and what is being done."""
 
+_PAPER_PERCENTILE = 98
+"""Bare paper is more than a fiftieth of a picture, and hot photosites and highlights are less."""
+
 
 @dataclass(frozen=True, eq=False)
-class Decoded:
+class DecodedFrame:
     """A frame as read.
 
     Attributes
@@ -52,9 +50,9 @@ class Decoded:
     black
         (2, 2) float64 counts, black level of each position of the block.
     strongest
-        The colour with the brightest paper.
+        The channel with the brightest paper.
     saturation
-        Raw count of saturation, as far as this frame tells.
+        Raw count of saturation, as far as it can be seen in this frame.
     """
 
     record: FrameRecord
@@ -64,25 +62,65 @@ class Decoded:
     saturation: int
 
 
-def threads() -> int:
-    """Return how many frames are read and measured at a time: one a processor, as far as memory allows."""
-    return min(processor_count(), MOST_THREADS)
+@dataclass(frozen=True, eq=False)
+class SelectedFrames:
+    """The frames that a table is made of.
+
+    Attributes
+    ----------
+    records
+        Every light's last accepted frame, and the accepted white and dark ones, in the order taken.
+    lights_without
+        Lights that have no accepted frame.
+    registered
+        The frame in which the chart is registered first.
+    primaries
+        The frames of red, green and blue alone; () where one of the three is lacking.
+    """
+
+    records: tuple[FrameRecord, ...]
+    lights_without: tuple[int, ...]
+    registered: FrameRecord
+    primaries: tuple[FrameRecord, ...]
+
+    @cached_property
+    def first_lit(self) -> FrameRecord:
+        """The first frame that is not dark."""
+        return next(record for record in self.records if record.kind != "dark")
+
+    def is_even(self, record: FrameRecord) -> bool:
+        """Return whether a frame's samples show how even cells are: the white ones, or the first with any light."""
+        return record.kind == "white" or record is self.first_lit
 
 
-def chosen_frames(session: Session) -> tuple[list[FrameRecord], list[int]]:
-    """Return the frames a table is made of, and the lights that have none.
-
-    The frames are every light's last accepted, and the white and dark ones, in the order taken.
+def select_frames(session: Session) -> SelectedFrames:
+    """Return the frames that a table of a session is made of, so far.
 
     Raises
     ------
     FormatError
-        Two lights have the same raw file.
+        No frame is accepted, or two lights have the same raw file.
     """
-    last: dict[int, FrameRecord] = {}
-    for record in accepted_lights(session):
-        if record.illumination is not None:
-            last[record.illumination] = record
+    accepted = [record for record in session.frames() if record.accepted]
+    if not any(record.kind in ("white", "light") for record in accepted):
+        raise FormatError(
+            f"{session.folder} holds no accepted frame; take the session with acquire run, then build the table"
+        )
+    last = _last_of_each_light(session, accepted)
+    others = [record for record in accepted if record.kind in ("white", "dark")]
+    pure = pure_lights(session.illuminations) or ()
+    return SelectedFrames(
+        records=tuple(sorted([*last.values(), *others], key=lambda record: (record.taken_at, record.file))),
+        lights_without=tuple(light.index for light in session.illuminations if light.index not in last),
+        registered=_frame_to_register(session, accepted),
+        primaries=tuple(last[light] for light in pure) if all(light in last for light in pure) else (),
+    )
+
+
+def _last_of_each_light(session: Session, accepted: Sequence[FrameRecord]) -> dict[int, FrameRecord]:
+    last = {
+        record.illumination: record for record in accepted if record.kind == "light" and record.illumination is not None
+    }
     lights_of: dict[str, int] = {}
     for light, record in last.items():
         other = lights_of.setdefault(record.sha256, light)
@@ -91,32 +129,14 @@ def chosen_frames(session: Session) -> tuple[list[FrameRecord], list[int]]:
                 f"{session.folder}: lights {other} and {light} have the same raw file, {record.file}, SHA-256 "
                 f"{record.sha256[:16]}…; each light has its own, so correct the list of frames and import it again"
             )
-    missing = [light.index for light in session.illuminations if light.index not in last]
-    others = [record for record in session.frames() if record.kind in ("white", "dark") and record.accepted]
-    return sorted([*last.values(), *others], key=lambda record: (record.taken_at, record.file)), missing
+    return last
 
 
-def accepted_lights(session: Session) -> list[FrameRecord]:
-    """Return the accepted frames of lights."""
-    return [record for record in session.frames() if record.kind == "light" and record.accepted]
-
-
-def best_frame(session: Session) -> FrameRecord:
-    """Return the frame to register: the first accepted white one, or else the brightest light's.
-
-    Raises
-    ------
-    FormatError
-        No frame is accepted.
-    """
-    whites = [record for record in session.frames() if record.kind == "white" and record.accepted]
-    if whites:
-        return whites[0]
-    lights = accepted_lights(session)
-    if not lights:
-        raise FormatError(
-            f"{session.folder} holds no accepted frame; take the session with acquire run, then build the table"
-        )
+def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> FrameRecord:
+    """Return the first white frame, or else the brightest light's."""
+    white = next((record for record in accepted if record.kind == "white"), None)
+    if white is not None:
+        return white
 
     def brightness(record: FrameRecord) -> int:
         if record.illumination is None or record.illumination >= len(session.illuminations):
@@ -124,18 +144,11 @@ def best_frame(session: Session) -> FrameRecord:
         colour = session.illuminations[record.illumination].colour
         return min(colour.red, colour.green, colour.blue)
 
-    return max(lights, key=brightness)
+    return max((record for record in accepted if record.kind == "light"), key=brightness)
 
 
-def pure_frames(session: Session, chosen: Sequence[FrameRecord]) -> list[FrameRecord]:
-    """Return those of the chosen frames that show red, green and blue alone; none where one of the three is lacking."""
-    lights = pure_lights(session.illuminations) or ()
-    found = {record.illumination: record for record in chosen if record.kind == "light"}
-    return [found[light] for light in lights] if all(light in found for light in lights) else []
-
-
-def decode(session: Session, record: FrameRecord) -> Decoded:
-    """Read a frame.
+def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
+    """Return a frame as read from its file, whose SHA-256 is checked first.
 
     Raises
     ------
@@ -160,49 +173,17 @@ def decode(session: Session, record: FrameRecord) -> Decoded:
         )
     mosaic = decode_raw(data, path)
     black = frame_black(mosaic)
-    return Decoded(record, mosaic, black, strongest_channel(mosaic, black), saturation(mosaic))
+    return DecodedFrame(record, mosaic, black, strongest_channel(mosaic, black), saturation(mosaic))
 
 
 def strongest_channel(mosaic: Mosaic, black: _Array) -> Channel:
-    """Return the colour with the brightest paper, from every sixteenth block."""
+    """Return the channel with the brightest paper, from every sixteenth block; `black` (2, 2) float64 counts."""
     blocks = mosaic.block_planes()[:, :, ::16, ::16]
     levels = [
-        max(float(np.percentile(blocks[place], 98) - black[place]) for place in places)
+        max(float(np.percentile(blocks[place], _PAPER_PERCENTILE) - black[place]) for place in places)
         for places in phases(mosaic).values()
     ]
     return CHANNELS[int(np.argmax(levels))]
-
-
-def ahead(
-    work: Callable[[FrameRecord], _Result], records: Sequence[FrameRecord], waits: Callable[[FrameRecord], bool]
-) -> Generator[tuple[FrameRecord, _Result]]:
-    """Yield each frame with what `work` made of it, in order, while threads work on those that follow.
-
-    Parameters
-    ----------
-    work
-        Called in a thread of its own.
-    records
-        The frames.
-    waits
-        Whether those after a frame cannot be worked on until it has been taken in.
-    """
-    count = threads()
-    with ThreadPoolExecutor(count) as pool:
-        waiting: deque[tuple[FrameRecord, Future[_Result]]] = deque()
-        todo = deque(records)
-        try:
-            while todo or waiting:
-                while todo and len(waiting) <= count and not any(waits(record) for record, _ in waiting):
-                    record = todo.popleft()
-                    waiting.append((record, pool.submit(work, record)))
-                record, future = waiting[0]
-                result = future.result()
-                yield record, result
-                waiting.popleft()
-        finally:
-            for _, future in waiting:
-                future.cancel()
 
 
 def session_sha256(records: Sequence[FrameRecord]) -> str:
@@ -210,9 +191,9 @@ def session_sha256(records: Sequence[FrameRecord]) -> str:
     return frames_sha256(listed(records))
 
 
-def listed(records: Sequence[FrameRecord]) -> list[Frame]:
+def listed(records: Sequence[FrameRecord]) -> list[SourceFrame]:
     """Return frames as a table lists them."""
-    return [Frame(record.kind, record.illumination, record.file, record.sha256) for record in records]
+    return [SourceFrame(record.kind, record.illumination, record.file, record.sha256) for record in records]
 
 
 def lost_frames(lut: Lut, session: Session, progress: Progress | None = None) -> list[str]:

@@ -1,90 +1,69 @@
 """Whether counts are proportional to light: a series of exposures of the chart, under one light, in its place.
 
-EMVA 1288 (release 4.0) plots a sensor's mean against exposure and asks how far it strays from a line between 5 and 95 %
-of saturation. Here every patch of the chart is such a curve, and since patches are of all brightnesses, a frame's own
-exposure need not be believed: from one frame to the next all patches must grow by one and the same factor. What grows
-otherwise at another level is the sensor's bend. One bend alone is not seen so, a power of the light, and for it the
-exposure times are needed: stated to some per cent only, as cameras write 0.3 s for 0.315 s, they enter together.
+EMVA 1288 (release 4.0, linearity error) plots a sensor's mean against exposure and measures its deviation from a
+straight line between 5 and 95 % of saturation. Here every patch of the chart is such a curve, and since patches are of
+all brightnesses, a frame's stated exposure is not needed: from one frame to the next, the counts of all patches must
+rise by one and the same factor, and a factor that depends on the level is the sensor's nonlinearity. One nonlinearity
+cannot be seen so, a power of the light, and for it the exposure times are needed: stated to some per cent only, as
+cameras write 0.3 s for 0.315 s, they enter all together.
 
 Laws that hold inside:
 
-- The series is no part of a table: it decides nothing about samples, and is told in the report.
+- The series is no part of a table: no sample depends on it, and its figures are in the report alone.
 - A frame that is not of the series (another camera, ISO speed or aperture, the chart elsewhere) is refused by name.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import frame_black
+from acquisition.framing.planes import CLIPPING_SHARE, frame_black
+from calibration.figures.linearity_figures import LinearityFigures
+from calibration.fitting.least_squares import least_squares
+from calibration.pipeline.baseline import Baseline
 from calibration.pipeline.frames import strongest_channel
-from calibration.pipeline.measuring import STILL_PX, Measurement
-from calibration.radiometry.fitting import least_squares
-from calibration.radiometry.paper import CLIPPED, saturation
-from calibration.registration.movement import Shift
+from calibration.radiometry.sensor_range import saturation
+from calibration.registration.movement import BUMP_PX, Shift
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import FormatError, InputError
 
 LEAST_FRAMES = 4
+"""Frames of different exposure times (judgement): with fewer, errors of the stated times look like nonlinearity."""
+
 LOWEST, HIGHEST = 0.05, 0.95
 """Between which shares of saturation a sensor has to be linear (EMVA 1288)."""
 
 _NODES = 10
+"""Levels at which the deviation is measured: about half a stop apart."""
+
 _LEAST_PATCHES = 50.0
+"""Patches near a level for it to be measured: their mean is good to a seventh of a patch's noise."""
+
 _STOPS = 3
+"""Shutter speeds are set in thirds of a stop."""
+
 _LEAST_POWER = 0.1
 """Below, the frames did not follow their times at all, and the figure is as bad as can be."""
+
 _HARD, _SOFT = 1e2, 0.1
+"""Weights of the constraints on deviations, beside patches of weight 1: mean and slope are 0, each one is near 0."""
+
 _Array = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Linearity:
-    """How counts follow the light.
-
-    Attributes
-    ----------
-    files
-        The frames, by rising exposure.
-    exposure_s
-        (K,) float64, as the files state them.
-    level
-        (B,) float64, shares of saturation.
-    deviation
-        (3, B) float64, relative, of the counts from the line that fits best; NaN where no patch tells.
-    """
-
-    files: tuple[str, ...]
-    exposure_s: _Array
-    level: _Array
-    deviation: _Array
-
-    @property
-    def worst(self) -> float:
-        """The largest deviation, a share."""
-        return float(np.nanmax(np.abs(self.deviation)))
-
-    @property
-    def covered(self) -> tuple[float, float]:
-        """The lowest and the highest share of saturation that a patch of any channel told of."""
-        told = np.flatnonzero(np.isfinite(self.deviation).any(axis=0))
-        return float(self.level[told[0]]), float(self.level[told[-1]])
-
-
-def read_linearity(folder: Path, work: Measurement) -> Linearity:
-    """Return what a series of exposures says.
+def read_linearity(folder: Path, baseline: Baseline) -> LinearityFigures:
+    """Return what a series of exposures shows.
 
     Parameters
     ----------
     folder
         Raw files of the chart where the session's first registered frame has it, under one steady light, with one ISO
         speed and aperture, from dim to the brink of saturation; eight are usual. Hidden files are passed over.
-    work
-        The measurement of the session, which knows where the patches are.
+    baseline
+        The session's, by which the patches are found.
 
     Raises
     ------
@@ -119,9 +98,9 @@ def read_linearity(folder: Path, work: Measurement) -> Linearity:
             )
         black = frame_black(mosaic)
         limit = saturation(mosaic)
-        _require_in_place(work.movement(mosaic, black, strongest_channel(mosaic, black), str(path)), path)
-        means, highest = work.patches(mosaic, black)
-        means[highest >= CLIPPED * limit] = np.nan
+        _require_in_place(baseline.movement(mosaic, black, strongest_channel(mosaic, black), str(path)), path)
+        means, highest = baseline.patches(mosaic, black)
+        means[highest >= CLIPPING_SHARE * limit] = np.nan
         seen.append(means)
         limits.append(limit - float(black.mean()))
     if len(set(times)) < LEAST_FRAMES:
@@ -136,7 +115,7 @@ def read_linearity(folder: Path, work: Measurement) -> Linearity:
             f"{folder}: no patch is between {LOWEST:.0%} and {HIGHEST:.0%} of saturation in two frames; "
             "take the series with times less far apart, from dim to nearly saturated"
         )
-    return Linearity(tuple(paths[number].name for number in order), np.array(times)[order], level, deviation)
+    return LinearityFigures(tuple(paths[number].name for number in order), np.array(times)[order], level, deviation)
 
 
 def _exposure_s(mosaic: Mosaic, path: Path) -> float:
@@ -146,8 +125,10 @@ def _exposure_s(mosaic: Mosaic, path: Path) -> float:
 
 
 def _require_in_place(shift: Shift, path: Path) -> None:
-    if shift.tags == 0 or shift.largest_px > 5 * STILL_PX:
-        moved = "its tags are not seen" if shift.tags == 0 else f"it lies {shift.largest_px:.2f} px further"
+    if shift.gauges == 0 or shift.largest_px > BUMP_PX:
+        moved = f"it has moved by {shift.largest_px:.2f} px, {BUMP_PX:g} allowed"
+        if shift.gauges == 0:
+            moved = "its tags, or the outline of its field, are not seen"
         raise FormatError(
             f"{path}: the chart is not where the session has it ({moved}); take the series with camera and print as "
             "they stand in the session, before it or after it"
@@ -155,20 +136,27 @@ def _require_in_place(shift: Shift, path: Path) -> None:
 
 
 def deviations(seen: _Array, exposure_s: _Array) -> tuple[_Array, _Array]:
-    """Return levels (B,) and by how much counts deviate there from proportion to the light (3, B), relative.
+    """Return levels and by how much counts deviate there from proportion to the light.
 
     Parameters
     ----------
     seen
-        (K, P, 3) mean counts of patches, shares of saturation; NaN where one cannot be used.
+        (K, P, 3) float64 mean counts of patches, shares of saturation; NaN where one cannot be used.
     exposure_s
-        (K,) stated exposure times, rising.
+        (K,) float64 s, stated exposure times, rising.
+
+    Returns
+    -------
+    level
+        (B,) float64, shares of saturation.
+    deviation
+        (3, B) float64, relative, of R, G and B; NaN where no patch has data.
     """
     nodes = np.geomspace(LOWEST, HIGHEST, _NODES)
     found = np.full((3, _NODES), np.nan)
     for channel in range(3):
         fits = [_bend(seen[..., channel], np.log(times), nodes) for times in (exposure_s, _stops(exposure_s))]
-        # Cameras write 0.3 s for a third of a stop, and some mean it: what the frames follow is believed.
+        # Cameras write 0.3 s for a third of a stop, and some expose for 0.3 s: the times that the frames follow count.
         found[channel] = min(fits, key=lambda fit: fit[1])[0]
     return nodes, found
 
@@ -179,10 +167,27 @@ def _stops(exposure_s: _Array) -> _Array:
 
 
 def _bend(seen: _Array, log_times: _Array, nodes: _Array) -> tuple[_Array, float]:
-    """Return the deviation at nodes (B,), and how far the frames' factors are from their times, RMS."""
+    """Return the deviation at nodes, and how far the frames' factors are from their times.
+
+    Parameters
+    ----------
+    seen
+        (K, P) float64 shares of saturation, of one channel.
+    log_times
+        (K,) float64, logarithms of exposure times in s.
+    nodes
+        (B,) float64 levels, shares of saturation.
+
+    Returns
+    -------
+    deviation
+        (B,) float64, relative; NaN where too few patches are near.
+    error
+        RMS of the logarithms of the frames' factors about a power of their times.
+    """
     frames = len(seen)
     rows: list[_Array] = []
-    grown: list[_Array] = []
+    factors_seen: list[_Array] = []
     hats = np.zeros(len(nodes))
     for number in range(frames - 1):
         before, after = seen[number], seen[number + 1]
@@ -196,26 +201,26 @@ def _bend(seen: _Array, log_times: _Array, nodes: _Array) -> tuple[_Array, float
         row[:, frames - 1 :] = high - low
         hats += low.sum(axis=0) + high.sum(axis=0)
         rows.append(row)
-        grown.append(np.log(after[used] / before[used]))
-    told = hats >= _LEAST_PATCHES
-    if not rows or told.sum() < 2:
+        factors_seen.append(np.log(after[used] / before[used]))
+    measured = hats >= _LEAST_PATCHES
+    if not rows or measured.sum() < 2:
         return np.full(len(nodes), np.nan), np.inf
-    # A power of the light is a slope here, and each patch's noise, which stands on both sides, would be taken for one;
-    # a pattern that repeats with the frames' steps is seen by none. Both are held at 0, hard and softly.
-    at = np.where(told, np.log(nodes) - np.log(nodes)[told].mean(), 0)
+    # A power of the light is a slope here, and each patch's noise, which is on both sides, would be taken for one; a
+    # pattern that repeats with the frames' steps cannot be seen. Both are constrained to 0, hard and softly.
+    at = np.where(measured, np.log(nodes) - np.log(nodes)[measured].mean(), 0)
     held = np.zeros((2 + len(nodes), frames - 1 + len(nodes)))
-    held[0, frames - 1 :], held[1, frames - 1 :] = _HARD * told, _HARD * at
+    held[0, frames - 1 :], held[1, frames - 1 :] = _HARD * measured, _HARD * at
     held[2:, frames - 1 :] = _SOFT * np.eye(len(nodes))
     design = np.concatenate([*rows, held])
-    values = np.concatenate([*grown, np.zeros(len(held))])
+    values = np.concatenate([*factors_seen, np.zeros(len(held))])
     solution = least_squares(design, values, np.ones(len(values)))
-    # The frames' factors against their times tell the power.
+    # The slope of the frames' factors against their times is the power.
     seen_frames = np.array([row[:, : frames - 1].any(axis=0) for row in rows]).any(axis=0)
     steps, factors = np.diff(log_times)[seen_frames], solution[: frames - 1][seen_frames]
     course, stated = (np.concatenate([[0.0], np.cumsum(each)]) for each in (factors, steps))
     course, stated = course - course.mean(), stated - stated.mean()
     power = max(float(course @ stated) / max(float(stated @ stated), 1e-12), _LEAST_POWER)
-    bend = np.where(told, solution[frames - 1 :] + (1 - 1 / power) * at, np.nan)
+    bend = np.where(measured, solution[frames - 1 :] + (1 - 1 / power) * at, np.nan)
     off = course - power * stated
     return np.asarray(bend - np.nanmean(bend), dtype=np.float64), float(np.sqrt((off**2).mean()))
 
@@ -224,13 +229,3 @@ def _hat(level: _Array, nodes: _Array) -> _Array:
     """Return the weights (N, B) of nodes for linear interpolation in the logarithm of a level."""
     at = (np.log(level) - np.log(nodes[0])) / (np.log(nodes[1]) - np.log(nodes[0]))
     return np.asarray(np.maximum(1 - np.abs(at[:, None] - np.arange(len(nodes))), 0), dtype=np.float64)
-
-
-def curve(linearity: Linearity) -> list[tuple[float, list[float | None]]]:
-    """Return each level with the deviations of R, G and B there, None where no patch tells; for `report.json`."""
-
-    def told(values: _Array) -> list[float | None]:
-        return [float(f"{value:.4g}") if np.isfinite(value) else None for value in values.tolist()]
-
-    levels = linearity.level.tolist()
-    return [(float(f"{level:.4g}"), told(linearity.deviation[:, number])) for number, level in enumerate(levels)]

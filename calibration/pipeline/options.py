@@ -1,4 +1,4 @@
-"""What a user may choose about how a table is made; part of a growing table's identity."""
+"""What a user may choose about how a table is built; part of an unfinished table's identity."""
 
 from __future__ import annotations
 
@@ -7,24 +7,23 @@ from typing import Any
 
 from acquisition.framing.corners import Corners
 from calibration.sampling.samples import WINDOW
+from calibration.sampling.windows import WINDOWS
 from foundation.errors import InputError
-
-WINDOWS = (3, 5, 7, 9)
 
 
 @dataclass(frozen=True)
-class Choices:
-    """How a table is made.
+class BuildOptions:
+    """How a table is built; as it stands, as in the paper: 25 samples, nothing subtracted but black.
 
     Attributes
     ----------
     window
-        Pixels along the side of a cell's window: one of `WINDOWS`.
+        Pixels along the side of a cell's window: one of `calibration.sampling.windows.WINDOWS`.
     subtract_dark
         Whether the light of the dark frames is subtracted from samples and ground truth.
     corners
-        Four corners (x, y) of the field of cells in the frame that is registered, half-size px, clockwise from the
-        printed top-left, for a chart without tags; None to have it found.
+        Four corners (x, y) of the field of cells in the frame that is registered first, half-size px, clockwise from
+        the printed top-left, for a chart without tags; None to have it found.
 
     Raises
     ------
@@ -40,7 +39,7 @@ class Choices:
         if self.window not in WINDOWS:
             raise InputError(
                 f"a window of {self.window} pixels was asked for; {', '.join(map(str, WINDOWS[:-1]))} or {WINDOWS[-1]} "
-                "expected: it has a middle pixel, and cells are about 10 pixels wide"
+                "expected: a window has a middle pixel, and cells are about 10 pixels wide"
             )
 
     @property
@@ -48,6 +47,10 @@ class Choices:
         """Samples of each cell."""
         return self.window**2
 
-    def told(self) -> dict[str, Any]:
-        """Return the choices as JSON holds them."""
+    def to_json(self) -> dict[str, Any]:
+        """Return the options as JSON can hold them."""
         return asdict(self) | {"corners": None if self.corners is None else [list(corner) for corner in self.corners]}
+
+
+AS_IN_THE_PAPER = BuildOptions()
+"""The options where none are given."""

@@ -2,8 +2,8 @@
 
 Laws that hold inside:
 
-- A level is the mean of its patches after the field is divided out, without patches that stand far off; its standard
-  error is that of the mean.
+- A level is the mean of its patches after the field is divided out, without outliers; its standard error is that of
+  the mean.
 - White is the ground truth; a grey has the light's chromaticity only as far as the print is neutral. How far it is not
   is the print's tint, an angle between camera RGB of grey and white.
 """
@@ -22,14 +22,19 @@ from acquisition.chart.model import Reference
 from foundation.angles import angles_deg
 from foundation.robust import MAD_TO_SIGMA
 
-NAME = "references.csv"
 COLUMNS = ("light", "name", "r", "g", "b", "r_error", "g_error", "b_error")
+
+_OUTLIER_SIGMAS = 6.0
+"""Robust standard deviations from the median beyond which a patch is covered or dirty."""
+
+_FEW_PATCHES = 4
+"""Patches up to which none is left out: of so few, none is surely the one that is wrong."""
 
 _Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Levels:
+class GreyLevels:
     """The printed levels of grey of a chart.
 
     Attributes
@@ -44,7 +49,7 @@ class Levels:
     level: npt.NDArray[np.int64]
 
     @classmethod
-    def of(cls, references: Sequence[Reference]) -> Levels:
+    def of(cls, references: Sequence[Reference]) -> GreyLevels:
         """Return the levels among references, one for each printed code."""
         codes = sorted({reference.rgb for reference in references}, reverse=True)
         first = {reference.rgb: reference.name for reference in reversed(references)}
@@ -54,7 +59,7 @@ class Levels:
         )
 
     def read(self, seen: _Array, field: _Array) -> tuple[_Array, _Array]:
-        """Return the value and standard error (levels, 3) of each level, NaN where no patch can be used.
+        """Return the value and standard error (G, 3) float64 of each level, counts, NaN where no patch can be used.
 
         Parameters
         ----------
@@ -72,7 +77,8 @@ class Levels:
                 continue
             middle = np.median(patches, axis=0)
             scale = MAD_TO_SIGMA * np.median(np.abs(patches - middle), axis=0) + 1e-9
-            kept = patches[(np.abs(patches - middle) < 6 * scale).all(axis=1)] if len(patches) > 4 else patches
+            near = (np.abs(patches - middle) < _OUTLIER_SIGMAS * scale).all(axis=1)
+            kept = patches[near] if len(patches) > _FEW_PATCHES else patches
             value[number] = kept.mean(axis=0)
             error[number] = kept.std(axis=0, ddof=1) / np.sqrt(len(kept)) if len(kept) > 1 else np.nan
         return value, error
@@ -105,5 +111,5 @@ def references_csv(names: Sequence[str], white: _Array, white_error: _Array, gre
 
 
 def tint_deg(white: _Array, greys: _Array) -> _Array:
-    """Return the angle (..., G) between camera RGB of greys (..., G, 3) and of white (..., 3), degrees."""
+    """Return the angle (..., G) float64, degrees, between camera RGB of greys (..., G, 3) and of white (..., 3)."""
     return angles_deg(np.broadcast_to(white[..., None, :], greys.shape), greys)

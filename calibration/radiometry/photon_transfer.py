@@ -12,12 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.sampling.samples import median_of_variance
+from calibration.sampling.patch_statistics import median_of_variance
 
 NOISY = 1e-8
 """Chance that noise alone lists a cell: a variance 3.5 times the model's for 25 samples."""
 
 _BINS = 48
+"""Levels at which the variance is read, at most: seven hundred cells of a full chart in each."""
+
 _Array = npt.NDArray[np.float64]
 
 
@@ -34,7 +36,7 @@ class PhotonTransfer:
     response
         (3,) float64, standard deviation of the photosites' response, a share.
     misfit
-        (3,) float64, RMS of the bins' variances about the curve, relative.
+        (3,) float64, RMS of the levels' variances about the curve, relative.
     ratio
         (N,) float64, each cell's variance over the model's, the largest of its channels.
     allowed
@@ -49,25 +51,25 @@ class PhotonTransfer:
     allowed: float
 
     def variance(self, level: _Array) -> _Array:
-        """Return the variance (..., 3) of one sample at levels (..., 3), counts above black."""
+        """Return the variance (..., 3) float64, counts², of one sample at levels (..., 3), counts above black."""
         lit = np.maximum(level, 0)
         return self.read_noise**2 + lit / self.gain_e + (self.response * lit) ** 2
 
     @property
     def noisy(self) -> npt.NDArray[np.bool_]:
-        """(N,) whether a cell's noise deviates."""
+        """(N,) bool, whether a cell is noisier than its level allows."""
         return self.ratio > self.allowed
 
 
 def photon_transfer(level: _Array, variance: _Array, samples: int = 25) -> PhotonTransfer:
-    """Return the curve through cells.
+    """Return the curve through cells: non-negative least squares on the medians of cells of like levels.
 
     Parameters
     ----------
     level
-        (N, 3) mean of each cell, counts above black.
+        (N, 3) float64 mean of each cell, counts above black.
     variance
-        (N, 3) variance of one sample of each.
+        (N, 3) float64 variance of one sample of each, counts².
     samples
         Samples of each cell.
     """

@@ -1,9 +1,11 @@
-"""Primaries that light the print unlike one another: what white paper cannot tell of a coloured cell.
+"""The flat field of coloured cells, where the projector's primaries light the print unevenly in different ways.
 
 A projector's red, green and blue do not fade alike towards the corners. The field of a light that mixes them, as bare
-paper shows it in a channel, is their fields' mean by what paper reflects of each into that channel; a coloured cell
-reflects other shares, and its mean is another. The frames of the primaries alone tell both: the field of each, on
-paper, and what each cell reflects of it. What a light is mixed of follows from its paper.
+paper shows it in a channel, is the mean of their fields, weighted by what paper reflects of each into that channel; a
+coloured cell reflects other shares, and its mean is another. The frames of the primaries alone show both: the field of
+each, on paper, and what each cell reflects of it. What a light is mixed of follows from its paper.
+
+Why so: `docs/decisions/0014-fields-of-the-primaries.md`.
 """
 
 from __future__ import annotations
@@ -16,14 +18,15 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.lights.illuminations import Illumination
-from calibration.radiometry.fitting import product
-from calibration.radiometry.paper import Field, Paper
+from calibration.fitting.least_squares import product
+from calibration.radiometry.flat_field import FlatField
+from calibration.radiometry.paper import Paper
 
 LEAST_PAPER = 300.0
-"""Counts above black that paper must show under a primary for its field to be told."""
+"""Counts above black that paper must show under a primary for its field to be known well enough (judgement)."""
 
 _LARGEST = 0.2
-"""A cell's field differs from paper's by less than that, or it is not believed."""
+"""Share by which a cell's field may differ from paper's; beyond, the difference is noise and left out."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -50,11 +53,11 @@ class Primaries:
     Attributes
     ----------
     lights
-        Index of red, green and blue.
+        Index of the light of red alone, of green and of blue.
     fields
-        Each one's field, of the channel that sees it best, for all channels.
+        The flat field of each, from the channel in which it is brightest, the same for all channels.
     paper
-        (3, 3) float64 counts of bare paper by primary and channel, field divided out.
+        (3, 3) float64 counts above black of bare paper by primary and channel, field divided out.
     at_cells
         (3, C) float64, the fields at the cells.
     cells
@@ -62,7 +65,7 @@ class Primaries:
     """
 
     lights: tuple[int, int, int]
-    fields: tuple[Field, Field, Field]
+    fields: tuple[FlatField, FlatField, FlatField]
     paper: _Array
     at_cells: _Array
     cells: _Array
@@ -71,18 +74,18 @@ class Primaries:
     def of(
         lights: Sequence[int], papers: Sequence[Paper], cells: Sequence[_Array], cells_mm: _Array
     ) -> Primaries | None:
-        """Return the primaries, None where one is too dim to tell.
+        """Return the primaries, None where paper shows less than `LEAST_PAPER` counts under one.
 
         Parameters
         ----------
         lights
-            Their indices.
+            Indices of red, green and blue.
         papers
-            What paper says in the frame of each.
+            Bare paper in the frame of each.
         cells
-            (C, 3) mean counts of each cell in them, field divided out.
+            (C, 3) float64 mean counts of each cell in each frame, field divided out.
         cells_mm
-            (C, 2) places.
+            (C, 2) float64 mm, the cells' centres.
         """
         white = np.array([paper.white for paper in papers])
         if white.max(axis=1).min() < LEAST_PAPER:
@@ -98,13 +101,16 @@ class Primaries:
         )
 
     def amounts(self, white: _Array) -> _Array:
-        """Return how much of each primary (3,) a light is made of, given its paper (3,) in counts; ≥ 0."""
+        """Return how much of each primary (3,) float64, ≥ 0, a light is made of, given its paper (3,) in counts.
+
+        By non-negative least squares; 1 is the primary as bright as in its own frame.
+        """
         from scipy.optimize import nnls
 
         return np.asarray(nnls(self.paper.T, np.maximum(white, 0))[0])
 
-    def beside_paper(self, white: _Array) -> _Array:
-        """Return the field of each cell over the field of paper in its place, (C, 3), near 1.
+    def field_ratio(self, white: _Array) -> _Array:
+        """Return the field of each cell over the field of paper in its place, (C, 3) float64, near 1.
 
         Parameters
         ----------
@@ -126,11 +132,11 @@ class Primaries:
 
     @property
     def difference(self) -> float:
-        """By how much the fields of two primaries differ at a cell, at most, as a share."""
+        """Largest difference of two primaries' fields at a cell, as a share."""
         return float((self.at_cells.max(axis=0) / self.at_cells.min(axis=0)).max() - 1)
 
     def correction(self, white: _Array) -> dict[str, Any]:
-        """Return what was done, for `lut.json`; `white` is (L, 3), paper under each light."""
+        """Return what was done, for `lut.json`; `white` is (L, 3) counts, paper under each light."""
         return {
             "name": "primaries",
             "how": "samples divided by R besides the field: R = [sum w F a / sum w a] / [sum w F p / sum w p], sums "
@@ -144,6 +150,6 @@ class Primaries:
         }
 
 
-def _for_all_channels(field: Field, channel: int) -> Field:
+def _for_all_channels(field: FlatField, channel: int) -> FlatField:
     factors = field.coefficients[channel]
-    return Field(field.page_mm, (factors, factors, factors))
+    return FlatField(field.page_mm, (factors, factors, factors))

@@ -1,4 +1,4 @@
-"""What the camera sees of a printed code: fitted on the frame itself, so that no print or light need be known.
+"""A model of the camera RGB of printed codes, fitted on the frame itself: neither print nor light need be known.
 
 Counts above black, camera RGB; codes 0 … 255; millimetres on the page.
 """
@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.radiometry.fitting import least_squares
+from calibration.fitting.least_squares import least_squares
+from calibration.fitting.polynomials import code_powers
 from foundation.robust import huber_weights, sigma_of
 
 _Array = npt.NDArray[np.float64]
@@ -38,28 +39,16 @@ class ColourModel:
     page_mm: tuple[float, float]
 
     def flat(self, rgb: npt.ArrayLike) -> _Array:
-        """Return camera RGB (N, 3), counts, of printed codes (N, 3) under even light."""
+        """Return camera RGB (N, 3) float64, counts, of printed codes (N, 3), 0 … 255, under even light."""
         return _code_terms(rgb, self.degree) @ self.coefficients
 
     def light_at(self, points_mm: _Array) -> _Array:
-        """Return the light (N, 3) at points of the page, mean about 1."""
+        """Return the light (N, 3) float64 at points (N, 2) mm of the page, mean about 1."""
         return _page_terms(points_mm, self.page_mm) @ self.light
 
     def seen(self, rgb: npt.ArrayLike, points_mm: _Array) -> _Array:
-        """Return camera RGB (N, 3), counts, of printed codes at points of the page."""
+        """Return camera RGB (N, 3) float64, counts, of printed codes (N, 3) at points (N, 2) mm of the page."""
         return self.flat(rgb) * self.light_at(points_mm)
-
-
-def code_powers(degree: int) -> list[tuple[int, int, int]]:
-    """Return the degrees in red, green and blue of each term of a polynomial in codes of total degree `degree`."""
-    return [(i, j, k) for i in range(degree + 1) for j in range(degree + 1 - i) for k in range(degree + 1 - i - j)]
-
-
-def code_polynomial(rgb: npt.ArrayLike, degree: int) -> _Array:
-    """Return the basis (C, terms) of printed codes (C, 3): products of Legendre polynomials as in `code_powers`."""
-    unit = 2 * np.asarray(rgb, dtype=np.float64) / 255 - 1
-    axes = [np.asarray(np.polynomial.legendre.legvander(unit[:, axis], degree), dtype=np.float64) for axis in range(3)]
-    return np.stack([axes[0][:, i] * axes[1][:, j] * axes[2][:, k] for i, j, k in code_powers(degree)], axis=-1)
 
 
 def _code_terms(rgb: npt.ArrayLike, degree: int) -> _Array:
@@ -75,20 +64,22 @@ def _page_terms(points_mm: _Array, page_mm: tuple[float, float]) -> _Array:
 def fit_colours(
     rgb: _Array, points_mm: _Array, seen: _Array, page_mm: tuple[float, float], finely: bool = False
 ) -> ColourModel:
-    """Return the colour model through patches, robust against those that are covered or not where they are thought.
+    """Return the colour model through patches, robust against those that are covered or displaced.
+
+    Alternating least squares for polynomial and light, reweighted by Huber's weights.
 
     Parameters
     ----------
     rgb
-        (N, 3) printed codes.
+        (N, 3) printed codes, 0 … 255.
     points_mm
-        (N, 2) centres.
+        (N, 2) mm, centres.
     seen
-        (N, 3) camera RGB, counts.
+        (N, 3) float64 camera RGB, counts above black.
     page_mm
         Width and height of the sheet.
     finely
-        Whether the steps between neighbouring codes must be true: a polynomial of degree 6 or 8 where patches suffice,
+        Whether the steps between neighbouring codes matter: a polynomial of degree 6 or 8 where patches suffice,
         which leaves a third of what one of degree 3 leaves.
     """
     degree = (

@@ -14,7 +14,10 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 _ROUGHNESS_PX = 0.1
-"""Second difference of the displacement between knots that is thought usual: a wave of 2 px every 30 knots."""
+"""Usual second difference of the displacement between knots: a wave of 2 px amplitude every 30 knots."""
+
+_RIDGE = 1e-3
+"""px⁻², on the diagonal: keeps knots that no measurement reaches solvable, and is nothing to a measured cell's."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -37,12 +40,12 @@ class Displacement:
 
     @classmethod
     def over(cls, low_mm: _Array, high_mm: _Array, knot_mm: float) -> Displacement:
-        """Return the displacement zero over a rectangle, with knots about `knot_mm` apart."""
+        """Return the displacement 0 over a rectangle between corners (2,) mm, with knots about `knot_mm` apart."""
         spans = np.maximum(np.ceil((high_mm - low_mm) / knot_mm), 1).astype(int)
         return cls(low_mm, (high_mm - low_mm) / spans, np.zeros((spans[1] + 3, spans[0] + 3, 2)))
 
     def basis(self, points_mm: npt.ArrayLike) -> sparse.csr_array:
-        """Return the (N, coefficients) matrix of the splines at points; outside, the border's cubic goes on."""
+        """Return the splines (N, coefficients) at points (N, 2) mm; outside, the border's cubic goes on."""
         rows, columns = self.coefficients.shape[:2]
         points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
         at = (points - self.origin_mm) / self.knot_mm
@@ -55,7 +58,7 @@ class Displacement:
         return sparse.csr_array((values.ravel(), (row, index.ravel())), shape=shape)
 
     def at(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the displacement (N, 2) px at points (N, 2) mm."""
+        """Return the displacement (N, 2) float64 px at points (N, 2) mm."""
         return np.asarray(self.basis(points_mm) @ self.coefficients.reshape(-1, 2))
 
     def fitted(self, points_mm: _Array, information: _Array, pull: _Array) -> Displacement:
@@ -66,7 +69,7 @@ class Displacement:
         Parameters
         ----------
         points_mm
-            (N, 2) where it was measured.
+            (N, 2) mm, where it was measured.
         information
             (N, 2, 2) A: inverse covariance of each measurement, px⁻²; 0 where nothing was seen.
         pull
@@ -76,8 +79,7 @@ class Displacement:
         rows, columns = self.coefficients.shape[:2]
         blocks = [[basis.T @ sparse.diags_array(information[:, i, j]) @ basis for j in (0, 1)] for i in (0, 1)]
         penalty = _second_differences(rows, columns) / _ROUGHNESS_PX**2
-        # A hair of ridge keeps knots that no measurement reaches solvable; 1 px⁻² counts for nothing beside a cell.
-        penalty = penalty + sparse.identity(rows * columns) * 1e-3
+        penalty = penalty + sparse.identity(rows * columns) * _RIDGE
         matrix = sparse.block_array([[blocks[0][0] + penalty, blocks[0][1]], [blocks[1][0], blocks[1][1] + penalty]])
         right = np.concatenate([basis.T @ pull[:, 0], basis.T @ pull[:, 1]])
         solution = np.asarray(sparse_linalg.spsolve(sparse.csc_array(matrix), right))

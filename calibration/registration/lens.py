@@ -15,6 +15,10 @@ from scipy import optimize
 from acquisition.framing.homography import fit_homography, project
 from foundation.errors import RegistrationError
 
+_PAIRS_FOR_ALL, _PAIRS_FOR_ONE = 48, 16
+"""Pairs from which on all four coefficients are fitted, or the first: the corners of twelve tags and of four. Fewer do
+not determine them, and each would fit noise."""
+
 _Array = npt.NDArray[np.float64]
 
 
@@ -40,7 +44,7 @@ class Lens:
     distortion: _Array
 
     def to_pixels(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return places (N, 2) of points (N, 2) on the print."""
+        """Return places (N, 2) float64 half-size px, x then y, of points (N, 2) mm on the print."""
         k1, k2, p1, p2 = self.distortion
         x, y = ((project(self.homography, points_mm) - self.centre_px) / self.radius_px).T
         r2 = x * x + y * y
@@ -59,12 +63,12 @@ def fit_lens(
 ) -> tuple[Lens, _Array]:
     """Return the lens through point pairs and the residuals.
 
-    Plain least squares first, then robustly: robust from the start it sticks far off.
+    Plain least squares first, then robust (soft L1 beyond 1 px): robust from the start it stops in a local minimum.
 
     Parameters
     ----------
     points_mm, places_px
-        (N, 2) pairs, N ≥ 8.
+        (N, 2) float64 pairs, mm and half-size px, N ≥ 8.
     frame_size
         Width and height of the frame, half-size px.
     normals
@@ -74,11 +78,15 @@ def fit_lens(
     -------
     Lens, ndarray
         (N, 2) float64 residuals, seen minus fitted, px; along the normals if there are some.
+
+    Raises
+    ------
+    RegistrationError
+        The points lie on one line.
     """
     centre = (np.array(frame_size, dtype=np.float64) - 1) / 2
     radius = float(np.hypot(*frame_size)) / 2
-    # Few tags cannot tell the coefficients apart; each is given up where it would only fit noise.
-    free = 4 if len(points_mm) >= 48 else 1 if len(points_mm) >= 16 else 0
+    free = 4 if len(points_mm) >= _PAIRS_FOR_ALL else 1 if len(points_mm) >= _PAIRS_FOR_ONE else 0
     middle, spread = points_mm.mean(axis=0), points_mm.std(axis=0).max()
     normal = np.array([[1 / spread, 0, -middle[0] / spread], [0, 1 / spread, -middle[1] / spread], [0, 0, 1]])
     start = fit_homography((points_mm - middle) / spread, (places_px - centre) / radius)

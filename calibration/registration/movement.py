@@ -12,25 +12,50 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.framing.finding import Framing
 from acquisition.framing.planes import Plane
-from acquisition.framing.tagless_field import Field
-from acquisition.framing.tags import FoundTag, Framing
+from acquisition.framing.tagless_field import FoundField
+from acquisition.framing.tags import FoundTag
 from foundation.robust import huber_weights, sigma_of
 
 MAX_SHIFT_PX = 3.0
+"""Half-size px that are measured at most: an edge that moved further has left the crop around its tag or its strip."""
+
+STILL_PX = 0.1
+"""Half-size px that the chart may move before the sampling grid follows: a fifth of the rounding of samples' places."""
+
+BUMP_PX = 0.5
+"""Half-size px from which on the chart is registered again: camera or print was knocked, and may have turned too."""
 
 _GAUGE_TAGS = 8
+"""Tags that are measured: the median of eight has an error of 0.005 px where paper has 290 counts."""
+
 _STEPS = 5
+"""Gauss-Newton steps at most."""
+
+_SETTLED_PX = 1e-3
+"""Step from which on no other is made: a fifth of the error."""
+
 _AROUND_TAG_PX = 12
+"""Half-size px around a tag that are read: the largest movement, the smoothing, and a turned tag's corners."""
 
 _STRIPS = 32
+"""Strips spread over the field's outline: eight a side, of which covered ones are outvoted."""
+
 _STRIP_ALONG, _STRIP_ACROSS = 30, 8
 """Half the length and the width of a strip, px."""
 
 _STRIP_REACH_PX = 6
+"""Half-size px around a strip that are read: the largest movement, the steps' overshoot and cubic interpolation."""
+
 _MIN_STRIPS = 8
-_LEAST_ALIKE = 0.5
+"""Strips that must be measured for shift, turn and growth to be known twice over."""
+
+_LEAST_CORRELATION = 0.5
+"""Of a tag or strip with itself in the earlier frame, for its movement to count (judgement)."""
+
 _LEAST_INDEPENDENT = 1e-6
+"""Least eigenvalue of a tag's scaled normal matrix; below, its picture is too plain to measure a movement."""
 
 _Points = npt.NDArray[np.float64]
 
@@ -42,11 +67,11 @@ class Shift:
     Attributes
     ----------
     dx, dy
-        Median over the tags measured, or what most of the strips say; half-size px, positive when the chart lies
+        Median over the tags measured, or the robust fit of the strips; half-size px, positive when the chart lies
         further right or down.
     largest_px
         The largest movement of a tag, or of a corner of the field, so that a rotation shows.
-    tags
+    gauges
         Tags, or strips, that could be measured; 0 leaves the rest 0 and means unknown.
     softer_px2
         How much more blurred the later frame is: the difference of the blurs' variances, half-size px², negative when
@@ -56,7 +81,7 @@ class Shift:
     dx: float
     dy: float
     largest_px: float
-    tags: int
+    gauges: int
     softer_px2: float = 0.0
 
     @property
@@ -66,7 +91,7 @@ class Shift:
 
 
 def gauge_boxes(framing: Framing) -> list[tuple[int, int, int, int]]:
-    """Return the parts of a plane that `shift_between` looks at: left, top, right, bottom, within some pixels."""
+    """Return the parts of a plane that `shift_between` reads, in elements: left, top, right, bottom (exclusive)."""
     if framing.field is None:
         outlines, around = [tag.corners_px for tag in _gauge_tags(framing)], _AROUND_TAG_PX
     else:
@@ -111,7 +136,7 @@ def _gauge_tags(framing: Framing) -> list[FoundTag]:
 
 
 def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
-    """Return the movement of one tag and how much softer it is, (3,), or None where they cannot be told."""
+    """Return the movement of one tag and its growth of blur, (3,) px, px, px², or None where it cannot be measured."""
     margin = int(np.ceil(MAX_SHIFT_PX)) + 2
     height, width = reference.values.shape
     corners = tag.corners_px - reference.offset_px
@@ -150,13 +175,13 @@ def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
         shift -= np.clip(step, -1, 1)
         if np.abs(shift).max() > MAX_SHIFT_PX + 1:
             return None
-        if np.abs(step).max() < 1e-3:
+        if np.abs(step).max() < _SETTLED_PX:
             break
     correlation = np.corrcoef(now, template)[0, 1]
-    return np.append(shift, softer) if correlation > 0.5 else None
+    return np.append(shift, softer) if correlation > _LEAST_CORRELATION else None
 
 
-def _strips(field: Field) -> tuple[_Points, _Points]:
+def _strips(field: FoundField) -> tuple[_Points, _Points]:
     """Return the middles (K, 2) px of strips spread over the field's outline, and the directions (K, 2) across it."""
     chosen = np.unique(np.linspace(0, len(field.outline_px) - 1, _STRIPS).round().astype(int))
     return field.outline_px[chosen], field.normals[chosen]
@@ -170,7 +195,7 @@ def _strip_places(middles: _Points, normals: _Points) -> _Points:
     return middles[:, None, None] + u * along[:, None, None] + v * normals[:, None, None]
 
 
-def _field_shift(reference: Plane, plane: Plane, field: Field) -> Shift:
+def _field_shift(reference: Plane, plane: Plane, field: FoundField) -> Shift:
     """Return the movement of the field, from how far strips of its outline moved across themselves."""
     unknown = Shift(0.0, 0.0, 0.0, 0)
     middles, normals = _strips(field)
@@ -187,7 +212,7 @@ def _field_shift(reference: Plane, plane: Plane, field: Field) -> Shift:
     # As for a tag, but blur along an edge shows nothing.
     bend = np.zeros_like(before)
     bend[:, :, 1:-1] = np.diff(before, 2, axis=2)
-    # A strip's ends have no neighbours to tell the slope from.
+    # At a strip's ends there are no neighbours on both sides, whose difference is the slope.
     seen = np.s_[:, :, 1:-1]
     template, slope, bend = (picture[seen].reshape(len(middles), -1) for picture in (before, slope, bend))
     design = np.stack([template, np.ones_like(template), slope, bend], axis=-1)
@@ -203,12 +228,12 @@ def _field_shift(reference: Plane, plane: Plane, field: Field) -> Shift:
         solution = found[..., 0]
         step = solution[:, 2] / np.maximum(solution[:, 0], 1e-6)
         moved = np.clip(moved - np.clip(step, -1, 1), -MAX_SHIFT_PX - 1, MAX_SHIFT_PX + 1)
-        if np.abs(step).max() < 1e-3:
+        if np.abs(step).max() < _SETTLED_PX:
             break
     centred = [values - values.mean(axis=1, keepdims=True) for values in (template, now)]
     power = np.sqrt((centred[0] ** 2).sum(axis=1) * (centred[1] ** 2).sum(axis=1))
-    alike = (centred[0] * centred[1]).sum(axis=1) / np.maximum(power, 1e-9)
-    good = (alike > _LEAST_ALIKE) & (np.abs(moved) < MAX_SHIFT_PX)
+    correlation = (centred[0] * centred[1]).sum(axis=1) / np.maximum(power, 1e-9)
+    good = (correlation > _LEAST_CORRELATION) & (np.abs(moved) < MAX_SHIFT_PX)
     if good.sum() < max(_MIN_STRIPS, 0.5 * len(middles)):
         return unknown
     left = now - np.einsum("kni,ki->kn", design, solution)
@@ -225,13 +250,15 @@ def _sampled(plane: Plane, places: _Points) -> _Points:
     return (np.roll(found, 1, axis=1) + 2 * found + np.roll(found, -1, axis=1)) / 4
 
 
-def _rigid(middles: _Points, normals: _Points, moved: _Points, weights: _Points, field: Field, softer: float) -> Shift:
-    """Return the shift, turn and growth that movements (K,) across strips tell of, robustly."""
+def _rigid(
+    middles: _Points, normals: _Points, moved: _Points, weights: _Points, field: FoundField, softer: float
+) -> Shift:
+    """Return the robust fit of shift, turn and growth of the field to movements (K,) px across strips."""
     centre = field.corners_px.mean(axis=0)
     x, y = ((middles - centre) / np.abs(field.corners_px - centre).max()).T
     # A turn moves (x, y) by (−y, x), a growth by (x, y).
-    aside = np.stack([normals[:, 1] * x - normals[:, 0] * y, normals[:, 0] * x + normals[:, 1] * y], axis=-1)
-    design = np.column_stack([normals, aside])
+    turn_and_growth = np.stack([normals[:, 1] * x - normals[:, 0] * y, normals[:, 0] * x + normals[:, 1] * y], axis=-1)
+    design = np.column_stack([normals, turn_and_growth])
     motion = np.zeros(4)
     trust = np.ones(len(moved))
     for _ in range(4):

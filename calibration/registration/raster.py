@@ -1,6 +1,6 @@
-"""The print's own raster: a frame rectified to it and the print drawn on it can be compared element by element.
+"""A raster on the print, in which the rectified frame and the print as drawn can be compared element by element.
 
-Pure geometry and sums; knows neither lenses nor colours. Elements, millimetres on the print, and half-size pixels.
+Pure geometry and sums, without lenses or colours. Elements, millimetres on the print, and half-size pixels.
 """
 
 from __future__ import annotations
@@ -22,9 +22,23 @@ ToPixels = Callable[[_Array], _Array]
 """From points (N, 2) mm to places (N, 2) px."""
 
 
+_LATTICE_STRIDE = 8
+"""Elements between nodes of the lattice on which maps are computed: bilinear within, they are off by < 0.001 px."""
+
+
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """A raster on the print: element (row, column) has its centre at low + (column + ½, row + ½) · step."""
+    """A raster on the print: element (row, column) has its centre at low + (column + ½, row + ½) · step.
+
+    Attributes
+    ----------
+    low_mm
+        (2,) float64, corner of the first element, x then y.
+    step_mm
+        (2,) float64, an element's width and height.
+    shape
+        Rows and columns.
+    """
 
     low_mm: _Array
     step_mm: _Array
@@ -36,7 +50,7 @@ class Raster:
         return cls(low_mm, step_mm, (int(size[1]), int(size[0])))
 
     def point(self, column: float, row: float) -> _Array:
-        """Return the place (2,) mm of a border between elements."""
+        """Return the place (2,) float64 mm of a border between elements."""
         return self.low_mm + np.array([column, row]) * self.step_mm
 
     def tiles(self, size: int) -> tuple[int, int]:
@@ -44,21 +58,21 @@ class Raster:
         return self.shape[0] // size, self.shape[1] // size
 
     def points_of_tiles(self, size: int) -> _Array:
-        """Return the middles (N, 2) mm of tiles of size × size elements, row by row."""
+        """Return the middles (N, 2) float64 mm of tiles of size × size elements, row by row."""
         rows, columns = self.tiles(size)
         y, x = np.mgrid[:rows, :columns]
         return self.low_mm + (np.stack([x.ravel(), y.ravel()], axis=-1) + 0.5) * size * self.step_mm
 
     def _lattice(self, to_pixels: ToPixels) -> tuple[_Array, int]:
-        """Return the map on a coarse lattice: nodes every `stride` elements from the first border on."""
-        stride = 8
+        """Return the map (rows, columns, 2) px on a coarse lattice, and its stride: nodes from the first border on."""
+        stride = _LATTICE_STRIDE
         rows, columns = (-(-length // stride) + 1 for length in self.shape)
         y, x = np.mgrid[:rows, :columns] * stride
         points = self.low_mm + np.stack([x.ravel(), y.ravel()], axis=-1) * self.step_mm
         return to_pixels(points).reshape(rows, columns, 2), stride
 
     def spread(self, to_pixels: ToPixels) -> _Float:
-        """Return the places (H, W, 2) float32 px of all elements; exact on a lattice, bilinear within (< 0.001 px)."""
+        """Return the places (H, W, 2) float32 px, x then y, of all elements; exact on a lattice, bilinear within."""
         lattice, stride = self._lattice(to_pixels)
         rows, columns = ((np.arange(length) + 0.5) / stride for length in self.shape)
         i, j = rows.astype(int), columns.astype(int)
@@ -79,7 +93,13 @@ class Raster:
         return np.asarray(cv2.remap(coarse, where_x, where_y, cv2.INTER_LINEAR), dtype=np.float32)
 
     def coverage(self, centres_mm: _Array, sizes_mm: _Array) -> sparse.csr_array:
-        """Return the share of each element that each rectangle covers, (H · W, N)."""
+        """Return the share of each element that each rectangle covers, (H · W, N) float32.
+
+        Parameters
+        ----------
+        centres_mm, sizes_mm
+            (N, 2) float64, x then y.
+        """
         height, width = self.shape
         low = (centres_mm - sizes_mm / 2 - self.low_mm) / self.step_mm
         high = (centres_mm + sizes_mm / 2 - self.low_mm) / self.step_mm
@@ -107,16 +127,16 @@ class Raster:
         )
 
     def near(self, cover: sparse.csr_array, per_cell: int) -> _Mask:
-        """Return which elements (H, W) are covered by a patch, or lie within a fifth of a cell of one.
+        """Return which elements (H, W) bool are covered by a patch, or lie within a fifth of a cell of one.
 
-        The margin beyond may hold anything: rulers, text, pins.
+        The margin beyond may have anything on it: rulers, text, pins.
         """
         covered = (np.diff(cover.indptr) > 0).reshape(self.shape).astype(np.uint8)
         reach = 2 * max(1, round(0.2 * per_cell)) + 1
         return np.asarray(cv2.dilate(covered, np.ones((reach, reach), dtype=np.uint8))).astype(np.bool_)
 
     def outside_tags(self, tags: tuple[Tag, ...]) -> _Mask:
-        """Return which elements (H, W) lie clear of every tag and its white rim."""
+        """Return which elements (H, W) bool lie clear of every tag and its white rim."""
         free = np.ones(self.shape, dtype=bool)
         for tag in tags:
             rim = np.ptp(tag.corners_mm, axis=0).max() / 8 * 1.5
@@ -128,7 +148,7 @@ class Raster:
 
 
 def tiles(shape: tuple[int, int], size: int, margin: int) -> Generator[tuple[slice, slice]]:
-    """Yield tiles of about size × size elements that leave a margin all round."""
+    """Yield rows and columns of tiles of size × size elements, evenly spread, that leave a margin all round."""
     starts: list[npt.NDArray[np.int64]] = []
     for length in shape:
         count = max(1, round((length - 2 * margin) / size))
@@ -140,14 +160,20 @@ def tiles(shape: tuple[int, int], size: int, margin: int) -> Generator[tuple[sli
 
 
 def jacobians(to_pixels: ToPixels, points_mm: _Array, step_mm: _Array) -> _Array:
-    """Return ∂(x, y) px / ∂(column, row) of a raster at points, (N, 2, 2)."""
+    """Return ∂(x, y) px / ∂(column, row) at points (N, 2) mm of a raster with elements of `step_mm` (2,).
+
+    (N, 2, 2) float64.
+    """
     reach = np.diag(step_mm)
     slopes = [(to_pixels(points_mm + reach[axis]) - to_pixels(points_mm - reach[axis])) / 2 for axis in (0, 1)]
     return np.stack(slopes, axis=-1)
 
 
 def to_pixel_units(sums: _Array, jacobians: _Array) -> tuple[_Array, _Array]:
-    """Return information (N, 2, 2) px⁻² and pull (N, 2) px⁻¹ of sums xx, xy, yy, xe, ye taken in raster elements."""
+    """Return information (N, 2, 2) px⁻² and pull (N, 2) px⁻¹ of sums (N, 5) xx, xy, yy, xe, ye in raster elements.
+
+    x and y are the image's slopes, e its error; `jacobians` (N, 2, 2) are those of the map; all float64.
+    """
     inverse = np.linalg.inv(jacobians)
     matrix = sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     information = np.einsum("nji,njk,nkl->nil", inverse, matrix, inverse)
@@ -155,18 +181,18 @@ def to_pixel_units(sums: _Array, jacobians: _Array) -> tuple[_Array, _Array]:
 
 
 def box(image: npt.NDArray[np.floating], size: int) -> _Float:
-    """Return the mean over size × size elements around each."""
+    """Return the mean (H, W) float32 over size × size elements around each of an image (H, W)."""
     return np.asarray(cv2.blur(image, (size, size)), dtype=np.float32)
 
 
 def sums_of(image: npt.NDArray[np.floating], size: int) -> _Float:
-    """Return the sums over tiles of size × size elements; what is left over is dropped."""
+    """Return the sums (rows, columns) float32 of an image (H, W) over tiles of size × size; the rest is dropped."""
     rows, columns = (length // size for length in image.shape)
     mean = cv2.resize(image[: rows * size, : columns * size], (columns, rows), interpolation=cv2.INTER_AREA)
     return np.asarray(mean, dtype=np.float32) * np.float32(size * size)
 
 
 def tile_middles(image: npt.NDArray[np.floating], size: int) -> npt.NDArray[np.floating]:
-    """Return the element in the middle of each tile."""
+    """Return the middle element of each tile, (rows, columns) of the image's dtype, of an image (H, W)."""
     rows, columns = (length // size for length in image.shape)
     return image[size // 2 :: size, size // 2 :: size][:rows, :columns]

@@ -8,46 +8,35 @@ Laws that hold inside:
 - A chart without tags has the outline of its field for that, and is then followed from coarse to fine: a map that has
   slipped by a cell is looked for, and refused.
 - All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres.
-- The result judges itself. A registration that cannot be trusted is a `RegistrationError`, never a value.
+- A registration that cannot be trusted is a `RegistrationError`, never a value.
 
 Places are half-size pixels, pixel centres at integers; millimetres on the print.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from acquisition.chart.model import Chart
+from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.homography import rms
 from acquisition.framing.outline import refined
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
-from acquisition.framing.sharpness import blur_px
-from acquisition.framing.tagless_field import Field
-from acquisition.framing.tags import Framing, find_chart
-from calibration.registration.colour_model import ColourModel
-from calibration.registration.displacement import Displacement
+from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
+from acquisition.framing.tagless_field import FoundField
+from acquisition.framing.visibility import MIN_CELL_PX
+from calibration.registration.blocks import Blocks
+from calibration.registration.colour_checks import agreement, mismatched
 from calibration.registration.lens import Lens, fit_lens
-from calibration.registration.matching import Anchors, Blocks, Matcher, not_this_chart
+from calibration.registration.matching import Anchors, Matcher, not_this_chart
+from calibration.registration.registration import SAMPLE_REACH_PX, Registration
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import RegistrationError
-from foundation.robust import MAD_TO_SIGMA, sigma_of
-
-SAMPLE_REACH_PX = 3.25
-"""From a cell's true centre to the outer edge of its 25 pixels: 2.5, rounding 0.5, registration 0.25."""
-
-MIN_CELL_PX = 8.0
-"""Half-size pixels a cell must have for 25 of them to lie safely inside; 8.6 already bleeds 1 % at σ = 0.7."""
-
-MAX_BLUR_PX = 1.0
-"""σ of the tags' edges up to which cells of any size are found to a few hundredths of a pixel, as `acquire check` has
-it. What such a blur mixes into the samples depends on the cells' size, and the verdict judges it as bleed."""
-
-ROOM_PX = 1.75
-"""From there to the edge of a cell of 10 px, for which the limits of places were found."""
+from foundation.robust import sigma_of
 
 MAX_TAG_RESIDUAL_PX = 8.0
 """RMS of the tags against homography and distortion; 2.3 is a sheet that waves by 6 mm and curls by 10."""
@@ -59,104 +48,36 @@ MIN_PLAIN_AGREEMENT = 0.95
 """The same for a chart without tags, whose smooth order a model of colours can follow into a cover; 0.99 is usual."""
 
 MIN_GOOD_BLOCKS = 0.75
+"""Least share of the blocks of cells that look as the chart has them (judgement)."""
+
 MAX_BLOCK_RESIDUAL_PX = 0.5
+"""RMS displacement that blocks may still need, for cells of 10 px: twice what the samples' reach allows for, and more
+than ten times what a sheet that waves by 3 mm leaves in simulated frames."""
 
 _GAUSS_NEWTON_STEPS = 5
+"""Steps at most; each is the cost of a comparison of all cells."""
+
+_SETTLED_PX = 0.01
+"""RMS movement of a step below which there is none to follow: a third of the map's own error."""
+
 _TAG_SIGMA_PX = 0.15
+"""Standard error of a tag's corner: 0.085 px measured in white light, .20 in a weak one."""
+
 _OUTLINE_SIGMA_PX = 0.1
+"""Standard error of a point of the outline, across it (judgement)."""
+
 _APART, _APART_PX = 5.0, 1.0
 """Points of an outline further from the lens than five of their standard deviations, and a pixel, are not of it."""
 
 _FOLLOWED_SOFTLY = (1.0, 1.0, 0.6)
 """Blur in cells of the steps that follow a chart without tags, before its cells are looked at."""
 
-_FEW_SLIPPED = 2
-_SLIPPED_SHARE = 0.015
-"""Parts of a field from which on it is refused; none looks slipped in any simulated room that is registered well."""
-
-_LEAST_COLOURS = 64
-"""A model fitted on fewer colours is no judge of one of them."""
-
-_STRANGE_SIGMA = 10.0
-_NEIGHBOURS = 13
-"""A cell and the twelve within two cells of it."""
-
-_STRANGE_NEIGHBOURS = 0.35
-_STRANGE_SHARE = 0.08
-"""Of paper white: the model's own errors at the gamut's corners stay below."""
+_FEW_SLIPPED, _SLIPPED_SHARE = 2, 0.015
+"""Number and share of a field's parts from which on it is refused: none looks slipped in any simulated room that is
+registered well."""
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class Registration:
-    """The chart's place in a frame.
-
-    Attributes
-    ----------
-    framing
-        The tags, or the field's outline, as found.
-    lens, displacement
-        The two parts of the map.
-    marks_residual_px
-        (N, 2) float64, the tags' corners against the final map; of a chart without tags the field's outline, across.
-    lens_residual_px
-        RMS of the same against the lens alone: what the paper's waviness leaves.
-    blocks
-        Fit of the cells.
-    colours
-        The colour model of the frame.
-    strangers
-        (N,) bool, cells in the chart's order whose colour is not nearly the model's: covered, damaged, misprinted.
-    agreement
-        Correlation of the cells' colours with the model's, the mean of the channels that carry light.
-    blur_px
-        σ of the tags' edges, or of the field's.
-    cell_px
-        Half-size pixels per cell, the shorter side of the smallest.
-    shift_px
-        Movement since the frame that was registered, (dx, dy).
-    """
-
-    framing: Framing
-    lens: Lens
-    displacement: Displacement
-    marks_residual_px: _Array
-    lens_residual_px: float
-    blocks: Blocks
-    colours: ColourModel
-    strangers: _Mask
-    agreement: float
-    blur_px: float
-    cell_px: float
-    shift_px: tuple[float, float] = (0.0, 0.0)
-
-    def to_pixels(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the half-size pixels (N, 2) float64, x then y, of points (N, 2) on the print."""
-        return self.lens.to_pixels(points_mm) + self.displacement.at(points_mm) + self.shift_px
-
-    def shifted(self, dx: float, dy: float) -> Registration:
-        """Return this registration for a frame in which the chart lies (dx, dy) px further."""
-        return replace(self, shift_px=(self.shift_px[0] + dx, self.shift_px[1] + dy))
-
-    @property
-    def marks_rms_px(self) -> float:
-        """RMS distance of the tags' corners, or the field's outline, from the final map."""
-        return rms(self.marks_residual_px)
-
-    @property
-    def block_rms_px(self) -> float:
-        """RMS of what the good blocks would still ask for: the registration's own estimate of its error."""
-        return rms(self.blocks.residual_px[self.blocks.good])
-
-    @property
-    def room(self) -> float:
-        """How much further samples are from their cells' edges than in cells of 10 px, ≥ 1: places matter less by it.
-
-        Cells of a hundred pixels are found to a pixel, which is nothing to them.
-        """
-        return max(1.0, (self.cell_px / 2 - SAMPLE_REACH_PX) / ROOM_PX)
 
 
 def register(
@@ -182,7 +103,7 @@ def register(
         For a chart without tags: (4, 2) half-size px, the corners of the field of cells, clockwise from the printed
         top-left, to some 20 px; found by themselves if not given.
     near
-        An earlier registration of the same session: a chart without tags then hangs the same way up.
+        An earlier registration of the same session: a chart without tags is then taken to hang the same way up.
 
     Raises
     ------
@@ -217,12 +138,12 @@ def register(
         for softness in _FOLLOWED_SOFTLY:
             matcher.follow(softness)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        if matcher.step() < 0.01:
+        if matcher.step() < _SETTLED_PX:
             break
     registration = _registered(chart, framing, matcher, marks, lens_rms)
     _judge(registration, MIN_AGREEMENT if chart.tags else MIN_PLAIN_AGREEMENT, what)
     if not chart.tags:
-        _require_own_cells(matcher, registration.strangers, what)
+        _require_own_cells(matcher, registration.mismatched_cells, what)
     return registration
 
 
@@ -233,20 +154,20 @@ def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
     return Anchors(corners_mm, corners_px, np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2)))
 
 
-def _outline(field: Field) -> Anchors:
-    """Return the field's outline, whose places are known across alone."""
+def _outline(field: FoundField) -> Anchors:
+    """Return the field's outline, whose places are known across it and not along it."""
     known = np.einsum("ni,nj->nij", field.normals, field.normals) / _OUTLINE_SIGMA_PX**2
     return Anchors(field.outline_mm, field.outline_px, known)
 
 
-def _clear_edges(field: Field, planes: list[Plane], blur: float) -> Field:
+def _clear_edges(field: FoundField, planes: list[Plane], blur: float) -> FoundField:
     """Return the field with its outline measured finely, where it is clear enough for that."""
     places, clear = refined(planes, field.outline_px, field.normals, blur)
     return replace(field, outline_mm=field.outline_mm[clear], outline_px=places[clear], normals=field.normals[clear])
 
 
-def _field_through_lens(field: Field, frame_size: tuple[int, int]) -> tuple[Field, Lens, _Array]:
-    """Return the field without points of its outline that stand apart, which are marks; its lens; and residuals."""
+def _field_through_lens(field: FoundField, frame_size: tuple[int, int]) -> tuple[FoundField, Lens, _Array]:
+    """Return the field without outlying points of its outline, which are marks in the margin; its lens; residuals."""
     lens, residual = fit_lens(field.outline_mm, field.outline_px, frame_size, field.normals)
     for _ in range(2):
         size = np.linalg.norm(residual, axis=1)
@@ -261,15 +182,15 @@ def _field_through_lens(field: Field, frame_size: tuple[int, int]) -> tuple[Fiel
     return field, lens, residual
 
 
-def _require_own_cells(matcher: Matcher, strangers: _Mask, what: str) -> None:
-    """Refuse a map on which parts of the field show the colours of the cells beside them."""
-    places, parts = matcher.slipped(strangers)
+def _require_own_cells(matcher: Matcher, mismatched_cells: _Mask, what: str) -> None:
+    """Refuse a map on which parts of the field show the colours of the neighbouring cells."""
+    places, parts = matcher.slipped(mismatched_cells)
     if len(places) >= max(_FEW_SLIPPED, _SLIPPED_SHARE * parts):
         x, y = places[0]
         raise RegistrationError(
-            f"{what}: {len(places)} of {parts} parts of the field look as if they lay one cell aside, the first about "
-            f"{x:.0f}, {y:.0f} mm from the sheet's top-left corner; uncover the print, hang it flatter, and see that "
-            "chart.json has its cells where they are printed"
+            f"{what}: {len(places)} of {parts} parts of the field have the colours of the cells beside them, the "
+            f"first at about {x:.0f}, {y:.0f} mm from the sheet's top-left corner; uncover the print, hang it flatter, "
+            "and see that chart.json has its cells where they are printed"
         )
 
 
@@ -287,6 +208,8 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
             f"{what}: a cell is {cell_px:.1f} px wide, at least {MIN_CELL_PX:g} expected for 25 pixels inside it; "
             "bring the camera nearer"
         )
+    # Up to MAX_BLUR_PX cells of any size are found to a few hundredths of a pixel. What such a blur mixes into their
+    # samples depends on the cells' size; the verdict judges it as bleed.
     allowed = max(MAX_BLUR_PX, (cell_px / 2 - SAMPLE_REACH_PX) / 2)
     if not blur <= allowed:
         raise RegistrationError(
@@ -296,21 +219,17 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
 
 
 def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors, lens_rms: float) -> Registration:
-    """Return the map with everything that tells how good it is."""
-    seen, wanted, paper = matcher.patches()
+    """Return the map with all figures of its quality."""
+    seen, expected, paper = matcher.patches()
     there = np.asarray(np.isfinite(seen).all(axis=1))
     residual = marks.places_px - matcher.to_pixels(marks.points_mm)
     if framing.field is not None:
         residual = (residual * framing.field.normals).sum(axis=1, keepdims=True) * framing.field.normals
-    strangers = np.zeros(chart.colour_count, dtype=np.bool_)
-    if chart.colour_count >= _LEAST_COLOURS:
-        strangers = _with_neighbours(
-            _strangers(seen, wanted, paper)[: chart.colour_count], chart.centres_mm / np.array(chart.cell_mm)
-        )
+    mismatched_cells = mismatched(seen, expected, paper, chart)
     blocks = matcher.blocks()
     if not chart.tags:
-        there[: chart.colour_count] &= ~strangers
-        blocks = _without_strangers(blocks, strangers, chart)
+        there[: chart.colour_count] &= ~mismatched_cells
+        blocks = _without_mismatched_cells(blocks, mismatched_cells, chart)
     return Registration(
         framing=framing,
         lens=matcher.lens,
@@ -319,43 +238,22 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
         lens_residual_px=lens_rms,
         blocks=blocks,
         colours=matcher.colours,
-        strangers=strangers,
-        agreement=_agreement(seen[there], wanted[there]),
+        mismatched_cells=mismatched_cells,
+        agreement=agreement(seen[there], expected[there]),
         blur_px=matcher.blur_px,
         cell_px=matcher.cell_px,
     )
 
 
-def _without_strangers(blocks: Blocks, strangers: _Mask, chart: Chart) -> Blocks:
-    """Return blocks whose score sinks with the share of strangers: a smooth order looks alike through a wide window."""
+def _without_mismatched_cells(blocks: Blocks, mismatched_cells: _Mask, chart: Chart) -> Blocks:
+    """Return blocks whose score sinks with their share of mismatched cells.
+
+    In a smooth order of colours neighbouring cells look alike through a wide window, covered or not.
+    """
     block = np.asarray(cKDTree(blocks.centres_mm).query(chart.centres_mm)[1])
     cells = np.maximum(np.bincount(block, minlength=len(blocks.score)), 1)
-    share = np.bincount(block, strangers, minlength=len(blocks.score)) / cells
+    share = np.bincount(block, mismatched_cells, minlength=len(blocks.score)) / cells
     return replace(blocks, score=blocks.score * (1 - share))
-
-
-def _strangers(seen: _Array, wanted: _Array, paper: _Array) -> _Mask:
-    """Return which patches (N,) differ from their model far more than is usual, and by a visible share of white."""
-    residual = np.abs(seen - wanted)
-    usual = MAD_TO_SIGMA * np.nanmedian(residual, axis=0)
-    return np.asarray(((residual > _STRANGE_SIGMA * usual) & (residual > _STRANGE_SHARE * paper)).any(axis=1))
-
-
-def _with_neighbours(strangers: _Mask, centres: _Array) -> _Mask:
-    """Return the strangers (N,) and the cells amid them, which a cover of their own colour would hide.
-
-    `centres` (N, 2) in cells.
-    """
-    near = cKDTree(centres).query(centres, k=min(_NEIGHBOURS, len(centres)))[1]
-    share = strangers[np.asarray(near).reshape(len(centres), -1)].mean(axis=1)
-    return np.asarray(strangers | (share > _STRANGE_NEIGHBOURS))
-
-
-def _agreement(seen: _Array, wanted: _Array) -> float:
-    """Return the correlation of colours with those wanted, the mean of the channels that carry most light."""
-    light = np.median(seen, axis=0)
-    used = np.flatnonzero(light >= 0.3 * light.max())
-    return float(np.mean([np.corrcoef(seen[:, channel], wanted[:, channel])[0, 1] for channel in used]))
 
 
 def _judge(registration: Registration, least_agreement: float, what: str) -> None:
@@ -371,9 +269,9 @@ def _judge(registration: Registration, least_agreement: float, what: str) -> Non
             what,
             f"{share:.0%} of the blocks of cells look as the chart has them, at least {MIN_GOOD_BLOCKS:.0%} needed",
         )
-    allowed = MAX_BLOCK_RESIDUAL_PX * registration.room
+    allowed = MAX_BLOCK_RESIDUAL_PX * registration.clearance
     if registration.block_rms_px > allowed:
         raise RegistrationError(
-            f"{what}: blocks of cells still ask for movements of {registration.block_rms_px:.2f} px RMS, "
+            f"{what}: the residual of the blocks of cells is {registration.block_rms_px:.2f} px RMS, at most "
             f"{allowed:.2g} allowed; hang the print flatter"
         )

@@ -21,12 +21,7 @@ from acquisition.framing.planes import CHANNELS, phases
 from drivers.raw.rawfile import Mosaic
 
 WINDOW = 5
-"""Pixels along the side of a cell's window, where no other is asked for: the paper's."""
-
-UNEVEN_SHARE = 0.01
-UNEVEN_SIGMA = 5.0
-"""Noise alone passes 3 σ in one of 370 comparisons, 265 of a whole chart's 98 304; 5 σ in one of 1.7 million."""
-_NOISE_BINS = 32
+"""Pixels along the side of a cell's window, where the user names no other: the paper's."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -89,11 +84,11 @@ def gather(
     highest
         (N,) uint16, the highest raw count of a patch's photosites.
     """
-    from calibration.sampling import loops
+    from calibration.sampling import kernels
 
     samples = np.empty((len(sites.rows), sites.window**2, 3), dtype=np.float32)
     highest = np.empty(len(sites.rows), dtype=np.uint16)
-    loops.sample(*_photosites(mosaic, black, sites), samples, highest)
+    kernels.sample(*_photosites(mosaic, black, sites), samples, highest)
     return samples, highest
 
 
@@ -109,7 +104,7 @@ def _photosites(
     int,
     npt.NDArray[np.float32],
 ]:
-    """Return the sensor, and where on it patches lie, as the compiled loops want them."""
+    """Return the sensor, and where on it patches lie, as the kernels expect them."""
     width, reach = mosaic.sensor.shape[1], sites.window // 2
     corner = (mosaic.visible.top + 2 * (sites.rows - reach)) * width + mosaic.visible.left + 2 * (sites.columns - reach)
     found = phases(mosaic)
@@ -150,11 +145,11 @@ def table_values(
     ndarray
         (N, S, 3) uint16.
     """
-    from calibration.sampling import loops
+    from calibration.sampling import kernels
 
     dark = np.zeros(field.shape, dtype=np.float32) if dark is None else dark
     values = np.empty(samples.shape, dtype=np.uint16)
-    loops.tabulate(samples, dark, field.astype(np.float32), values)
+    kernels.tabulate(samples, dark, field.astype(np.float32), values)
     return values
 
 
@@ -165,108 +160,14 @@ def gather_values(
     field: _Array,
     dark: npt.NDArray[np.float32] | None = None,
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
-    """Return `table_values` of what `gather` finds, and the highest counts, in a third of the time of both."""
-    from calibration.sampling import loops
+    """Return `table_values` of what `gather` returns, (N, S, 3) uint16, and the highest counts (N,) uint16.
+
+    In a third of the time of both; parameters as theirs.
+    """
+    from calibration.sampling import kernels
 
     dark = np.zeros(field.shape, dtype=np.float32) if dark is None else dark
     values = np.empty((len(sites.rows), sites.window**2, 3), dtype=np.uint16)
     highest = np.empty(len(sites.rows), dtype=np.uint16)
-    loops.sample_to_table(*_photosites(mosaic, black, sites), dark, field.astype(np.float32), values, highest)
+    kernels.sample_to_table(*_photosites(mosaic, black, sites), dark, field.astype(np.float32), values, highest)
     return values, highest
-
-
-def patch_means(values: npt.NDArray[np.uint16]) -> npt.NDArray[np.float64]:
-    """Return the means (N, 3) of patches' values (N, S, 3), in an eighth of numpy's time."""
-    from calibration.sampling import loops
-
-    means = np.empty((values.shape[0], 3))
-    loops.patch_means(values, means)
-    return means
-
-
-def _inner(samples: int) -> npt.NDArray[np.bool_]:
-    """Return which of a window's samples (S,) are not on its rim."""
-    window = round(samples**0.5)
-    inner = np.zeros((window, window), dtype=bool)
-    inner[1:-1, 1:-1] = True
-    return inner.ravel()
-
-
-def rim_against_middle(
-    samples: npt.NDArray[np.floating], noise: npt.NDArray[np.floating]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return by how much rim and middle of patches differ (N, 3), and the standard deviation of that; as `uneven`."""
-    inner = _inner(samples.shape[1])
-    middle = samples[:, inner].mean(axis=1, dtype=np.float64)
-    rim = samples[:, ~inner].mean(axis=1, dtype=np.float64)
-    return np.abs(rim - middle), noise * np.sqrt(1 / inner.sum() + 1 / (~inner).sum())
-
-
-def uneven(samples: npt.NDArray[np.floating], noise: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """Return how uneven patches are: the largest significant difference of rim and middle, relative, 0 where none is.
-
-    The outer pixels, 16 of 25, are compared with the inner ones, channel by channel; a difference counts when it
-    exceeds both 5 of its standard deviations and 1 % of the patch. In a window of 3×3 the inner one is a single pixel,
-    and what is found is coarse: 1.06 σ of one sample's noise, against 0.42 σ in 5×5.
-
-    Parameters
-    ----------
-    samples
-        (N, S, 3), the mean of one or more frames of equal light.
-    noise
-        (N, 3), standard deviation of one of these values.
-
-    Returns
-    -------
-    ndarray
-        (N,) float64.
-    """
-    difference, sigma = rim_against_middle(samples, noise)
-    level = np.maximum(samples.mean(axis=1, dtype=np.float64), 1e-6)
-    significant = (difference > UNEVEN_SIGMA * sigma) & (difference > UNEVEN_SHARE * level)
-    return np.where(significant, difference / level, 0.0).max(axis=1)
-
-
-DEAD_SHARE = 0.5
-DEAD_LEVEL = 300.0
-"""Counts that a cell must have for a dead photosite to be told from noise: 21 σ there."""
-
-
-def dead_samples(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
-    """Return which patches (N,) hold a photosite that sees less than half of what the others do.
-
-    `samples` (N, 25, 3) are counts above black, the mean of one or more frames. A green sample is the mean of two
-    photosites, so that one of them dead halves it.
-    """
-    middle = np.median(samples, axis=1, keepdims=True)
-    allowed = np.array([DEAD_SHARE, 0.5 * (1 + DEAD_SHARE), DEAD_SHARE])
-    return np.asarray(((samples < allowed * middle) & (middle > DEAD_LEVEL)).any(axis=(1, 2)))
-
-
-def noise_of(samples: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """Return the standard deviation of one value of each patch, (N, 3), as usual for patches of its level.
-
-    Measured in the inner pixels of all patches (in a 3×3 window, in all nine) and taken as a function of the level,
-    since nine values of one patch alone tell it to a quarter only.
-    """
-    inner = _inner(samples.shape[1])
-    # A rim that another colour bleeds into is no noise; a window too small to do without it keeps it.
-    middle = (samples[:, inner] if inner.sum() >= 9 else samples).astype(np.float64)
-    level, variance = middle.mean(axis=1), middle.var(axis=1, ddof=1)
-    noise = np.empty_like(level)
-    degrees = middle.shape[1] - 1
-    for channel in range(3):
-        order = np.argsort(level[:, channel])
-        bins: list[npt.NDArray[np.int64]] = np.array_split(order, max(1, min(_NOISE_BINS, len(order) // 16)))
-        at = np.array([float(np.median(level[part, channel])) for part in bins])
-        usual = np.array([float(np.median(variance[part, channel])) for part in bins]) / median_of_variance(degrees)
-        noise[:, channel] = np.interp(level[:, channel], at, np.sqrt(usual))
-    return noise
-
-
-def median_of_variance(degrees: int) -> float:
-    """Return the median of a variance of normal values over its mean, for its degrees of freedom.
-
-    Wilson and Hilferty's cube root (PNAS 1931): 0.919 for eight, where the exact value is 0.918.
-    """
-    return (1 - 2 / (9 * degrees)) ** 3

@@ -6,7 +6,7 @@ word, so that a table that was fetched is the one that was published, hash by ha
 
 Laws that hold inside:
 
-- The attributes are completed last: an array that does not say it is whole was never finished.
+- The attributes are completed last: an array without the attribute `whole` was never finished.
 - Nothing is overwritten but such an array.
 - A table that is fetched appears in its folder whole and verified, or not at all.
 
@@ -16,8 +16,6 @@ Needs zarr, the extra `cluster`.
 from __future__ import annotations
 
 import base64
-import hashlib
-import io
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
@@ -27,16 +25,21 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from calibration.table.lut import FRAMES, SAMPLES, Lut, open_lut
+from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, REFERENCES, SAMPLES
+from calibration.table.lut import Lut, open_lut
+from calibration.table.sample_hashes import light_sha256
 from foundation.errors import CropError, FormatError, InputError, StorageError
 from foundation.files import require_free, storage_error, whole_folder, write_whole
+from foundation.hashing import file_sha256
 
 FORMAT: Final = "crop.lut.published"
 VERSION: Final = 1
-SHARD_LIGHTS: Final = 32
-"""Lights of one object of the store."""
+"""The only version so far."""
 
-_TEXTS: Final = ("illuminations.csv", FRAMES, "references.csv", "report.json", "lut.json")
+SHARD_LIGHTS: Final = 32
+"""Lights of one object of the store: 100 MB compressed of a full table, a size that stores and networks like."""
+
+_TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, "report.json", PROVENANCE)
 """Files that go along where the table has them, the one that makes a folder a table last."""
 
 Progress = Callable[[int, int], None]
@@ -53,7 +56,7 @@ def publish(lut: Lut, url: str, progress: Progress | None = None) -> None:
         Where to: a path, or a URL that fsspec knows, such as ``s3://bucket/eos550d``. Must be free, or hold a table
         that was never finished.
     progress
-        Told how many lights are written, and how many there are.
+        Called with the number of lights written, and the number of all.
 
     Raises
     ------
@@ -85,8 +88,7 @@ def publish(lut: Lut, url: str, progress: Progress | None = None) -> None:
         texts = {name: (lut.folder / name).read_text("utf-8") for name in _TEXTS if (lut.folder / name).is_file()}
         with (lut.folder / SAMPLES).open("rb") as stream:
             head = stream.read((lut.folder / SAMPLES).stat().st_size - lut.samples.nbytes)
-        told = {"version": VERSION, "files": texts, "head": base64.b64encode(head).decode(), "whole": True}
-        array.attrs.update(told)
+        array.attrs.update({"version": VERSION, "files": texts, "head": base64.b64encode(head).decode(), "whole": True})
     except CropError:
         raise
     except Exception as error:
@@ -106,7 +108,7 @@ def fetch(url: str, folder: Path, progress: Progress | None = None) -> Lut:
     folder
         Must be free; appears when the table is complete and verified.
     progress
-        Told how many lights are read, and how many there are.
+        Called with the number of lights read, and the number of all.
 
     Raises
     ------
@@ -157,20 +159,15 @@ def _light(array: Any, light: int, url: str) -> npt.NDArray[np.uint16]:
 
 
 def _verify(lut: Lut, url: str) -> None:
-    """Refuse a table whose samples have not the hashes that it tells; first tables of version 1 told none."""
+    """Refuse a table whose samples have not the hashes that it records; the first tables of version 1 recorded none."""
     known = lut.provenance
     for light, then in enumerate(known.lights_sha256):
-        if hashlib.sha256(memoryview(lut.samples[light]).cast("B")).hexdigest() != then:
+        if light_sha256(lut.samples[light]) != then:
             raise FormatError(
                 f"the samples of light {light} from {url} are not those that were measured; publish again"
             )
-    if known.samples_sha256 is not None:
-        digest = hashlib.sha256()
-        with (lut.folder / SAMPLES).open("rb") as stream:
-            while block := stream.read(io.DEFAULT_BUFFER_SIZE * 128):
-                digest.update(block)
-        if digest.hexdigest() != known.samples_sha256:
-            raise FormatError(f"the samples from {url} are not those that were measured; publish the table again")
+    if known.samples_sha256 is not None and file_sha256(lut.folder / SAMPLES) != known.samples_sha256:
+        raise FormatError(f"the samples from {url} are not those that were measured; publish the table again")
 
 
 def _require_free(url: str) -> None:

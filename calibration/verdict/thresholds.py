@@ -2,10 +2,10 @@
 
 Laws that hold inside:
 
-- A figure within `accept` is well; between `accept` and `refuse` it is a remark; beyond `refuse` there is no table.
-- A limit without `refuse` can only be remarked on: what it tells about does not make the table wrong.
-- Where a measurement refuses by itself (`calibration.registration.register`), the number stands there and is repeated
-  here.
+- A value within `accept` is accepted; between `accept` and `refuse` it is remarked on; beyond `refuse` there is no
+  table.
+- A limit without `refuse` is only ever remarked on: what it measures does not make the table wrong.
+- Where a measurement refuses by itself (`calibration.registration.register`), the number is defined there and imported.
 """
 
 from __future__ import annotations
@@ -13,20 +13,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from acquisition.framing.planes import MIN_SIGNAL
-from acquisition.framing.tags import MIN_TAG_SHARE
-from calibration.radiometry.paper import CLIPPED, MAX_BLACK_DRIFT
+from acquisition.framing.finding import MIN_TAG_SHARE
+from acquisition.framing.planes import CLIPPING_SHARE, MIN_SIGNAL
+from acquisition.framing.visibility import MIN_CELL_PX
+from calibration.radiometry.sensor_range import MAX_BLACK_DRIFT
 from calibration.registration.register import (
     MAX_BLOCK_RESIDUAL_PX,
     MAX_TAG_RESIDUAL_PX,
     MIN_AGREEMENT,
-    MIN_CELL_PX,
     MIN_GOOD_BLOCKS,
 )
 
 Sense = Literal["at most", "at least"]
 JUDGEMENT = "judgement"
+"""The source of a limit that nothing but experience supports."""
+
 SIMULATED = "measured on simulated frames"
+"""The source of a limit found in rooms whose truth is known (`benchmarks.rooms`, `benchmarks.accuracy`)."""
 
 
 @dataclass(frozen=True)
@@ -36,23 +39,23 @@ class Threshold:
     Attributes
     ----------
     name
-        Of the figure that it judges, as in `report.json`.
+        Of the value that it judges, as in `report.json`.
     title
-        The figure for people.
+        The value for people.
     unit
-        Of the figure and both limits; "" for a count or a plain number, "share" for 0 … 1.
+        Of the value and both limits; "" for a count or a plain number, "share" for 0 … 1.
     sense
-        On which side of the limits a figure is well.
+        On which side of the limits a value is accepted.
     accept
-        Up to here nothing is said.
+        Up to here nothing is remarked.
     refuse
-        Beyond it no table is made; None where the figure can only be remarked on.
+        Beyond it no table is made; None where the value is only ever remarked on.
     why
         What goes wrong beyond.
     source
         Where the number comes from.
     remedy
-        What to do about it.
+        What to do about it; "" where it depends on the cause (`calibration.verdict.wording`).
     """
 
     name: str
@@ -66,47 +69,47 @@ class Threshold:
     remedy: str
 
 
-_HANG = "hang the print flatter"
-_STILL = "fix camera and print, and let nobody walk about"
-_LAMP = "let the lamp warm up for longer before the session"
+_FLATTEN = "hang the print flatter"
+_FIX = "fix camera and print, and let nobody walk about"
+_WARM_UP = "let the lamp warm up for longer before the session"
 
 THRESHOLDS: tuple[Threshold, ...] = (
     Threshold(
         "tags_found", "Tags found", "share", "at least", 1.0, MIN_TAG_SHARE,
-        "where a tag is missing, nothing but the cells tell where they are", JUDGEMENT,
+        "where a tag is missing, the place of the cells around it rests on the cells alone", JUDGEMENT,
         "bring all of the chart into the picture, and uncover it",
     ),
     Threshold(
-        "cell_px", "Cell, shorter side", "px", "at least", 8.6, MIN_CELL_PX,
+        "cell_px", "Shorter side of a cell", "px", "at least", 8.6, MIN_CELL_PX,
         "25 pixels reach 3.25 px from a cell's centre, rounding and registration included",
         "geometry: half of 5 px, 0.5 px rounding, 0.25 px registration; 8.6 px bleeds 1.3 % at a blur of 0.7 px",
         "bring the camera nearer or take a longer lens",
     ),
     Threshold(
-        "bleed", "Neighbours' light in the worst sample", "share", "at most", 0.005, 0.03,
-        "the outermost of the window's pixels sees the neighbouring cells through the lens's blur",
+        "bleed", "Light of neighbouring cells in the worst sample", "share", "at most", 0.005, 0.03,
+        "the lens's blur mixes neighbouring cells into the outermost of the window's pixels",
         "normal integral beyond the cell's edge at 0.75 px misplacement; 0.2 % is a sharp lens at 10 px a cell",
         "focus on the print, stop down to f/8, bring the camera nearer, or take a smaller window (build-lut --window)",
     ),
     Threshold(
-        "tag_residual_px", "Tags against plane and lens", "px RMS", "at most", 2.5, MAX_TAG_RESIDUAL_PX,
-        "a sheet that waves more is followed by its cells alone",
+        "tag_residual_px", "Residual of tags, plane and lens", "px RMS", "at most", 2.5, MAX_TAG_RESIDUAL_PX,
+        "the place of a sheet that waves more rests on its cells alone",
         SIMULATED + ": 6 mm of waves and 10 mm of curl give 2.3",
-        _HANG,
+        _FLATTEN,
     ),
     Threshold(
-        "tag_final_px", "Tags against the final map", "px RMS", "at most", 0.4, 2.0,
-        "cells and tags disagree about where the print is; of cells of 10 px, larger ones leave more room",
+        "tag_final_px", "Residual of tags, final map", "px RMS", "at most", 0.4, 2.0,
+        "cells and tags disagree about where the print is; the limits are for cells of 10 px and rise with their size",
         SIMULATED + ": 0.05 to 0.2, the detector's own error 0.09",
         "check that chart.json is that of the print, and that the print is one flat sheet",
     ),
     Threshold(
-        "block_residual_px", "Movement that blocks still ask for", "px RMS", "at most", 0.1, MAX_BLOCK_RESIDUAL_PX,
-        "cells are sampled beside their centres; of cells of 10 px, larger ones leave more room",
-        SIMULATED + ": 0.01 to 0.06", _HANG,
+        "block_residual_px", "Residual of cell blocks", "px RMS", "at most", 0.1, MAX_BLOCK_RESIDUAL_PX,
+        "cells are sampled beside their centres; the limits are for cells of 10 px and rise with their size",
+        SIMULATED + ": 0.01 to 0.06", _FLATTEN,
     ),
     Threshold(
-        "blocks_good", "Blocks that look like the chart", "share", "at least", 0.98, MIN_GOOD_BLOCKS,
+        "blocks_good", "Cell blocks that match the chart", "share", "at least", 0.98, MIN_GOOD_BLOCKS,
         "part of the print is covered, damaged, or another print", JUDGEMENT, "uncover the print, or print it anew",
     ),
     Threshold(
@@ -119,73 +122,74 @@ THRESHOLDS: tuple[Threshold, ...] = (
         "colours without samples are missing from every picture", JUDGEMENT, "",
     ),
     Threshold(
-        "doubtful_share", "Cells whose surroundings are 1 % off their codes", "share", "at most", 0.0003, None,
-        "a stain, a fold or a shadow on the print; from 2 % on its cells are listed as unfit",
+        "doubtful_share", "Cells in surroundings 1 % off their codes' colours", "share", "at most", 0.0003, None,
+        "a stain, a fold or a shadow lies on the print; from 2 % on its cells are listed as unfit",
         SIMULATED + ": none on a clean flat print", "clean the print, hang it flatter, and look for shadows on it",
     ),
     Threshold(
-        "softer_bleed", "More of the neighbours' light in the softest frame", "share", "at most", 0.003, 0.012,
-        "a frame is out of focus, or was shaken; only white frames are looked at cell by cell for bleeding",
+        "softer_bleed", "Light of neighbouring cells added in the most blurred frame", "share", "at most", 0.003, 0.012,
+        "a frame is out of focus, or was shaken; only white frames are checked cell by cell for such light",
         SIMULATED + ": 0.9 px of blur in one frame of a session with 0.5 px give 0.8 % and cells 1.2 % off, "
         "1.1 px 2 % and cells 4 % off",
         "switch off autofocus and stabilisation, see that nothing shakes the camera",
     ),
     Threshold(
-        "unlike_scatter", "Cells about what their codes give, worst frame", "share", "at most", 0.012, 0.03,
+        "unlike_scatter", "Scatter of cells about their codes' colours, worst frame", "share", "at most", 0.012, 0.03,
         "the frame is out of focus, or shows another print: its samples are not its colours'",
         SIMULATED + ": to 0.8 % without noise; a blur of 1.1 px gives 1.4 %, 1.5 px 5 %, another print 50 %",
         "see that nothing changes during the session",
     ),
     Threshold(
-        "unlike_block", "Worst part of the print in the worst frame", "share", "at most", 0.01, 0.03,
-        "a hand, a shadow or a reflection lay on the print in that frame, and its samples hold it",
+        "unlike_block", "Deviation of the worst block of cells, worst frame", "share", "at most", 0.01, 0.03,
+        "a hand, a shadow or a reflection lay on the print in that frame, and its samples contain it",
         SIMULATED + ": to 0.4 % beyond noise",
         "see that nobody comes between lamp, print and camera",
     ),
     Threshold(
-        "moved_anew", "Frames registered anew", "", "at most", 0, None,
-        "the chart or the camera moved between frames; the grid followed", JUDGEMENT, _STILL,
+        "moved_anew", "Frames registered again", "", "at most", 0, None,
+        "the chart or the camera moved between frames; the sampling grid followed", JUDGEMENT, _FIX,
     ),
     Threshold(
         "black_drift_counts", "Drift of the black level", "counts", "at most", MAX_BLACK_DRIFT, 16.0,
-        "the sensor warmed; each frame's own black is subtracted, but dark cells of about 30 counts feel what is left",
+        "the sensor warmed up; each frame's own black is subtracted, but an error of it shows in dark cells of about "
+        "30 counts",
         JUDGEMENT, "let the camera run for some minutes before the session, and rest between frames",
     ),
     Threshold(
         "white_drift", "Drift of paper white between white frames", "share", "at most", 0.01, 0.15,
         "lights taken at other times differ in brightness; each has its own ground truth, so its colour is right",
-        JUDGEMENT + "; 1 % between whites is usual for a warm lamp", _LAMP,
+        JUDGEMENT + "; 1 % between whites is usual for a warm lamp", _WARM_UP,
     ),
     Threshold(
         "white_drift_deg", "Drift of white's colour", "°", "at most", 0.2, 2.0,
         "the lamp's spectrum changes, not its brightness alone",
-        JUDGEMENT + ": a tenth of a good method's error", _LAMP,
+        JUDGEMENT + ": a tenth of a good method's error", _WARM_UP,
     ),
     Threshold(
-        "leak_share", "Light while the projector shows black, of white", "share", "at most", 0.005, 0.1,
-        "every light holds this much of the projector's leak and the room's light, so that deep colours are paler",
+        "leak_share", "Light while the projector shows black, relative to white", "share", "at most", 0.005, 0.1,
+        "every light contains this much of the projector's leak and the room's light, so that deep colours are paler",
         JUDGEMENT + "; a contrast of 1 : 1500 leaks 0.07 %",
         "darken the room, cover lamps and displays, or have it subtracted (build-lut --subtract-dark)",
     ),
     Threshold(
-        "dark_drift", "Change of that light between dark frames, of white", "share", "at most", 0.002, 0.05,
+        "dark_drift", "Change of that light between dark frames, relative to white", "share", "at most", 0.002, 0.05,
         "the room's light changes; what is subtracted, or part of each light, is not what was there",
         JUDGEMENT + ": a hundredth of a cell of a fifth of white", "darken the room, and keep daylight out",
     ),
     Threshold(
-        "linearity", "Bend of the sensor's response, 5 to 95 % of saturation", "share", "at most", 0.01, 0.05,
+        "linearity", "Deviation from linearity, 5 to 95 % of saturation", "share", "at most", 0.01, 0.05,
         "counts are not proportional to light, so that chromaticities change with brightness",
         "EMVA 1288 asks for the range; 1 % is " + JUDGEMENT,
         "expose less, switch the camera's highlight priority off, and take the series in steady light",
     ),
     Threshold(
         "additivity", "White against the sum of the primaries", "share", "at most", 0.02, None,
-        "the projector brightens or converts white, so a light cannot be predicted from its codes; the table holds",
+        "the projector brightens or converts white, so a light cannot be predicted from its codes; the table is valid",
         JUDGEMENT + "; the drift of the lamp is taken out first",
         "switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
     ),
     Threshold(
-        "off_codes_deg", "White of a light against what its codes give", "°", "at most", 2.0, 8.0,
+        "off_codes_deg", "White of a light against what its codes predict", "°", "at most", 2.0, 8.0,
         "a frame bears another light's name, or was taken before the picture changed: codes in the table are not those "
         "of its whites",
         SIMULATED + ": .2 and less, with wheels of six segments, any gamma and 10 % of drift to .5; a list of frames "
@@ -195,43 +199,45 @@ THRESHOLDS: tuple[Threshold, ...] = (
     ),
     Threshold(
         "grey_tint_deg", "Tint of the print's greys against paper", "°", "at most", 6.0, None,
-        "greys are not neutral; the ground truth is paper's, so methods that trust in grey are judged by another grey",
+        "greys are not neutral; the ground truth is paper's, so methods that rely on grey are judged by another grey",
         JUDGEMENT + "; the simulated print, without colour management, has 4.5",
-        "print without colour management on matte paper, or live with it",
+        "print without colour management on matte paper, or accept it",
     ),
     Threshold(
         "noise_misfit", "Cells' noise about the photon-transfer curve", "share", "at most", 0.3, None,
-        "scatter that light and sensor do not explain: the camera smooths its raw files, or the light flickers",
+        "there is scatter that light and sensor do not explain: the camera smooths its raw files, or the light "
+        "flickers",
         "EMVA 1288 model; " + SIMULATED + ": 0.05 to 0.15", "switch the camera's noise reduction off",
     ),
     Threshold(
-        "noisy_share", "Cells noisier than their level allows", "share", "at most", 0.002, 0.1,
+        "noisy_share", "Cells noisier than their level explains", "share", "at most", 0.002, 0.1,
         "they are not of one colour: dirt, a fold, a neighbour's edge", "a variance 3.5 times the model's",
         "clean the print, focus, and hang it flatter",
     ),
     Threshold(
         "references_used", "White references used, worst frame", "share", "at least", 0.9, 0.3,
-        "field and ground truth rest on few places", JUDGEMENT,
+        "flat field and ground truth rest on few places", JUDGEMENT,
         "uncover the print, bring all of it into the picture, expose so that bare paper stays below saturation",
     ),
     Threshold(
-        "reference_spread", "White references about the field, under white", "share", "at most", 0.01, 0.05,
-        "a stain, a fold or a shadow is no smooth field and stays in the samples",
+        "reference_spread", "White references about the flat field, under white", "share", "at most", 0.01, 0.05,
+        "a stain, a fold or a shadow is not smooth, so that the flat field leaves it in the samples",
         SIMULATED + ": 0.3 % of noise and photosites' response",
         "clean or flatten the print, and look for shadows on it",
     ),
     Threshold(
-        "truth_median_deg", "Ground truth, standard error, median light", "°", "at most", 0.1, 1.0,
-        "a method's error cannot be measured finer than the truth is known",
+        "truth_median_deg", "Standard error of the ground truth, median light", "°", "at most", 0.1, 1.0,
+        "a method's error cannot be measured finer than the ground truth is known",
         JUDGEMENT + ": good methods are 1 to 2 degrees off", "expose longer",
     ),
     Threshold(
-        "truth_worst_deg", "Ground truth, standard error, worst light", "°", "at most", 0.5, 3.0,
-        "as above, for the darkest light", JUDGEMENT, "expose longer, or leave the darkest lights out",
+        "truth_worst_deg", "Standard error of the ground truth, worst light", "°", "at most", 0.5, 3.0,
+        "under that light a method's error cannot be measured finer than the ground truth is known", JUDGEMENT,
+        "expose longer, or leave the darkest lights out",
     ),
     Threshold(
         "brightest_share", "Bare paper under the brightest light, of saturation", "share", "at most",
-        0.9, CLIPPED,
+        0.9, CLIPPING_SHARE,
         "the unevenness of the light carries cells into saturation",
         JUDGEMENT + ": 0.8 leaves room for 20 % unevenness",
         "expose less",

@@ -28,7 +28,7 @@ _HIGHEST_CODE = 0xFF
 
 
 @dataclass(frozen=True)
-class Step:
+class DialPosition:
     """One position of a dial: the camera's code, its label, and the nominal value (s, f-number or ISO)."""
 
     code: int
@@ -41,7 +41,7 @@ class Scale:
     """A dial: its steps by ascending code, special codes without a value, and the law behind them."""
 
     name: str
-    steps: tuple[Step, ...]
+    steps: tuple[DialPosition, ...]
     specials: dict[int, str]
     law: Callable[[int], float] = field(repr=False)
 
@@ -106,10 +106,10 @@ class Scale:
         """Return what the camera shows for `codes`, in their order, for a message."""
         return ", ".join(self.label(code) for code in codes) or "nothing"
 
-    def _step(self, code: int) -> Step | None:
+    def _step(self, code: int) -> DialPosition | None:
         return next((step for step in self.steps if step.code == code), None)
 
-    def _absent(self, wanted: float | str, number: float | None, steps: list[Step]) -> InputError:
+    def _absent(self, wanted: float | str, number: float | None, steps: list[DialPosition]) -> InputError:
         near = steps if number is None else sorted(steps, key=lambda step: abs(math.log2(step.value / number)))[:4]
         offers = ", ".join(dict.fromkeys(step.label for step in sorted(near, key=lambda step: step.code)))
         return InputError(f"{self.name} {wanted} is not offered; near it: {offers or 'nothing, the list is empty'}")
@@ -133,12 +133,12 @@ def _near(number: float, nominal: float) -> bool:
 
 
 def _scale(name: str, table: str, specials: dict[int, str], law: Callable[[int], float]) -> Scale:
-    steps: list[Step] = []
+    steps: list[DialPosition] = []
     for entry in table.split():
         code, label = entry.split("=")
         value = _number(label)
         assert value is not None
-        steps.append(Step(int(code, 16), label, value))
+        steps.append(DialPosition(int(code, 16), label, value))
     return Scale(name, tuple(sorted(steps, key=lambda step: step.code)), specials, law)
 
 

@@ -7,7 +7,7 @@ Laws that hold inside:
 - GetEvent is asked until it has nothing more, but never without end: some firmware repeats itself.
 - A body keeps a frame in its memory until TransferComplete, and refuses the next when that memory is full. So every
   object that it announces is fetched or thrown away, and freed in either case.
-- Sizes and counts that a body tells are checked against what arrives.
+- Sizes and counts that a body reports are checked against what arrives.
 - A fault of cable or protocol ends the session, and goes to `drivers.canon.camera`, which begins a new one.
 
 Source: conversations of an EOS 60D and an EOS 400D with a host; libgphoto2 2.5.34 for the order of a release.
@@ -20,11 +20,12 @@ from collections.abc import Callable
 from typing import BinaryIO
 
 from drivers.camera import CameraIdentity
-from drivers.canon.records import PropertySetting, decode_events, number_value
+from drivers.canon.records import decode_events
 from drivers.canon.state import EosState, WaitingObject, host_destination
+from drivers.canon.values import PropertySetting, number_value
 from drivers.ptp.codes import CaptureDestination, Operation, Property, ReleaseButton, ResponseCode
 from drivers.ptp.datasets import DeviceInfo
-from drivers.ptp.session import PASSING_LIMIT_S, START_TIMEOUT_S, Declined, PtpSession
+from drivers.ptp.session import PASSING_LIMIT_S, START_TIMEOUT_S, OperationDeclined, PtpSession
 from drivers.ptp.transport import Transport
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolError
@@ -36,7 +37,7 @@ MAX_FRAME_BYTES = 256 << 20
 MAX_POLLS = 64
 """GetEvent answers that one drain takes, at most."""
 KEEP_ALIVE_S = 10.0
-"""After this long a body is told to stay awake."""
+"""After this long a body is asked to stay awake."""
 SETTLE_LIMIT_S = 5.0
 """How long a body may take to report a value that it was given, or room for a frame."""
 RELEASE_TRIES = 5
@@ -85,7 +86,7 @@ class EosBody:
         return self._session.label
 
     def identity(self) -> CameraIdentity:
-        """Return what the body says of itself; its serial number is the one that is engraved on it, where told."""
+        """Return what the body says of itself; the serial number is the engraved one, where it sends that."""
         serial = self.state.text(Property.EOS_SERIAL_NUMBER) or self._info.serial_number
         return CameraIdentity(self._info.manufacturer, self._info.model, serial, self._info.device_version)
 
@@ -115,17 +116,17 @@ class EosBody:
             self._session.call(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, Property.EOS_SERIAL_NUMBER)
             self._settled(lambda: Property.EOS_SERIAL_NUMBER in self.state.values)
         if not self.state.lists:
-            raise ProtocolError(f"{self.label} tells no state when asked for events; switch it off and on")
+            raise ProtocolError(f"{self.label} sends no state when asked for events; switch it off and on")
         self._receive_frames()
 
     def disconnect(self) -> None:
         """Give the body back as it was found; a fault of the cable goes to the caller."""
         self.free_waiting()
         if self._destination is not None:
-            with contextlib.suppress(Declined):
+            with contextlib.suppress(OperationDeclined):
                 self._send(Property.EOS_CAPTURE_DESTINATION, self._destination)
         for operation in (Operation.EOS_SET_REMOTE_MODE, Operation.EOS_SET_EVENT_MODE):
-            with contextlib.suppress(Declined):
+            with contextlib.suppress(OperationDeclined):
                 self._session.call(operation, _REMOTE_OFF, timeout=START_TIMEOUT_S, patience=1.0)
         self._session.close()
 
@@ -199,14 +200,14 @@ class EosBody:
                     patience=0.0,
                 )
                 break
-            except Declined as error:
+            except OperationDeclined as error:
                 # What keeps a body busy here is a release still held down, or events that nobody fetched.
                 self._let_go()
                 self.drain()
                 if error.code != ResponseCode.DEVICE_BUSY:
                     raise
                 if not left:
-                    raise Declined(
+                    raise OperationDeclined(
                         f"{error}; look for mirror lockup, a timer or a menu on its display", error.code
                     ) from error
                 self._clock.sleep(PASSING_LIMIT_S / RELEASE_TRIES)
@@ -247,7 +248,7 @@ class EosBody:
 
         Raises
         ------
-        Declined
+        OperationDeclined
             There is no such object (`ResponseCode.INVALID_OBJECT_HANDLE`), or the body will not give it.
         DeviceError
             It gives less than it announced, or announced a size that no frame has.
@@ -267,7 +268,7 @@ class EosBody:
         for left in reversed(range(_FREE_TRIES)):
             try:
                 self._session.call(Operation.EOS_TRANSFER_COMPLETE, waiting.handle)
-            except Declined as error:
+            except OperationDeclined as error:
                 if error.code != ResponseCode.INVALID_OBJECT_HANDLE:  # else it has gone, which is as well
                     if left:
                         self._clock.sleep(_PAUSES_S[-1])
@@ -289,15 +290,15 @@ class EosBody:
         for left in reversed(range(_PIECE_TRIES)):
             try:
                 sent, data = self._session.call(operation, waiting.handle, offset, wanted)
-            except Declined as error:
+            except OperationDeclined as error:
                 if not left or error.code in _LASTING:
                     raise
             else:
                 if len(data) > wanted:
                     raise ProtocolError(f"{self.label} gives {len(data)} bytes at {offset}; {wanted} were asked for")
-                # The standard's operation tells how many bytes were sent; what Canon's own answers is not known.
-                told = sent[0] if sent and operation == Operation.GET_PARTIAL_OBJECT else len(data)
-                if data and told == len(data):
+                # The standard's operation answers how many bytes were sent; what Canon's own answers is not known.
+                counted = sent[0] if sent and operation == Operation.GET_PARTIAL_OBJECT else len(data)
+                if data and counted == len(data):
                     return data
             self._clock.sleep(_PAUSES_S[-1])
         raise DeviceError(
@@ -306,7 +307,7 @@ class EosBody:
         )
 
     def _receive_frames(self) -> None:
-        """Have frames sent to the host, and tell the body that there is room for them."""
+        """Have frames sent to the host, and report room for them to the body."""
         host = host_destination(self.state)
         # A body that a killed run left behind stands at the host already; its user wants the card again.
         self._destination = number_value(CaptureDestination.CARD)
@@ -335,7 +336,7 @@ class EosBody:
         )
 
     def _let_go(self) -> None:
-        with contextlib.suppress(Declined):
+        with contextlib.suppress(OperationDeclined):
             self._session.call(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
 
     def _settled(self, condition: Callable[[], bool]) -> bool:
@@ -354,7 +355,7 @@ class EosBody:
         if now - self._spoken_at >= KEEP_ALIVE_S:
             self._spoken_at = now
             if self._offers(Operation.EOS_KEEP_DEVICE_ON):
-                with contextlib.suppress(Declined):
+                with contextlib.suppress(OperationDeclined):
                     self._session.call(Operation.EOS_KEEP_DEVICE_ON, patience=0.0)
 
     def _offers(self, operation: int) -> bool:

@@ -21,9 +21,9 @@ from typing import BinaryIO, TypeVar
 
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.canon.body import EosBody
-from drivers.canon.state import WaitingObject, plan
+from drivers.canon.state import WaitingObject, plan, shutter_speeds
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.session import PASSING, Declined
+from drivers.ptp.session import PASSING, OperationDeclined
 from drivers.ptp.transport import Transport
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
@@ -35,7 +35,7 @@ RECOVERY_LIMIT_S = 60.0
 FRAME_LIMIT_S = 90.0
 """How long after its exposure a frame may be announced."""
 REDISCOVERY_S = 10.0
-"""The same on a new connection, on which the body tells all its state at once."""
+"""The same on a new connection, on which the body sends its whole state at once."""
 
 _SYSTEM_CLOCK = SystemClock()
 _CERTAIN_SHARE = 0.9
@@ -115,6 +115,21 @@ class CanonEos:
         self._carry_out(configured)
         self._settings = settings
 
+    def shutter_speeds(self) -> tuple[float, ...]:
+        """Return the shutter times that the body offers now, as engraved, seconds, rising; empty if it lists none.
+
+        Raises
+        ------
+        DeviceError
+            It cannot be reached.
+        """
+
+        def listed(body: EosBody) -> tuple[float, ...]:
+            body.drain()
+            return shutter_speeds(body.state)
+
+        return self._carry_out(listed)
+
     def capture(self, into: BinaryIO) -> CapturedFrame:
         """Release the shutter without autofocus and write the raw file, whole and unchanged, to `into`.
 
@@ -166,7 +181,7 @@ class CanonEos:
                 self._drop(error)
                 if not left:
                     # A body that is busy in every session is kept so by its own settings, not by a fault.
-                    busy = isinstance(error, Declined) and error.code == ResponseCode.DEVICE_BUSY
+                    busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
                     kind = DeviceRefused if busy else DeviceError
                     raise kind(
                         f"{error}; the connection was renewed {RECOVERIES} times without success: {_REMEDY}"
@@ -211,7 +226,7 @@ class CanonEos:
             shot.fetched = frame
             try:
                 body.fetch(frame, into, offset)
-            except Declined as error:
+            except OperationDeclined as error:
                 if error.code != ResponseCode.INVALID_OBJECT_HANDLE:
                     raise
                 shot.absent.add(frame.handle)
@@ -285,7 +300,9 @@ def _apply(body: EosBody, settings: ExposureSettings) -> None:
 
 def _curable(error: DeviceError) -> bool:
     """Return whether a new connection may help."""
-    return isinstance(error, LinkError | ProtocolError) or (isinstance(error, Declined) and error.code in _STUCK)
+    return isinstance(error, LinkError | ProtocolError) or (
+        isinstance(error, OperationDeclined) and error.code in _STUCK
+    )
 
 
 def _file_name(frame: WaitingObject) -> str:

@@ -1,9 +1,9 @@
-"""What an EOS body has told of itself, and what follows from it for a series of raw frames.
+"""What an EOS body has reported of itself, and what follows from it for a series of raw frames.
 
 Laws that hold inside:
 
-- `EosState` is fed the records of GetEvent in their order and knows nothing that was not told.
-- What a body does not tell is no problem: properties come and go between bodies, and only what is known to spoil a
+- `EosState` is fed the records of GetEvent in their order and knows nothing that was not reported.
+- What a body does not report is no problem: properties come and go between bodies, and only what is known to spoil a
   series is named.
 - Nothing is taken for settable that the body does not list.
 
@@ -19,19 +19,15 @@ from dataclasses import dataclass, field
 from drivers.camera import ExposureSettings
 from drivers.canon.apex import APERTURE, ISO, SHUTTER, Scale
 from drivers.canon.records import (
-    RAW_ONLY,
     AvailableFormats,
     AvailableValues,
-    ImageFormat,
     Notice,
     ObjectEvent,
     PropertyChanged,
     Record,
     TransferRequest,
-    number_of,
-    number_value,
-    text_of,
 )
+from drivers.canon.values import RAW_ONLY, ImageFormat, number_of, number_value, text_of
 from drivers.ptp.codes import (
     AeMode,
     CameraStatus,
@@ -79,7 +75,7 @@ class EosState:
     Attributes
     ----------
     values
-        The value of each property told so far.
+        The value of each property reported so far.
     lists, formats
         What a property can be set to now.
     functions
@@ -127,17 +123,17 @@ class EosState:
                     pass
 
     def number(self, code: int) -> int | None:
-        """Return the value of a property that is a number, None where it was not told."""
+        """Return the value of a property that is a number, None where it was not reported."""
         value = self.values.get(code)
         return number_of(value) if value is not None and len(value) >= 4 else None
 
     def text(self, code: int) -> str:
-        """Return the value of a property that is text, empty where it was not told."""
+        """Return the value of a property that is text, empty where it was not reported."""
         return text_of(self.values.get(code, b""))
 
     def holds(self, code: int, value: bytes) -> bool:
         """Return whether a property has this value now."""
-        # Some bodies tell more bytes than they take.
+        # Some bodies send more bytes than they take.
         return code in self.values and self.values[code][: len(value)] == value
 
     def _announce(self, waiting: WaitingObject) -> None:
@@ -221,6 +217,12 @@ def plan(state: EosState, settings: ExposureSettings) -> dict[int, bytes]:
         # Raw values do not depend on it; a fixed one keeps what converters show the same through the series.
         wanted[Property.EOS_WHITE_BALANCE] = number_value(WhiteBalance.DAYLIGHT)
     return wanted
+
+
+def shutter_speeds(state: EosState) -> tuple[float, ...]:
+    """Return the nominal shutter times that a body lists, seconds, rising; bulb and codes in no table are left out."""
+    values = {step.code: step.value for step in SHUTTER.steps}
+    return tuple(sorted({values[code] for code in state.lists.get(Property.EOS_SHUTTER_SPEED, ()) if code in values}))
 
 
 def host_destination(state: EosState) -> bytes:

@@ -7,7 +7,7 @@ Laws that hold inside:
   the screen is read over another connection, as a screenshot program does; on Windows and macOS, the front buffer.
 - One thread owns the window: the one that opened it. OpenGL contexts and GLFW want it so.
 - The window belongs to this process: however that ends, killed included, the window goes with it.
-- GLFW and OpenGL are spoken to here and nowhere else; GLFW runs while anything here is open.
+- GLFW and OpenGL are used in this folder and nowhere else; GLFW runs while anything here is open.
 
 On Linux the window is an X window. Under Wayland that is XWayland, whose compositor may scale and tint behind our back:
 `FullScreen.warnings` says so. Gamma ramps, which night light and colour management load, lie behind everything that can
@@ -21,122 +21,39 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import os
-import re
-import sys
 import threading
-from collections.abc import Callable, Generator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from drivers.display.x11 import XScreen, is_lost, outlive
+from drivers.display import opengl
+from drivers.display.displays import Display, choose_display, displays_of, list_displays, running_glfw
+from drivers.display.opengl import OpenGl
+from drivers.display.x11 import XScreen, is_lost
 from drivers.presenter import BLACK, Colour
 from foundation.clock import Clock, SystemClock
-from foundation.errors import ConfigurationError, DeviceError
+from foundation.errors import DeviceError
 
-if TYPE_CHECKING:
-    from types import ModuleType
-
-OPENING_S = 5.0
+OPENING_S: Final = 5.0
 """How long a window may take to fill its display; window managers animate."""
-CONFIRMING_S = 1.0
+
+CONFIRMING_S: Final = 1.0
 """How long a frame may take from the swap to the screen; a compositor adds a frame or two."""
-RAMP_TOLERANCE = 1.5 / 255
+
+RAMP_TOLERANCE: Final = 1.5 / 255
 """How far a gamma ramp may be from a straight line: drivers end it at 255/256 or at 1."""
 
-_LOOK_AGAIN_S = 0.002
-_GL_FRONT, _GL_BACK = 0x0404, 0x0405
-_GL_COLOUR_BIT = 0x4000
-_GL_DITHER, _GL_SCISSOR = 0x0BD0, 0x0C11
-_GL_BGRA, _GL_8888_REVERSED = 0x80E1, 0x8367
-"""Read so, a pixel is the number 0xAARRGGBB, which is how drivers keep it: nothing needs converting."""
-_DIGITS = ("111101101101111", "010110010010111", "111001111100111", "111001111001111", "101101111001001",
-           "111100111001111", "111100111101111", "111001001001001", "111101111101111", "111101111001111")  # fmt: skip
+_LOOK_AGAIN_S: Final = 0.002
+"""Pause between two looks at the screen: a frame lasts eight of them."""
+
+_DIGITS: Final = (
+    "111101101101111", "010110010010111", "111001111100111", "111001111001111", "101101111001001",
+    "111100111001111", "111100111101111", "111001001001001", "111101111101111", "111101111001111",
+)  # fmt: skip
 """0 … 9 in 3×5 blocks, rows from the top."""
 
 _SYSTEM_CLOCK = SystemClock()
-_users = 0
-
-
-@dataclass(frozen=True)
-class Display:
-    """A display as the desktop arranged it; `x`, `y`, `width`, `height` in px of the whole desktop, y down."""
-
-    number: int
-    name: str
-    x: int
-    y: int
-    width: int
-    height: int
-    refresh_hz: int
-
-    @property
-    def place(self) -> str:
-        """Where it is, such as ``+1920+0``."""
-        return f"{self.x:+d}{self.y:+d}"
-
-    def __str__(self) -> str:
-        return f"{self.number}: {self.name} {self.width}×{self.height} at {self.place}, {self.refresh_hz} Hz"
-
-
-def list_displays() -> tuple[Display, ...]:
-    """Return every display, from left to right, then from top to bottom; `number` counts them from 1.
-
-    Raises
-    ------
-    DeviceError
-        There is no desktop to ask.
-    """
-    with _running() as glfw:
-        return tuple(display for display, _ in _displays(glfw))
-
-
-def choose_display(displays: tuple[Display, ...], wanted: str | int | None = None) -> Display:
-    """Return the display that `wanted` names.
-
-    Parameters
-    ----------
-    wanted
-        Its name (``"HDMI-1"``), its place (``"+1920+0"``), ``"left"``, ``"right"``, or its number; None stands for
-        the only one.
-
-    Raises
-    ------
-    ConfigurationError
-        None fits, or several do; the message lists what there is.
-    """
-    there = "; ".join(str(display) for display in displays) or "none"
-    if wanted is None:
-        fitting = list(displays)
-    elif isinstance(wanted, int):
-        fitting = [display for display in displays if display.number == wanted]
-    elif wanted in ("left", "right"):
-        # With one display, the other is the one that is missing: that is no time to guess.
-        ends = [display.x for display in displays]
-        if len(set(ends)) < 2:
-            raise ConfigurationError(
-                f"display {wanted!r}: there are not two displays side by side, but {there}; "
-                "connect the projector and extend the desktop to it"
-            )
-        end = min(ends) if wanted == "left" else max(ends)
-        fitting = [display for display in displays if display.x == end]
-    elif re.fullmatch(r"[+-]\d+[+-]\d+", wanted):
-        fitting = [display for display in displays if display.place == wanted]
-    else:
-        fitting = [display for display in displays if display.name == wanted]
-        if not fitting and wanted.isdecimal():
-            return choose_display(displays, int(wanted))
-    if len(fitting) == 1:
-        return fitting[0]
-    named = "no display is named" if wanted is None else f"display {wanted!r}"
-    if fitting:
-        raise ConfigurationError(f"{named}: {len(fitting)} fit; name one by its place, such as +1920+0; found: {there}")
-    raise ConfigurationError(
-        f"{named} is not there; found: {there}; connect and switch on the projector, or name another"
-    )
 
 
 class FullScreen:
@@ -164,8 +81,8 @@ class FullScreen:
         self._thread = threading.get_ident()
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opening:
-            self._glfw = glfw = opening.enter_context(_running())
-            found = _displays(glfw)
+            self._glfw = glfw = opening.enter_context(running_glfw())
+            found = displays_of(glfw)
             self.display = choose_display(tuple(one for one, _ in found), display)
             """The display that it fills."""
             self._monitor: Any = next(monitor for one, monitor in found if one == self.display)
@@ -175,7 +92,7 @@ class FullScreen:
                 opening.callback(self._screen.close)
             self._window: Any = self._open_window()
             opening.callback(glfw.destroy_window, self._window)
-            self._gl = _Gl(glfw)
+            self._gl = OpenGl(glfw)
             self._drawn: npt.NDArray[np.uint32] = np.empty((self.display.height, self.display.width), np.uint32)
             glfw.swap_interval(1)
             self._wait_until_full()
@@ -206,7 +123,7 @@ class FullScreen:
         self._present(colour)
 
     def identify(self) -> None:
-        """Show the display's number in big white blocks on black, so that it can be told from the others."""
+        """Show the display's number in big white blocks on black, to identify it among the others."""
         self._require_usable()
         self._glfw.make_context_current(self._window)
         self._fill(BLACK)
@@ -215,7 +132,7 @@ class FullScreen:
         block = min(self.display.width // columns, self.display.height // rows)
         left = (self.display.width - columns * block) // 2
         top = (self.display.height + rows * block) // 2
-        self._gl.enable(_GL_SCISSOR)
+        self._gl.enable(opengl.SCISSOR)
         self._gl.clear_colour(1.0, 1.0, 1.0, 1.0)
         for place, digit in enumerate(digits):
             for cell in (cell for cell, lit in enumerate(digit) if lit == "1"):
@@ -223,8 +140,8 @@ class FullScreen:
                 # OpenGL counts from the bottom.
                 x, y = left + (1 + 4 * place + column) * block, top - (2 + row) * block
                 self._gl.scissor(x, y, block, block)
-                self._gl.clear(_GL_COLOUR_BIT)
-        self._gl.disable(_GL_SCISSOR)
+                self._gl.clear(opengl.COLOUR_BIT)
+        self._gl.disable(opengl.SCISSOR)
         self._glfw.swap_buffers(self._window)
         self._gl.finish()
         self._glfw.poll_events()
@@ -260,7 +177,7 @@ class FullScreen:
                 f"a colour profile is set for {self.display.name}, which desktops may apply to what they show: remove "
                 "it in the desktop's colour settings (colormgr, dispwin -U)"
             )
-        twins = [str(one) for one, _ in _displays(self._glfw) if one.place == self.display.place]
+        twins = [str(one) for one, _ in displays_of(self._glfw) if one.place == self.display.place]
         if len(twins) > 1:
             found.append(f"the same picture goes to several displays ({'; '.join(twins)}): extend, do not mirror")
         return tuple(found)
@@ -335,7 +252,7 @@ class FullScreen:
     def _present(self, colour: Colour) -> None:
         self._glfw.make_context_current(self._window)
         self._fill(colour)
-        self._require(self._read_buffer(_GL_BACK), colour, "OpenGL drew")
+        self._require(self._read_buffer(opengl.BACK), colour, "OpenGL drew")
         self._glfw.swap_buffers(self._window)
         self._gl.finish()
         deadline = self._clock.monotonic() + CONFIRMING_S
@@ -352,14 +269,14 @@ class FullScreen:
     def _fill(self, colour: Colour) -> None:
         gl = self._gl
         gl.viewport(0, 0, self.display.width, self.display.height)
-        gl.disable(_GL_DITHER)
+        gl.disable(opengl.DITHER)
         # Fixed point keeps round(255 · c / 255), which single precision gives back as the code (OpenGL 2.1, 2.14.9).
         gl.clear_colour(colour.red / 255, colour.green / 255, colour.blue / 255, 1.0)
-        gl.clear(_GL_COLOUR_BIT)
+        gl.clear(opengl.COLOUR_BIT)
 
     def _read_screen(self) -> npt.NDArray[np.uint32]:
         if self._screen is None:
-            return self._read_buffer(_GL_FRONT)
+            return self._read_buffer(opengl.FRONT)
         display = self.display
         return self._screen.read(display.x, display.y, display.width, display.height)
 
@@ -367,7 +284,8 @@ class FullScreen:
         """Return a buffer of the window as (height, width) uint32, 0xRRGGBB, bottom row first."""
         display = self.display
         self._gl.read_buffer(buffer)
-        self._gl.read_pixels(0, 0, display.width, display.height, _GL_BGRA, _GL_8888_REVERSED, self._drawn.ctypes.data)
+        pixels, kind = self._drawn.ctypes.data, opengl.UNSIGNED_INT_8_8_8_8_REVERSED
+        self._gl.read_pixels(0, 0, display.width, display.height, opengl.BGRA, kind, pixels)
         np.bitwise_and(self._drawn, np.uint32(0xFFFFFF), out=self._drawn)
         return self._drawn
 
@@ -418,8 +336,8 @@ def _profile_of(glfw: Any, monitor: Any) -> str:
 
 def _is_noise(ramp: npt.NDArray[np.float64]) -> bool:
     """Return whether a gamma ramp goes up and down as none that somebody set: some X servers never write theirs."""
-    way = float(np.abs(np.diff(ramp)).sum())
-    return way > 2 * float(np.ptp(ramp)) and way > 0.1
+    travel = float(np.abs(np.diff(ramp)).sum())
+    return travel > 2 * float(np.ptp(ramp)) and travel > 0.1
 
 
 def identify_displays(seconds: float, clock: Clock = _SYSTEM_CLOCK) -> tuple[Display, ...]:
@@ -437,82 +355,4 @@ def identify_displays(seconds: float, clock: Clock = _SYSTEM_CLOCK) -> tuple[Dis
             opened.callback(screen.close)
             screen.identify()
         clock.sleep(seconds)
-    return displays
-
-
-class _Gl:
-    """The functions of OpenGL that fill a window and read it, found at run time."""
-
-    def __init__(self, glfw: ModuleType) -> None:
-        kind: Callable[..., Any] = ctypes.WINFUNCTYPE if sys.platform == "win32" else ctypes.CFUNCTYPE
-        number, enum, real = ctypes.c_int, ctypes.c_uint, ctypes.c_float
-
-        def function(name: str, *arguments: type) -> Callable[..., None]:
-            address = glfw.get_proc_address(name)
-            if not address:
-                raise DeviceError(f"OpenGL has no {name} here; install the graphics driver (Debian: libgl1-mesa-dri)")
-            return kind(None, *arguments)(address)
-
-        self.clear = function("glClear", enum)
-        self.clear_colour = function("glClearColor", real, real, real, real)
-        self.disable = function("glDisable", enum)
-        self.enable = function("glEnable", enum)
-        self.finish = function("glFinish")
-        self.read_buffer = function("glReadBuffer", enum)
-        self.read_pixels = function("glReadPixels", number, number, number, number, enum, enum, ctypes.c_void_p)
-        self.scissor = function("glScissor", number, number, number, number)
-        self.viewport = function("glViewport", number, number, number, number)
-
-
-@contextlib.contextmanager
-def _running() -> Generator[ModuleType]:
-    """Keep GLFW running; it ends when the last who needs it is through."""
-    global _users
-    glfw = _library()
-    if not _users:
-        if sys.platform == "linux":
-            glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
-        try:
-            glfw.init()
-        except glfw.GLFWError as error:
-            raise DeviceError(
-                f"no desktop to show a picture on ({error}); run this on the machine that the projector is connected "
-                "to, logged in there, with DISPLAY set on Linux"
-            ) from error
-        if sys.platform == "linux":
-            outlive(glfw.get_x11_display())
-    _users += 1
-    try:
-        yield glfw
-    finally:
-        _users -= 1
-        if not _users:
-            glfw.terminate()
-
-
-def _library() -> ModuleType:
-    """Return GLFW's module, imported late: to load it asks another process for its version."""
-    if sys.platform == "linux":
-        # The wheel holds two libraries; only the one for X can be told to use it.
-        os.environ.setdefault("PYGLFW_LIBRARY_VARIANT", "x11")
-    try:
-        import glfw
-    except (ImportError, OSError) as error:
-        raise DeviceError(
-            f"GLFW cannot be loaded ({error}); reinstall with: pip install --force-reinstall glfw"
-        ) from error
-    glfw.ERROR_REPORTING = "exception"
-    return glfw
-
-
-def _displays(glfw: ModuleType) -> list[tuple[Display, Any]]:
-    found: list[tuple[int, int, str, Any]] = []
-    for monitor in glfw.get_monitors():
-        x, y = glfw.get_monitor_pos(monitor)
-        name = glfw.get_monitor_name(monitor)
-        found.append((x, y, name.decode("utf-8", "replace") if isinstance(name, bytes) else name, monitor))
-    displays: list[tuple[Display, Any]] = []
-    for number, (x, y, name, monitor) in enumerate(sorted(found, key=lambda one: one[:3]), 1):
-        mode = glfw.get_video_mode(monitor)
-        displays.append((Display(number, name, x, y, mode.size.width, mode.size.height, mode.refresh_rate), monitor))
     return displays

@@ -26,8 +26,8 @@ from drivers.display.lightcrafter_wire import (
     MODE_VIDEO,
     PATTERN_SOLID,
     SOURCE_TEST_PATTERN,
-    Command,
-    Request,
+    LightCrafterCommand,
+    LightCrafterRequest,
     encode_colour,
     encode_request,
     parse_colour,
@@ -51,16 +51,16 @@ SWITCHING_S = 3.0
 _LOOK_AGAIN_S = 0.05
 _STALE_REPLIES = 8
 _SETTLED = (
-    # What is set, to what, and which bits of the answer say so (the rest tells of other things).
-    (Command.TEST_PATTERN, PATTERN_SOLID, 0x0F),
-    (Command.INPUT_SOURCE, SOURCE_TEST_PATTERN, 0x07),
-    (Command.DISPLAY_MODE, MODE_VIDEO, 0x03),
+    # What is set, to what, and which bits of the answer say so (the rest means other things).
+    (LightCrafterCommand.TEST_PATTERN, PATTERN_SOLID, 0x0F),
+    (LightCrafterCommand.INPUT_SOURCE, SOURCE_TEST_PATTERN, 0x07),
+    (LightCrafterCommand.DISPLAY_MODE, MODE_VIDEO, 0x03),
 )
 _SYSTEM_CLOCK = SystemClock()
 
 
 def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = None) -> Reports:
-    """Open the one LightCrafter on USB, of whatever kind; `serial` tells it from its like.
+    """Open the one LightCrafter on USB, of whatever kind; `serial` names one of several.
 
     Raises
     ------
@@ -94,7 +94,7 @@ class LightCrafter:
     Raises
     ------
     DeviceError
-        The controller cannot be reached, or does not do as it is told.
+        The controller cannot be reached, or does not do what it was sent.
     """
 
     def __init__(self, connect: Callable[[], Reports], clock: Clock = _SYSTEM_CLOCK) -> None:
@@ -114,7 +114,7 @@ class LightCrafter:
             if self._reports is None:
                 self._reports = self._connect()
             # The colour comes first, so that nothing else is seen when the generator is switched to.
-            self._write(Command.PATTERN_COLOUR, encode_colour(colour))
+            self._write(LightCrafterCommand.PATTERN_COLOUR, encode_colour(colour))
             if fresh:
                 for command, value, _ in _SETTLED:
                     self._write(command, bytes([value]))
@@ -136,7 +136,7 @@ class LightCrafter:
     def _confirm(self, colour: Colour) -> None:
         deadline = self._clock.monotonic() + SWITCHING_S
         while True:
-            shown = parse_colour(self._read(Command.PATTERN_COLOUR))
+            shown = parse_colour(self._read(LightCrafterCommand.PATTERN_COLOUR))
             expected = parse_colour(encode_colour(colour))
             reason = f"colour {shown} in place of {expected} of 1023" if shown != expected else self._unsettled()
             if not reason:
@@ -156,16 +156,16 @@ class LightCrafter:
                 return f"{answer[0] & mask} in place of {value} for {command.name.lower().replace('_', ' ')}"
         return ""
 
-    def _write(self, command: Command, data: bytes) -> None:
+    def _write(self, command: LightCrafterCommand, data: bytes) -> None:
         self._exchange(command, data, reads=False)
 
-    def _read(self, command: Command) -> bytes:
+    def _read(self, command: LightCrafterCommand) -> bytes:
         return self._exchange(command, b"", reads=True)
 
-    def _exchange(self, command: Command, data: bytes, *, reads: bool) -> bytes:
+    def _exchange(self, command: LightCrafterCommand, data: bytes, *, reads: bool) -> bytes:
         assert self._reports is not None
         self._sequence = (self._sequence + 1) % 256
-        self._reports.write(encode_request(Request(self._sequence, command, data, reads)), TIMEOUT_S)
+        self._reports.write(encode_request(LightCrafterRequest(self._sequence, command, data, reads)), TIMEOUT_S)
         for _ in range(_STALE_REPLIES):
             reply = parse_reply(self._reports.read(TIMEOUT_S))
             if reply.sequence != self._sequence:

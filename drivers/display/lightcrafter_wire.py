@@ -24,7 +24,7 @@ FULL = 1023
 _READ, _REPLY, _ERROR = 0x80, 0x40, 0x20
 
 
-class Command(IntEnum):
+class LightCrafterCommand(IntEnum):
     """What of the controller is set and read here."""
 
     TEST_PATTERN = 0x1203
@@ -39,7 +39,7 @@ MODE_VIDEO = 0
 
 
 @dataclass(frozen=True)
-class Request:
+class LightCrafterRequest:
     """A report to the device."""
 
     sequence: int
@@ -49,7 +49,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Reply:
+class LightCrafterReply:
     """A report from the device; `refused` where it does not know the command or its data."""
 
     sequence: int
@@ -57,14 +57,14 @@ class Reply:
     refused: bool = False
 
 
-def encode_request(request: Request) -> bytes:
+def encode_request(request: LightCrafterRequest) -> bytes:
     """Return the report of a request; every one asks for a reply."""
     flags = _REPLY | (_READ if request.reads else 0)
     head = struct.pack("<BBHH", flags, request.sequence, 2 + len(request.data), request.command)
     return (head + request.data).ljust(REPORT, b"\0")
 
 
-def parse_request(report: bytes) -> Request:
+def parse_request(report: bytes) -> LightCrafterRequest:
     """Return the request in a report.
 
     Raises
@@ -75,16 +75,16 @@ def parse_request(report: bytes) -> Request:
     flags, sequence, length, command = struct.unpack_from("<BBHH", _whole(report))
     if not 2 <= length <= 2 + MAX_DATA:
         raise ProtocolError(f"a request of {length} bytes; 2 … {2 + MAX_DATA} fit in a report")
-    return Request(sequence, command, report[6 : 4 + length], bool(flags & _READ))
+    return LightCrafterRequest(sequence, command, report[6 : 4 + length], bool(flags & _READ))
 
 
-def encode_reply(reply: Reply, *, reads: bool) -> bytes:
+def encode_reply(reply: LightCrafterReply, *, reads: bool) -> bytes:
     """Return the report of a reply to a request that `reads` or writes."""
     flags = _REPLY | (_READ if reads else 0) | (_ERROR if reply.refused else 0)
     return (struct.pack("<BBH", flags, reply.sequence, len(reply.data)) + reply.data).ljust(REPORT, b"\0")
 
 
-def parse_reply(report: bytes) -> Reply:
+def parse_reply(report: bytes) -> LightCrafterReply:
     """Return the reply in a report.
 
     Raises
@@ -95,7 +95,7 @@ def parse_reply(report: bytes) -> Reply:
     flags, sequence, length = struct.unpack_from("<BBH", _whole(report))
     if length > REPORT - 4:
         raise ProtocolError(f"a reply of {length} bytes; {REPORT - 4} fit in a report: {report.hex(' ')}")
-    return Reply(sequence, report[4 : 4 + length], bool(flags & _ERROR))
+    return LightCrafterReply(sequence, report[4 : 4 + length], bool(flags & _ERROR))
 
 
 def ten_bits(code: int) -> int:
@@ -112,12 +112,12 @@ def eight_bits(code: int) -> int:
 
 
 def encode_colour(colour: Colour) -> bytes:
-    """Return the data of `Command.PATTERN_COLOUR`: foreground red, green, blue, and a black background."""
+    """Return the data of `LightCrafterCommand.PATTERN_COLOUR`: foreground red, green, blue, and a black background."""
     return struct.pack("<6H", ten_bits(colour.red), ten_bits(colour.green), ten_bits(colour.blue), 0, 0, 0)
 
 
 def parse_colour(data: bytes) -> tuple[int, int, int]:
-    """Return the foreground in the data of `Command.PATTERN_COLOUR`, 10 bits each.
+    """Return the foreground in the data of `LightCrafterCommand.PATTERN_COLOUR`, 10 bits each.
 
     Raises
     ------

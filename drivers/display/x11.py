@@ -3,8 +3,8 @@
 Laws that hold inside:
 
 - A connection of its own, beside that of the window: what it reads is what the server shows, whoever drew it.
-- Through libxcb, which tells errors to its caller. Xlib, which the window needs, ends the process when its server goes;
-  `outlive` talks it out of that.
+- Through libxcb, which returns errors to its caller. Xlib, which the window needs, ends the process when its server
+  goes; `outlive` prevents that.
 - The hold on screen saver and power saving ends with the connection, hence with the process, however that ends.
 
 Sources: X Window System Protocol, GetImage, QueryExtension and GetProperty; MIT-SCREEN-SAVER extension 1.1, Suspend;

@@ -15,7 +15,8 @@ import contextlib
 import errno
 import math
 from collections.abc import Generator
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Protocol
 
 import usb.core
 import usb.util
@@ -26,11 +27,14 @@ from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
 if TYPE_CHECKING:
     from usb.backend import IBackend
 
-REPORT = 64
+REPORT: Final = 64
 """Bytes of a report in either direction."""
 
-_HID_CLASS = 3
-_INTERRUPT = 3
+_HID_CLASS: Final = 3
+"""bInterfaceClass of a human interface device (HID 1.11, 4.1)."""
+
+_INTERRUPT: Final = 3
+"""Transfer type in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
 
 
 class Reports(Protocol):
@@ -104,7 +108,8 @@ class HidDevice:
         self._claimed = Claim(device)
         try:
             with self._transfer("does not answer"):
-                self._claim()
+                self._pipes = _report_pipes(self._claimed.configuration(), label)
+                self._claimed.make(self._pipes.interface)
         except BaseException:
             self.close()
             raise
@@ -117,29 +122,16 @@ class HidDevice:
     def write(self, report: bytes, timeout: float) -> None:
         """Send one report."""
         with self._transfer(f"takes no report for {timeout:g} s"):
-            self._device.write(self._out, report, max(1, math.ceil(timeout * 1000)))
+            self._device.write(self._pipes.outward, report, max(1, math.ceil(timeout * 1000)))
 
     def read(self, timeout: float) -> bytes:
         """Return the next report."""
         with self._transfer(f"has not answered for {timeout:g} s"):
-            return self._device.read(self._in, REPORT, max(1, math.ceil(timeout * 1000))).tobytes()
+            return self._device.read(self._pipes.inward, REPORT, max(1, math.ceil(timeout * 1000))).tobytes()
 
     def close(self) -> None:
         """Release the device and give it back to the kernel's driver, if there was one."""
         self._claimed.release()
-
-    def _claim(self) -> None:
-        for interface in self._claimed.configuration():
-            ends = {
-                bool(endpoint.bEndpointAddress & 0x80): endpoint.bEndpointAddress
-                for endpoint in interface
-                if endpoint.bmAttributes & 3 == _INTERRUPT
-            }
-            if interface.bInterfaceClass == _HID_CLASS and len(ends) == 2:
-                self._in, self._out = ends[True], ends[False]
-                self._claimed.make(interface.bInterfaceNumber)
-                return
-        raise ProtocolError(f"{self._label} has no HID interface with pipes both ways; it is another device")
 
     @contextlib.contextmanager
     def _transfer(self, late: str) -> Generator[None]:
@@ -163,6 +155,34 @@ class HidDevice:
             raise DeviceRefused(
                 f"{self._label} cannot be used with the driver that the system has for it; on Windows install WinUSB"
             ) from error
+
+
+@dataclass(frozen=True)
+class _ReportPipes:
+    """Number of a HID interface, and addresses of its two interrupt endpoints."""
+
+    interface: int
+    inward: int
+    outward: int
+
+
+def _report_pipes(configuration: usb.core.Configuration, label: str) -> _ReportPipes:
+    """Return the first HID interface that has interrupt pipes both ways; `label` names the device.
+
+    Raises
+    ------
+    ProtocolError
+        There is none.
+    """
+    for interface in configuration:
+        ends = {
+            bool(endpoint.bEndpointAddress & 0x80): endpoint.bEndpointAddress
+            for endpoint in interface
+            if endpoint.bmAttributes & 3 == _INTERRUPT
+        }
+        if interface.bInterfaceClass == _HID_CLASS and len(ends) == 2:
+            return _ReportPipes(interface.bInterfaceNumber, ends[True], ends[False])
+    raise ProtocolError(f"{label} has no HID interface with pipes both ways; it is another device")
 
 
 def _serial(device: usb.core.Device) -> str | None:

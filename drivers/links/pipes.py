@@ -8,9 +8,12 @@ nowhere else.
 from __future__ import annotations
 
 from enum import Enum
-from typing import Protocol
+from typing import Final, Protocol
 
 from foundation.errors import LinkError
+
+STILL_IMAGE_CLASS: Final = (6, 1, 1)
+"""Class, subclass and protocol of a still image interface (USB Still Image Capture Device Definition 1.0, clause 4)."""
 
 
 class PipeStalled(LinkError):

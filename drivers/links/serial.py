@@ -99,7 +99,7 @@ class SerialLink:
 
 
 def _unopened(error: OSError, device: str) -> LinkError | DeviceRefused:
-    # On Windows pyserial keeps the number of the system's error to itself and tells its name only.
+    # On Windows pyserial hides the number of the system's error and gives its name only.
     said = str(error)
     if error.errno in (errno.EACCES, errno.EPERM) or "PermissionError" in said:
         return DeviceRefused(

@@ -3,7 +3,7 @@
 Rules that hold inside:
 
 - The system's errors become `LinkTimeout` and `LinkClosed` here and nowhere else; every message names host and port.
-- `TcpServer` listens on loopback unless told otherwise, has one thread for each connection, and leaves none behind.
+- `TcpServer` listens on loopback unless a host is given, has one thread for each connection, and leaves none behind.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class TcpServer:
         Called with each new link; the link is closed when it returns. A `LinkError` that it raises ends that
         connection quietly, for that is how connections end.
     port
-        0 lets the system pick one; `address` tells which.
+        0 lets the system pick one, which `address` names.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Datagrams of the network: one UDP socket, for finding devices and for hearing what they tell unasked.
+"""Datagrams of the network: one UDP socket, for finding devices and for receiving their notices.
 
 Rules that hold inside:
 
@@ -27,7 +27,7 @@ class UdpSocket:
     Parameters
     ----------
     port
-        Where it listens, and from where it sends; 0 lets the system pick one, `address` tells which.
+        Where it listens, and from where it sends; 0 lets the system pick one, which `address` names.
     host
         The own address to listen at; all of them unless given.
 
@@ -91,7 +91,7 @@ class UdpSocket:
                 self._socket.settimeout(max(deadline - time.monotonic(), 0.0))
                 data, (sender, sender_port, *_) = self._socket.recvfrom(MAX_DATAGRAM)
             except ConnectionResetError:
-                # Windows tells so that an earlier datagram found nobody; for us that is no news.
+                # Windows reports here that an earlier datagram found nobody; for us that is no news.
                 continue
             except (TimeoutError, BlockingIOError) as error:
                 raise LinkTimeout(f"no datagram came to {host}:{port} for {timeout:g} s") from error

@@ -2,7 +2,7 @@
 
 Laws that hold inside:
 
-- Devices are told apart by vendor, product and serial number, or by the port they are plugged into: the address
+- Devices are distinguished by vendor, product and serial number, or by the port they are plugged into: the address
   changes whenever a device restarts.
 - The system's errors are translated here and nowhere else, and say what helps: ETIMEDOUT is `LinkTimeout`; ENODEV, EIO
   and whatever else ends the transfer is `LinkClosed`; EPIPE is `PipeStalled`; EBUSY and EACCES are `DeviceRefused`.
@@ -16,16 +16,15 @@ from __future__ import annotations
 import contextlib
 import errno
 import math
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import usb.core
 import usb.util
 
-from drivers.links.pipes import Pipe, PipeStalled
+from drivers.links.pipes import STILL_IMAGE_CLASS, Pipe, PipeStalled
 from drivers.links.usb_claim import Claim
-from drivers.ptp.container import INTERFACE_CLASS
 from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout, ProtocolError
 
 if TYPE_CHECKING:
@@ -34,11 +33,16 @@ if TYPE_CHECKING:
 UDEV_RULE = "70-crop-cameras.rules"
 """The file in `drivers/data` that lets users of a Linux machine open cameras."""
 
-_CLASS_OUT = 0x21
-_CLASS_IN = 0xA1
-_BULK = 2
-_INTERRUPT = 3
-_MAX_POLLING_S = 0.05
+_CLASS_OUT: Final = 0x21
+_CLASS_IN: Final = 0xA1
+"""bmRequestType of requests of the class to the interface, and from it (USB 2.0, 9.3)."""
+
+_BULK: Final = 2
+_INTERRUPT: Final = 3
+"""Transfer types in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
+
+_MAX_POLLING_S: Final = 0.05
+"""Longest interval that is believed: a wrong descriptor must not slow the events down to seconds."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +125,7 @@ class OpenUsbDevice:
         self._label = str(description)
         self._claimed = Claim(device)
         try:
-            self._claim()
+            self._interface = self._claim()
         except BaseException:
             self.close()
             raise
@@ -134,83 +138,65 @@ class OpenUsbDevice:
     @property
     def packet_size(self) -> int:
         """Bytes of a full packet on the bulk pipes."""
-        return self._packet_size
+        return self._interface.packet_size
 
     @property
     def polling_s(self) -> float:
         """Seconds between two looks at the interrupt pipe."""
-        return self._polling_s
+        return self._interface.polling_s
 
     def bulk_write(self, data: bytes, timeout: float) -> None:
         """Send all of `data`; none is a zero-length packet."""
         with self._transfer(f"takes no data for {timeout:g} s"):
-            sent = self._device.write(self._addresses[Pipe.BULK_OUT], data, _milliseconds(timeout))
+            sent = self._device.write(self._interface.addresses[Pipe.BULK_OUT], data, _milliseconds(timeout))
         if sent != len(data):
             raise LinkTimeout(f"{self._label} took {sent} of {len(data)} bytes within {timeout:g} s; reset it")
 
     def bulk_read(self, limit: int, timeout: float) -> bytes:
         """Return what one transfer brings, up to `limit` bytes."""
         with self._transfer(f"sent nothing for {timeout:g} s"):
-            return self._device.read(self._addresses[Pipe.BULK_IN], limit, _milliseconds(timeout)).tobytes()
+            return self._device.read(self._interface.addresses[Pipe.BULK_IN], limit, _milliseconds(timeout)).tobytes()
 
     def interrupt_read(self, timeout: float) -> bytes:
         """Return the next packet of the interrupt pipe."""
         with self._transfer(f"has no event for {timeout:g} s"):
-            address = self._addresses[Pipe.INTERRUPT_IN]
-            return self._device.read(address, self._interrupt_size, _milliseconds(timeout)).tobytes()
+            address = self._interface.addresses[Pipe.INTERRUPT_IN]
+            return self._device.read(address, self._interface.interrupt_size, _milliseconds(timeout)).tobytes()
 
     def control_out(self, request: int, data: bytes, timeout: float) -> None:
         """Send a request of the interface's class on the control pipe."""
         with self._transfer(f"takes no control request for {timeout:g} s"):
-            self._device.ctrl_transfer(_CLASS_OUT, request, 0, self._interface, data, _milliseconds(timeout))
+            number = self._interface.number
+            self._device.ctrl_transfer(_CLASS_OUT, request, 0, number, data, _milliseconds(timeout))
 
     def control_in(self, request: int, limit: int, timeout: float) -> bytes:
         """Return the answer to a request of the interface's class."""
         with self._transfer(f"answers no control request for {timeout:g} s"):
-            answer = self._device.ctrl_transfer(_CLASS_IN, request, 0, self._interface, limit, _milliseconds(timeout))
+            number = self._interface.number
+            answer = self._device.ctrl_transfer(_CLASS_IN, request, 0, number, limit, _milliseconds(timeout))
         return bytes(answer)
 
     def clear_halt(self, pipe: Pipe) -> None:
         """Let a stalled pipe transfer again."""
         with self._transfer("does not end a stall"):
-            self._device.clear_halt(self._addresses[pipe])
+            self._device.clear_halt(self._interface.addresses[pipe])
 
     def reset_port(self) -> None:
         """Have the bus reset the device, and claim it again."""
         with self._transfer("does not come back from a reset"):
             self._device.reset()
-        self._claim()
+        self._interface = self._claim()
 
     def close(self) -> None:
         """Release the interface and give it back to the kernel's driver, if there was one."""
         self._claimed.release()
 
-    def _claim(self) -> None:
+    def _claim(self) -> _StillImageInterface:
         with self._transfer("does not answer"):
             interface = next(found for found in self._claimed.configuration() if _is_still_image(found))
-            self._interface = interface.bInterfaceNumber
-            self._addresses: dict[Pipe, int] = {}
-            for endpoint in interface:
-                self._note(endpoint)
-            missing = [pipe.value for pipe in Pipe if pipe not in self._addresses]
-            if missing:
-                raise ProtocolError(f"{self._label} has no pipe {', '.join(missing)}; it is no PTP device")
-            self._claimed.make(self._interface)
-
-    def _note(self, endpoint: usb.core.Endpoint) -> None:
-        kind = endpoint.bmAttributes & 3
-        inward = bool(endpoint.bEndpointAddress & 0x80)
-        # Bits 11 and 12 count extra transactions in a microframe (USB 2.0, 9.6.6).
-        size = endpoint.wMaxPacketSize & 0x7FF
-        if kind == _BULK:
-            self._addresses[Pipe.BULK_IN if inward else Pipe.BULK_OUT] = endpoint.bEndpointAddress
-            self._packet_size = size
-        elif kind == _INTERRUPT and inward:
-            self._addresses[Pipe.INTERRUPT_IN] = endpoint.bEndpointAddress
-            self._interrupt_size = size
-            # High speed counts 2^(n-1) microframes of 125 µs, full speed n frames of 1 ms; slower than needed is safe.
-            frames = 2 ** (min(endpoint.bInterval, 16) - 1) / 8 if endpoint.bInterval else 1
-            self._polling_s = min(max(frames, endpoint.bInterval) / 1000 + 0.001, _MAX_POLLING_S)
+            pipes = _pipes_of(interface, self._label)
+            self._claimed.make(pipes.number)
+        return pipes
 
     @contextlib.contextmanager
     def _transfer(self, late: str) -> Generator[None]:
@@ -227,6 +213,65 @@ class OpenUsbDevice:
                 f"{self._label} cannot be used with the driver that the system has for it; "
                 f"on Windows install WinUSB for it"
             ) from error
+
+
+@dataclass(frozen=True)
+class _StillImageInterface:
+    """A still image interface as its descriptors have it.
+
+    Attributes
+    ----------
+    number
+        The interface's.
+    addresses
+        Endpoint of each pipe.
+    packet_size, interrupt_size
+        Bytes of a full packet on the bulk pipes and on the interrupt pipe.
+    polling_s
+        Seconds between two looks at the interrupt pipe.
+    """
+
+    number: int
+    addresses: Mapping[Pipe, int]
+    packet_size: int
+    interrupt_size: int
+    polling_s: float
+
+
+def _pipes_of(interface: usb.core.Interface, label: str) -> _StillImageInterface:
+    """Return what the endpoints of an interface say; `label` names the device.
+
+    Raises
+    ------
+    ProtocolError
+        A pipe is missing.
+    """
+    endpoints: dict[Pipe, usb.core.Endpoint] = {}
+    for endpoint in interface:
+        kind = endpoint.bmAttributes & 3
+        inward = bool(endpoint.bEndpointAddress & 0x80)
+        if kind == _BULK:
+            endpoints[Pipe.BULK_IN if inward else Pipe.BULK_OUT] = endpoint
+        elif kind == _INTERRUPT and inward:
+            endpoints[Pipe.INTERRUPT_IN] = endpoint
+    missing = [pipe.value for pipe in Pipe if pipe not in endpoints]
+    if missing:
+        raise ProtocolError(f"{label} has no pipe {', '.join(missing)}; it is no PTP device")
+    interval = endpoints[Pipe.INTERRUPT_IN].bInterval
+    # High speed counts 2^(n-1) microframes of 125 µs, full speed n frames of 1 ms; slower than needed is safe.
+    frames = 2 ** (min(interval, 16) - 1) / 8 if interval else 1
+    return _StillImageInterface(
+        interface.bInterfaceNumber,
+        {pipe: endpoint.bEndpointAddress for pipe, endpoint in endpoints.items()},
+        _packet_size(endpoints[Pipe.BULK_IN]),
+        _packet_size(endpoints[Pipe.INTERRUPT_IN]),
+        min(max(frames, interval) / 1000 + 0.001, _MAX_POLLING_S),
+    )
+
+
+def _packet_size(endpoint: usb.core.Endpoint) -> int:
+    # Bits 11 and 12 count extra transactions in a microframe (USB 2.0, 9.6.6).
+    return endpoint.wMaxPacketSize & 0x7FF
 
 
 def _found(backend: IBackend | None) -> Iterator[tuple[usb.core.Device, UsbDevice, DeviceRefused | None]]:
@@ -265,7 +310,7 @@ def _has_still_image(device: usb.core.Device) -> bool:
 
 def _is_still_image(interface: usb.core.Interface) -> bool:
     kind = (interface.bInterfaceClass, interface.bInterfaceSubClass, interface.bInterfaceProtocol)
-    return kind == INTERFACE_CLASS
+    return kind == STILL_IMAGE_CLASS
 
 
 def _translated(

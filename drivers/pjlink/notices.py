@@ -1,4 +1,4 @@
-"""PJLink over UDP as bytes: how class 2 projectors are found, and what they tell unasked.
+"""PJLink over UDP as bytes: how class 2 projectors are found, and the notices that they send.
 
 Rules that hold inside:
 
@@ -99,7 +99,7 @@ def is_notice_of_start(line: bytes) -> bool:
 def _message(line: bytes) -> Found | Notice | None:
     try:
         reply = wire.parse_reply(line.strip())
-        if not isinstance(reply, wire.Reply) or reply.level != 2:
+        if not isinstance(reply, wire.PjLinkReply) or reply.level != 2:
             return None
         match reply.command:
             case "ACKN":

@@ -16,7 +16,16 @@ from collections.abc import Callable
 
 from drivers.links.link import Link
 from drivers.pjlink import notices, wire
-from drivers.pjlink.wire import ErrorCode, Input, LineCutter, NoResolution, Refused, Reply, Request, Resolution
+from drivers.pjlink.wire import (
+    ErrorCode,
+    Input,
+    LineCutter,
+    NoResolution,
+    PjLinkReply,
+    PjLinkRequest,
+    Refused,
+    Resolution,
+)
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
@@ -61,7 +70,7 @@ class _Connection:
                 raise LinkTimeout(f"the projector has not finished its answer within {self._timeout:g} s")
             self._lines = self._cutter.feed(self.link.read(wire.MAX_LINE, remaining))
 
-    def ask(self, request: Request) -> Reply | Refused:
+    def ask(self, request: PjLinkRequest) -> PjLinkReply | Refused:
         # Whatever stands here unasked answers no question of ours.
         self._lines.clear()
         self.link.write(wire.encode_request(request), self._timeout)
@@ -144,7 +153,7 @@ class PjLinkProjector:
 
     def lamps(self) -> tuple[Lamp, ...]:
         """Return every lamp; empty for a lampless projector, which does not know the question."""
-        reply = self._exchange(Request("LAMP"))
+        reply = self._exchange(PjLinkRequest("LAMP"))
         if reply.error is ErrorCode.UNDEFINED:
             return ()
         return wire.parse_lamps(self._value(reply))
@@ -152,12 +161,12 @@ class PjLinkProjector:
     def pjlink_class(self) -> int:
         """Return the class of PJLink that the projector speaks, 1 or 2; asked once."""
         if self._class is None:
-            reply = self._exchange(Request("CLSS"))
+            reply = self._exchange(PjLinkRequest("CLSS"))
             self._class = 1 if reply.error is ErrorCode.UNDEFINED else wire.parse_class(self._value(reply))
         return self._class
 
     def other_information(self) -> str:
-        """Return what the maker found worth telling; empty where there is nothing."""
+        """Return the maker's own text about the projector (INFO); empty where there is none."""
         return self._name("INFO")
 
     def inputs(self) -> tuple[Input, ...]:
@@ -179,7 +188,7 @@ class PjLinkProjector:
         Parameters
         ----------
         code
-            As `inputs` tells it, two characters.
+            As in `inputs`, two characters.
 
         Raises
         ------
@@ -214,7 +223,7 @@ class PjLinkProjector:
         self._set_class_2("FREZ", wire.format_freeze(frozen))
 
     def picture_fault(self) -> str | None:
-        """Return whether the picture is frozen or no signal arrives, as far as class 2 tells; None with class 1."""
+        """Return whether the picture is frozen or no signal arrives, as far as class 2 can say; None with class 1."""
         if self.pjlink_class() < 2:
             return None
         if self.frozen():
@@ -251,11 +260,11 @@ class PjLinkProjector:
             connection.link.close()
 
     def _name(self, command: str) -> str:
-        reply = self._exchange(Request(command))
+        reply = self._exchange(PjLinkRequest(command))
         return reply.value if reply.error is None else ""
 
     def _ask(self, command: str, level: int = 1) -> str:
-        return self._value(self._exchange(Request(command, level=level)))
+        return self._value(self._exchange(PjLinkRequest(command, level=level)))
 
     def _ask_class_2(self, command: str) -> str:
         self._require_class_2(command)
@@ -264,12 +273,12 @@ class PjLinkProjector:
     def _ask_for_part(self, command: str) -> str | None:
         """Return what a projector says of a part, None where it does not know the question for want of the part."""
         self._require_class_2(command)
-        reply = self._exchange(Request(command, level=2))
+        reply = self._exchange(PjLinkRequest(command, level=2))
         return None if reply.error is ErrorCode.UNDEFINED else self._value(reply)
 
     def _input_name(self, code: str) -> str:
         # Names are a courtesy: some projectors keep them back in standby, or have none.
-        reply = self._exchange(Request("INNM", wire.QUERY + code, level=2))
+        reply = self._exchange(PjLinkRequest("INNM", wire.QUERY + code, level=2))
         return reply.value if reply.error is None else ""
 
     def _require_class_2(self, command: str) -> None:
@@ -283,12 +292,12 @@ class PjLinkProjector:
         self._set(command, parameter, level=2)
 
     def _set(self, command: str, parameter: str, level: int = 1) -> None:
-        value = self._value(self._exchange(Request(command, parameter, level)), parameter)
+        value = self._value(self._exchange(PjLinkRequest(command, parameter, level)), parameter)
         if value.upper() != wire.OK:
             self.close()
             raise ProtocolError(f"{self._label} answers {value!r} to {command} {parameter}; expected OK")
 
-    def _value(self, reply: Reply, parameter: str = wire.QUERY) -> str:
+    def _value(self, reply: PjLinkReply, parameter: str = wire.QUERY) -> str:
         asked = f"{self._label} answers {reply.value} to {reply.command} {parameter}"
         match reply.error:
             case None:
@@ -304,21 +313,21 @@ class PjLinkProjector:
             case ErrorCode.FAILURE:
                 raise DeviceFault(f"{asked}: it reports a failure of its own; look at its lamps and display")
 
-    def _exchange(self, request: Request) -> Reply:
+    def _exchange(self, request: PjLinkRequest) -> PjLinkReply:
         """Return the answer to `request`, over a new connection if the one there is has been dropped meanwhile."""
         try:
             return self._exchange_once(request)
         except _ConnectionSpent:
             return self._exchange_once(request)
 
-    def _exchange_once(self, request: Request) -> Reply:
+    def _exchange_once(self, request: PjLinkRequest) -> PjLinkReply:
         connection = self._connection
         if connection is None:
             connection = self._connection = self._greeted()
         used, connection.used = connection.used, True
         try:
             digest, connection.digest = connection.digest, ""
-            reply = connection.ask(Request(request.command, request.parameter, request.level, digest))
+            reply = connection.ask(PjLinkRequest(request.command, request.parameter, request.level, digest))
             if isinstance(reply, Refused):
                 if used:
                     # Some servers want the digest before every command: a new connection begins with one.

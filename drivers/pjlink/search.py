@@ -1,4 +1,4 @@
-"""Finds PJLink projectors on the network, and hears what they tell unasked (class 2 only).
+"""Finds PJLink projectors on the network, and receives the notices that they send (class 2 only).
 
 Rules that hold inside:
 
@@ -117,7 +117,7 @@ class NoticePort:
     Parameters
     ----------
     port
-        Where projectors send them; the standard allows 4352 only. 0 lets the system pick one, `address` tells which.
+        Where projectors send them; the standard allows 4352 only. 0 lets the system pick one, which `address` names.
     host
         The own address to listen at; all of them unless given.
 

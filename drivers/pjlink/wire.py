@@ -64,7 +64,7 @@ class Refused(Enum):
 
 
 @dataclass(frozen=True)
-class Request:
+class PjLinkRequest:
     """A command: four capital letters and a parameter, `QUERY` to ask; `digest` on a connection's first one."""
 
     command: str
@@ -74,7 +74,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Reply:
+class PjLinkReply:
     """An answer: the command it belongs to, and its value, or `OK`, or an error's code."""
 
     command: str
@@ -185,7 +185,7 @@ def parse_greeting(line: bytes) -> Greeting | Refused:
             )
 
 
-def encode_request(request: Request) -> bytes:
+def encode_request(request: PjLinkRequest) -> bytes:
     """Return a command line.
 
     Raises
@@ -201,7 +201,7 @@ def encode_request(request: Request) -> bytes:
     return request.digest.encode("ascii") + line
 
 
-def parse_request(line: bytes) -> Request:
+def parse_request(line: bytes) -> PjLinkRequest:
     """Return the command in a line, without its end."""
     found = re.fullmatch(rb"([0-9A-Fa-f]{96}|[0-9A-Fa-f]{32})?%([0-9])([0-9A-Za-z]{4}) (.{1,128})", line, re.DOTALL)
     if found is None:
@@ -209,7 +209,7 @@ def parse_request(line: bytes) -> Request:
             f"{_quoted(line)} is no PJLink command; expected %1 or %2, four letters, a space, a parameter"
         )
     digest, level, command, parameter = found.groups(b"")
-    return Request(
+    return PjLinkRequest(
         command.decode("ascii").upper(),
         parameter.decode("utf-8", "replace"),
         int(level),
@@ -217,14 +217,14 @@ def parse_request(line: bytes) -> Request:
     )
 
 
-def encode_reply(reply: Reply | Refused) -> bytes:
+def encode_reply(reply: PjLinkReply | Refused) -> bytes:
     """Return an answer's line."""
     if isinstance(reply, Refused):
         return f"{reply.value}\r".encode("ascii")
     return f"%{reply.level}{reply.command}={reply.value}\r".encode()
 
 
-def parse_reply(line: bytes) -> Reply | Refused:
+def parse_reply(line: bytes) -> PjLinkReply | Refused:
     """Return the answer in a line, without its end; a value's case is kept, for names have one."""
     if line.strip().upper() == b"PJLINK ERRA":
         return Refused.WRONG_PASSWORD
@@ -232,7 +232,7 @@ def parse_reply(line: bytes) -> Reply | Refused:
     if found is None:
         raise ProtocolError(f"the projector answers {_quoted(line)}; expected %1 or %2, four letters, = and a value")
     level, command, value = found.groups()
-    return Reply(command.decode("ascii").upper(), value.decode("utf-8", "replace").strip(), int(level))
+    return PjLinkReply(command.decode("ascii").upper(), value.decode("utf-8", "replace").strip(), int(level))
 
 
 _POWERS = {"0": Power.STANDBY, "1": Power.ON, "2": Power.COOLING, "3": Power.WARMING}
@@ -345,7 +345,7 @@ class Resolution:
 
 
 class NoResolution(Enum):
-    """Why an input has no resolution to tell (IRES)."""
+    """Why an input has no resolution (IRES)."""
 
     NO_SIGNAL = "-"
     UNKNOWN_SIGNAL = "*"

@@ -135,7 +135,7 @@ class ResponseCode(IntEnum):
 
 
 class EventCode(IntEnum):
-    """What a device tells on its event channel; from 0xc000 Canon's."""
+    """What a device reports on its event channel; from 0xc000 Canon's."""
 
     UNDEFINED = 0x4000
     CANCEL_TRANSACTION = 0x4001

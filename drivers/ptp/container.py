@@ -9,7 +9,7 @@ Laws that hold inside:
   phase is handed on as it comes, so that no object ever lies here in full.
 - Lengths are checked before they are believed; whatever arrives, the only error is `ProtocolError`. The stream has
   then lost its place: every further `feed` raises too, until a new reader is taken.
-- The one thing a stream alone cannot tell is where a data phase of unknown length ends. Only there a piece must be
+- The one thing a stream alone does not show is where a data phase of unknown length ends. Only there a piece must be
   what one read of the pipe returned, for a short packet ends it.
 
 Sources: USB Still Image Capture Device Definition 1.0, clauses 5 (control requests) and 7 (containers);
@@ -23,11 +23,9 @@ from enum import IntEnum
 
 from drivers.ptp.cursor import Cursor
 from drivers.ptp.datasets import encode_integer
-from drivers.ptp.messages import MAX_PARAMETERS, Event, Request, Response
+from drivers.ptp.messages import MAX_PARAMETERS, PtpEvent, PtpRequest, PtpResponse
 from foundation.errors import ProtocolError
 
-INTERFACE_CLASS = (6, 1, 1)
-"""USB class, subclass and protocol of a still image device."""
 HEADER_LENGTH = 12
 UNKNOWN_LENGTH = 0xFFFFFFFF
 """A container's length where the payload goes on until a short packet: more than 4 GiB, or not known."""
@@ -46,7 +44,7 @@ class ContainerType(IntEnum):
 
 @dataclass(frozen=True)
 class DataStart:
-    """A data phase begins; `length` counts the payload's bytes, None where only a short packet will tell."""
+    """A data phase begins; `length` counts the payload's bytes, None where only a short packet ends it."""
 
     code: int
     transaction: int
@@ -61,7 +59,7 @@ class DataPiece:
     last: bool = False
 
 
-Message = Request | Response | Event | DataStart | DataPiece
+Message = PtpRequest | PtpResponse | PtpEvent | DataStart | DataPiece
 
 
 class ContainerReader:
@@ -128,11 +126,11 @@ class ContainerReader:
         values = body.integers(parameters, 4, "parameters")
         match kind:
             case ContainerType.COMMAND:
-                messages.append(Request(code, transaction, values))
+                messages.append(PtpRequest(code, transaction, values))
             case ContainerType.RESPONSE:
-                messages.append(Response(code, transaction, values))
+                messages.append(PtpResponse(code, transaction, values))
             case _:
-                messages.append(Event(code, transaction, values))
+                messages.append(PtpEvent(code, transaction, values))
         return bool(self._rest)
 
     def _start_data(self, messages: list[Message], code: int, transaction: int, length: int, piece: bytes) -> None:
@@ -165,7 +163,7 @@ class ContainerReader:
         return bool(self._rest)
 
 
-def encode(message: Request | Response | Event) -> bytes:
+def encode(message: PtpRequest | PtpResponse | PtpEvent) -> bytes:
     """Return the container of a message.
 
     Raises
@@ -176,11 +174,11 @@ def encode(message: Request | Response | Event) -> bytes:
     if len(message.parameters) > MAX_PARAMETERS:
         raise ValueError(f"{message} has {len(message.parameters)} parameters; at most {MAX_PARAMETERS} are possible")
     match message:
-        case Request():
+        case PtpRequest():
             kind = ContainerType.COMMAND
-        case Response():
+        case PtpResponse():
             kind = ContainerType.RESPONSE
-        case Event():
+        case PtpEvent():
             kind = ContainerType.EVENT
     length = HEADER_LENGTH + 4 * len(message.parameters)
     return _header(length, kind, message.code, message.transaction) + b"".join(

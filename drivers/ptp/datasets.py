@@ -316,7 +316,7 @@ class StorageInfo:
 
 
 class Form(IntEnum):
-    """How a property's values are told (13.3.3)."""
+    """How a property's values are listed (13.3.3)."""
 
     NONE = 0
     RANGE = 1
@@ -337,7 +337,7 @@ class EnumerationForm:
     """A property takes the values of a list.
 
     `widened` says that a device sends values of one byte as two, as the EOS 60D does for the battery's level
-    (0x5001: 100, 75, 50, 25, 0); the standard does not allow it, but it can be told by the bytes that are left.
+    (0x5001: 100, 75, 50, 25, 0); the standard does not allow it, but the bytes that are left show it.
     """
 
     values: tuple[Value, ...]

@@ -1,8 +1,8 @@
 """What passes between the two ends of PTP, whatever the cable: requests, responses, events.
 
-A transaction is one `Request`, then at most one data phase in either direction, then one `Response`. `Event` comes
-from the responder at any time. Codes stay plain integers here, for a device may use any; `drivers.ptp.codes` names
-those that are known.
+A transaction is one `PtpRequest`, then at most one data phase in either direction, then one `PtpResponse`. A `PtpEvent`
+comes from the responder at any time. Codes stay plain integers here, for a device may use any; `drivers.ptp.codes`
+names those that are known.
 
 Source: ISO 15740:2013, clause 9.
 """
@@ -20,7 +20,7 @@ LAST_TRANSACTION = 0xFFFFFFFE
 
 
 @dataclass(frozen=True)
-class Request:
+class PtpRequest:
     """An operation that the initiator asks for."""
 
     code: int
@@ -32,7 +32,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Response:
+class PtpResponse:
     """How an operation ended; `transaction` is the request's."""
 
     code: int
@@ -49,7 +49,7 @@ class Response:
 
 
 @dataclass(frozen=True)
-class Event:
+class PtpEvent:
     """Something that happened in the device; `transaction` is 0xffffffff where it belongs to none."""
 
     code: int

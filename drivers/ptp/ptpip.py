@@ -24,7 +24,7 @@ from enum import IntEnum
 
 from drivers.ptp.cursor import Cursor
 from drivers.ptp.datasets import encode_integer
-from drivers.ptp.messages import MAX_PARAMETERS, Event, Request, Response
+from drivers.ptp.messages import MAX_PARAMETERS, PtpEvent, PtpRequest, PtpResponse
 from foundation.errors import ProtocolError
 
 PORT = 15740
@@ -108,7 +108,7 @@ class InitFail:
 class OperationRequest:
     """A request, and whether the initiator will send the data phase."""
 
-    request: Request
+    request: PtpRequest
     sends_data: bool = False
 
 
@@ -160,8 +160,8 @@ Packet = (
     | InitEventAck
     | InitFail
     | OperationRequest
-    | Response
-    | Event
+    | PtpResponse
+    | PtpEvent
     | StartData
     | Data
     | EndData
@@ -198,9 +198,9 @@ def encode(packet: Packet) -> bytes:
         case OperationRequest(request, sends_data):
             kind = PacketType.OPERATION_REQUEST
             body = encode_integer(_DATA_OUT if sends_data else _NO_DATA_OR_IN, 4) + _message(request)
-        case Response():
+        case PtpResponse():
             kind, body = PacketType.OPERATION_RESPONSE, _message(packet)
-        case Event():
+        case PtpEvent():
             kind, body = PacketType.EVENT, _message(packet)
         case StartData(transaction, total):
             kind = PacketType.START_DATA
@@ -357,7 +357,7 @@ def _read_version(cursor: Cursor) -> int:
     return cursor.u32("version") if cursor.left else VERSION
 
 
-def _message(message: Request | Response | Event) -> bytes:
+def _message(message: PtpRequest | PtpResponse | PtpEvent) -> bytes:
     if len(message.parameters) > MAX_PARAMETERS:
         raise ValueError(f"{message} has {len(message.parameters)} parameters; at most {MAX_PARAMETERS} are possible")
     return (
@@ -381,7 +381,7 @@ def _read_operation(cursor: Cursor) -> OperationRequest:
     phase = cursor.u32("data phase")
     if phase > _DATA_OUT:
         raise cursor.fault("data phase", "1 none or in, 2 out", phase)
-    return OperationRequest(Request(*_read_message(cursor)), phase == _DATA_OUT)
+    return OperationRequest(PtpRequest(*_read_message(cursor)), phase == _DATA_OUT)
 
 
 def _read_start(cursor: Cursor) -> StartData:
@@ -405,8 +405,8 @@ _BODIES: dict[int, Callable[[Cursor], Packet]] = {
     PacketType.INIT_EVENT_ACK: lambda cursor: InitEventAck(),
     PacketType.INIT_FAIL: lambda cursor: InitFail(cursor.u32("reason")),
     PacketType.OPERATION_REQUEST: _read_operation,
-    PacketType.OPERATION_RESPONSE: lambda cursor: Response(*_read_message(cursor)),
-    PacketType.EVENT: lambda cursor: Event(*_read_message(cursor)),
+    PacketType.OPERATION_RESPONSE: lambda cursor: PtpResponse(*_read_message(cursor)),
+    PacketType.EVENT: lambda cursor: PtpEvent(*_read_message(cursor)),
     PacketType.START_DATA: _read_start,
     PacketType.DATA: lambda cursor: Data(cursor.u32("transaction"), cursor.rest()),
     PacketType.CANCEL: lambda cursor: Cancel(cursor.u32("transaction")),

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.ptp.messages import Request, Response
+from drivers.ptp.messages import PtpRequest, PtpResponse
 from drivers.ptp.transport import MAX_COLLECTED, Transaction
 from foundation.errors import LinkClosed, LinkError, ProtocolError
 
@@ -77,7 +77,7 @@ class Turns:
 class Reception:
     """Takes what the device sends between a request and the end of its response; `label` names the device."""
 
-    def __init__(self, request: Request, receive: Callable[[bytes], object] | None, label: str) -> None:
+    def __init__(self, request: PtpRequest, receive: Callable[[bytes], object] | None, label: str) -> None:
         self.request = request
         self._receive = receive
         self.label = label
@@ -125,7 +125,7 @@ class Reception:
         else:
             self._collected += piece
 
-    def end(self, response: Response) -> Transaction:
+    def end(self, response: PtpResponse) -> Transaction:
         """Return the transaction that `response` ends.
 
         Raises

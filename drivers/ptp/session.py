@@ -2,8 +2,8 @@
 
 Laws that hold inside:
 
-- A response other than OK is a `Declined`, which tells its code by number and by name; what a device declines for the
-  moment only (`PASSING`) is asked again, for a limited time.
+- A response other than OK raises `OperationDeclined`, which has its code by number and by name; what a device declines
+  for the moment only (`PASSING`) is asked again, for a limited time.
 - A fault of cable or protocol goes straight to the caller: whether an operation may be repeated is not known here.
   After one, the session is spent; a new one begins with `Transport.reset` or a new transport.
 
@@ -16,7 +16,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 
 from drivers.ptp.codes import Operation, ResponseCode, describe
-from drivers.ptp.messages import Event, Request, next_transaction
+from drivers.ptp.messages import PtpEvent, PtpRequest, next_transaction
 from drivers.ptp.transport import Transport
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolError
@@ -24,7 +24,7 @@ from foundation.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolE
 START_TIMEOUT_S = 1.5
 """Wait for the answer to OpenSession: a body that a killed host left behind never answers before a reset."""
 TIMEOUT_S = 20.0
-"""Wait for every other answer, unless told otherwise."""
+"""Wait for every other answer, unless the caller sets another."""
 PASSING_LIMIT_S = 10.0
 """How long an operation is asked again when a device declines it for the moment."""
 OPEN_TRIES = 3
@@ -38,7 +38,7 @@ _LONGEST_PAUSE_S = 1.0
 _LAST_SESSION = 8
 
 
-class Declined(DeviceRefused):
+class OperationDeclined(DeviceRefused):
     """A device answered an operation with another response than OK: `code`."""
 
     def __init__(self, message: str, code: int) -> None:
@@ -74,7 +74,7 @@ class PtpSession:
         ------
         LinkTimeout, LinkClosed, ProtocolError
             No answer, after `OPEN_TRIES` tries.
-        Declined
+        OperationDeclined
             The device answers, and refuses.
         """
         faults = 0
@@ -83,7 +83,7 @@ class PtpSession:
         while True:
             try:
                 code = self._transport.transact(
-                    Request(Operation.OPEN_SESSION, 0, (session,)), timeout=START_TIMEOUT_S
+                    PtpRequest(Operation.OPEN_SESSION, 0, (session,)), timeout=START_TIMEOUT_S
                 ).response.code
             except (LinkTimeout, ProtocolError):
                 faults += 1
@@ -97,7 +97,7 @@ class PtpSession:
             if code == ResponseCode.INVALID_TRANSACTION_ID and session < _LAST_SESSION:
                 session += 1
             elif code not in PASSING or not next(pauses, False):
-                raise self._declined(Request(Operation.OPEN_SESSION, 0, (session,)), code)
+                raise self._declined(PtpRequest(Operation.OPEN_SESSION, 0, (session,)), code)
 
     def close(self) -> None:
         """Close the session as far as the device still answers; the cable stays open."""
@@ -135,7 +135,7 @@ class PtpSession:
 
         Raises
         ------
-        Declined
+        OperationDeclined
             The device answered something else than OK.
         LinkError, ProtocolError
             From the transport; the session is spent.
@@ -143,7 +143,7 @@ class PtpSession:
         pauses = self._pauses(patience)
         while True:
             self._transaction = next_transaction(self._transaction)
-            request = Request(operation, self._transaction, parameters)
+            request = PtpRequest(operation, self._transaction, parameters)
             done = self._transport.transact(request, send=send, receive=receive, timeout=timeout)
             if done.response.ok:
                 return done.response.parameters, done.data
@@ -151,7 +151,7 @@ class PtpSession:
             if done.response.code not in PASSING or not next(pauses, False):
                 raise self._declined(request, done.response.code)
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that came on the event channel since the last call; never waits."""
         return self._transport.events()
 
@@ -164,6 +164,6 @@ class PtpSession:
             pause = min(2 * pause, _LONGEST_PAUSE_S)
             yield True
 
-    def _declined(self, request: Request, code: int) -> Declined:
+    def _declined(self, request: PtpRequest, code: int) -> OperationDeclined:
         remedy = "; wait until it is idle, then try again" if code in PASSING else ""
-        return Declined(f"{self.label} answers {describe(ResponseCode, code)} to {request}{remedy}", code)
+        return OperationDeclined(f"{self.label} answers {describe(ResponseCode, code)} to {request}{remedy}", code)

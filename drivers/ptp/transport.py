@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 
 MAX_COLLECTED = 4 * 1024 * 1024
 """Bytes of a data phase that a transport collects for a caller who takes none of it piece by piece."""
@@ -20,7 +20,7 @@ MAX_COLLECTED = 4 * 1024 * 1024
 class Transaction:
     """How a transaction ended: the device's response, and the data phase if it was collected."""
 
-    response: Response
+    response: PtpResponse
     data: bytes = b""
 
 
@@ -34,7 +34,7 @@ class Transport(Protocol):
 
     def transact(
         self,
-        request: Request,
+        request: PtpRequest,
         *,
         send: bytes | None = None,
         receive: Callable[[bytes], object] | None = None,
@@ -64,7 +64,7 @@ class Transport(Protocol):
         """
         ...
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come since the last call; never waits."""
         ...
 

@@ -28,7 +28,7 @@ from drivers.ptp.container import (
     encode_data_header,
     ends_with_empty_packet,
 )
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.reception import Reception, Turns
 from drivers.ptp.transport import Transaction
 from foundation.clock import Clock
@@ -65,7 +65,7 @@ class UsbTransport:
 
     def transact(
         self,
-        request: Request,
+        request: PtpRequest,
         *,
         send: bytes | None = None,
         receive: Callable[[bytes], object] | None = None,
@@ -81,7 +81,7 @@ class UsbTransport:
 
         return self._turns.take(Reception(request, receive, self.label), exchange, self._cancel)
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come since the last call.
 
         Takes one polling interval of the interrupt pipe, some milliseconds, for the bus looks no more often.
@@ -94,7 +94,7 @@ class UsbTransport:
             It sends what is no event; what follows will be read again.
         """
         self._turns.check_open(self.label)
-        events: list[Event] = []
+        events: list[PtpEvent] = []
         while len(events) < MAX_EVENTS:
             try:
                 piece = self._pipes.interrupt_read(self._pipes.polling_s)
@@ -108,7 +108,7 @@ class UsbTransport:
             except ProtocolError:
                 self._events_reader = ContainerReader(self._pipes.packet_size)
                 raise
-            events += [message for message in messages if isinstance(message, Event)]
+            events += [message for message in messages if isinstance(message, PtpEvent)]
             if not piece:
                 break
         return tuple(events)
@@ -138,7 +138,7 @@ class UsbTransport:
         self._turns.closed = True
         self._pipes.close()
 
-    def _send(self, request: Request, send: bytes | None, timeout: float) -> None:
+    def _send(self, request: PtpRequest, send: bytes | None, timeout: float) -> None:
         self._write(encode(request), timeout)
         if send is None:
             return
@@ -189,7 +189,7 @@ class UsbTransport:
                     case DataPiece(data, last):
                         reception.take(data)
                         open_ended = open_ended and not last
-                    case Response() as response:
+                    case PtpResponse() as response:
                         return reception.end(response)
                     case _:
                         raise ProtocolError(f"{self.label} sends {message} where a response was due; reset it")

@@ -9,8 +9,8 @@ from __future__ import annotations
 import io
 from functools import lru_cache
 
-from drivers.tiff.reading import CFA
-from drivers.tiff.writing import Kind, head, text
+from drivers.tiff.tags import CFA, TiffTag
+from drivers.tiff.writing import Kind, Tags, head, text
 
 Matrix = tuple[tuple[float, float, float], ...]
 """Three rows R, G, B of three numbers: from CIE XYZ (D65, Y = 1) to linear camera RGB."""
@@ -27,20 +27,20 @@ def camera_matrix(camera: str) -> Matrix | None:
         return None
     import rawpy
 
-    tags = {
-        256: (Kind.LONG, [_SIDE]),  # ImageWidth
-        257: (Kind.LONG, [_SIDE]),  # ImageLength
-        258: (Kind.SHORT, [16]),  # BitsPerSample
-        259: (Kind.SHORT, [1]),  # Compression: none
-        262: (Kind.SHORT, [CFA]),
-        271: text(maker),
-        272: text(camera),
-        277: (Kind.SHORT, [1]),  # SamplesPerPixel
-        278: (Kind.LONG, [_SIDE]),  # RowsPerStrip
-        33421: (Kind.SHORT, [2, 2]),  # CFARepeatPatternDim
-        33422: (Kind.BYTE, [0, 1, 1, 2]),  # CFAPattern
-        50706: (Kind.BYTE, [1, 4, 0, 0]),  # DNGVersion
-        50708: text(camera),  # UniqueCameraModel
+    tags: Tags = {
+        TiffTag.IMAGE_WIDTH: (Kind.LONG, [_SIDE]),
+        TiffTag.IMAGE_LENGTH: (Kind.LONG, [_SIDE]),
+        TiffTag.BITS_PER_SAMPLE: (Kind.SHORT, [16]),
+        TiffTag.COMPRESSION: (Kind.SHORT, [1]),  # none
+        TiffTag.PHOTOMETRIC_INTERPRETATION: (Kind.SHORT, [CFA]),
+        TiffTag.MAKE: text(maker),
+        TiffTag.MODEL: text(camera),
+        TiffTag.SAMPLES_PER_PIXEL: (Kind.SHORT, [1]),
+        TiffTag.ROWS_PER_STRIP: (Kind.LONG, [_SIDE]),
+        TiffTag.CFA_REPEAT_PATTERN_DIM: (Kind.SHORT, [2, 2]),
+        TiffTag.CFA_PATTERN: (Kind.BYTE, [0, 1, 1, 2]),
+        TiffTag.DNG_VERSION: (Kind.BYTE, [1, 4, 0, 0]),
+        TiffTag.UNIQUE_CAMERA_MODEL: text(camera),
     }
     pixels = bytes(2 * _SIDE * _SIDE)
     try:

@@ -16,7 +16,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.tiff.reading import CFA, Directory, Tag
+from drivers.tiff.reading import Directory
+from drivers.tiff.tags import CFA, TiffTag
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
@@ -61,16 +62,16 @@ class PlainDng:
     shutter_s: float | None
 
 
-_PLAIN: dict[Tag, tuple[tuple[int, ...], ...]] = {
-    Tag.COMPRESSION: ((1,),),
-    Tag.PHOTOMETRIC: ((CFA,),),
-    Tag.BITS_PER_SAMPLE: ((16,),),
-    Tag.SAMPLES_PER_PIXEL: ((1,), ()),
-    Tag.CFA_REPEAT_DIM: ((2, 2),),
-    Tag.CFA_PLANE_COLOR: ((0, 1, 2), ()),
-    Tag.CFA_LAYOUT: ((1,), ()),
-    Tag.LINEARIZATION_TABLE: ((),),
-    Tag.TILE_OFFSETS: ((),),
+_PLAIN: dict[TiffTag, tuple[tuple[int, ...], ...]] = {
+    TiffTag.COMPRESSION: ((1,),),
+    TiffTag.PHOTOMETRIC_INTERPRETATION: ((CFA,),),
+    TiffTag.BITS_PER_SAMPLE: ((16,),),
+    TiffTag.SAMPLES_PER_PIXEL: ((1,), ()),
+    TiffTag.CFA_REPEAT_PATTERN_DIM: ((2, 2),),
+    TiffTag.CFA_PLANE_COLOR: ((0, 1, 2), ()),
+    TiffTag.CFA_LAYOUT: ((1,), ()),
+    TiffTag.LINEARIZATION_TABLE: ((),),
+    TiffTag.TILE_OFFSETS: ((),),
 }
 """What a plain file states, or does not state."""
 
@@ -92,8 +93,9 @@ def read_plainly(data: bytes | memoryview, directories: Sequence[Directory]) -> 
         return None
     if any(pixels.integers(tag) not in allowed for tag, allowed in _PLAIN.items()):
         return None
-    size, pattern = (*pixels.integers(Tag.LENGTH), *pixels.integers(Tag.WIDTH)), pixels.integers(Tag.CFA_PATTERN)
-    white, black, strips = pixels.integers(Tag.WHITE_LEVEL), stated_black(pixels), pixels.extents()
+    size = (*pixels.integers(TiffTag.IMAGE_LENGTH), *pixels.integers(TiffTag.IMAGE_WIDTH))
+    pattern = pixels.integers(TiffTag.CFA_PATTERN)
+    white, black, strips = pixels.integers(TiffTag.WHITE_LEVEL), stated_black(pixels), pixels.extents()
     letters = "".join("RGB"[index] for index in pattern if index < 3)
     if len(size) != 2 or letters not in BAYER_PATTERNS or len(white) != 1 or black is None or not strips:
         return None
@@ -105,7 +107,10 @@ def read_plainly(data: bytes | memoryview, directories: Sequence[Directory]) -> 
     sensor = np.frombuffer(data, dtype=np.uint16, count=size[0] * size[1], offset=start).reshape(size)
     black = np.array(black)
     black.setflags(write=False)
-    iso, aperture, shutter = (_exposure(directories, tag) for tag in (Tag.ISO, Tag.APERTURE, Tag.SHUTTER))
+    iso, aperture, shutter = (
+        _exposure(directories, tag)
+        for tag in (TiffTag.PHOTOGRAPHIC_SENSITIVITY, TiffTag.F_NUMBER, TiffTag.EXPOSURE_TIME)
+    )
     return PlainDng(
         sensor,
         active,
@@ -118,7 +123,7 @@ def read_plainly(data: bytes | memoryview, directories: Sequence[Directory]) -> 
     )
 
 
-def _exposure(directories: Sequence[Directory], tag: Tag) -> float:
+def _exposure(directories: Sequence[Directory], tag: TiffTag) -> float:
     """Return the first number of `tag` in any directory, 0 if none has it."""
     found = (directory.numbers(tag) for directory in directories)
     return next((numbers[0] for numbers in found if numbers), 0.0)
@@ -129,9 +134,9 @@ def raw_pixels(directories: Sequence[Directory]) -> Directory | None:
     found = [
         directory
         for directory in directories
-        if directory.integers(Tag.PHOTOMETRIC) == (CFA,) or directory.integers(Tag.CR2_SLICES)
+        if directory.integers(TiffTag.PHOTOMETRIC_INTERPRETATION) == (CFA,) or directory.integers(TiffTag.CR2_SLICES)
     ]
-    return max(found, key=lambda directory: directory.integers(Tag.WIDTH), default=None)
+    return max(found, key=lambda directory: directory.integers(TiffTag.IMAGE_WIDTH), default=None)
 
 
 def stated_black(pixels: Directory | None) -> NDArray[np.float64] | None:
@@ -140,25 +145,25 @@ def stated_black(pixels: Directory | None) -> NDArray[np.float64] | None:
     LibRaw cuts the level to an integer. The rows and columns of BlackLevel count from the active area's corner
     (DNG 1.7, BlackLevel); deltas per row and column enter by their mean, as in LibRaw.
     """
-    if pixels is None or not pixels.numbers(Tag.BLACK_LEVEL):
+    if pixels is None or not pixels.numbers(TiffTag.BLACK_LEVEL):
         return None
-    levels = np.array(pixels.numbers(Tag.BLACK_LEVEL), dtype=np.float64)
-    shape = pixels.integers(Tag.BLACK_LEVEL_REPEAT_DIM) or (1, 1)
+    levels = np.array(pixels.numbers(TiffTag.BLACK_LEVEL), dtype=np.float64)
+    shape = pixels.integers(TiffTag.BLACK_LEVEL_REPEAT_DIM) or (1, 1)
     if shape not in ((1, 1), (1, 2), (2, 1), (2, 2)) or levels.size != shape[0] * shape[1]:
         return None
-    deltas = [pixels.numbers(tag) for tag in (Tag.BLACK_LEVEL_DELTA_H, Tag.BLACK_LEVEL_DELTA_V)]
+    deltas = [pixels.numbers(tag) for tag in (TiffTag.BLACK_LEVEL_DELTA_H, TiffTag.BLACK_LEVEL_DELTA_V)]
     extra = sum(float(np.mean(delta)) for delta in deltas if delta)
     return np.broadcast_to(levels.reshape(shape), (2, 2)) + extra
 
 
 def active_area(pixels: Directory | None, sensor: tuple[int, int]) -> Area | None:
     """Return the visible area that a DNG states; LibRaw would make its top even for a Canon, dcraw does not."""
-    areas = stated_areas(pixels, Tag.ACTIVE_AREA, sensor)
+    areas = stated_areas(pixels, TiffTag.ACTIVE_AREA, sensor)
     return areas[0] if areas and min(areas[0].height, areas[0].width) >= 2 else None
 
 
-def stated_areas(pixels: Directory | None, tag: Tag, sensor: tuple[int, int]) -> tuple[Area, ...]:
-    """Return the rectangles of `tag`, told as top, left, bottom, right, that lie on the sensor."""
+def stated_areas(pixels: Directory | None, tag: TiffTag, sensor: tuple[int, int]) -> tuple[Area, ...]:
+    """Return the rectangles of `tag`, stored as top, left, bottom, right, that lie on the sensor."""
     edges = () if pixels is None else pixels.integers(tag)
     return tuple(
         Area(top, left, bottom - top, right - left)

@@ -36,7 +36,8 @@ from drivers.raw.plain_dng import (
     stated_areas,
     stated_black,
 )
-from drivers.tiff.reading import Directory, Tag, TiffDamaged, is_tiff, read_directories
+from drivers.tiff.reading import Directory, TiffDamaged, is_tiff, read_directories
+from drivers.tiff.tags import TiffTag
 from foundation.errors import FormatError
 from foundation.files import read_whole
 from foundation.robust import MAD_TO_SIGMA
@@ -314,12 +315,12 @@ def _check_structure(path: Path, data: bytes | memoryview) -> list[Directory]:
 
 def _camera_name(data: bytes | memoryview, directories: list[Directory]) -> str:
     for directory in directories:
-        maker, model = directory.text(Tag.MAKE), directory.text(Tag.MODEL)
+        maker, model = directory.text(TiffTag.MAKE), directory.text(TiffTag.MODEL)
         if model:
             return _joined(maker, model)
     for directory in directories:
-        if directory.text(Tag.UNIQUE_CAMERA_MODEL):
-            return directory.text(Tag.UNIQUE_CAMERA_MODEL)
+        if directory.text(TiffTag.UNIQUE_CAMERA_MODEL):
+            return directory.text(TiffTag.UNIQUE_CAMERA_MODEL)
     return _joined(*_ciff_camera(data))
 
 
@@ -365,7 +366,7 @@ def _dcraw_frame(sensor: tuple[int, int], framed: Area) -> Area:
 
 def _masked_areas(pixels: Directory | None, camera: str, visible: Area, sensor: tuple[int, int]) -> tuple[Area, ...]:
     """Return the optically black areas that the file states, that are known of the sensor, or that Canon always has."""
-    stated = stated_areas(pixels, Tag.MASKED_AREAS, sensor)
+    stated = stated_areas(pixels, TiffTag.MASKED_AREAS, sensor)
     if stated:
         return stated
     if (camera, sensor) in _MASKED:

@@ -5,9 +5,9 @@ Rules that hold inside:
 - ``*pow=?#`` asks, ``*pow=on#`` sets; the answer repeats the name, ``*POW=ON#``. Between them may stand an echo of
   what was sent and the prompt ``>``; projectors on a network send neither.
 - A command that changes nothing may be answered as wrong, so that none is sent.
-- The language knows power on and off only. `BenqProjector.power` takes ``Block item`` for the way between: from where
-  it was last seen. A projector that says on while its lamp still warms up is taken at its word.
-- It cannot tell faults, and `BenqProjector.faults` is always empty.
+- The language knows power on and off only. `BenqProjector.power` takes ``Block item`` for warm-up or cooling, by the
+  state seen last. A projector that says on while its lamp still warms up is taken at its word.
+- It has no question about faults, and `BenqProjector.faults` is always empty.
 
 Source: BenQ, RS232 Command Control (command table, baud rates, the three refusals, echo). Not confirmed by a manual:
 what pow=? answers in warm-up and cooling (as other drivers have met it); which questions standby answers.
@@ -66,7 +66,7 @@ def take_command(data: bytes) -> tuple[str, int] | None:
 def reply_taker(command: bytes) -> Taker[str]:
     """Return what takes the answer to `command` off the front of the bytes, past echo and prompts.
 
-    Where the answer and the echo look the same and only one comes, the prompt after it tells that it was the answer.
+    Where the answer and the echo look the same and only one comes, the prompt after it shows that it was the answer.
     """
     sent = command.strip(b"\r").decode("ascii")
 
@@ -153,7 +153,7 @@ class BenqProjector:
         Raises
         ------
         DeviceRefused
-            It is on the way from one state to another, and was not asked before: which way, it does not tell.
+            It is changing its state and was not asked before: it does not report whether it warms up or cools down.
         """
         try:
             lit = on_or_off("pow", self._command("pow"))
@@ -165,7 +165,7 @@ class BenqProjector:
                     return Power.COOLING
                 case _:
                     raise DeviceRefused(
-                        f"{self._label} is warming up or cooling down, and does not tell which; wait two minutes"
+                        f"{self._label} is warming up or cooling down, and does not report which; wait two minutes"
                     ) from error
         self._settled = Power.ON if lit else Power.STANDBY
         return self._settled

@@ -87,7 +87,7 @@ def take_reply(data: bytes) -> tuple[str, int] | None:
         if not text.startswith(_EVENT):
             return text, end + 1
         start = end + 1
-    # At the wrong speed a colon may never come; what stands there tells it earlier.
+    # At the wrong speed a colon may never come; what stands there shows it earlier.
     text_of(data[start:].replace(b"\r", b"").replace(b"\n", b""))
     return None
 
@@ -149,7 +149,7 @@ def parse_power(code: str) -> Power:
 
 
 def format_fault(part: str) -> str:
-    """Return ERR's code for an ill part; the language knows neither warnings nor two faults at once."""
+    """Return ERR's code for a faulty part; the language knows neither warnings nor two faults at once."""
     return _FAULT_CODES[part]
 
 
@@ -236,7 +236,7 @@ class EpsonProjector:
             raise ProtocolError(f"{self._label} answers {reply!r} to MUTE; expected the colon alone")
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return the fault reported now; empty when healthy, and during warm-up and cooling, when none is told."""
+        """Return the fault reported now; empty when healthy, and during warm-up and cooling, when none is reported."""
         try:
             return parse_faults(self._get("ERR"))
         except DeviceRefused:
@@ -245,7 +245,7 @@ class EpsonProjector:
             raise
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return every lamp; refused where the projector does not tell its hours now."""
+        """Return every lamp; refused where the projector does not report its hours now."""
         value = self._get("LAMP")
         if not re.fullmatch(r"[0-9]+( +[0-9]+)*", value):
             raise ProtocolError(f"{self._label} answers LAMP={value}; expected hours")

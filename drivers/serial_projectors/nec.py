@@ -5,8 +5,8 @@ Rules that hold inside:
 - A frame is a kind, a code, two numbers (0 from us; the projector's own from it), the length of the data, the data,
   and the low byte of the sum of all before. A reply's kind is the command's plus 20h, plus A0h when it failed; then two
   bytes say why.
-- `NecProjector.power` is the running status; warm-up and switching off both show as "switching", and are told apart by
-  whether cooling or our own last command says off.
+- `NecProjector.power` is the running status; warm-up and switching off both show as "switching"; which of them it is
+  follows from the state of cooling or from our own last command.
 
 Source: NEC, Projector Control Command Reference Manual, revision 6.1 (037, 078-2 to 078-5), and Control Commands
 (Basic), revision 5.16 (009, 015, table of error codes). Not confirmed by a manual: the bytes of 016 power off, 020 and
@@ -30,7 +30,7 @@ _HEADER = 5
 
 
 @dataclass(frozen=True)
-class Command:
+class NecCommand:
     """What we say."""
 
     kind: int
@@ -39,8 +39,8 @@ class Command:
 
 
 @dataclass(frozen=True)
-class Reply:
-    """What the projector says; `failed` holds the two bytes that tell why it did not do it."""
+class NecReply:
+    """What the projector says; `failed` holds the two bytes that give the reason why it did not do it."""
 
     kind: int
     code: int
@@ -50,15 +50,15 @@ class Reply:
     model: int = 0x40
 
 
-POWER_ON = Command(2, 0x00)
-POWER_OFF = Command(2, 0x01)
-MUTE_ON = Command(2, 0x10)
-MUTE_OFF = Command(2, 0x11)
-ERRORS = Command(0, 0x88)
-RUNNING = Command(0, 0x85, b"\x01")
-MUTES = Command(0, 0x85, b"\x03")
-MODEL = Command(0, 0x85, b"\x04")
-INFORMATION = Command(3, 0x8A)
+POWER_ON = NecCommand(2, 0x00)
+POWER_OFF = NecCommand(2, 0x01)
+MUTE_ON = NecCommand(2, 0x10)
+MUTE_OFF = NecCommand(2, 0x11)
+ERRORS = NecCommand(0, 0x88)
+RUNNING = NecCommand(0, 0x85, b"\x01")
+MUTES = NecCommand(0, 0x85, b"\x03")
+MODEL = NecCommand(0, 0x85, b"\x04")
+INFORMATION = NecCommand(3, 0x8A)
 
 UNKNOWN_COMMAND = (0, 0)
 POWER_IS_OFF = (2, 0x0D)
@@ -98,13 +98,13 @@ def checksum(data: bytes) -> int:
     return sum(data) & 0xFF
 
 
-def encode_command(command: Command) -> bytes:
+def encode_command(command: NecCommand) -> bytes:
     """Return a command's frame."""
     frame = bytes([command.kind, command.code, 0, 0, len(command.data)]) + command.data
     return frame + bytes([checksum(frame)])
 
 
-def encode_reply(reply: Reply) -> bytes:
+def encode_reply(reply: NecReply) -> bytes:
     """Return a reply's frame."""
     data = reply.data if reply.failed is None else bytes(reply.failed)
     kind = reply.kind | (0x20 if reply.failed is None else 0xA0)
@@ -112,13 +112,13 @@ def encode_reply(reply: Reply) -> bytes:
     return frame + bytes([checksum(frame)])
 
 
-def take_command(data: bytes) -> tuple[Command, int] | None:
+def take_command(data: bytes) -> tuple[NecCommand, int] | None:
     """Take one command off the front of `data`."""
     frame = _take_frame(data)
-    return None if frame is None else (Command(frame[0], frame[1], frame[_HEADER:-1]), len(frame))
+    return None if frame is None else (NecCommand(frame[0], frame[1], frame[_HEADER:-1]), len(frame))
 
 
-def take_reply(data: bytes) -> tuple[Reply, int] | None:
+def take_reply(data: bytes) -> tuple[NecReply, int] | None:
     """Take one reply off the front of `data`."""
     if data and data[0] & 0xF0 not in (0x20, 0xA0):
         raise ProtocolError(f"the projector answers {quoted(data)}, which begins no reply; {CHECK_SPEED}")
@@ -132,7 +132,7 @@ def take_reply(data: bytes) -> tuple[Reply, int] | None:
         if len(content) != 2:
             raise ProtocolError(f"the projector refuses with {quoted(frame)}; expected two bytes that say why")
         failed, content = (content[0], content[1]), b""
-    return Reply(kind & 0x0F, code, content, failed, projector, model), len(frame)
+    return NecReply(kind & 0x0F, code, content, failed, projector, model), len(frame)
 
 
 def _take_frame(data: bytes) -> bytes | None:
@@ -163,7 +163,7 @@ def parse_running(data: bytes, ordered_off: bool = False) -> Power:
     Parameters
     ----------
     ordered_off
-        Whether a projector that is switching has been told to switch off.
+        Whether a projector that is switching was commanded off.
     """
     if len(data) < 6:
         raise ProtocolError(f"the running status holds {len(data)} bytes; expected 16")
@@ -288,7 +288,7 @@ class NecProjector:
         """Release the cable; the power state stays."""
         self._exchange.close()
 
-    def _ask(self, command: Command) -> bytes:
+    def _ask(self, command: NecCommand) -> bytes:
         reply = self._exchange.ask(encode_command(command), take_reply)
         asked = f"command {command.kind:02X}h {command.code:02X}h"
         if (reply.kind, reply.code) != (command.kind, command.code):

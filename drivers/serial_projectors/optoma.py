@@ -3,8 +3,8 @@
 Rules that hold inside:
 
 - A command is answered by ``P`` or ``F``, a question by ``OK`` and a value, all ended by CR.
-- The projector says unasked ``INFO`` and a number when it changes its power state or falls ill. `OptomaProjector` keeps
-  what it has overheard: warm-up and cooling are known from there only, as power is else on or off.
+- The projector sends ``INFO`` and a number unasked when it changes its power state or has a fault. `OptomaProjector`
+  keeps what it has received so: warm-up and cooling are known from there only, as power is else on or off.
 - A fault once overheard is reported until the projector warms up again; none can be asked for.
 - Mute cannot be asked of older models; then what this driver has set last is the answer.
 
@@ -42,7 +42,7 @@ _PART_NUMBERS = {part: number for number, part in _PARTS.items()}
 
 
 @dataclass(frozen=True)
-class Done:
+class PassFail:
     """The answer to a command: whether it was passed."""
 
     passed: bool
@@ -62,11 +62,11 @@ class Info:
     number: int
 
 
-Message = Done | Value | Info
+Message = PassFail | Value | Info
 
 
 @dataclass(frozen=True)
-class Command:
+class OptomaCommand:
     """A command or question: its number and what it is given."""
 
     number: int
@@ -79,24 +79,24 @@ _BEGINNING = re.compile(rb"[\r\n\0 ]*(?:[oO]([kK][^\r\n]*)?|I(N(F(O[0-9]{0,3})?)
 _COMMAND = re.compile(r"~([0-9]{2})([0-9]{2,3}) (.{1,20})")
 
 
-def encode_command(command: Command) -> bytes:
+def encode_command(command: OptomaCommand) -> bytes:
     """Return a command's line."""
     return f"~{command.projector:02d}{command.number:02d} {command.value}\r".encode("ascii")
 
 
-def take_command(data: bytes) -> tuple[Command | None, int] | None:
+def take_command(data: bytes) -> tuple[OptomaCommand | None, int] | None:
     """Take one line off the front of `data`; None stands for a line that is no command."""
     end = data.find(b"\r")
     if end < 0:
         return None
     found = _COMMAND.fullmatch(data[:end].decode("ascii", "replace").strip())
-    return (Command(int(found[2]), found[3].strip(), int(found[1])) if found else None), end + 1
+    return (OptomaCommand(int(found[2]), found[3].strip(), int(found[1])) if found else None), end + 1
 
 
 def encode_message(message: Message) -> bytes:
     """Return what the projector says."""
     match message:
-        case Done(passed):
+        case PassFail(passed):
             return b"P\r" if passed else b"F\r"
         case Value(text):
             return f"OK{text}\r".encode("ascii")
@@ -113,7 +113,7 @@ def take_message(data: bytes) -> tuple[Message, int] | None:
         return None
     done, value, info = found.groups()
     if done is not None:
-        return Done(done == b"P"), found.end()
+        return PassFail(done == b"P"), found.end()
     if value is not None:
         return Value(text_of(value).strip()), found.end()
     return Info(int(info)), found.end()
@@ -213,7 +213,7 @@ class OptomaProjector:
         return tuple(Fault(part, Severity.ERROR) for part in self._faults)
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return its lamp; empty where the projector tells no hours."""
+        """Return its lamp; empty where the projector reports no hours."""
         try:
             value = self._get(LAMP_HOURS)
         except DeviceRefused:
@@ -227,20 +227,20 @@ class OptomaProjector:
         self._exchange.close()
 
     def _get(self, number: int) -> str:
-        match self._ask(Command(number, "1")):
+        match self._ask(OptomaCommand(number, "1")):
             case Value(text):
                 return text
-            case Done(passed=False):
+            case PassFail(passed=False):
                 raise DeviceRefused(f"{self._label} answers F to question {number}: its model does not know it, or now")
             case message:
                 self._exchange.close()
                 raise ProtocolError(f"{self._label} answers {message} to question {number}; expected OK…")
 
     def _set(self, number: int, value: str) -> None:
-        match self._ask(Command(number, value)):
-            case Done(passed=True):
+        match self._ask(OptomaCommand(number, value)):
+            case PassFail(passed=True):
                 return
-            case Done(passed=False):
+            case PassFail(passed=False):
                 raise DeviceRefused(
                     f"{self._label} answers F to command {number} {value}; wait until its power is on and try again"
                 )
@@ -248,7 +248,7 @@ class OptomaProjector:
                 self._exchange.close()
                 raise ProtocolError(f"{self._label} answers {message} to command {number} {value}; expected P or F")
 
-    def _ask(self, command: Command) -> Message:
+    def _ask(self, command: OptomaCommand) -> Message:
         # The exchange throws away what waits when a question is asked; here it may be news.
         while (message := self._exchange.glance(take_message, 0.0)) is not None:
             self._overheard(message)

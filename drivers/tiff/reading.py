@@ -4,7 +4,7 @@ Rules that hold inside:
 
 - A pure function of bytes; nothing is opened, printed or logged, and every byte sequence whatever ends in a result or
   in `TiffDamaged`.
-- Only the tags in `Tag` are decoded; maker notes and previews are not touched.
+- Only the tags in `_DECODED` are decoded; maker notes and previews are not touched.
 - Maker's own magic numbers (Olympus, Panasonic) pass, since what follows is TIFF all the same.
 
 Source: TIFF 6.0 section 2; TIFF/EP (ISO 12234-2) for the colour filter array; DNG 1.7 for the tags from 50706 on.
@@ -14,57 +14,25 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from enum import IntEnum
+from typing import Final
+
+from drivers.tiff.tags import TiffTag
 
 
 class TiffDamaged(ValueError):
     """The bytes are no TIFF, or a directory points beyond their end."""
 
 
-class Tag(IntEnum):
-    """The tags that are decoded."""
+_MAX_DIRECTORIES: Final = 64
+"""Directories that are read: a camera's file has under ten, and a damaged chain must end."""
 
-    WIDTH = 256
-    LENGTH = 257
-    BITS_PER_SAMPLE = 258
-    COMPRESSION = 259
-    PHOTOMETRIC = 262
-    MAKE = 271
-    MODEL = 272
-    STRIP_OFFSETS = 273
-    SAMPLES_PER_PIXEL = 277
-    STRIP_BYTE_COUNTS = 279
-    TILE_OFFSETS = 324
-    TILE_BYTE_COUNTS = 325
-    SUB_IFDS = 330
-    CFA_REPEAT_DIM = 33421
-    CFA_PATTERN = 33422
-    SHUTTER = 33434
-    APERTURE = 33437
-    EXIF = 34665
-    ISO = 34855
-    DNG_VERSION = 50706
-    UNIQUE_CAMERA_MODEL = 50708
-    CFA_PLANE_COLOR = 50710
-    CFA_LAYOUT = 50711
-    LINEARIZATION_TABLE = 50712
-    BLACK_LEVEL_REPEAT_DIM = 50713
-    BLACK_LEVEL = 50714
-    BLACK_LEVEL_DELTA_H = 50715
-    BLACK_LEVEL_DELTA_V = 50716
-    WHITE_LEVEL = 50717
-    CR2_SLICES = 50752
-    ACTIVE_AREA = 50829
-    MASKED_AREAS = 50830
+_MAX_VALUES: Final = 1 << 20
+"""Values of one tag: a linearisation table, the longest that is read, has at most 65 536."""
 
+_TEXT: Final = 2
+"""Type ASCII (TIFF 6.0, section 2)."""
 
-CFA = 32803
-"""Photometric interpretation of a colour filter array (TIFF/EP)."""
-
-_MAX_DIRECTORIES = 64
-_MAX_VALUES = 1 << 20
-_TEXT = 2
-_FORMATS = {
+_FORMATS: Final = {
     1: "B",
     2: "s",
     3: "H",
@@ -79,35 +47,73 @@ _FORMATS = {
     12: "d",
     13: "I",
 }
-_WANTED = frozenset(int(tag) for tag in Tag)
+"""Letters of `struct` by type (TIFF 6.0, section 2; 13, IFD: TIFF technical note 1); rationals are two numbers."""
+
+_DECODED: Final = frozenset(
+    {
+        TiffTag.IMAGE_WIDTH,
+        TiffTag.IMAGE_LENGTH,
+        TiffTag.BITS_PER_SAMPLE,
+        TiffTag.COMPRESSION,
+        TiffTag.PHOTOMETRIC_INTERPRETATION,
+        TiffTag.MAKE,
+        TiffTag.MODEL,
+        TiffTag.STRIP_OFFSETS,
+        TiffTag.SAMPLES_PER_PIXEL,
+        TiffTag.STRIP_BYTE_COUNTS,
+        TiffTag.TILE_OFFSETS,
+        TiffTag.TILE_BYTE_COUNTS,
+        TiffTag.SUB_IFDS,
+        TiffTag.CFA_REPEAT_PATTERN_DIM,
+        TiffTag.CFA_PATTERN,
+        TiffTag.EXPOSURE_TIME,
+        TiffTag.F_NUMBER,
+        TiffTag.EXIF_IFD_POINTER,
+        TiffTag.PHOTOGRAPHIC_SENSITIVITY,
+        TiffTag.DNG_VERSION,
+        TiffTag.UNIQUE_CAMERA_MODEL,
+        TiffTag.CFA_PLANE_COLOR,
+        TiffTag.CFA_LAYOUT,
+        TiffTag.LINEARIZATION_TABLE,
+        TiffTag.BLACK_LEVEL_REPEAT_DIM,
+        TiffTag.BLACK_LEVEL,
+        TiffTag.BLACK_LEVEL_DELTA_H,
+        TiffTag.BLACK_LEVEL_DELTA_V,
+        TiffTag.WHITE_LEVEL,
+        TiffTag.CR2_SLICES,
+        TiffTag.ACTIVE_AREA,
+        TiffTag.MASKED_AREAS,
+    }
+)
+"""Tags whose values are read; a damaged value of any other is no fault of the pixels."""
 
 Value = str | tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Directory:
-    """One image file directory: the wanted tags that it holds; rationals have become floats."""
+    """One image file directory: the decoded tags that it holds; rationals have become floats."""
 
     values: dict[int, Value]
 
-    def numbers(self, tag: Tag) -> tuple[float, ...]:
+    def numbers(self, tag: TiffTag) -> tuple[float, ...]:
         """Return the numbers of `tag`; empty where the directory has none."""
         value = self.values.get(tag, ())
         return () if isinstance(value, str) else value
 
-    def integers(self, tag: Tag) -> tuple[int, ...]:
+    def integers(self, tag: TiffTag) -> tuple[int, ...]:
         """Return the numbers of `tag` cut to integers; empty where the directory has none."""
         return tuple(int(number) for number in self.numbers(tag))
 
-    def text(self, tag: Tag) -> str:
+    def text(self, tag: TiffTag) -> str:
         """Return the text of `tag`; empty where the directory has none."""
         value = self.values.get(tag, "")
         return value if isinstance(value, str) else ""
 
     def extents(self) -> list[tuple[int, int]]:
         """Return offset and size in bytes of every strip and tile."""
-        strips = zip(self.integers(Tag.STRIP_OFFSETS), self.integers(Tag.STRIP_BYTE_COUNTS), strict=False)
-        tiles = zip(self.integers(Tag.TILE_OFFSETS), self.integers(Tag.TILE_BYTE_COUNTS), strict=False)
+        strips = zip(self.integers(TiffTag.STRIP_OFFSETS), self.integers(TiffTag.STRIP_BYTE_COUNTS), strict=False)
+        tiles = zip(self.integers(TiffTag.TILE_OFFSETS), self.integers(TiffTag.TILE_BYTE_COUNTS), strict=False)
         return [*strips, *tiles]
 
 
@@ -122,7 +128,7 @@ def read_directories(data: bytes | memoryview) -> list[Directory]:
     Raises
     ------
     TiffDamaged
-        `data` is no TIFF, or a directory or a wanted value reaches beyond its end: the file has been cut or damaged.
+        `data` is no TIFF, or a directory or a decoded value reaches beyond its end: the file has been cut or damaged.
     """
     if not is_tiff(data) or len(data) < 8:
         raise TiffDamaged("it does not begin as a TIFF file does")
@@ -138,7 +144,7 @@ def read_directories(data: bytes | memoryview) -> list[Directory]:
         directory, following = _read_directory(order, data, offset)
         directories.append(directory)
         waiting.append(following)
-        waiting.extend(reversed([*directory.integers(Tag.SUB_IFDS), *directory.integers(Tag.EXIF)]))
+        waiting.extend(reversed([*directory.integers(TiffTag.SUB_IFDS), *directory.integers(TiffTag.EXIF_IFD_POINTER)]))
     return directories
 
 
@@ -148,7 +154,7 @@ def _read_directory(order: str, data: bytes | memoryview, offset: int) -> tuple[
     for number in range(count):
         entry = offset + 2 + 12 * number
         tag, kind, length = _unpack(order, "HHI", data, entry)
-        if tag in _WANTED and kind in _FORMATS:
+        if tag in _DECODED and kind in _FORMATS:
             values[tag] = _read_value(order, data, entry + 8, kind, length)
     end = offset + 2 + 12 * count
     # Some writers leave out the link that ends the chain when the directory is the last thing in the file.

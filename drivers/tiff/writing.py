@@ -14,6 +14,8 @@ from enum import IntEnum
 from fractions import Fraction
 from typing import Final
 
+from drivers.tiff.tags import TiffTag
+
 
 class Kind(IntEnum):
     """The types of a tag's values that are written (TIFF 6.0, section 2)."""
@@ -30,15 +32,11 @@ class Kind(IntEnum):
 Value = tuple[Kind, Sequence[int]]
 """A tag's type and its numbers; a rational is two of them, numerator first."""
 
-Tags = dict[int, Value]
-"""Values by tag code."""
+Tags = dict[TiffTag, Value]
+"""Values by tag."""
 
 LARGEST_FILE: Final = (1 << 32) - 1
 """Bytes that the 32-bit offsets of TIFF reach."""
-
-STRIP_OFFSETS: Final = 273
-STRIP_BYTE_COUNTS: Final = 279
-EXIF: Final = 34665
 
 _LETTERS: Final = {
     Kind.BYTE: "B",
@@ -86,18 +84,22 @@ def head(main: Tags, strip: int, exif: Tags | None = None) -> bytes:
     ValueError
         The file would be larger than its 32-bit offsets reach.
     """
-    tags: Tags = {**main, STRIP_OFFSETS: (Kind.LONG, [0]), STRIP_BYTE_COUNTS: (Kind.LONG, [min(strip, LARGEST_FILE)])}
+    tags: Tags = {
+        **main,
+        TiffTag.STRIP_OFFSETS: (Kind.LONG, [0]),
+        TiffTag.STRIP_BYTE_COUNTS: (Kind.LONG, [min(strip, LARGEST_FILE)]),
+    }
     if exif is not None:
-        tags[EXIF] = (Kind.LONG, [0])
+        tags[TiffTag.EXIF_IFD_POINTER] = (Kind.LONG, [0])
     exif_at = len(_HEADER) + len(_directory(tags, 0))
     end = exif_at
     if exif is not None:
-        tags[EXIF] = (Kind.LONG, [exif_at])
+        tags[TiffTag.EXIF_IFD_POINTER] = (Kind.LONG, [exif_at])
         end += len(_directory(exif, 0))
     strip_at = end + -end % _ALIGNMENT
     if strip_at + strip > LARGEST_FILE:
         raise ValueError(f"{strip} bytes of pixels are more than the 4 GiB of a TIFF file")
-    tags[STRIP_OFFSETS] = (Kind.LONG, [strip_at])
+    tags[TiffTag.STRIP_OFFSETS] = (Kind.LONG, [strip_at])
     directories = _directory(tags, len(_HEADER)) + (b"" if exif is None else _directory(exif, exif_at))
     return _HEADER + directories + bytes(strip_at - end)
 

@@ -24,15 +24,28 @@ class GrayEdge:
     Attributes
     ----------
     name
-        What tables call it.
+        Its name in tables.
     order
         n, order of the derivative: 0, 1 or 2.
     p
         Minkowski norm, ≥ 1; infinity takes the maximum.
     sigma
-        Scale of the Gaussian, px; 0 for none, which order 0 alone allows.
+        Scale of the Gaussian, px; 0 for none, which only order 0 allows.
     border
         Pixels left out along every edge; by default ⌊σ⌋ + 1 as in the authors' program.
+
+    Raises
+    ------
+    ValueError
+        Order, norm and scale make no method of the framework.
+
+    Examples
+    --------
+    Gray-world on an image that is grey on average under a greenish light:
+
+    >>> image = np.array([[[100, 200, 100], [300, 600, 300]], [[50, 100, 50], [30, 60, 30]]], np.uint16)
+    >>> GrayEdge("Gray-world", order=0, p=1, sigma=0, border=0).estimate(image).round(3)
+    array([0.408, 0.816, 0.408])
     """
 
     name: str
@@ -43,7 +56,10 @@ class GrayEdge:
 
     def __post_init__(self) -> None:
         if self.order not in (0, 1, 2) or self.p < 1 or self.sigma < 0 or (self.order and not self.sigma):
-            raise ValueError(f"order {self.order}, p {self.p}, sigma {self.sigma} make no method of the framework")
+            raise ValueError(
+                f"order {self.order}, p {self.p}, sigma {self.sigma} make no method of the framework; expected order 0 "
+                "to 2, p from 1, and sigma from 0, above 0 for a derivative"
+            )
 
     def estimate(
         self,
@@ -51,7 +67,7 @@ class GrayEdge:
         saturation: float | None = None,
         mask: npt.NDArray[np.bool_] | None = None,
     ) -> npt.NDArray[np.float64]:
-        """Return the light (3,) float64 of unit length; `GREY` where no pixel may be used. See `Method.estimate`."""
+        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
         border = math.floor(self.sigma) + 1 if self.border is None else self.border
         used = usable(image, saturation, mask, border)
         response = differentiate(image.astype(np.float32), self.order, self.sigma)
@@ -72,9 +88,24 @@ def _minkowski(values: npt.NDArray[np.float32], p: float, scale: float) -> float
 
 
 def differentiate(image: npt.NDArray[np.float32], order: int, sigma: float) -> npt.NDArray[np.float32]:
-    """Return the size of the Gaussian derivative of an image (H, W, 3) float32 ≥ 0, channel by channel.
+    """Return the size of an image's Gaussian derivative, (H, W, 3) float32, channel by channel.
 
     Order 0 is the smoothed image, order 1 the gradient's length, order 2 √(f_xx² + 4 f_xy² + f_yy²).
+
+    Parameters
+    ----------
+    image
+        (H, W, 3) float32 ≥ 0, linear camera RGB.
+    order
+        0, 1 or 2.
+    sigma
+        Scale of the Gaussian, px; 0 for none, which only order 0 allows.
+
+    Examples
+    --------
+    >>> ramp = np.full((1, 40, 3), 2, np.float32).cumsum(axis=1)
+    >>> differentiate(ramp, order=1, sigma=1.0)[0, 20].round(3)
+    array([2., 2., 2.], dtype=float32)
     """
     if not sigma:
         return np.abs(image)
@@ -90,7 +121,20 @@ def differentiate(image: npt.NDArray[np.float32], order: int, sigma: float) -> n
 def gaussian_kernel(sigma: float, order: int) -> npt.NDArray[np.float64]:
     """Return the kernel (2⌊3σ + ½⌋ + 1,) float64 of a Gaussian's derivative, to be correlated with.
 
-    Normalised on the grid: order 0 sums to 1; order 1 answers 1 to the ramp x; order 2 answers 1 to x²/2 and 0 to 1.
+    Normalised on the grid of pixels: order 0 sums to 1; order 1 gives 1 for the ramp x; order 2 gives 1 for x²/2 and 0
+    for a constant.
+
+    Parameters
+    ----------
+    sigma
+        Standard deviation of the Gaussian, px, above 0.
+    order
+        Order of the derivative, 0, 1 or 2.
+
+    Examples
+    --------
+    >>> gaussian_kernel(0.5, 1).round(3)
+    array([-0.002, -0.495,  0.   ,  0.495,  0.002])
     """
     reach = math.floor(3 * sigma + 0.5)
     x = np.arange(-reach, reach + 1, dtype=np.float64)

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 GREY = np.full(3, 3**-0.5)
-"""The estimate where no pixel may be used, or none differs from black: no cast.
+"""The estimate (3,) float64 where no pixel is usable, or every one is black: no colour cast.
 
-Methods return this very array then, by which it is told from grey that was found.
+Methods then return this very array, which distinguishes it from an estimate that happens to be grey.
 """
 GREY.setflags(write=False)
 
@@ -25,6 +25,28 @@ def usable(
 
     Left out are pixels of which a channel is saturated, with their eight neighbours; masked pixels; and `border` px
     along every edge (J. van de Weijer's reference program of the Gray-Edge framework, 2007).
+
+    Parameters
+    ----------
+    image
+        (H, W, 3) of any type, linear camera RGB.
+    saturation
+        Value from which a channel is saturated; None if none is.
+    mask
+        (H, W) bool, True where a pixel must not be used; None if every one may be.
+    border
+        Pixels left out along every edge, px.
+
+    Examples
+    --------
+    >>> image = np.zeros((5, 6, 3))
+    >>> image[0, 0] = 900
+    >>> usable(image, saturation=800, mask=None, border=0).astype(int)
+    array([[0, 0, 1, 1, 1, 1],
+           [0, 0, 1, 1, 1, 1],
+           [1, 1, 1, 1, 1, 1],
+           [1, 1, 1, 1, 1, 1],
+           [1, 1, 1, 1, 1, 1]])
     """
     import cv2
 
@@ -46,7 +68,15 @@ def usable(
 
 
 def unit(estimate: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return `estimate` (3,) scaled to length 1, or `GREY` where it is zero or not finite."""
+    """Return `estimate` (3,) as float64 scaled to length 1, or `GREY` where it is zero or not finite.
+
+    Examples
+    --------
+    >>> unit([3, 4, 0])
+    array([0.6, 0.8, 0. ])
+    >>> unit([0, 0, 0]) is GREY
+    True
+    """
     vector = np.asarray(estimate, dtype=np.float64)
     length = float(np.linalg.norm(vector))
     return vector / length if np.isfinite(length) and length > 0 else GREY

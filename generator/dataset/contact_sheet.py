@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -18,11 +18,12 @@ from generator.lights.lighting import parse_mixture
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_ROWS = 12
-MAX_COLUMNS = 8
-_PAPER = "#16171a"
-_INK = "#e8e6e1"
-_FAINT = "#8d8f96"
+MAX_ROWS: Final = 12
+MAX_COLUMNS: Final = 8
+"""Sources and lights of a sheet: what is still recognised where the page fills a screen."""
+_PAPER: Final = "#16171a"
+_INK: Final = "#e8e6e1"
+_FAINT: Final = "#8d8f96"
 
 
 def contact_sheet(dataset: Dataset, max_rows: int = MAX_ROWS, max_columns: int = MAX_COLUMNS) -> npt.NDArray[np.uint8]:
@@ -51,6 +52,7 @@ def _even(count: int, most: int) -> list[int]:
 
 
 def _load(dataset: Dataset, entry: Entry) -> npt.NDArray[np.uint8]:
+    """Return the preview (H, W, 3) uint8 of an image, sRGB codes."""
     import cv2
 
     preview = dataset.read_preview(entry)

@@ -1,9 +1,9 @@
 """Deflate (RFC 1951) for the rows of a 16-bit RGB PNG, made for images drawn from a table.
 
-Two ways to pack a band of rows, whichever is smaller:
+A band of rows is packed by one of two methods, whichever gives fewer bytes:
 
-    repeats     no filter; a pixel that came before as it is, anywhere in the 32 KiB that deflate looks back, becomes a
-                match of six bytes, or more where runs repeat. A table has only so many samples of a colour, so half
+    repeats     no filter; a pixel equal to one before it, anywhere in the 32 KiB that deflate looks back, becomes a
+                match of six bytes, or of more where runs repeat. A table has only so many samples of a colour, so half
                 the pixels of a photograph find one. Matches of less than a pixel are not looked for.
     neighbours  the difference to the pixel on the left (filter Sub), in Huffman codes alone. Smaller where a picture
                 is so smooth that few pixels share a colour.
@@ -11,11 +11,11 @@ Two ways to pack a band of rows, whichever is smaller:
 Every band is one block with its own codes, ends on a whole byte and looks back into no other, so bands can be packed
 at once by several threads and put one after the other.
 
-Which is smaller is tried on a few rows from the band's middle. Of a band that is not small, the codes of repeats come
-from every few rows: counting all of them takes a third as long as the packing, and saves a six-hundredth.
+Which is smaller is tried on a few rows from the band's middle. Of a band that is not small, the codes of repeats are
+made from one row in `_STEP`: counting all rows takes a third as long as packing them, and saves a six-hundredth.
 
-A band is packed in one compiled call, in which the interpreter's lock is let go once: taking it back between steps of
-a millisecond costs several threads more than the steps.
+A band is packed in one compiled call, which releases the interpreter's lock once: to take it again between steps of a
+millisecond would cost several threads more time than the steps.
 """
 
 from __future__ import annotations
@@ -40,27 +40,30 @@ from generator.files.huffman import (
 )
 
 WIDEST: Final = 1 << 28
-"""Pixels of a row that positions are counted for."""
+"""Most pixels of a row: positions of its bytes fit into 31 bits, above the 33 that the hash leaves of a pixel."""
 
 _WINDOW: Final = 32768
+"""Bytes that deflate looks back at most (RFC 1951, 2)."""
 _WINDOW_PIXELS: Final = _WINDOW // 6
+"""The same in pixels of six bytes."""
 _LONGEST_RUN: Final = 258 // 6
-"""Pixels of the longest match."""
+"""Pixels of the longest match, 258 bytes (RFC 1951, 3.2.5)."""
 _PLACES: Final = 1 << 15
-"""Of the table of pixels seen: the last one with each hash."""
+"""Entries of the table of pixels, the last one with each hash: 256 KiB, which second-level caches hold."""
 _MIX: Final = 0x9E3779B97F4B
-"""Odd, so that multiplying modulo 2⁴⁸ gives every pixel a number of its own."""
+"""Multiplier of the hash, odd, so that multiplying modulo 2⁴⁸ gives every pixel a number of its own."""
 _TRIED: Final = 3 * _WINDOW_PIXELS
+"""Pixels on which both methods are tried: one window that fills the look back, and two that are counted."""
 _STEP: Final = 8
-"""Of a large band, one row of so many is counted."""
+"""Rows of a large band of which one is counted; the head of this file has the gain and the cost."""
 _FEW_ROWS: Final = 4
-"""Rows that are counted at least."""
+"""Rows that are counted at least, so that no single row decides."""
 _FEW: Final = 1 << 13
-"""Symbols from which the counted rows speak for the others."""
+"""Symbols that the counted rows must have to represent all rows; with fewer, all are counted."""
 _ROOMY: Final = 56
-"""Bits that a flush has room for beside the up to seven that wait."""
+"""Bits that can be added to up to seven waiting ones before a flush, which takes 63 at most."""
 _ROOM: Final = 1024
-"""Bytes for the head of a block, its end, and what a flush writes beyond; no byte of a row takes two, see `LONGEST`."""
+"""Bytes for a block's head and end and what a flush writes beyond it; no byte of a row takes two, see `LONGEST`."""
 
 
 def _distance_symbol(distance: int) -> int:
@@ -77,33 +80,35 @@ def _length_symbol(length: int) -> tuple[int, int, int]:
     return 257 + 4 * bits + ((length - 3) >> bits), bits, (length - 3) & ((1 << bits) - 1)
 
 
-# Symbols of distances: of 1 … 256, then of every 128th.
 _DISTANCE_SYMBOLS: Final = np.array(
     [_distance_symbol(distance) for distance in (*range(1, 257), *range(1, _WINDOW, 128))], dtype=np.uint8
 )
+"""Symbols of the distances 1 … 256, then of every 128th (RFC 1951, 3.2.5)."""
 _DISTANCE_BITS: Final = np.array([max(symbol // 2 - 1, 0) for symbol in range(DISTANCES)], dtype=np.int64)
-# Symbol, extra bits and their value of a run of so many pixels; extra bits of each symbol.
+"""Extra bits of each symbol of a distance (RFC 1951, 3.2.5)."""
 _RUNS: Final = np.array([(0, 0, 0), *(_length_symbol(6 * run) for run in range(1, _LONGEST_RUN + 1))], dtype=np.int64)
+"""Symbol, extra bits and their value of a match of so many pixels."""
 _ONE: Final = int(_RUNS[1, 0])
 """The symbol of a match of one pixel."""
 _LENGTH_BITS: Final = np.zeros(LITERALS, np.int64)
+"""Extra bits of each symbol of a literal or length."""
 _LENGTH_BITS[_RUNS[:, 0]] = _RUNS[:, 1]
 
 
 @compiled
 def _split(image: Any, rows: Any) -> Any:
-    """Fill `rows` with the unfiltered bytes of `image`, upper before lower, a 0 before each row.
+    """Fill `rows` (h, 1 + 6 w) uint8 with the unfiltered bytes of `image` (h, w, 3), big-endian, a 0 before each row.
 
     Returns
     -------
     int
-        Every sample's bits joined: no sample is larger.
+        The bits of all samples combined by or: no sample is larger.
     """
     joined = uint16(0)
     for y in range(image.shape[0]):
         samples, row = image[y].reshape(-1), rows[y]
         row[0] = 0
-        # Joined by row, or the compiler makes no vectors of it.
+        # Combined by row, or the compiler would not vectorise it.
         of_row = uint16(0)
         for i in range(len(samples)):
             row[1 + 2 * i] = samples[i] >> 8
@@ -145,18 +150,19 @@ def _count_bytes(rows: Any, literals: Any) -> None:
 
 @compiled
 def find_repeats(image: Any, seen: Any, distances: Any) -> None:
-    """Fill `distances` (rows, columns) with the bytes back to the last equal pixel, 0 where there is none in reach.
+    """Fill `distances` (h, w) uint16 with the bytes back to the last equal pixel, 0 where there is none in reach.
 
-    `seen` holds for each hash of a pixel where it was last seen, in bytes, above the bits of the pixel that the
-    hash leaves open. As mixing is one to one, what agrees in both is the pixel itself.
+    `image` is (h, w, 3) uint16. `seen` (32768,) uint64 holds for each hash the position, in bytes, of the last pixel
+    that had it, above those bits of the mixed pixel that are not in the hash. Mixing is one to one, so pixels that
+    agree in both are equal.
     """
     left, turn = uint64(48) - uint64(15), uint64(64 - 48 + 15)
     open_bits = (uint64(1) << left) - uint64(1)
     for place in range(_PLACES):
         seen[place] = 0
     samples, backs = image.reshape(-1), distances.reshape(-1)
-    # Empty places lie out of reach of every pixel. Unsigned numbers everywhere, since one that may be negative makes
-    # every index a choice.
+    # Empty entries are out of reach of every pixel. All numbers are unsigned: numba adds a branch to every index that
+    # may be negative.
     position = uint64(_WINDOW + 1)
     at, pixels = uint64(0), uint64(0)
     for _ in range(image.shape[0]):
@@ -172,8 +178,8 @@ def find_repeats(image: Any, seen: Any, distances: Any) -> None:
             here = (position << left) | (mixed & open_bits)
             gone = here - seen[place]
             seen[place] = here
-            # The bytes back to the last pixel of this hash, and above them what is not 0 where that is another pixel.
-            # Whether a pixel repeats cannot be foreseen, so there is no branch on it.
+            # The bytes back to the last pixel of this hash, and above them bits that are not 0 if it is another pixel.
+            # Whether a pixel repeats cannot be predicted, so there is no branch on it.
             back = (gone >> left) | (gone << turn)
             backs[pixels] = uint16(back) if back - uint64(1) < uint64(_WINDOW) else uint16(0)
             at += uint64(3)
@@ -183,20 +189,20 @@ def find_repeats(image: Any, seen: Any, distances: Any) -> None:
 
 @compiled
 def _place_of(less: Any) -> Any:
-    """Return where `_DISTANCE_SYMBOLS` has the symbol of a distance, given one less than the distance."""
+    """Return the index in `_DISTANCE_SYMBOLS` of a distance, given the distance less one."""
     return less if less < uint64(256) else uint64(256) + (less >> uint64(7))
 
 
 @compiled
 def _symbol_of(distance: Any) -> Any:
-    """Return the symbol of a distance; some symbol where there is none."""
+    """Return the symbol of a distance; of distance 0, which is none, any symbol."""
     return _DISTANCE_SYMBOLS[_place_of((uint64(distance) - uint64(1)) & uint64(_WINDOW - 1))]
 
 
 @compiled
 def _count(rows: Any, distances: Any, step: int, literals: Any, backs: Any) -> None:
     """Add the symbols of one row of every `step` to the frequencies of literals and distances."""
-    # Whether a pixel is a match cannot be foreseen, so there is no branch on it; each of a pixel's bytes has a counter
+    # Whether a pixel is a match cannot be predicted, so there is no branch on it; each of a pixel's bytes has a counter
     # of its own, so that equal ones do not wait for each other.
     counts = np.zeros((6, 256), np.uint32)
     matches = 0
@@ -226,7 +232,7 @@ def _count(rows: Any, distances: Any, step: int, literals: Any, backs: Any) -> N
 
 @compiled
 def _bits(literals: Any, backs: Any) -> int:
-    """Return the bits of symbols of such frequencies in their best codes."""
+    """Return the number of bits that symbols of these frequencies take in their best codes."""
     lengths, back_lengths = code_lengths(literals, LONGEST), code_lengths(backs, LONGEST)
     total = 0
     for symbol in range(LITERALS):
@@ -238,11 +244,11 @@ def _bits(literals: Any, backs: Any) -> int:
 
 @compiled
 def _repeats_pay(image: Any, plain: Any, filtered: Any, distances: Any, seen: Any) -> bool:
-    """Return whether repeats pack the middle of a band into fewer bits than neighbours."""
+    """Return whether the method of repeats packs the middle of a band into fewer bits than that of neighbours."""
     height, width = distances.shape
     tried = min(height, 1 + _TRIED // width)
     top = (height - tried) // 2
-    # The first rows of a look back have nothing before them.
+    # The first rows have too little before them to repeat.
     counted = top + min(tried - 1, _WINDOW_PIXELS // width)
     end = top + tried
     find_repeats(image[top:end], seen, distances[top:end])
@@ -256,7 +262,7 @@ def _repeats_pay(image: Any, plain: Any, filtered: Any, distances: Any, seen: An
 
 @compiled
 def _estimate(plain: Any, distances: Any, literals: Any, backs: Any) -> None:
-    """Fill the frequencies of a band's literals and distances, or near them and of none 0 that might occur."""
+    """Fill the frequencies of a band's literals and distances: estimates of them, above 0 for all that may occur."""
     step = max(1, min(_STEP, len(distances) // _FEW_ROWS))
     _count(plain, distances, step, literals, backs)
     if step > 1 and literals.sum() < _FEW:
@@ -268,7 +274,7 @@ def _estimate(plain: Any, distances: Any, literals: Any, backs: Any) -> None:
             literals[value] = step * literals[value] + 1
         for symbol in range(END + 1, LITERALS):
             literals[symbol] *= step
-        # Several runs share a symbol; that they add more than 1 does no harm.
+        # Several runs share a symbol, and add more than 1 to it, which does no harm.
         for run in range(1, _LONGEST_RUN + 1):
             literals[_RUNS[run, 0]] += 1
         for symbol in range(DISTANCES):
@@ -277,9 +283,10 @@ def _estimate(plain: Any, distances: Any, literals: Any, backs: Any) -> None:
 
 @compiled
 def _join_codes(codes: Any, largest: Any, samples: Any) -> None:
-    """Fill `samples` with the code of both bytes of every sample up to `largest`, its length in the lowest eight bits.
+    """Fill `samples` (65536,) uint32 with the codes of both bytes of every sample up to `largest`.
 
-    So a word is the number of places to shift what follows it, and sums of words have the sum of lengths.
+    Their length is in the lowest eight bits, so that a word is the number of places by which the next code is shifted,
+    and a sum of words has the sum of the lengths.
     """
     mask, length = uint32(0xFFFF), uint32(16)
     for high in range((largest >> 8) + 1):
@@ -295,7 +302,7 @@ def _join_codes(codes: Any, largest: Any, samples: Any) -> None:
 def _run_codes(codes: Any) -> Any:
     """Return the code and extra bits, 12 + 5 at most, of each run's length; (`_LONGEST_RUN` + 1,) uint64.
 
-    They stand from bit 8 on, their number in the lowest bits.
+    The codes begin at bit 8, their number of bits is in the lowest eight.
     """
     runs = np.zeros(_LONGEST_RUN + 1, np.uint64)
     for run in range(1, _LONGEST_RUN + 1):
@@ -309,8 +316,8 @@ def _run_codes(codes: Any) -> Any:
 def _match_codes(single: Any, codes: Any) -> Any:
     """Return the codes of a match of a `single` pixel for each entry of `_DISTANCE_SYMBOLS`; (N,) uint64.
 
-    They stand from bit 8 on, 12 each at most, their number in the lowest bits, that of all bits from bit 32 on, and a
-    mask of the distance's extra bits, 13 at most, from bit 48 on.
+    The codes begin at bit 8, 12 bits each at most, and their number of bits is in the lowest eight. The number of all
+    bits begins at bit 32, a mask of the distance's extra bits, 13 at most, at bit 48.
     """
     matches = np.zeros(len(_DISTANCE_SYMBOLS), np.uint64)
     first = single & uint64(63)
@@ -326,7 +333,7 @@ def _match_codes(single: Any, codes: Any) -> Any:
 
 @compiled
 def _match(matches: Any, distance: Any) -> Any:
-    """Return the bits of a match of one pixel, and their number; some where there is no distance."""
+    """Return the bits of a match of one pixel, and their number; meaningless for distance 0, which is none."""
     less = (distance - uint64(1)) & uint64(_WINDOW - 1)
     match = matches[_place_of(less)]
     extra = (less & (match >> uint64(48))) << (match & uint64(63))
@@ -335,7 +342,7 @@ def _match(matches: Any, distance: Any) -> Any:
 
 @compiled
 def _put_bytes(out: Any, writer: Any, rows: Any, codes: Any) -> None:
-    """Write rows (height, 1 + 6 width) byte by byte."""
+    """Write rows (h, 1 + 6 w) uint8 byte by byte."""
     at, waiting, number = writer[0], writer[1], writer[2]
     mask, length, one, two = uint64(0xFFFF), uint64(16), uint64(1), uint64(2)
     data = rows.reshape(-1)
@@ -374,7 +381,7 @@ def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, 
         while x < end:
             distance = uint64(backs[x])
             following = uint64(backs[x + one]) if x + one < end else zero
-            # Seldom the next pixel goes on with a match. One sign tells it: of two conditions LLVM makes two branches.
+            # Seldom the next pixel continues a match. One sign bit shows it; of two conditions LLVM makes two branches.
             if (((following ^ distance) - one) & (zero - distance)) >> low:
                 run = two
                 while run < uint64(_LONGEST_RUN) and x + run < end and uint64(backs[x + run]) == distance:
@@ -385,7 +392,7 @@ def _put_repeats(out: Any, writer: Any, image: Any, distances: Any, codes: Any, 
                 at, waiting, number = flush(out, at, waiting, number + length)
                 x += run
                 continue
-            # Whether a pixel is a match cannot be foreseen: both ways are gone, which takes less than a wrong guess.
+            # Whether a pixel is a match cannot be predicted; making both codes is faster than a wrong prediction.
             i = three * x
             red, green = uint64(joined[samples[i]]), uint64(joined[samples[i + one]])
             blue = uint64(joined[samples[i + two]])
@@ -438,7 +445,7 @@ def _pack(image: Any, last: int, plain: Any, filtered: Any, distances: Any, seen
 
 
 class Packer:
-    """Packs bands, one at a time; keeps its working memory, since fresh pages take as long as the packing."""
+    """Packs bands, one at a time; keeps its working memory, since new memory takes as long as the packing."""
 
     def __init__(self) -> None:
         self._seen = np.empty(_PLACES, np.uint64)
@@ -448,7 +455,7 @@ class Packer:
         self._out = np.empty(0, np.uint8)
 
     def pack(self, image: npt.NDArray[np.uint16], *, last: bool) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-        """Return a band of an image as deflate data, and the bytes that they unpack to.
+        """Return a band of an image as deflate data, and the bytes that these unpack to.
 
         Parameters
         ----------

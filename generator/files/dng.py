@@ -1,11 +1,10 @@
 """Adobe DNG: the image as the Bayer mosaic of a raw file, which raw programs open with the right white balance.
 
 Each photosite of the RGGB pattern takes its own channel of its pixel; two thirds of the values are left out, as by a
-sensor. Black is 0, white the table's saturation, AsShotNeutral the ground truth: what a raw program shows is neutral
-where the scene is. The colour matrix is the one that LibRaw holds for the table's camera, or, for a camera that it
-does not know, that of linear sRGB: neutral things stay neutral with either, colours are only the camera's with the
-first. The file names CroP as its maker, so that no program applies to it what it knows of the camera's own files, such
-as their black level.
+sensor. Black is 0, white the table's saturation, AsShotNeutral the ground truth, so that a raw program shows neutral
+things as neutral. The colour matrix is the one that LibRaw holds for the table's camera or, for a camera unknown to it,
+that of linear sRGB: neutral things stay neutral with both, other colours are right with the first only. The file names
+CroP as its maker, so that no program applies facts of the camera's own files to it, such as their black level.
 
 Source: DNG 1.7.1, chapters 2 and 4.
 """
@@ -18,26 +17,25 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.raw.camera_matrix import Matrix, camera_matrix
-from drivers.tiff.reading import CFA
+from drivers.tiff.tags import CFA, D65, TiffTag
 from drivers.tiff.writing import Kind, Tags, head, rationals, text
 from foundation.errors import InputError
-from generator.files.shot import Shot
+from generator.files.metadata import ImageMetadata
 
 SMALLEST_SIDE = 22
 """Photosites along a side below which LibRaw takes a file for no raw file."""
 
-_D65 = 21
 _SRGB: Matrix = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570))
 """From XYZ to linear sRGB, IEC 61966-2-1."""
 
 
-def encode_dng(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
+def encode_dng(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
     """Return the file of `image` (H, W, 3) uint16, uncompressed.
 
     Raises
     ------
     InputError
-        The image is smaller than raw programs open or larger than the format holds, or the shot's white level or
+        The image is smaller than raw programs open or larger than the format holds, or the metadata's white level or
         white cannot be written.
     """
     height, width, _ = image.shape
@@ -46,35 +44,38 @@ def encode_dng(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
             f"an image of {width}x{height} px is too small for DNG: raw programs open none below "
             f"{SMALLEST_SIDE}x{SMALLEST_SIDE}; choose png or tiff"
         )
-    neutral = _neutral(shot)
-    matrix = camera_matrix(shot.camera) or _SRGB
-    model = f"{shot.camera} generated".strip()
+    neutral = _neutral(metadata)
+    matrix = camera_matrix(metadata.camera) or _SRGB
+    model = f"{metadata.camera} generated".strip()
     tags: Tags = {
-        254: (Kind.LONG, [0]),  # NewSubfileType: the picture itself
-        256: (Kind.LONG, [width]),
-        257: (Kind.LONG, [height]),
-        258: (Kind.SHORT, [16]),  # BitsPerSample
-        259: (Kind.SHORT, [1]),  # Compression: none
-        262: (Kind.SHORT, [CFA]),
-        270: text(shot.note()),  # ImageDescription
-        271: text("CroP"),  # Make
-        272: text(model),
-        274: (Kind.SHORT, [1]),  # Orientation: as it lies
-        277: (Kind.SHORT, [1]),  # SamplesPerPixel
-        278: (Kind.LONG, [height]),  # RowsPerStrip
-        284: (Kind.SHORT, [1]),  # PlanarConfiguration
-        33421: (Kind.SHORT, [2, 2]),  # CFARepeatPatternDim
-        33422: (Kind.BYTE, [0, 1, 1, 2]),  # CFAPattern: red, green, green, blue
-        50706: (Kind.BYTE, [1, 4, 0, 0]),  # DNGVersion
-        50707: (Kind.BYTE, [1, 1, 0, 0]),  # DNGBackwardVersion
-        50708: text(f"CroP {model}"),  # UniqueCameraModel
-        50710: (Kind.BYTE, [0, 1, 2]),  # CFAPlaneColor
-        50711: (Kind.SHORT, [1]),  # CFALayout: rectangular
-        50714: (Kind.SHORT, [0]),  # BlackLevel
-        50717: (Kind.SHORT, [shot.white_level]),  # WhiteLevel
-        50721: (Kind.SRATIONAL, [part for row in matrix for entry in row for part in (round(10000 * entry), 10000)]),
-        50728: rationals(*neutral),  # AsShotNeutral
-        50778: (Kind.SHORT, [_D65]),  # CalibrationIlluminant1
+        TiffTag.NEW_SUBFILE_TYPE: (Kind.LONG, [0]),  # the picture itself
+        TiffTag.IMAGE_WIDTH: (Kind.LONG, [width]),
+        TiffTag.IMAGE_LENGTH: (Kind.LONG, [height]),
+        TiffTag.BITS_PER_SAMPLE: (Kind.SHORT, [16]),
+        TiffTag.COMPRESSION: (Kind.SHORT, [1]),  # none
+        TiffTag.PHOTOMETRIC_INTERPRETATION: (Kind.SHORT, [CFA]),
+        TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
+        TiffTag.MAKE: text("CroP"),
+        TiffTag.MODEL: text(model),
+        TiffTag.ORIENTATION: (Kind.SHORT, [1]),  # as it lies
+        TiffTag.SAMPLES_PER_PIXEL: (Kind.SHORT, [1]),
+        TiffTag.ROWS_PER_STRIP: (Kind.LONG, [height]),
+        TiffTag.PLANAR_CONFIGURATION: (Kind.SHORT, [1]),
+        TiffTag.CFA_REPEAT_PATTERN_DIM: (Kind.SHORT, [2, 2]),
+        TiffTag.CFA_PATTERN: (Kind.BYTE, [0, 1, 1, 2]),  # red, green, green, blue
+        TiffTag.DNG_VERSION: (Kind.BYTE, [1, 4, 0, 0]),
+        TiffTag.DNG_BACKWARD_VERSION: (Kind.BYTE, [1, 1, 0, 0]),
+        TiffTag.UNIQUE_CAMERA_MODEL: text(f"CroP {model}"),
+        TiffTag.CFA_PLANE_COLOR: (Kind.BYTE, [0, 1, 2]),
+        TiffTag.CFA_LAYOUT: (Kind.SHORT, [1]),  # rectangular
+        TiffTag.BLACK_LEVEL: (Kind.SHORT, [0]),
+        TiffTag.WHITE_LEVEL: (Kind.SHORT, [metadata.white_level]),
+        TiffTag.COLOR_MATRIX_1: (
+            Kind.SRATIONAL,
+            [part for row in matrix for entry in row for part in (round(10000 * entry), 10000)],
+        ),
+        TiffTag.AS_SHOT_NEUTRAL: rationals(*neutral),
+        TiffTag.CALIBRATION_ILLUMINANT_1: (Kind.SHORT, [D65]),
     }
     try:
         start = head(tags, 2 * height * width)
@@ -86,7 +87,14 @@ def encode_dng(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
 
 
 def mosaic_of(image: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
-    """Return what an RGGB sensor keeps of `image` (H, W, 3): (H, W) uint16, little-endian."""
+    """Return the RGGB mosaic (H, W) uint16, little-endian, of `image` (H, W, 3) uint16.
+
+    Examples
+    --------
+    >>> mosaic_of(np.full((2, 4, 3), (10, 20, 30), np.uint16))
+    array([[10, 20, 10, 20],
+           [20, 30, 20, 30]], dtype=uint16)
+    """
     counts = np.empty(image.shape[:2], "<u2")
     counts[0::2, 0::2] = image[0::2, 0::2, 0]
     counts[0::2, 1::2] = image[0::2, 1::2, 1]
@@ -96,7 +104,15 @@ def mosaic_of(image: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
 
 
 def half_size(counts: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
-    """Return linear RGB (H // 2, W // 2, 3) uint16 of an RGGB mosaic: red, mean of both greens rounded up, blue."""
+    """Return linear RGB (H // 2, W // 2, 3) uint16 of an RGGB mosaic (H, W) uint16.
+
+    Each 2×2 block becomes a pixel: red, the mean of both greens rounded up, blue.
+
+    Examples
+    --------
+    >>> half_size(np.array([[10, 20], [25, 30]], np.uint16))
+    array([[[10, 23, 30]]], dtype=uint16)
+    """
     height, width = (size // 2 * 2 for size in counts.shape)
     image = np.empty((height // 2, width // 2, 3), np.uint16)
     image[..., 0] = counts[0:height:2, 0:width:2]
@@ -106,14 +122,14 @@ def half_size(counts: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
     return image
 
 
-def _neutral(shot: Shot) -> tuple[float, float, float]:
-    """Return the light's white over its largest channel."""
-    if not 1 <= shot.white_level <= 65535:
-        raise InputError(f"the white level is {shot.white_level}; DNG expects 1 to 65535")
-    largest = max(shot.white)
-    if not all(math.isfinite(part) and part > largest * 1e-5 for part in shot.white):
+def _neutral(metadata: ImageMetadata) -> tuple[float, float, float]:
+    """Return the light's white over its largest channel, as AsShotNeutral has it."""
+    if not 1 <= metadata.white_level <= 65535:
+        raise InputError(f"the white level is {metadata.white_level}; DNG expects 1 to 65535")
+    largest = max(metadata.white)
+    if not all(math.isfinite(part) and part > largest * 1e-5 for part in metadata.white):
         raise InputError(
-            f"the light's white is {shot.white}, DNG expects every channel above 0; choose png, tiff, exr or jxl"
+            f"the light's white is {metadata.white}, DNG expects every channel above 0; choose png, tiff, exr or jxl"
         )
-    red, green, blue = (part / largest for part in shot.white)
+    red, green, blue = (part / largest for part in metadata.white)
     return red, green, blue

@@ -1,13 +1,15 @@
-"""A 16-bit linear image as the bytes of a file, losslessly, and back; the small pictures beside them.
+"""A 16-bit linear image as the bytes of a file, losslessly, and back; masks and previews beside it.
 
     png     16-bit RGB; read by everything; the smallest of photographs
     tiff    16-bit RGB, uncompressed: the fastest to write and to read
     exr     OpenEXR, 32-bit float, which holds every 16-bit number (half does not); compressed by zip
     jxl     JPEG XL, lossless, 16 bits: the smallest of smooth pictures
-    dng     a raw file: the Bayer mosaic of the image, two thirds of the values left out as by a sensor
+    dng     a raw file: the Bayer mosaic of the image, two thirds of the values left out, as by a sensor
 
-Every encoder lets go of the interpreter's lock while it computes (not while it copies uncompressed pixels into the
-file), and no byte depends on the number of threads. Beside image and file a PNG takes some megabytes, however large.
+Every encoder releases the interpreter's lock while it computes (not while it copies uncompressed pixels into the file),
+and no byte depends on the number of threads. Beside image and file a PNG takes some megabytes, however large.
+
+This is the room's door: code of other rooms imports this file and no other of `generator.files`.
 """
 
 from __future__ import annotations
@@ -20,14 +22,15 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
-from generator.files.shot import Shot
+from generator.files.metadata import ImageMetadata
 
 __all__ = [
     "FORMATS",
     "Format",
-    "Shot",
+    "ImageMetadata",
     "decode_image",
     "encode_image",
+    "encode_map",
     "encode_pieces",
     "encode_preview",
     "libraries_of",
@@ -45,15 +48,19 @@ _LIBRARIES: Final[dict[Format, tuple[str, ...]]] = {
     "jxl": ("imagecodecs",),
     "dng": ("rawpy",),
 }
+"""Distributions that encode a format, or for a raw file name its colour matrix."""
+
+_JPEG_QUALITY: Final = 92
+"""Of previews, on libjpeg's scale to 100: no blocks are visible."""
 
 
 def suffix_of(form: Format) -> str:
-    """Return the end of the names of files of that format, ``.png``."""
+    """Return the suffix of file names of that format, such as ``.png``."""
     return f".{form}"
 
 
 def libraries_of(form: Format) -> tuple[str, ...]:
-    """Return the distributions whose version may change the bytes of a file of that format; none where we write it."""
+    """Return the distributions whose version may change the bytes of a file of that format; none if CroP encodes it."""
     return _LIBRARIES[form]
 
 
@@ -66,7 +73,7 @@ def smallest_side(form: Format) -> int:
     return SMALLEST_SIDE
 
 
-def encode_image(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> bytes:
+def encode_image(image: npt.NDArray[np.uint16], form: Format, metadata: ImageMetadata) -> bytes:
     """Return `image` as the bytes of a file.
 
     Parameters
@@ -75,40 +82,50 @@ def encode_image(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> byt
         (H, W, 3) uint16, linear camera RGB.
     form
         The format; `dng` keeps one channel of each pixel, the others every bit.
-    shot
-        What is known of the image; written wherever the format has a place for it (not `jxl`), needed by `dng`.
+    metadata
+        Light and camera of the image; written wherever the format has a place for it (not `jxl`), needed by `dng`.
 
     Raises
     ------
     InputError
-        The image is not of that shape and type, or its size or the shot does not fit the format.
+        The image is not of that shape and type, or its size or the metadata do not fit the format.
+
+    Examples
+    --------
+    >>> image = np.full((4, 6, 3), 1000, np.uint16)
+    >>> data = encode_image(image, "png", ImageMetadata(white_level=4095, white=(0.4, 1.0, 0.7), camera="Maker Model"))
+    >>> data[1:4]
+    b'PNG'
+    >>> decode_image(data, "png", "a.png")[0, 0]
+    array([1000, 1000, 1000], dtype=uint16)
     """
     _check(image)
     if form == "png":
         from generator.files.png import encode_png
 
-        return encode_png(image, shot)
+        return encode_png(image, metadata)
     if form == "tiff":
         from generator.files.tiff import encode_tiff
 
-        return encode_tiff(image, shot)
+        return encode_tiff(image, metadata)
     if form == "exr":
         from generator.files.exr import encode_exr
 
-        return encode_exr(image, shot)
+        return encode_exr(image, metadata)
     if form == "jxl":
         from generator.files.jxl import encode_jxl
 
         return encode_jxl(image)
     from generator.files.dng import encode_dng
 
-    return encode_dng(image, shot)
+    return encode_dng(image, metadata)
 
 
-def encode_pieces(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> Iterable[bytes | memoryview]:
-    """Return the file of `encode_image` in pieces, whose memory may be used again for the next one.
+def encode_pieces(image: npt.NDArray[np.uint16], form: Format, metadata: ImageMetadata) -> Iterable[bytes | memoryview]:
+    """Return the file of `image` (H, W, 3) uint16 in pieces, whose memory may be used again for the next one.
 
-    Of a PNG they are encoded when they are asked for, so that a file of any size is written out of a cache's memory.
+    Pieces of a PNG are encoded one after the other, so that a file of any size needs little memory. The parameters are
+    those of `encode_image`.
 
     Raises
     ------
@@ -119,8 +136,8 @@ def encode_pieces(image: npt.NDArray[np.uint16], form: Format, shot: Shot) -> It
     if form == "png":
         from generator.files.png import png_pieces
 
-        return png_pieces(image, shot)
-    return (encode_image(image, form, shot),)
+        return png_pieces(image, metadata)
+    return (encode_image(image, form, metadata),)
 
 
 def _check(image: npt.NDArray[np.uint16]) -> None:
@@ -138,7 +155,7 @@ def decode_image(data: bytes, form: Format, what: str) -> npt.NDArray[np.uint16]
     form
         Its format.
     what
-        What messages call it, such as its path.
+        Name of the image in messages, such as its path.
 
     Returns
     -------
@@ -180,11 +197,28 @@ def _decoded(data: bytes, form: Format) -> npt.NDArray[np.uint16]:
     return decode_exr(data)
 
 
+def encode_map(values: npt.NDArray[np.uint16]) -> bytes:
+    """Return smooth `values` (H, W) or (H, W, 3) uint16, such as a mask of weights, as the bytes of a 16-bit PNG."""
+    from generator.files import maps
+
+    return maps.encode_map(values)
+
+
 def encode_preview(picture: npt.NDArray[np.uint8]) -> bytes:
-    """Return `picture` (H, W, 3) uint8, RGB, as the bytes of a JPEG file of quality 92."""
+    """Return `picture` (H, W, 3) uint8, RGB, as the bytes of a JPEG file.
+
+    Raises
+    ------
+    InputError
+        A side is longer than JPEG allows, 65 500 px.
+    """
     import cv2
 
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92])
+    done, data = cv2.imencode(
+        ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    )
     if not done:
-        raise InputError(f"a preview of {picture.shape[1]}x{picture.shape[0]} px cannot be written as JPEG")
+        raise InputError(
+            f"a preview of {picture.shape[1]}x{picture.shape[0]} px cannot be written as JPEG; make it smaller"
+        )
     return data.tobytes()

@@ -14,18 +14,22 @@ from numba import uint8, uint32, uint64
 from foundation.compiled import compiled
 
 LITERALS: Final = 286
-"""Symbols for literals, the end of a block and lengths."""
+"""Symbols for literals, the end of a block and lengths (RFC 1951, 3.2.5)."""
 DISTANCES: Final = 30
+"""Symbols for distances (RFC 1951, 3.2.5)."""
 END: Final = 256
+"""The symbol that ends a block (RFC 1951, 3.2.5)."""
 LONGEST: Final = 12
-"""Bits of the longest code for literals and distances; three and up to seven bits that wait fit into 64."""
+"""Bits of the longest code for literals and distances: three codes beside up to seven waiting bits fit into 64."""
 
 _LONGEST_OF_LENGTHS: Final = 7
+"""Bits of the longest code for code lengths: its length is written in three bits (RFC 1951, 3.2.7)."""
 _LENGTHS: Final = 19
+"""Symbols of the code for code lengths (RFC 1951, 3.2.7)."""
 _SYMBOL_BITS: Final = 9
-"""Of a symbol, below 512: frequency and symbol are sorted as one number."""
-# RFC 1951, 3.2.7: the order in which the lengths of the code for lengths are told.
+"""Bits of a symbol, below 512: frequency and symbol are sorted as one number."""
 _ORDER: Final = np.array([16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15])
+"""The order in which the lengths of the code for code lengths are written (RFC 1951, 3.2.7)."""
 
 
 @compiled
@@ -43,10 +47,10 @@ def _sort(keys: Any, used: int) -> None:
 
 @compiled
 def code_lengths(frequencies: Any, longest: int) -> Any:
-    """Return the bits of each symbol's code, 0 where it does not occur and at most `longest`; (N,) int64.
+    """Return the bits (N,) int64 of each symbol's code, of frequencies (N,) int64: 0 where it does not occur.
 
-    Moffat and Katajainen's two queues instead of a heap; codes that would be too long are cut, and others made longer
-    until Kraft's sum is 1 again, which costs next to nothing of the best.
+    Huffman's algorithm on two queues instead of a heap (A. Moffat, J. Katajainen, 1995). Codes of more than `longest`
+    bits are cut, and others made longer until Kraft's sum is 1 again: hardly more bits than the best codes have.
     """
     lengths = np.zeros(len(frequencies), np.int64)
     keys = np.empty(len(frequencies), np.int64)
@@ -107,7 +111,7 @@ def code_lengths(frequencies: Any, longest: int) -> Any:
 
 @compiled
 def codes_of(lengths: Any) -> Any:
-    """Return the canonical codes of such lengths (RFC 1951, 3.2.2); (N,) uint32, as the head of this file says."""
+    """Return the canonical codes (N,) uint32, in the form above, of lengths (N,) int64 (RFC 1951, 3.2.2)."""
     number = np.zeros(17, np.int64)
     for length in lengths:
         number[length] += 1
@@ -129,11 +133,12 @@ def codes_of(lengths: Any) -> Any:
 
 @compiled
 def flush(out: Any, at: Any, waiting: Any, number: Any) -> Any:
-    """Write the waiting bits, 63 at most, and go on after the whole bytes among them.
+    """Write the waiting bits, 63 at most, to `out` (n,) uint8; return the new place, waiting bits and their number.
 
-    Bits wait in the order in which deflate writes them. Eight bytes are written, however few of them count.
+    Eight bytes are written at `at`, and the place moves on by the whole bytes among them; up to seven bits remain
+    waiting, in the order in which deflate writes them.
     """
-    # The compiler makes one store of these.
+    # The compiler makes a single store of these.
     out[at] = uint8(waiting)
     out[at + uint64(1)] = uint8(waiting >> uint64(8))
     out[at + uint64(2)] = uint8(waiting >> uint64(16))
@@ -147,22 +152,22 @@ def flush(out: Any, at: Any, waiting: Any, number: Any) -> Any:
 
 @compiled
 def put(out: Any, writer: Any, value: int, bits: int) -> None:
-    """Write the low `bits`, 32 at most, of `value`, the others 0.
+    """Write `value` in `bits` bits, 32 at most; its other bits are 0.
 
-    `writer` holds the place in `out`, the waiting bits and their number.
+    `writer` (3,) uint64 holds the place in `out`, the waiting bits and their number.
     """
     waiting = writer[1] | (uint64(value) << writer[2])
     writer[0], writer[1], writer[2] = flush(out, writer[0], waiting, writer[2] + uint64(bits))
 
 
 @compiled
-def _tokens(told: Any, tokens: Any) -> int:
-    """Fill `tokens` with symbol, extra bits and their number for lengths in a row; return how many there are."""
+def _run_lengths(sequence: Any, tokens: Any) -> int:
+    """Fill `tokens` (n, 3) with symbol, extra bits and their number, by which lengths in a row are coded; return n."""
     found = 0
     i = 0
-    while i < len(told):
-        value, run = told[i], 1
-        while i + run < len(told) and told[i + run] == value:
+    while i < len(sequence):
+        value, run = sequence[i], 1
+        while i + run < len(sequence) and sequence[i + run] == value:
             run += 1
         i += run
         if value:
@@ -189,21 +194,21 @@ def _tokens(told: Any, tokens: Any) -> int:
 
 
 @compiled
-def _told(lengths: Any, least: int) -> int:
-    """Return how many lengths are told, those after the last one of a code that occurs left out."""
-    told = len(lengths)
-    while told > least and not lengths[told - 1]:
-        told -= 1
-    return told
+def _used_length(lengths: Any, least: int) -> int:
+    """Return the number of lengths to be written, at least `least`: up to the last one that is not 0."""
+    used = len(lengths)
+    while used > least and not lengths[used - 1]:
+        used -= 1
+    return used
 
 
 @compiled
 def put_head(out: Any, writer: Any, literals: Any, distances: Any, last: int) -> None:
-    """Write the head of a block of dynamic codes of these lengths (RFC 1951, 3.2.7); `last`: no block follows."""
-    told_literals, told_distances = _told(literals, END + 1), _told(distances, 1)
-    told = np.concatenate((literals[:told_literals], distances[:told_distances]))
-    tokens = np.empty((len(told), 3), np.int64)
-    found = _tokens(told, tokens)
+    """Write the head of a block with codes of these lengths (RFC 1951, 3.2.7); `last`: 1 if none follows, else 0."""
+    used_literals, used_distances = _used_length(literals, END + 1), _used_length(distances, 1)
+    sequence = np.concatenate((literals[:used_literals], distances[:used_distances]))
+    tokens = np.empty((len(sequence), 3), np.int64)
+    found = _run_lengths(sequence, tokens)
     frequencies = np.zeros(_LENGTHS, np.int64)
     for i in range(found):
         frequencies[tokens[i, 0]] += 1
@@ -214,8 +219,8 @@ def put_head(out: Any, writer: Any, literals: Any, distances: Any, last: int) ->
         number -= 1
     put(out, writer, last, 1)
     put(out, writer, 2, 2)
-    put(out, writer, told_literals - 257, 5)
-    put(out, writer, told_distances - 1, 5)
+    put(out, writer, used_literals - 257, 5)
+    put(out, writer, used_distances - 1, 5)
     put(out, writer, number - 4, 4)
     for i in range(number):
         put(out, writer, lengths[_ORDER[i]], 3)

@@ -1,6 +1,6 @@
 """JPEG XL (ISO/IEC 18181), lossless at its lowest effort: small for smooth pictures; PNG is smaller for photographs.
 
-libjxl writes it; other versions may give other bytes. The shot is not told in it.
+libjxl writes it; other versions may give other bytes. The file has no place for the image's metadata.
 """
 
 from __future__ import annotations

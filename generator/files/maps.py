@@ -1,7 +1,8 @@
-"""PNG (ISO/IEC 15948) of what is smooth: 16-bit grey masks and RGB ground truths, around ISA-L's deflate.
+"""PNG (ISO/IEC 15948) of smooth planes: 16-bit grey masks and RGB ground truths, around ISA-L's deflate.
 
-Rows as differences from the rows above (filter Up, clause 9.2) suit what is smooth. Level 1 of ISA-L packs them into as
-little as OpenCV's writer does, in a fifth of its time. Its bytes are alike with AVX2 and AVX-512; arm64 may differ.
+Rows are filtered as differences from the rows above (filter Up, clause 9.2), which are small where values are smooth.
+Level 1 of ISA-L packs them into as few bytes as OpenCV's writer, in a fifth of its time. Its bytes are the same with
+AVX2 and AVX-512; arm64 may differ.
 """
 
 from __future__ import annotations
@@ -16,13 +17,15 @@ from isal import isal_zlib
 from generator.files.png import SIGNATURE, chunk
 
 _COLOUR_TYPES: Final = {1: 0, 3: 2}
-"""Of images of one channel and of three (clause 11.2.2)."""
+"""Colour type of images of one channel, greyscale, and of three, truecolour (clause 11.2.2)."""
 _UP: Final = 2
+"""The filter type Up (clause 9.2)."""
 _LEVEL: Final = 1
+"""Level of ISA-L's compression, see above."""
 
 
 def encode_map(values: npt.NDArray[np.uint16]) -> bytes:
-    """Return the PNG file of `values` (H, W) or (H, W, 3) uint16."""
+    """Return the bytes of the PNG file of `values` (H, W) or (H, W, 3) uint16."""
     height, width = values.shape[:2]
     channels = values.size // (height * width)
     plain = values.astype(">u2").view(np.uint8).reshape(height, 2 * width * channels)

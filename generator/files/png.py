@@ -21,23 +21,25 @@ from isal import isal_zlib
 
 from foundation.errors import InputError
 from generator.files.deflate import WIDEST, Packer
-from generator.files.shot import Shot
+from generator.files.metadata import ImageMetadata
 
 SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 """The first bytes of every PNG file (clause 5.2)."""
 BAND: Final = 1 << 18
-"""Pixels that a band has at most, unless a row has more."""
+"""Most pixels of a band, unless a row has more: 1.5 MiB, so that an image of any size needs little memory."""
 TALLEST: Final = (1 << 31) - 1
 """Largest size in the format (clause 11.2.2)."""
 
 _ZLIB: Final = bytes([0x78, 0x01])
 """Deflate, a window of 32 KiB, packed fast (RFC 1950, 2.2)."""
 _ADLER: Final = 65521
+"""The modulus of Adler-32, the largest prime below 2¹⁶ (RFC 1950, 8.2)."""
 
 _threads = threading.local()
+"""Each thread's packer, with its working memory."""
 
 
-def encode_png(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> bytes:
+def encode_png(image: npt.NDArray[np.uint16], metadata: ImageMetadata, threads: int = 1) -> bytes:
     """Return the file of `image` (H, W, 3) uint16; no byte depends on the number of threads.
 
     Raises
@@ -45,11 +47,13 @@ def encode_png(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> b
     InputError
         The image is wider or higher than a PNG may be.
     """
-    return b"".join([bytes(piece) for piece in png_pieces(image, shot, threads)])
+    return b"".join([bytes(piece) for piece in png_pieces(image, metadata, threads)])
 
 
-def png_pieces(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> Iterator[bytes | memoryview]:
-    """Yield the file of `encode_png` piece by piece; the memory of each is used again for the next."""
+def png_pieces(
+    image: npt.NDArray[np.uint16], metadata: ImageMetadata, threads: int = 1
+) -> Iterator[bytes | memoryview]:
+    """Yield the file of `image` (H, W, 3) uint16 piece by piece; the memory of each is used again for the next."""
     height, width, _ = image.shape
     if width > WIDEST or height > TALLEST:
         raise InputError(
@@ -58,7 +62,7 @@ def png_pieces(image: npt.NDArray[np.uint16], shot: Shot, threads: int = 1) -> I
         )
     yield SIGNATURE
     yield from chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0))
-    yield from chunk(b"tEXt", b"Description\0" + shot.note().encode("ascii"))
+    yield from chunk(b"tEXt", b"Description\0" + metadata.to_json().encode("ascii"))
     rows = max(1, BAND // width)
     tops = range(0, height, rows)
     total = 1
@@ -91,7 +95,7 @@ def _bands(
 
 
 def _bytes(data: npt.NDArray[np.uint8]) -> Any:
-    """Return the memory of an array; imagecodecs takes it, though its type hints do not say so."""
+    """Return the buffer of an array: imagecodecs takes it, though its type hints omit it."""
     return data.data
 
 

@@ -1,6 +1,6 @@
 """TIFF 6.0 as every reader can read it: 16-bit RGB in one uncompressed strip; the fastest of the formats.
 
-The shot is told in ImageDescription. Nothing is compressed: the zstd codec is missing from widespread readers, and
+ImageDescription holds the metadata. Nothing is compressed: the zstd codec is missing from widespread readers, and
 deflate, at the speed of their TIFF writers, costs more time than it saves room.
 """
 
@@ -9,14 +9,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from drivers.tiff.tags import RGB, TiffTag
 from drivers.tiff.writing import Kind, Tags, head, text
 from foundation.errors import InputError
-from generator.files.shot import Shot
-
-_RGB = 2
+from generator.files.metadata import ImageMetadata
 
 
-def encode_tiff(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
+def encode_tiff(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
     """Return the file of `image` (H, W, 3) uint16.
 
     Raises
@@ -26,17 +25,17 @@ def encode_tiff(image: npt.NDArray[np.uint16], shot: Shot) -> bytes:
     """
     height, width, channels = image.shape
     tags: Tags = {
-        254: (Kind.LONG, [0]),  # NewSubfileType: the picture itself
-        256: (Kind.LONG, [width]),
-        257: (Kind.LONG, [height]),
-        258: (Kind.SHORT, [16] * channels),  # BitsPerSample
-        259: (Kind.SHORT, [1]),  # Compression: none
-        262: (Kind.SHORT, [_RGB]),  # PhotometricInterpretation
-        270: text(shot.note()),  # ImageDescription
-        277: (Kind.SHORT, [channels]),  # SamplesPerPixel
-        278: (Kind.LONG, [height]),  # RowsPerStrip
-        284: (Kind.SHORT, [1]),  # PlanarConfiguration: pixel by pixel
-        339: (Kind.SHORT, [1] * channels),  # SampleFormat: unsigned integers
+        TiffTag.NEW_SUBFILE_TYPE: (Kind.LONG, [0]),  # the picture itself
+        TiffTag.IMAGE_WIDTH: (Kind.LONG, [width]),
+        TiffTag.IMAGE_LENGTH: (Kind.LONG, [height]),
+        TiffTag.BITS_PER_SAMPLE: (Kind.SHORT, [16] * channels),
+        TiffTag.COMPRESSION: (Kind.SHORT, [1]),  # none
+        TiffTag.PHOTOMETRIC_INTERPRETATION: (Kind.SHORT, [RGB]),
+        TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
+        TiffTag.SAMPLES_PER_PIXEL: (Kind.SHORT, [channels]),
+        TiffTag.ROWS_PER_STRIP: (Kind.LONG, [height]),
+        TiffTag.PLANAR_CONFIGURATION: (Kind.SHORT, [1]),  # pixel by pixel
+        TiffTag.SAMPLE_FORMAT: (Kind.SHORT, [1] * channels),  # unsigned integers
     }
     try:
         start = head(tags, image.nbytes)

@@ -1,4 +1,4 @@
-"""What the kernels' callers hand in, looked at before compiled code touches it; and rows shared among threads."""
+"""Arguments of the kernels, checked before compiled code reads their memory; and rows split among threads."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import numpy.typing as npt
 
 from foundation.errors import InputError
 from generator.kernels.palette import bits_of
-from generator.kernels.philox import key_of
+from generator.philox import key_of
 
 Samples = npt.NDArray[np.uint16]
 Picture = npt.NDArray[np.uint8]
 
 _PAGE: Final = 4096
-"""The smallest unit of memory protection on the processors we know; larger pages are whole multiples."""
+"""Bytes of a page, the smallest unit of memory protection on x86-64 and arm64; larger pages are whole multiples."""
 _OFFSETS: Final = 0xFFFFFFFF
-"""Compiled code counts bytes of a light's samples in 32 bits."""
+"""Most bytes of a light's samples: compiled code counts them in 32 bits."""
 
 
 def check_samples(samples: Samples) -> int:
-    """Return the bits of a light's samples; they must be uint16 (8**bits, S, 3), S ≥ 1.
+    """Return the bits a channel of a light's samples; they must be uint16 (8**bits, S, 3), S ≥ 1.
 
     Raises
     ------
     InputError
-        They are something else.
+        They are of another shape or type.
     """
     if samples.dtype != np.uint16 or samples.ndim != 3 or samples.shape[2] != 3 or not samples.shape[1]:
         raise InputError(f"the samples are {samples.dtype} {samples.shape}, expected uint16 (8**bits, samples, 3)")
@@ -38,12 +38,12 @@ def check_samples(samples: Samples) -> int:
 
 
 def check_tables(tables: Samples | Sequence[Samples]) -> list[Samples]:
-    """Return the samples of several lights as a list; they must be uint16 (8**bits, S, 3), all alike.
+    """Return the samples of several lights as a list; they must be uint16 (8**bits, S, 3), all of one shape.
 
     Raises
     ------
     InputError
-        There is none, or they are something else.
+        There is none, or they are of another shape or type.
     """
     checked = list(tables)
     if not checked:
@@ -61,21 +61,21 @@ def check_picture(picture: Picture) -> None:
     Raises
     ------
     InputError
-        It is something else.
+        It is of another shape or type.
     """
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
         raise InputError(f"the picture is {picture.dtype} {picture.shape}, expected uint8 (height, width, 3)")
 
 
-def check_target(
+def check_out(
     out: npt.NDArray[Any] | None, shape: tuple[int, ...], dtype: type[np.uint16] | type[np.float32]
 ) -> npt.NDArray[Any]:
-    """Return `out`, or a new array if it is None.
+    """Return `out`, of that shape and that dtype, or a new array of them if it is None.
 
     Raises
     ------
     InputError
-        `out` is of another shape or type, or not to be written to.
+        `out` is of another shape or type, or read-only.
     """
     if out is None:
         return np.empty(shape, dtype)
@@ -86,8 +86,8 @@ def check_target(
     return out
 
 
-def check_place(seed: int, image: int) -> np.uint64:
-    """Return the seed as compiled code takes it.
+def check_seed(seed: int, image: int) -> np.uint64:
+    """Return the seed as uint64 after checking it and the image number.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def check_place(seed: int, image: int) -> np.uint64:
     return np.uint64(seed)
 
 
-def check_white(white_level: int) -> None:
+def check_white_level(white_level: int) -> None:
     """Check that `white_level` is 1 … 65535.
 
     Raises
@@ -112,40 +112,57 @@ def check_white(white_level: int) -> None:
         raise InputError(f"the white level is {white_level}, expected 1 to 65535")
 
 
-def packed(picture: Picture) -> Picture:
-    """Return `picture` with the bytes of each row in one piece, itself where they are."""
+def check_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float64]:
+    """Return the weights of `lights` lights as (K,) float64.
+
+    Raises
+    ------
+    InputError
+        They are not one finite number ≥ 0 a light.
+    """
+    checked = np.asarray(weights, dtype=np.float64)
+    if checked.shape != (lights,) or not np.isfinite(checked).all() or (checked < 0).any():
+        raise InputError(f"the weights are {np.asarray(weights).tolist()}, expected {lights} finite numbers from 0")
+    return checked
+
+
+def packed_rows(picture: Picture) -> Picture:
+    """Return `picture` (H, W, 3) uint8 with the bytes of each row contiguous: itself, or a copy if they are not."""
     return picture if picture.strides[1:] == (3, 1) else np.ascontiguousarray(picture)
 
 
 def readable(samples: Samples) -> Samples:
-    """Return samples in one piece, behind which two more bytes can be read: themselves where possible.
+    """Return samples (8**bits, S, 3) uint16 as a contiguous array behind which two more bytes can be read.
 
-    Samples are fetched eight bytes at a time. The two bytes behind an array can be read wherever they are on the page
-    of its last byte, be they anyone's; where they are not, the samples are copied.
+    Samples, of six bytes, are fetched eight bytes at a time. The two bytes behind an array can be read if they are on
+    the page of its last byte, whoever owns them; if not, or if the samples are not contiguous, a copy is returned.
     """
     last = samples.ctypes.data + samples.nbytes - 1
     if samples.flags.c_contiguous and last // _PAGE == (last + 2) // _PAGE:
         return samples
-    roomy = np.empty(samples.size + 1, np.uint16)
-    roomy[:-1] = samples.reshape(-1)
-    return roomy[:-1].reshape(samples.shape)
+    padded = np.empty(samples.size + 1, np.uint16)
+    padded[:-1] = samples.reshape(-1)
+    return padded[:-1].reshape(samples.shape)
 
 
 def writable(target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
-    """Return `target` if its rows are pieces at even addresses, else an array of its shape to be `delivered`."""
+    """Return `target`, (H, W, 3) or (H, W) uint16, if compiled code can write its rows, else a new array of its shape.
+
+    Rows must be contiguous and at even addresses. A new array is to be given to `copied_back` when it is filled.
+    """
     piece = (6, 2) if target.ndim == 3 else (2,)
     return target if target.strides[1:] == piece and target.flags.aligned else np.empty(target.shape, target.dtype)
 
 
-def delivered(work: npt.NDArray[np.uint16], target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
-    """Return `target` with the content of `work`, which is itself or came from `writable`."""
+def copied_back(work: npt.NDArray[np.uint16], target: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
+    """Return `target`, (H, W, 3) or (H, W) uint16, with the content of `work`: itself, or the array from `writable`."""
     if work is not target:
         target[...] = work
     return target
 
 
-def share(fill: Callable[[int, int], object], count: int, threads: int) -> None:
-    """Call `fill(first, end)` for parts of 0 … count − 1, in as many threads."""
+def run_in_threads(fill: Callable[[int, int], object], count: int, threads: int) -> None:
+    """Call `fill(first, end)` for as many parts of 0 … count − 1 as there are threads, a thread each."""
     threads = min(threads, count)
     if threads <= 1:
         fill(0, count)

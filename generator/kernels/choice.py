@@ -26,19 +26,19 @@ import numba
 import numpy as np
 from numba import uint32, uint64
 
-from generator.kernels.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES
 from generator.kernels.vector import GROUP, LANES, LINE, choose, copy1, prefetch_once
+from generator.philox import KEY_STEPS, MULTIPLIERS, ROUNDS, SAMPLES
 
-AHEAD: Final = 2
-"""Groups of pixels whose offsets are chosen before the first one's samples are fetched."""
-OFFSETS: Final = 4 * GROUP
-"""Bytes of a group's offsets."""
-_SOON: Final = 2048
-"""Bytes of a picture that are asked for before they are read."""
-EDGE: Final = 128
-"""Bytes of scratch memory for the last pixels of a row."""
-SCRATCH: Final = EDGE + 4 * OFFSETS
-"""Bytes of scratch memory a thread needs: a row's last pixels, and four groups' offsets."""
+LEAD: Final = 2
+"""Groups of pixels by which choosing offsets leads fetching samples, so that the processor computes while it waits."""
+OFFSETS_BYTES: Final = 4 * GROUP
+"""Bytes of a group's offsets, uint32 each."""
+_PREFETCH_BYTES: Final = 2048
+"""Bytes by which prefetching the picture leads reading it, some 21 groups: time for the memory to answer."""
+EDGE_BYTES: Final = 128
+"""Bytes of scratch memory for the last pixels of a row: a group's 96, rounded up to whole lines of the cache."""
+SCRATCH_BYTES: Final = EDGE_BYTES + 4 * OFFSETS_BYTES
+"""Bytes of scratch memory a thread needs: a row's last pixels, and the offsets of four groups, LEAD + 1 in use."""
 
 _P0: Final = np.uint64(MULTIPLIERS[0])
 _P1: Final = np.uint64(MULTIPLIERS[1])
@@ -49,8 +49,8 @@ _PURPOSE: Final = np.uint32(SAMPLES)
 
 
 @numba.njit(inline="always")
-def four_words(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
-    """Return the four words of Philox4x32-10; words and counter are uint32, `seed` is uint64."""
+def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
+    """Return the four words of Philox4x32-10, compiled; words and counter are uint32, `seed` is uint64."""
     k0, k1 = uint32(seed), uint32(seed >> _HALF)
     for _ in range(ROUNDS):
         p0, p1 = uint64(c0) * _P0, uint64(c2) * _P1
@@ -67,18 +67,18 @@ def four_words(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
 @numba.njit(inline="always")
 def row_keys(y: Any, place: Any, image: Any, seed: Any) -> Any:
     """Return the three keys (uint32) of row `y`; `seed` is uint64."""
-    k0, k1, k2, _ = four_words(uint32(y), uint32(place), uint32(image), _PURPOSE, seed)
+    k0, k1, k2, _ = philox4x32(uint32(y), uint32(place), uint32(image), _PURPOSE, seed)
     return k0, k1, k2
 
 
 @numba.njit(inline="always")
-def slot(scratch: int, group: int) -> int:
+def offsets_slot(scratch: int, group: int) -> int:
     """Return where in a thread's scratch memory the offsets of `group` stand until they are used."""
-    return scratch + EDGE + OFFSETS * (group & 3)
+    return scratch + EDGE_BYTES + OFFSETS_BYTES * (group & 3)
 
 
 @numba.njit(inline="always")
-def group_of(row: int, width: int, group: int, scratch: int) -> int:
+def group_address(row: int, width: int, group: int, scratch: int) -> int:
     """Return where the pixels from x = 32 `group` on can be read; `row` is the address of a row's first pixel.
 
     Of a group that reaches beyond the row only the pixels in the row are copied to scratch memory.
@@ -92,15 +92,15 @@ def group_of(row: int, width: int, group: int, scratch: int) -> int:
 
 
 @numba.njit(inline="always")
-def ask_group(row: int, group: int) -> None:
-    """Ask for pixels that will be read soon: the lines of one group, in turn for every group."""
-    soon = row + 3 * GROUP * group + _SOON
-    prefetch_once(soon)
-    prefetch_once(soon + LINE)
+def prefetch_group(row: int, group: int) -> None:
+    """Prefetch a group's share of the pixels that will be read soon; to be called for every group in turn."""
+    line = row + 3 * GROUP * group + _PREFETCH_BYTES
+    prefetch_once(line)
+    prefetch_once(line + LINE)
 
 
 @numba.njit(inline="always")
 def choose_group(row: int, width: int, group: int, keys: Any, count: Any, bits: Any, scratch: int, target: int) -> None:
-    """Write the offsets of a row's pixels from x = 32 `group` on."""
-    source = group_of(row, width, group, scratch)
+    """Write the offsets, uint32 bytes, of the samples of a row's pixels from x = 32 `group` on at `target`."""
+    source = group_address(row, width, group, scratch)
     choose(source, uint32(LANES * group), keys[0], keys[1], keys[2], count, bits, target)

@@ -1,4 +1,4 @@
-"""The samples of one light for a row's pixels: the loop that whole images and lone lights among several share."""
+"""The samples of one light for a row's pixels: the loop that images under one light and under several share."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from typing import Any
 import numba
 from numba import uint32
 
-from generator.kernels.choice import AHEAD, ask_group, choose_group, slot
+from generator.kernels.choice import LEAD, choose_group, offsets_slot, prefetch_group
 from generator.kernels.vector import GROUP, LANES, LINE, SAMPLE_BYTES, choose, copy6, copy8, offset_at, prefetch
 
 
 @numba.njit(inline="always")
-def choose_first(row: int, width: int, keys: Any, count: Any, bits: Any, scratch: int, begin: int, limit: int) -> None:
-    """Choose what `draw_groups` finds chosen when it starts with group `begin` of a row."""
-    for group in range(begin, min(begin + AHEAD, limit)):
-        choose_group(row, width, group, keys, count, bits, scratch, slot(scratch, group))
+def choose_first_groups(
+    row: int, width: int, keys: Any, count: Any, bits: Any, scratch: int, begin: int, limit: int
+) -> None:
+    """Choose the offsets of the first `LEAD` groups from `begin` on, which `draw_groups` expects in scratch memory."""
+    for group in range(begin, min(begin + LEAD, limit)):
+        choose_group(row, width, group, keys, count, bits, scratch, offsets_slot(scratch, group))
 
 
 @numba.njit(inline="always")
@@ -30,31 +32,31 @@ def draw_groups(
     begin: int,
     end: int,
     limit: int,
-    soon: int,
-    asked: int,
+    prefetch_from: int,
+    lines_per_group: int,
     base: int,
 ) -> None:
     """Write the samples of groups `begin` … `end` − 1 of a row; its first pixel would go to `base`.
 
-    Offsets are chosen `AHEAD` groups before the samples they lead to are fetched, but none from group `limit` on, so
-    that the processor multiplies while it waits. With each group so many lines of what is read `soon` are `asked` for.
-    Two bytes are written behind the last pixel, if it is not the row's last.
+    Offsets are chosen `LEAD` groups before the samples they point to are fetched, but none from group `limit` on. With
+    each group `lines_per_group` further lines of the cache are prefetched, the first at address `prefetch_from`. Two
+    bytes are written behind the last pixel, if it is not the row's last.
     """
     done, whole = begin, min(limit, width // GROUP)
     while done < end:
-        while done < min(end, whole - AHEAD):
-            source, word = row + 3 * GROUP * (done + AHEAD), uint32(LANES * (done + AHEAD))
-            ask_group(row, done + AHEAD)
-            _ask(soon, asked, done - begin)
-            choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, done + AHEAD))
-            _copy_group(samples, slot(scratch, done), base + SAMPLE_BYTES * GROUP * done)
+        while done < min(end, whole - LEAD):
+            source, word = row + 3 * GROUP * (done + LEAD), uint32(LANES * (done + LEAD))
+            prefetch_group(row, done + LEAD)
+            _prefetch_lines(prefetch_from, lines_per_group, done - begin)
+            choose(source, word, keys[0], keys[1], keys[2], count, bits, offsets_slot(scratch, done + LEAD))
+            _copy_group(samples, offsets_slot(scratch, done), base + SAMPLE_BYTES * GROUP * done)
             done += 1
-        # The last groups have none to choose ahead, or fewer pixels.
+        # For the last groups no offsets are left to choose, or they have fewer pixels.
         if done < end:
-            _ask(soon, asked, done - begin)
-            if done + AHEAD < limit:
-                choose_group(row, width, done + AHEAD, keys, count, bits, scratch, slot(scratch, done + AHEAD))
-            offsets, at, pixels = slot(scratch, done), base + SAMPLE_BYTES * GROUP * done, width - GROUP * done
+            _prefetch_lines(prefetch_from, lines_per_group, done - begin)
+            if done + LEAD < limit:
+                choose_group(row, width, done + LEAD, keys, count, bits, scratch, offsets_slot(scratch, done + LEAD))
+            offsets, at, pixels = offsets_slot(scratch, done), base + SAMPLE_BYTES * GROUP * done, width - GROUP * done
             if pixels > GROUP:
                 _copy_group(samples, offsets, at)
             else:
@@ -64,9 +66,9 @@ def draw_groups(
 
 
 @numba.njit(inline="always")
-def _ask(soon: int, lines: int, group: int) -> None:
+def _prefetch_lines(prefetch_from: int, lines: int, group: int) -> None:
     for line in range(lines * group, lines * (group + 1)):
-        prefetch(soon + LINE * line)
+        prefetch(prefetch_from + LINE * line)
 
 
 @numba.njit(inline="always")

@@ -1,4 +1,4 @@
-"""Several lights at once, with the noise one exposure would have had.
+"""Several lights at once, with the noise that one exposure under all of them would have.
 
 Light is additive: under lights i of weights w_i a colour's mean is Σ w_i m_i, m_i its mean under light i alone. Noise
 is not: a sample is x_i = m_i + n_i, where the variance of n_i is g m_i + r² (photons at gain g, and read noise r), and
@@ -27,98 +27,57 @@ from numba import uint32
 
 from foundation.compiled import compiled
 from foundation.errors import InputError
-from generator.kernels import philox, streaming
+from generator.kernels import streaming
 from generator.kernels.arguments import (
     Picture,
     Samples,
+    check_out,
     check_picture,
-    check_place,
+    check_seed,
     check_tables,
-    check_target,
-    check_white,
-    packed,
+    check_weights,
+    check_white_level,
+    packed_rows,
     readable,
-    share,
+    run_in_threads,
     writable,
 )
-from generator.kernels.choice import OFFSETS, SCRATCH, ask_group, four_words, group_of, row_keys
-from generator.kernels.drawing import choose_first, draw_groups
+from generator.kernels.choice import OFFSETS_BYTES, SCRATCH_BYTES, group_address, prefetch_group, row_keys
+from generator.kernels.drawing import choose_first_groups, draw_groups
 from generator.kernels.palette import bits_of, colours_in
-from generator.kernels.streaming import line_at, line_room, pass_on
+from generator.kernels.streaming import first_line, line_buffer_bytes, stream_lines
 from generator.kernels.vector import (
     GROUP,
     LANES,
     LINE,
     SAMPLE_BYTES,
-    choose_named,
-    name_colours,
+    choose_for_colours,
     prefetch,
-    settle,
+    store_fence,
+    write_colours,
 )
 from generator.kernels.vector_mixing import (
     BLOCK,
-    FAULTS,
+    FAULT_BYTES,
     MEAN_BYTES,
-    PLAN,
-    interleave8,
-    line_up,
-    look,
+    PLAN_ENTRIES,
+    arrange_weights,
+    interleave_weights,
     mean4,
     mix,
+    weight_flags,
 )
 
-MIXTURES: Final = np.uint32(philox.MIXTURES)
-STRETCH: Final = 512
-"""Pixels of a row whose offsets are chosen before their samples are fetched, a whole number of groups."""
-_SOON: Final = 4096
-"""Pixels of a row whose weights are asked for before they are read: they come from memory while others are drawn."""
-ROOM: Final = OFFSETS * (STRETCH // GROUP + 1)
-"""Bytes of a stretch's offsets, or of one light's weights; a row's last may be longer by up to seven pixels."""
-PAIR_ROOM: Final = 6 * ROOM
-"""Bytes of a stretch's weights, as they are looked at and as they are mixed, and of its offsets, for two lights."""
-_LINES: Final = line_room(SAMPLE_BYTES * (STRETCH + BLOCK))
-"""Bytes of a stretch that is put together before it is streamed."""
-
-
-@compiled
-def _mix_table(samples: Any, weight: float, seed: Any, place: int, shuffled: bool, chosen: Any, total: Any) -> None:
-    """Add one light to `total` (N, S, 3) float64, each chosen colour's samples in the order of a shuffle of its own."""
-    count = samples.shape[1]
-    root = np.sqrt(weight)
-    order = np.empty(count, np.uint32)
-    for i in range(count):
-        order[i] = i
-    words = np.empty(count + 3, np.uint32)
-    rest = np.empty(3)
-    for number, colour in enumerate(chosen):
-        drawn, sums = samples[colour], total[number]
-        if shuffled:
-            for i in range(0, count, 4):
-                words[i], words[i + 1], words[i + 2], words[i + 3] = four_words(
-                    np.uint32(colour), np.uint32(i // 4), np.uint32(place), MIXTURES, seed
-                )
-            for i in range(count):
-                order[i] = i
-            for i in range(count - 1):
-                j = i + np.int64((np.uint64(words[i]) * np.uint64(count - i)) >> np.uint64(32))
-                order[i], order[j] = order[j], order[i]
-        red = green = blue = 0
-        for i in range(count):
-            red, green, blue = red + drawn[i, 0], green + drawn[i, 1], blue + drawn[i, 2]
-        for channel, mean in enumerate((red / count, green / count, blue / count)):
-            rest[channel] = (weight - root) * mean
-        for i in range(count):
-            sample = drawn[order[i]]
-            for channel in range(3):
-                sums[i, channel] += root * sample[channel] + rest[channel]
-
-
-@compiled
-def _round_table(total: Any, white: float, chosen: Any, out: Any) -> None:
-    for number, colour in enumerate(chosen):
-        for i in range(total.shape[1]):
-            for channel in range(3):
-                out[colour, i, channel] = np.uint16(min(max(total[number, i, channel] + 0.5, 0.0), white))
+SEGMENT_PIXELS: Final = 512
+"""Pixels of a row that are mixed together, whole groups: their weights and offsets stay in the second-level cache."""
+_PREFETCH_PIXELS: Final = 4096
+"""Pixels by which prefetching weights leads reading them: eight segments: time for the memory to answer."""
+SEGMENT_BYTES: Final = OFFSETS_BYTES * (SEGMENT_PIXELS // GROUP + 1)
+"""Bytes of a segment's offsets, or of one light's weights; a row's last may be longer by up to seven pixels."""
+PAIR_BYTES: Final = 6 * SEGMENT_BYTES
+"""Bytes of a segment's weights in the order of pixels and in that of `mix`, and of its offsets, for two lights each."""
+_LINES_BYTES: Final = line_buffer_bytes(SAMPLE_BYTES * (SEGMENT_PIXELS + BLOCK))
+"""Bytes of a segment that is put together before it is streamed."""
 
 
 @compiled
@@ -131,21 +90,21 @@ def _fill_means(samples: int, chosen: Any, count: int, means: int, step: int) ->
 
 
 @numba.njit(inline="always")
-def _alone(couples: Any, count: int) -> int:
-    """Return the one light that has weights other than 0 in a stretch's first pixels, all 1; -1 if there is none."""
-    shining, alone = 0, -1
-    for pair in range(len(couples)):
-        seen = look(couples[pair], count)
+def _single_light(pair_weights: Any, count: int) -> int:
+    """Return the only light with weights other than 0 in a segment's first pixels if they are all 1, else -1."""
+    lit, single = 0, -1
+    for pair in range(len(pair_weights)):
+        seen = weight_flags(pair_weights[pair], count)
         for member in range(2):
             if seen >> member & 1:
-                shining += 1
+                lit += 1
                 if not seen >> 2 + member & 1:
-                    alone = 2 * pair + member
-    return alone if shining == 1 else -1
+                    single = 2 * pair + member
+    return single if lit == 1 else -1
 
 
 @compiled
-def _draw_stretch(
+def _draw_segment(
     row: int,
     width: int,
     low: int,
@@ -155,21 +114,21 @@ def _draw_stretch(
     count: Any,
     bits: Any,
     scratch: int,
-    soon: int,
-    asked: int,
+    prefetch_from: int,
+    lines_per_group: int,
     base: int,
 ) -> None:
     """Fill the groups `low` … `high` − 1 of a row under one light; the row's first pixel would go to `base`.
 
-    A function of its own, as `_mix_stretch`: both within the loop of rows are more than the registers hold. With each
-    group so many lines of what is read `soon` are `asked` for.
+    A function of its own, as `_mix_segment`: both within the loop of rows are more than the registers hold. With each
+    group `lines_per_group` lines of weights are prefetched, the first at address `prefetch_from`.
     """
-    choose_first(row, width, keys, count, bits, scratch, low, high)
-    draw_groups(row, width, keys, samples, count, bits, scratch, low, high, high, soon, asked, base)
+    choose_first_groups(row, width, keys, count, bits, scratch, low, high)
+    draw_groups(row, width, keys, samples, count, bits, scratch, low, high, high, prefetch_from, lines_per_group, base)
 
 
 @compiled
-def _mix_stretch(
+def _mix_segment(
     row: int,
     width: int,
     low: int,
@@ -180,52 +139,53 @@ def _mix_stretch(
     means: int,
     count: Any,
     bits: Any,
-    couples: Any,
+    pair_weights: Any,
     white: Any,
     scratch: int,
-    soon: int,
-    asked: int,
+    prefetch_from: int,
+    lines_per_group: int,
     plan: Any,
     plan_at: int,
     target: int,
 ) -> None:
-    """Fill the groups `low` … `high` − 1 of a row, `pixels` in all, by weights of which `couples` holds each pair's.
+    """Fill the groups `low` … `high` − 1 of a row, `pixels` in all, under lights with weights.
 
-    In scratch memory stand a row's last pixels, what tells faulty weights, the colours' offsets in means and in
-    samples, and each pair's weights and offsets. Weights that are all 0 add nothing, so that such a light needs no
-    offsets. With each group so many lines of what is read `soon` are `asked` for.
+    `pair_weights` are the addresses of each pair's weights. Scratch memory holds, in this order, a row's last pixels,
+    the marks of faulty weights, the colours' offsets in means and in samples, and each pair's weights and offsets. A
+    light whose weights are all 0 adds nothing and needs no offsets. With each group `lines_per_group` lines of weights
+    are prefetched, the first at address `prefetch_from`.
     """
-    pairs = len(couples)
-    faults = scratch + SCRATCH
-    mean_places = faults + FAULTS
-    colours = mean_places + ROOM
-    lines = colours + ROOM
+    pairs = len(pair_weights)
+    faults = scratch + SCRATCH_BYTES
+    mean_places = faults + FAULT_BYTES
+    colours = mean_places + SEGMENT_BYTES
+    lines = colours + SEGMENT_BYTES
     for group in range(low, high):
-        place = OFFSETS * (group - low)
-        ask_group(row, group)
-        for line in range(asked):
-            prefetch(soon + LINE * (asked * (group - low) + line))
-        source = group_of(row, width, group, scratch)
+        place = OFFSETS_BYTES * (group - low)
+        prefetch_group(row, group)
+        for line in range(lines_per_group):
+            prefetch(prefetch_from + LINE * (lines_per_group * (group - low) + line))
+        source = group_address(row, width, group, scratch)
         mean_stride, stride = uint32(2 * MEAN_BYTES * pairs), uint32(SAMPLE_BYTES * count)
-        name_colours(source, bits, mean_stride, mean_places + place, stride, colours + place)
+        write_colours(source, bits, mean_stride, mean_places + place, stride, colours + place)
     lit_pairs = 0
     for pair in range(pairs):
-        line, light = lines + PAIR_ROOM * pair + 2 * ROOM, 2 * pair
-        lit = line_up(couples[pair], pixels, line)
+        line, light = lines + PAIR_BYTES * pair + 2 * SEGMENT_BYTES, 2 * pair
+        lit = arrange_weights(pair_weights[pair], pixels, line)
         if not lit:
             continue
         plan[lit_pairs, 0], plan[lit_pairs, 5] = line, means + 2 * MEAN_BYTES * pair
         for member in range(2):
-            # In the place of a light without weight stands its partner.
-            it = member if lit >> member & 1 else 1 - member
-            offsets = line + ROOM * (2 + it)
-            plan[lit_pairs, 1 + member], plan[lit_pairs, 3 + member] = offsets, tables[light + it]
-            if it != member:
+            # A light without weight is replaced by its partner.
+            shown = member if lit >> member & 1 else 1 - member
+            offsets = line + SEGMENT_BYTES * (2 + shown)
+            plan[lit_pairs, 1 + member], plan[lit_pairs, 3 + member] = offsets, tables[light + shown]
+            if shown != member:
                 continue
-            k0, k1, k2 = keys[light + it, 0], keys[light + it, 1], keys[light + it, 2]
+            k0, k1, k2 = keys[light + shown, 0], keys[light + shown, 1], keys[light + shown, 2]
             for group in range(low, high):
-                place, word = OFFSETS * (group - low), uint32(LANES * group)
-                choose_named(colours + place, word, k0, k1, k2, count, offsets + place)
+                place, word = OFFSETS_BYTES * (group - low), uint32(LANES * group)
+                choose_for_colours(colours + place, word, k0, k1, k2, count, offsets + place)
         lit_pairs += 1
     mix(plan_at, lit_pairs, pixels, mean_places, faults, np.float32(white), target)
 
@@ -253,21 +213,21 @@ def _mix_pixels(
     plan: Any,
     plan_at: int,
     keys: Any,
-    couples: Any,
-    nothing: int,
+    pair_weights: Any,
+    zero_weight: int,
     streamed: bool,
 ) -> None:
     """Fill rows of at least eight pixels. `weight_steps` are the bytes from row to row, pixel to pixel, light to light.
 
-    A stretch of a row at a time. Where only one light has weights in it, all of them 1, and its samples are `within`
-    the white level, no more is done than for one light.
+    A row is done segment by segment. Where only one light has weights in a segment, all of them 1, and its samples are
+    `within` the white level, the segment is drawn as under one light.
     """
-    lights, pairs = len(tables), len(couples)
-    lines = scratch + SCRATCH + FAULTS + 2 * ROOM
-    held_lines = line_at(lines + PAIR_ROOM * pairs)
-    alike = weight_steps[0] == 0 and weight_steps[1] == 0
+    lights, pairs = len(tables), len(pair_weights)
+    lines = scratch + SCRATCH_BYTES + FAULT_BYTES + 2 * SEGMENT_BYTES
+    held_lines = first_line(lines + PAIR_BYTES * pairs)
+    uniform = weight_steps[0] == 0 and weight_steps[1] == 0
     # Lines of the weights of a group, where those of a pixel lie together.
-    asked = GROUP * weight_steps[1] // LINE if weight_steps[1] == 4 * lights else 0
+    lines_per_group = GROUP * weight_steps[1] // LINE if weight_steps[1] == 4 * lights else 0
     for y in range(rows):
         row, start = picture + y * pitch, 0
         begin = target + y * target_pitch
@@ -275,37 +235,50 @@ def _mix_pixels(
         for light in range(lights):
             keys[light, 0], keys[light, 1], keys[light, 2] = row_keys(first_row + y, light, image, seed)
         while start < width:
-            # What is left after a stretch must not be fewer than eight pixels.
-            end = width if width - start < STRETCH + BLOCK else start + STRETCH
+            # What is left after a segment must not be fewer than eight pixels.
+            end = width if width - start < SEGMENT_PIXELS + BLOCK else start + SEGMENT_PIXELS
             pixels, low, high = end - start, start // GROUP, (end + GROUP - 1) // GROUP
             for pair in range(pairs):
-                line, light = lines + PAIR_ROOM * pair, 2 * pair
+                line, light = lines + PAIR_BYTES * pair, 2 * pair
                 first, step = weights + y * weight_steps[0] + light * weight_steps[2], weight_steps[1]
                 # Where lights are odd in number, the last one's partner never has a weight.
-                second, second_step = (first + weight_steps[2], step) if light + 1 < lights else (nothing, 0)
+                second, second_step = (first + weight_steps[2], step) if light + 1 < lights else (zero_weight, 0)
                 if step == 8 and second == first + 4:
-                    couples[pair] = first + step * start
+                    pair_weights[pair] = first + step * start
                     continue
-                couples[pair] = line
-                if not alike or (y == 0 and start == 0):
-                    for i in range(0, STRETCH + BLOCK if alike else pixels, BLOCK):
-                        x = i if alike else min(i, pixels - BLOCK)
+                pair_weights[pair] = line
+                if not uniform or (y == 0 and start == 0):
+                    for i in range(0, SEGMENT_PIXELS + BLOCK if uniform else pixels, BLOCK):
+                        x = i if uniform else min(i, pixels - BLOCK)
                         at, other = first + step * (start + x), second + second_step * (start + x)
-                        interleave8(at, step, other, second_step, line + 8 * x)
-            soon = weights + y * weight_steps[0] + (end + _SOON) * weight_steps[1]
+                        interleave_weights(at, step, other, second_step, line + 8 * x)
+            prefetch_from = weights + y * weight_steps[0] + (end + _PREFETCH_PIXELS) * weight_steps[1]
             to = target + y * target_pitch + SAMPLE_BYTES * start
             stop = to + SAMPLE_BYTES * pixels
             if streamed:
                 to = held_lines + held
-            # The first pixels tell in most cases that no light is alone.
-            alone = _alone(couples, BLOCK)
-            if alone >= 0:
-                alone = _alone(couples, pixels)
-            if alone >= 0 and within[alone]:
-                its, base = (keys[alone, 0], keys[alone, 1], keys[alone, 2]), to - SAMPLE_BYTES * start
-                _draw_stretch(row, width, low, high, its, tables[alone], count, bits, scratch, soon, asked, base)
+            # The first pixels show in most cases that several lights are lit.
+            single = _single_light(pair_weights, BLOCK)
+            if single >= 0:
+                single = _single_light(pair_weights, pixels)
+            if single >= 0 and within[single]:
+                its_keys, base = (keys[single, 0], keys[single, 1], keys[single, 2]), to - SAMPLE_BYTES * start
+                _draw_segment(
+                    row,
+                    width,
+                    low,
+                    high,
+                    its_keys,
+                    tables[single],
+                    count,
+                    bits,
+                    scratch,
+                    prefetch_from,
+                    lines_per_group,
+                    base,
+                )
             else:
-                _mix_stretch(
+                _mix_segment(
                     row,
                     width,
                     low,
@@ -316,92 +289,21 @@ def _mix_pixels(
                     means,
                     count,
                     bits,
-                    couples,
+                    pair_weights,
                     white,
                     scratch,
-                    soon,
-                    asked,
+                    prefetch_from,
+                    lines_per_group,
                     plan,
                     plan_at,
                     to,
                 )
             if streamed:
-                held = pass_on(held_lines, begin, stop, end == width)
+                held = stream_lines(held_lines, begin, stop, end == width)
                 begin = stop - held
             start = end
     if streamed:
-        settle()
-
-
-def _checked_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float64]:
-    """Return `weights` as (K,) float64 after looking at them.
-
-    Raises
-    ------
-    InputError
-        They are not one finite number ≥ 0 a light.
-    """
-    checked = np.asarray(weights, dtype=np.float64)
-    if checked.shape != (lights,) or not np.isfinite(checked).all() or (checked < 0).any():
-        raise InputError(f"the weights are {np.asarray(weights).tolist()}, expected {lights} finite numbers from 0")
-    return checked
-
-
-def mixed_table(
-    tables: Samples | Sequence[Samples],
-    weights: npt.ArrayLike,
-    *,
-    white_level: int = 65535,
-    seed: int = 0,
-    colours: npt.NDArray[np.bool_] | None = None,
-) -> Samples:
-    """Return the samples of a light that is the mixture of some lights; the formula stands at the head of this file.
-
-    The result is used as a light's samples: `draw_samples(mixed_table(...), picture)`. Each colour's samples of the
-    first light with a weight keep their order; those of each further light are shuffled on their own, so that the
-    lights' noises meet by chance.
-
-    Parameters
-    ----------
-    tables
-        (K, 8**bits, S, 3) uint16 or a sequence of K (8**bits, S, 3), linear camera RGB of the lights.
-    weights
-        (K,) ≥ 0, what each light contributes; 1 is the light as it was photographed.
-    white_level
-        Saturation of the sensor: larger values are cut to it.
-    seed
-        Of the shuffles, 0 … 2⁶⁴ − 1.
-    colours
-        (8**bits,) which colours are wanted, if not all, such as `palette.colours_in` has them: for a small picture much
-        less work. The samples of the others are 0; those of the wanted ones do not depend on it.
-
-    Returns
-    -------
-    ndarray
-        (8**bits, S, 3) uint16, rounded to the nearest count, halves up.
-
-    Raises
-    ------
-    InputError
-        A shape, type or number is not as above.
-    """
-    lights = check_tables(tables)
-    checked = _checked_weights(weights, len(lights))
-    check_white(white_level)
-    key = check_place(seed, 0)
-    shape = lights[0].shape
-    if colours is not None and (colours.shape != shape[:1] or colours.dtype != np.bool_):
-        raise InputError(f"the colours are {colours.dtype} {colours.shape}, expected bool ({shape[0]},)")
-    chosen = np.flatnonzero(np.ones(shape[0], np.bool_) if colours is None else colours)
-    total = np.zeros((len(chosen), *shape[1:]), np.float64)
-    shuffled = False
-    for place, (samples, weight) in enumerate(zip(lights, checked, strict=True)):
-        if weight > 0:
-            _mix_table(np.asarray(samples), float(weight), key, place, shuffled, chosen, total)
-            shuffled = True
-    out = np.zeros(shape, np.uint16)
-    _round_table(total, float(white_level), chosen, out)
-    return out
+        store_fence()
 
 
 def mix_samples(
@@ -432,7 +334,7 @@ def mix_samples(
     white_level
         Saturation of the sensor: larger values are cut to it.
     seed, image, first_row, threads
-        As for `kernel.draw_samples`.
+        As for `rendering.draw_samples`.
     out
         (H, W, 3) uint16 to fill instead of a new array.
 
@@ -446,20 +348,31 @@ def mix_samples(
     ------
     InputError
         A shape, type or number is not as above.
+
+    Examples
+    --------
+    Two lights on a white wall, the left half in the first, the right half in both:
+
+    >>> red, blue = np.zeros((2, 8, 25, 3), np.uint16)
+    >>> red[7], blue[7] = (800, 400, 200), (200, 400, 800)
+    >>> weights = np.array([[[1, 0], [0.5, 0.5]]], np.float32)
+    >>> mix_samples([red, blue], np.full((1, 2, 3), 255, np.uint8), weights)
+    array([[[800, 400, 200],
+            [500, 400, 500]]], dtype=uint16)
     """
     lights = check_tables(tables)
     bits = bits_of(lights[0].shape[0])
     check_picture(picture)
-    check_white(white_level)
-    target = check_target(out, picture.shape, np.uint16)
-    key = check_place(seed, image)
+    check_white_level(white_level)
+    target = check_out(out, picture.shape, np.uint16)
+    key = check_seed(seed, image)
     shape = (*picture.shape[:2], len(lights))
     each = np.asarray(weights)
     if each.dtype != np.float32:
-        each = _checked_weights(each, len(lights)).astype(np.float32)
+        each = check_weights(each, len(lights)).astype(np.float32)
     if each.shape not in (shape, shape[2:]):
         raise InputError(f"the weights are {each.shape}, expected {shape} or {shape[2:]}")
-    source, each = packed(picture), np.broadcast_to(each, shape)
+    source, each = packed_rows(picture), np.broadcast_to(each, shape)
     if picture.shape[1] < BLOCK:
         source = np.pad(source, ((0, 0), (0, BLOCK), (0, 0)))
         each = np.pad(each, ((0, 0), (0, BLOCK), (0, 0)))
@@ -469,9 +382,9 @@ def mix_samples(
     pairs = (len(lights) + 1) // 2
     colours, count = lights[0].shape[:2]
     # A pair's means, 32 bytes, are to lie in one line of the cache.
-    room = np.zeros(8 * pairs * colours + 15, np.float32)
-    means = room[-room.ctypes.data % 64 // 4 :][: 8 * pairs * colours].reshape(colours, 2 * pairs, MEAN_BYTES // 4)
-    # To go through a whole light takes longer than to make a small picture.
+    memory = np.zeros(8 * pairs * colours + 15, np.float32)
+    means = memory[-memory.ctypes.data % 64 // 4 :][: 8 * pairs * colours].reshape(colours, 2 * pairs, MEAN_BYTES // 4)
+    # The means of a whole light take longer than a small picture.
     small = picture.shape[0] * picture.shape[1] < 10 * colours
     chosen = np.flatnonzero(colours_in(picture, bits) if small else np.ones(colours, np.bool_))
     most = [
@@ -483,8 +396,10 @@ def mix_samples(
     no_weight = np.zeros(1, np.float32)
 
     def fill(top: int, bottom: int) -> None:
-        scratch = np.zeros(SCRATCH + FAULTS + 2 * ROOM + PAIR_ROOM * pairs + _LINES, np.uint8)
-        plan = np.zeros((pairs, PLAN), np.int64)
+        scratch = np.zeros(
+            SCRATCH_BYTES + FAULT_BYTES + 2 * SEGMENT_BYTES + PAIR_BYTES * pairs + _LINES_BYTES, np.uint8
+        )
+        plan = np.zeros((pairs, PLAN_ENTRIES), np.int64)
         _mix_pixels(
             source[top:].ctypes.data,
             source.strides[0],
@@ -511,11 +426,11 @@ def mix_samples(
             no_weight.ctypes.data,
             work.nbytes >= streaming.STREAMED_BYTES,
         )
-        faults.append(bool(np.isnan(scratch[SCRATCH : SCRATCH + FAULTS].view(np.float32)).any()))
+        faults.append(bool(np.isnan(scratch[SCRATCH_BYTES : SCRATCH_BYTES + FAULT_BYTES].view(np.float32)).any()))
 
-    share(fill, len(picture), threads)
+    run_in_threads(fill, len(picture), threads)
     if any(faults):
-        raise InputError("a weight is negative, infinite or no number; expected finite numbers from 0")
+        raise InputError("a weight is negative, infinite or NaN; expected finite numbers from 0")
     if work is not target:
         target[...] = work[:, : target.shape[1]]
     return target

@@ -1,7 +1,7 @@
-"""Colours of a source picture that the table cannot stand for, and what stands in for them.
+"""The colours of a table, and what replaces those of a picture that the table lists as unfit for use.
 
 A table lists the cells whose samples must not be used. A pixel of such a colour takes the nearest fit colour, and the
-number of those pixels is told and recorded with the dataset; nothing is replaced in silence.
+number of those pixels is printed and recorded with the dataset; nothing is replaced in silence.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from numba import uint32
 
 from foundation.compiled import compiled
 from foundation.errors import InputError, QualityError
-from generator.kernels.choice import EDGE, OFFSETS, group_of
-from generator.kernels.vector import GROUP, copy1, name_colours, offset_at
+from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, group_address
+from generator.kernels.vector import GROUP, copy1, offset_at, write_colours
 
 if TYPE_CHECKING:
-    from calibration.table.lut import Provenance
+    from calibration.table.provenance import Provenance
 
 
 def bits_of(colours: int) -> int:
@@ -30,6 +30,11 @@ def bits_of(colours: int) -> int:
     ------
     InputError
         No table has that many colours.
+
+    Examples
+    --------
+    >>> bits_of(32768)
+    5
     """
     for bits in range(1, 6):
         if colours == 8**bits:
@@ -38,13 +43,21 @@ def bits_of(colours: int) -> int:
 
 
 def channels_of(colours: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
-    """Return the codes (..., 3) int64, 0 … 2**bits − 1, of colour indices 0 … 8**bits − 1."""
+    """Return the codes (..., 3) int64, red, green, blue 0 … 2**bits − 1, of colour indices (...) int 0 … 8**bits − 1.
+
+    Examples
+    --------
+    >>> channels_of([0, 1, 32767], bits=5)
+    array([[ 0,  0,  0],
+           [ 0,  0,  1],
+           [31, 31, 31]])
+    """
     colours = np.asarray(colours, dtype=np.int64)
     mask = (1 << bits) - 1
     return np.stack([colours >> 2 * bits & mask, colours >> bits & mask, colours & mask], axis=-1)
 
 
-def stand_ins(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
+def nearest_fit_colours(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
     """Return for each unfit colour the nearest fit one.
 
     Nearest by Euclidean distance of the codes; of several equally near the lowest index.
@@ -65,6 +78,11 @@ def stand_ins(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
     ------
     QualityError
         No colour is fit.
+
+    Examples
+    --------
+    >>> nearest_fit_colours([0, 1], bits=2)
+    array([4, 2])
     """
     unfit = np.asarray(unfit, dtype=np.int64)
     is_fit = np.ones(8**bits, dtype=bool)
@@ -79,7 +97,7 @@ def stand_ins(unfit: npt.ArrayLike, bits: int) -> npt.NDArray[np.int64]:
     return np.array(nearest, dtype=np.int64).reshape(unfit.shape)
 
 
-def fit_picture(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple[npt.NDArray[np.uint8], int]:
+def replace_unfit_colours(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple[npt.NDArray[np.uint8], int]:
     """Return `picture` with unfit colours replaced, and the number of pixels replaced.
 
     Parameters
@@ -93,6 +111,16 @@ def fit_picture(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple
     -------
     tuple
         (H, W, 3) uint8, the same array if nothing had to be replaced; and the count.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> stained = SimpleNamespace(bits=2, unfit=(SimpleNamespace(colour=0),))
+    >>> picture = np.array([[[0, 10, 20], [255, 255, 255]]], np.uint8)
+    >>> replaced, pixels = replace_unfit_colours(picture, stained)
+    >>> replaced, pixels
+    (array([[[  0,   0,  64],
+            [255, 255, 255]]], dtype=uint8), 1)
     """
     bits = provenance.bits
     unfit = tuple(sorted({cell.colour for cell in provenance.unfit}))
@@ -105,30 +133,36 @@ def fit_picture(picture: npt.NDArray[np.uint8], provenance: Provenance) -> tuple
 
 @lru_cache(maxsize=4)
 def _replacements(unfit: tuple[int, ...], bits: int) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.uint8]]:
-    """Return which of a table's colours are unfit, and the codes (8**bits, 3) to stand in for those."""
+    """Return which colours of a table are unfit, (8**bits,) bool, and their replacements, (8**bits, 3) uint8."""
     is_unfit, instead = np.zeros(8**bits, np.bool_), np.zeros((8**bits, 3), np.uint8)
     is_unfit[list(unfit)] = True
-    instead[list(unfit)] = channels_of(stand_ins(unfit, bits), bits) << (8 - bits)
+    instead[list(unfit)] = channels_of(nearest_fit_colours(unfit, bits), bits) << (8 - bits)
     return is_unfit, instead
 
 
 def colours_in(picture: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.bool_]:
-    """Return which of the (8**bits,) colours of a table are in a picture (H, W, 3) uint8."""
+    """Return which colours of a table, (8**bits,) bool, are in a picture (H, W, 3) uint8.
+
+    Examples
+    --------
+    >>> np.flatnonzero(colours_in(np.array([[[0, 0, 0], [255, 255, 0]]], np.uint8), bits=5))
+    array([    0, 32736])
+    """
     found = np.zeros(8**bits, np.bool_)
     pixels = np.ascontiguousarray(picture)
-    scratch = np.ones(EDGE + 2 * OFFSETS + 1, np.uint8)
+    scratch = np.ones(EDGE_BYTES + 2 * OFFSETS_BYTES + 1, np.uint8)
     _find(pixels.ctypes.data, pixels.size // 3, np.uint32(bits), found.ctypes.data, scratch.ctypes.data)
     return found
 
 
 @compiled
 def _find(pixels: int, count: int, bits: Any, found: int, scratch: int) -> None:
-    """Set the byte of each colour that is among the pixels to the last one of scratch memory."""
-    places, others = scratch + EDGE, scratch + EDGE + OFFSETS
-    one = others + OFFSETS
+    """Set the byte at `found` of each colour that is among the pixels to 1, the last byte of scratch memory."""
+    places, others = scratch + EDGE_BYTES, scratch + EDGE_BYTES + OFFSETS_BYTES
+    one = others + OFFSETS_BYTES
     for group in range((count + GROUP - 1) // GROUP):
-        source = group_of(pixels, count, group, scratch)
-        name_colours(source, bits, uint32(1), places, uint32(0), others)
+        source = group_address(pixels, count, group, scratch)
+        write_colours(source, bits, uint32(1), places, uint32(0), others)
         for i in range(min(GROUP, count - GROUP * group)):
             copy1(one, found + offset_at(places + 4 * i))
 

@@ -1,7 +1,7 @@
 """Crops for training: float32, one plane a channel, of any window of a picture.
 
-A crop is the window of the image that `kernel.draw_samples` makes of the whole picture, mirrored if asked for, times a
-gain, in units of the sensor's saturation and cut off there:
+A crop is the window of the image that `rendering.draw_samples` makes of the whole picture, mirrored if asked for, times
+a gain, in units of the sensor's saturation and cut off there:
 
     out[c, y, x] = min(float32(sample) · float32(gain / white_level), 1)
 
@@ -20,18 +20,19 @@ import numpy.typing as npt
 from foundation.compiled import compiled
 from foundation.errors import InputError
 from generator.kernels.arguments import (
+    check_out,
     check_picture,
     check_samples,
-    check_target,
-    check_white,
-    packed,
+    check_white_level,
+    packed_rows,
     readable,
-    share,
+    run_in_threads,
 )
-from generator.kernels.choice import EDGE, OFFSETS, choose_group, row_keys
-from generator.kernels.vector import EIGHT, GROUP, mirrored8, offset_at, plane1, planes8, prefetch
+from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, choose_group, row_keys
+from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, planes8_mirrored, prefetch
 
 Window = tuple[int, int, int, int]
+"""x and y of a window's first pixel in the picture, and its width and height, px."""
 
 
 @compiled
@@ -54,10 +55,10 @@ def _crop(
 ) -> None:
     """Fill the items `first` to `end` of a batch.
 
-    The offsets of a row are chosen, and their samples asked for, before the row above is fetched: the samples may lie
-    in memory nobody has touched for long. `last` stands in for the table's last light; `arguments.readable`.
+    The offsets of a row are chosen, and their samples prefetched, before the row above is fetched: the samples may lie
+    in memory that is in no cache. `last` is the table's last light as `arguments.readable` returns it.
     """
-    row_bytes = OFFSETS * (width // GROUP + 2)
+    row_bytes = OFFSETS_BYTES * (width // GROUP + 2)
     for item in range(first, end):
         light, picture, pitch, picture_width, x0, y0, flip, image, lights = plan[item]
         samples = last if light == lights - 1 else tables + light * light_bytes
@@ -66,15 +67,15 @@ def _crop(
         for y in range(height + 1):
             if y < height:
                 keys = row_keys(y0 + y, 0, image, seeds[item])
-                chosen = scratch + EDGE + row_bytes * (y & 1)
+                chosen = scratch + EDGE_BYTES + row_bytes * (y & 1)
                 for group in range(low, high + 1):
-                    to = chosen + OFFSETS * (group - low)
+                    to = chosen + OFFSETS_BYTES * (group - low)
                     choose_group(picture + y * pitch, picture_width, group, keys, count, bits, scratch, to)
                     for i in range(GROUP):
                         prefetch(samples + offset_at(to + 4 * i))
             if y == 0:
                 continue
-            offsets = scratch + EDGE + row_bytes * ((y - 1) & 1) + 4 * (x0 - GROUP * low)
+            offsets = scratch + EDGE_BYTES + row_bytes * ((y - 1) & 1) + 4 * (x0 - GROUP * low)
             if flip:
                 offsets += 4 * (width - 1)
             red = target + item * pitches[0] + (y - 1) * pitches[2]
@@ -87,10 +88,10 @@ def _crop(
                     plane1(sample + 4, scale, blue + 4 * x)
             else:
                 for start in range(0, width, EIGHT):
-                    # The last eight may be some of the ones before again.
+                    # The last eight may overlap the ones before.
                     x = min(start, width - EIGHT)
                     if flip:
-                        mirrored8(samples, offsets - 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
+                        planes8_mirrored(samples, offsets - 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
                     else:
                         planes8(samples, offsets + 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
 
@@ -150,12 +151,20 @@ def draw_planar(
     ------
     InputError
         A shape, type or number is not as above, or the window is not inside the picture.
+
+    Examples
+    --------
+    >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(8, 2, 3)
+    >>> white = np.full((6, 8, 3), 255, np.uint8)
+    >>> planes = draw_planar(samples, white, white_level=50, window=(2, 1, 4, 3), gain=2.0)
+    >>> planes.shape, planes.dtype, float(planes.max())
+    ((3, 3, 4), dtype('float32'), 1.0)
     """
     check_samples(samples)
     check_picture(picture)
     whole = (0, 0, picture.shape[1], picture.shape[0])
     x0, y0, width, height = whole if window is None else _checked_window(window, picture)
-    target = check_target(out, (3, height, width), np.float32)
+    target = check_out(out, (3, height, width), np.float32)
     parts = max(1, min(threads, height))
     edges = [height * part // parts for part in range(parts + 1)]
     pieces = [target[:, top:bottom] for top, bottom in pairwise(edges)]
@@ -175,7 +184,7 @@ def draw_planar(
                 out=piece[None],
             )
 
-    share(fill, parts, parts)
+    run_in_threads(fill, parts, parts)
     return target
 
 
@@ -195,8 +204,8 @@ def draw_batch(
 ) -> npt.NDArray[np.float32]:
     """Return N crops, item i being `draw_planar(tables[lights[i]], pictures[i], window=windows[i], ...)`.
 
-    Nothing is copied or prepared, so that `tables` may be gigabytes mapped from disk. All work is done without the
-    interpreter's lock.
+    Tables are not copied, so that they may be gigabytes mapped from disk. All work is done without the interpreter's
+    lock.
 
     Parameters
     ----------
@@ -211,7 +220,7 @@ def draw_batch(
     white_level
         As for `draw_planar`.
     flips, gains, seeds, images
-        (N,) or one for all, as for `draw_planar`.
+        (N,) bool, float, int and int, or one for all, as for `draw_planar`.
     threads
         Threads that share the items; no byte depends on it.
     out
@@ -226,11 +235,19 @@ def draw_batch(
     ------
     InputError
         A shape, type or number is not as above.
+
+    Examples
+    --------
+    >>> tables = np.arange(2 * 8 * 2 * 3, dtype=np.uint16).reshape(2, 8, 2, 3)
+    >>> white = np.full((6, 8, 3), 255, np.uint8)
+    >>> crops = draw_batch(tables, [0, 1], [white, white], [(0, 0, 4, 4), (4, 2, 4, 4)], white_level=100)
+    >>> crops.shape, crops.dtype
+    ((2, 3, 4, 4), dtype('float32'))
     """
     if tables.ndim != 4 or not len(tables):
         raise InputError(f"the tables are {tables.shape}, expected (lights, 8**bits, samples, 3)")
     bits = check_samples(tables[0])
-    check_white(white_level)
+    check_white_level(white_level)
     count = len(pictures)
     frames = np.asarray(windows, dtype=np.int64)
     if frames.shape != (count, 4) or not count:
@@ -244,20 +261,20 @@ def draw_batch(
     gained = np.broadcast_to(np.asarray(gains, dtype=np.float64), count)
     if not (np.isfinite(gained) & (gained >= 0)).all():
         raise InputError(f"the gain is {gained.min()}, expected a finite number from 0")
-    seeded, imaged = _whole(seeds, count, 64, "seed"), _whole(images, count, 32, "image number")
-    target = check_target(out, (count, 3, height, width), np.float32)
+    seeded, imaged = _whole_numbers(seeds, count, 64, "seed"), _whole_numbers(images, count, 32, "image number")
+    target = check_out(out, (count, 3, height, width), np.float32)
     work = target if target.strides[3] == 4 or width == 1 else np.empty(target.shape, np.float32)
     if not tables[0].flags.c_contiguous:
         tables = np.ascontiguousarray(tables)
     last = readable(tables[-1])
-    # Most batches show a picture more than once: each is looked at once.
+    # Most batches show a picture more than once; each is checked once.
     distinct = {id(picture): picture for picture in pictures}
     for picture in distinct.values():
         check_picture(picture)
-    sources = [packed(picture) for picture in distinct.values()]
-    facts = np.array([(one.ctypes.data, one.strides[0], one.shape[1], one.shape[0]) for one in sources], np.int64)
+    sources = [packed_rows(picture) for picture in distinct.values()]
+    layouts = np.array([(one.ctypes.data, one.strides[0], one.shape[1], one.shape[0]) for one in sources], np.int64)
     places = {identity: place for place, identity in enumerate(distinct)}
-    shown = facts[[places[id(picture)] for picture in pictures]]
+    shown = layouts[[places[id(picture)] for picture in pictures]]
     outside = (frames[:, :2] < 0).any(axis=1) | (frames[:, :2] + frames[:, 2:] > shown[:, 2:]).any(axis=1)
     for item in np.flatnonzero(outside | (min(width, height) < 1))[:1]:
         _checked_window(frames[item].tolist(), pictures[int(item)])
@@ -268,7 +285,7 @@ def draw_batch(
     scales = (gained / white_level).astype(np.float32)
 
     def fill(first: int, end: int) -> None:
-        scratch = np.empty(EDGE + 2 * OFFSETS * (width // GROUP + 2), np.uint8)
+        scratch = np.empty(EDGE_BYTES + 2 * OFFSETS_BYTES * (width // GROUP + 2), np.uint8)
         _crop(
             plan,
             seeded,
@@ -287,14 +304,14 @@ def draw_batch(
             scratch.ctypes.data,
         )
 
-    share(fill, count, threads)
+    run_in_threads(fill, count, threads)
     if work is not target:
         target[...] = work
     return target
 
 
-def _whole(numbers: npt.ArrayLike, count: int, bits: int, name: str) -> npt.NDArray[np.uint64]:
-    """Return `count` whole numbers 0 … 2**bits − 1, one for all repeated."""
+def _whole_numbers(numbers: npt.ArrayLike, count: int, bits: int, name: str) -> npt.NDArray[np.uint64]:
+    """Return `count` whole numbers 0 … 2**bits − 1 as (count,) uint64; a single one is repeated."""
     given = np.asarray(numbers)
     if given.dtype.kind not in "iu":
         given = np.asarray(numbers, dtype=object)

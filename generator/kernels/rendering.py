@@ -1,6 +1,6 @@
 """From source codes to linear camera RGB: each pixel becomes one of the table's samples of its colour.
 
-Paper, section 3.4. With n the table's bits (5 in the paper), a pixel R, G, B at (x, y) becomes
+Source: paper, section 3.4. With n the table's bits (5 in the paper), a pixel R, G, B at (x, y) becomes
 
     samples[((R >> (8 - n)) << 2n) | ((G >> (8 - n)) << n) | (B >> (8 - n)), choice(seed, image, x, y)]
 
@@ -24,20 +24,20 @@ from foundation.compiled import compiled
 from foundation.errors import InputError
 from generator.kernels import streaming
 from generator.kernels.arguments import (
+    check_out,
     check_picture,
-    check_place,
     check_samples,
-    check_target,
-    delivered,
-    packed,
+    check_seed,
+    copied_back,
+    packed_rows,
     readable,
-    share,
+    run_in_threads,
     writable,
 )
-from generator.kernels.choice import AHEAD, SCRATCH, ask_group, choose_group, row_keys, slot
-from generator.kernels.drawing import choose_first, draw_groups
-from generator.kernels.palette import fit_picture
-from generator.kernels.streaming import line_at, line_room, pass_on
+from generator.kernels.choice import LEAD, SCRATCH_BYTES, choose_group, offsets_slot, prefetch_group, row_keys
+from generator.kernels.drawing import choose_first_groups, draw_groups
+from generator.kernels.palette import replace_unfit_colours
+from generator.kernels.streaming import first_line, line_buffer_bytes, stream_lines
 from generator.kernels.vector import (
     GROUP,
     LANES,
@@ -46,17 +46,17 @@ from generator.kernels.vector import (
     choose,
     copy2,
     offset_at,
-    settle,
+    store_fence,
 )
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
-WHOLE_LIGHT: Final = 1 << 20
-"""Pixels from which reading a light's samples in one go is cheaper than touching their pages at random."""
+WHOLE_LIGHT_PIXELS: Final = 1 << 20
+"""Pixels from which copying all samples of a light (5 MB) is cheaper than reading their pages in random order."""
 
-_STRETCH: Final = 16
-"""Groups of pixels that are put together before they are streamed."""
+_SEGMENT_GROUPS: Final = 16
+"""Groups of pixels that are put together before they are streamed: 3 KiB, which stay in the first-level cache."""
 
 PATTERNS: Final = {"RGGB": (0, 1, 1, 2), "BGGR": (2, 1, 1, 0), "GRBG": (1, 0, 2, 1), "GBRG": (1, 2, 0, 1)}
 """The channel of each site of a 2x2 Bayer block, in reading order."""
@@ -79,31 +79,31 @@ def _gather(
     streamed: bool,
     scratch: int,
 ) -> None:
-    """Fill rows of 3-channel pixels; numbers are addresses, and bytes from row to row.
+    """Fill rows of 3-channel pixels; picture, samples, target and scratch are addresses, pitches bytes from row to row.
 
-    Picture and image leave the caches to the samples: the one is asked for as what is read once, the other, if
-    `streamed`, put together in scratch memory and written a line at a time.
+    Picture and image leave the caches to the samples: the picture is prefetched as data that are read once; the image,
+    if `streamed`, is put together in scratch memory and written past the caches, a line at a time.
     """
     groups = (width + GROUP - 1) // GROUP
-    lines = line_at(scratch + SCRATCH)
+    lines = first_line(scratch + SCRATCH_BYTES)
     for y in range(rows):
         keys = row_keys(first_row + y, 0, image, seed)
         row, to = picture + y * pitch, target + y * target_pitch
         begin, held = to, to & (LINE - 1)
-        choose_first(row, width, keys, count, bits, scratch, 0, groups)
+        choose_first_groups(row, width, keys, count, bits, scratch, 0, groups)
         done = 0
         while done < groups:
             end, base = groups, to
             if streamed:
-                end, base = min(done + _STRETCH, groups), lines + held - SAMPLE_BYTES * GROUP * done
+                end, base = min(done + _SEGMENT_GROUPS, groups), lines + held - SAMPLE_BYTES * GROUP * done
             draw_groups(row, width, keys, samples, count, bits, scratch, done, end, groups, 0, 0, base)
             if streamed:
                 stop = to + SAMPLE_BYTES * min(GROUP * end, width)
-                held = pass_on(lines, begin, stop, end == groups)
+                held = stream_lines(lines, begin, stop, end == groups)
                 begin = stop - held
             done = end
     if streamed:
-        settle()
+        store_fence()
 
 
 @compiled
@@ -131,22 +131,25 @@ def _gather_mosaic(
         channels = pattern >> (4 * ((first_row + y) & 1))
         even, odd = samples + 2 * (channels & 3), samples + 2 * (channels >> 2 & 3)
         group = 0
-        while group < groups + AHEAD:
-            while AHEAD <= group < whole:
+        while group < groups + LEAD:
+            while LEAD <= group < whole:
                 source, word = row + 3 * GROUP * group, uint32(LANES * group)
-                ask_group(row, group)
-                choose(source, word, keys[0], keys[1], keys[2], count, bits, slot(scratch, group))
-                offsets, begin = slot(scratch, group - AHEAD), to + 2 * GROUP * (group - AHEAD)
+                prefetch_group(row, group)
+                choose(source, word, keys[0], keys[1], keys[2], count, bits, offsets_slot(scratch, group))
+                offsets, begin = (
+                    offsets_slot(scratch, group - LEAD),
+                    to + 2 * GROUP * (group - LEAD),
+                )
                 for i in range(0, GROUP, 2):
                     copy2(even + offset_at(offsets + 4 * i), begin + 2 * i)
                     copy2(odd + offset_at(offsets + 4 * i + 4), begin + 2 * i + 2)
                 group += 1
             if group < groups:
-                choose_group(row, width, group, keys, count, bits, scratch, slot(scratch, group))
-            done = group - AHEAD
+                choose_group(row, width, group, keys, count, bits, scratch, offsets_slot(scratch, group))
+            done = group - LEAD
             if done >= 0:
                 for i in range(min(GROUP, width - GROUP * done)):
-                    site = (odd if i & 1 else even) + offset_at(slot(scratch, done) + 4 * i)
+                    site = (odd if i & 1 else even) + offset_at(offsets_slot(scratch, done) + 4 * i)
                     copy2(site, to + 2 * (GROUP * done + i))
             group += 1
 
@@ -189,15 +192,26 @@ def draw_samples(
     ------
     InputError
         A shape, type or number is not as above.
+
+    Examples
+    --------
+    A table of one bit a channel has 8 colours, here with two samples each; the picture is white, the last colour:
+
+    >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(8, 2, 3)
+    >>> draw_samples(samples, np.full((1, 4, 3), 255, np.uint8), seed=0)
+    array([[[45, 46, 47],
+            [45, 46, 47],
+            [42, 43, 44],
+            [45, 46, 47]]], dtype=uint16)
     """
     bits = check_samples(samples)
     check_picture(picture)
-    target = check_target(out, picture.shape, np.uint16)
-    key = check_place(seed, image)
-    source, table, work = packed(picture), readable(samples), writable(target)
+    target = check_out(out, picture.shape, np.uint16)
+    key = check_seed(seed, image)
+    source, table, work = packed_rows(picture), readable(samples), writable(target)
 
     def fill(top: int, bottom: int) -> None:
-        scratch = np.empty(SCRATCH + line_room(SAMPLE_BYTES * GROUP * _STRETCH), np.uint8)
+        scratch = np.empty(SCRATCH_BYTES + line_buffer_bytes(SAMPLE_BYTES * GROUP * _SEGMENT_GROUPS), np.uint8)
         _gather(
             source[top:].ctypes.data,
             source.strides[0],
@@ -215,8 +229,8 @@ def draw_samples(
             scratch.ctypes.data,
         )
 
-    share(fill, len(picture), threads)
-    return delivered(work, target)
+    run_in_threads(fill, len(picture), threads)
+    return copied_back(work, target)
 
 
 def draw_mosaic(
@@ -248,24 +262,31 @@ def draw_mosaic(
     Returns
     -------
     ndarray
-        (H, W) uint16, in the units of `samples`.
+        (H, W) uint16, linear camera values in the units of `samples`.
 
     Raises
     ------
     InputError
         A shape, type or number is not as above, or the pattern is none of these.
+
+    Examples
+    --------
+    >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(8, 2, 3)
+    >>> draw_mosaic(samples, np.full((2, 4, 3), 255, np.uint8), pattern="RGGB")
+    array([[45, 46, 42, 46],
+           [43, 47, 46, 44]], dtype=uint16)
     """
     bits = check_samples(samples)
     check_picture(picture)
-    target = check_target(out, picture.shape[:2], np.uint16)
-    key = check_place(seed, image)
+    target = check_out(out, picture.shape[:2], np.uint16)
+    key = check_seed(seed, image)
     if pattern not in PATTERNS:
         raise InputError(f"{pattern!r} is no Bayer pattern; expected {', '.join(PATTERNS)}")
     channels = sum(channel << 2 * place for place, channel in enumerate(PATTERNS[pattern]))
-    source, table, work = packed(picture), readable(samples), writable(target)
+    source, table, work = packed_rows(picture), readable(samples), writable(target)
 
     def fill(top: int, bottom: int) -> None:
-        scratch = np.empty(SCRATCH, np.uint8)
+        scratch = np.empty(SCRATCH_BYTES, np.uint8)
         _gather_mosaic(
             source[top:].ctypes.data,
             source.strides[0],
@@ -283,12 +304,14 @@ def draw_mosaic(
             scratch.ctypes.data,
         )
 
-    share(fill, len(picture), threads)
-    return delivered(work, target)
+    run_in_threads(fill, len(picture), threads)
+    return copied_back(work, target)
 
 
-def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT) -> npt.NDArray[np.uint16]:
-    """Return the samples (8**bits, S, 3) uint16 of light number `light`, in memory if `pixels` are worth the copy.
+def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT_PIXELS) -> npt.NDArray[np.uint16]:
+    """Return the samples (8**bits, S, 3) uint16 of light number `light`.
+
+    For a picture of `WHOLE_LIGHT_PIXELS` or more they are copied to memory, else they stay on disk until they are used.
 
     Raises
     ------
@@ -302,7 +325,7 @@ def read_light(lut: Lut, light: int, pixels: int = WHOLE_LIGHT) -> npt.NDArray[n
     if not 0 <= number < len(lut.samples):
         raise InputError(f"there is no light {number}; the table {lut.folder} has lights 0 to {len(lut.samples) - 1}")
     mapped = lut.samples[number]
-    return np.array(mapped) if pixels >= WHOLE_LIGHT else mapped
+    return np.array(mapped) if pixels >= WHOLE_LIGHT_PIXELS else mapped
 
 
 def render(
@@ -310,14 +333,14 @@ def render(
 ) -> npt.NDArray[np.uint16]:
     """Return the raw linear image of `picture` printed, lit by the table's light `light` and photographed.
 
-    Colours that the table lists as unfit are replaced by the nearest fit one; see `kernels.palette.fit_picture`.
+    Colours that the table lists as unfit are replaced by the nearest fit one; see `palette.replace_unfit_colours`.
 
     Parameters
     ----------
     lut
         A table, from `calibration.table.lut.open_lut`.
     picture
-        (H, W, 3) uint8 sRGB codes, from `scene.read_picture` or any array.
+        (H, W, 3) uint8 sRGB codes, from `pictures.picture.read_picture` or any array.
     light
         Number of the light in the table.
     seed, image, threads
@@ -332,8 +355,19 @@ def render(
     ------
     InputError
         The table has no such light, or the picture is not of that shape and type.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> samples = np.arange(8 * 2 * 3, dtype=np.uint16).reshape(1, 8, 2, 3)
+    >>> lut = SimpleNamespace(samples=samples, provenance=SimpleNamespace(bits=1, white_level=100, unfit=()))
+    >>> render(lut, np.full((1, 2, 3), 255, np.uint8), light=0)
+    array([[[45, 46, 47],
+            [45, 46, 47]]], dtype=uint16)
+
+    Usually the table comes from `generator.open_lut` and the picture from `generator.read_picture`.
     """
     check_picture(picture)
     samples = read_light(lut, light, picture.shape[0] * picture.shape[1])
-    fit, _ = fit_picture(picture, lut.provenance)
+    fit, _ = replace_unfit_colours(picture, lut.provenance)
     return draw_samples(samples, fit, seed=seed, image=image, threads=threads)

@@ -1,6 +1,6 @@
 """Writing past the caches: for an image that they could not keep, so that they keep the table.
 
-Pixels are put together in a thread's own memory, a stretch of a row at a time, and passed on in whole lines of memory.
+Pixels are put together in a thread's own memory, a segment of a row at a time, and written in whole lines of the cache.
 """
 
 from __future__ import annotations
@@ -12,25 +12,26 @@ import numba
 from generator.kernels.vector import LINE, copy2, copy_line, stream_line
 
 STREAMED_BYTES: Final = 24 << 20
-"""Bytes of an image from which it is streamed: what a processor's last cache may have."""
+"""Bytes of an image from which it is streamed: the size of a desktop processor's last-level cache."""
 
 
-def line_room(stretch_bytes: int) -> int:
-    """Return the bytes of memory for a stretch that begins anywhere in a line, and a line behind it."""
-    return stretch_bytes + 3 * LINE
-
-
-@numba.njit(inline="always")
-def line_at(room: int) -> int:
-    """Return the first line in the memory at `room`."""
-    return (room + LINE - 1) & -LINE
+def line_buffer_bytes(segment_bytes: int) -> int:
+    """Return the bytes of memory for a segment that begins anywhere in a line, and a line behind it."""
+    return segment_bytes + 3 * LINE
 
 
 @numba.njit(inline="always")
-def pass_on(lines: int, begin: int, stop: int, last: bool) -> int:
-    """Stream what `lines` holds, which is to stand from the line of `begin` up to `stop`; addresses are even.
+def first_line(buffer: int) -> int:
+    """Return the address of the first whole line in the memory at `buffer`."""
+    return (buffer + LINE - 1) & -LINE
 
-    Nothing is written before `begin`. Returns the bytes of the last line, which are kept but for the row's `last`.
+
+@numba.njit(inline="always")
+def stream_lines(lines: int, begin: int, stop: int, last: bool) -> int:
+    """Stream the content of `lines` to its target, from the line of address `begin` up to `stop`; both are even.
+
+    Nothing is written before `begin`. The last line, not full yet, is kept for the next call, and the number of its
+    bytes returned, unless this is the row's `last` segment.
     """
     source, to = lines, begin & -LINE
     if begin > to:

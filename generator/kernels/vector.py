@@ -18,12 +18,15 @@ from numba import types
 from numba.extending import intrinsic
 
 LANES: Final = 16
+"""Numbers of 32 bits in a vector: one register of AVX-512."""
 GROUP: Final = 2 * LANES
-"""Pixels that share a vector of words; `choice.py`."""
+"""Pixels whose choices come from one vector of words, two from each word; see `choice.py`."""
 EIGHT: Final = 8
+"""Pixels that are written to float32 planes at a time: one register of AVX2 a channel."""
 SAMPLE_BYTES: Final = 6
+"""Bytes of a sample: red, green and blue, uint16 each."""
 LINE: Final = 64
-"""Bytes that memory gives and takes at once."""
+"""Bytes of a line of the cache, on x86-64 and on most arm64 processors."""
 
 I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 F32 = ir.FloatType()
@@ -34,6 +37,7 @@ _EIGHT_FLOATS, _EIGHT_WORDS = ir.VectorType(F32, EIGHT), ir.VectorType(I32, EIGH
 _LINE = ir.VectorType(I32, LINE // 4)
 ADDRESS = types.int64
 _MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
+"""Of the three rounds of the choice rule; `choice.py` names their source."""
 
 Builder = Any
 Value = Any
@@ -44,32 +48,32 @@ def constant(kind: Any, numbers: int | Sequence[int]) -> Value:
     return ir.Constant(kind, [numbers] * kind.count if isinstance(numbers, int) else list(numbers))
 
 
-def spread(builder: Builder, number: Value, kind: Any) -> Value:
+def broadcast(builder: Builder, number: Value, kind: Any) -> Value:
     """Return a vector whose every lane is `number`."""
     unset = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(unset, number, ir.Constant(I32, 0))
     return builder.shuffle_vector(first, unset, constant(ir.VectorType(I32, kind.count), 0))
 
 
-def at(builder: Builder, address: Value, offset: int, kind: Any) -> Value:
-    """Return a pointer to what lies `offset` bytes behind `address`."""
+def pointer_at(builder: Builder, address: Value, offset: int, kind: Any) -> Value:
+    """Return a pointer of that kind to the memory `offset` bytes behind `address`."""
     return builder.inttoptr(builder.add(address, ir.Constant(I64, offset)), kind.as_pointer())
 
 
 def load(builder: Builder, address: Value, offset: int, kind: Any) -> Value:
-    """Return what lies there, wherever that is."""
-    loaded = builder.load(at(builder, address, offset, kind))
+    """Return the value of that kind `offset` bytes behind `address`, aligned or not."""
+    loaded = builder.load(pointer_at(builder, address, offset, kind))
     loaded.align = 1
     return loaded
 
 
 def store(builder: Builder, value: Value, address: Value, offset: int) -> None:
-    """Write `value` there, wherever that is."""
-    builder.store(value, at(builder, address, offset, value.type)).align = 1
+    """Write `value` to the memory `offset` bytes behind `address`, aligned or not."""
+    builder.store(value, pointer_at(builder, address, offset, value.type)).align = 1
 
 
-def joined(builder: Builder, parts: Sequence[Value]) -> Value:
-    """Return one vector of some of a size, a power of two of them."""
+def concatenated(builder: Builder, parts: Sequence[Value]) -> Value:
+    """Return the vectors of `parts` as one; they are of one size and a power of two in number."""
     while len(parts) > 1:
         lanes = constant(ir.VectorType(I32, 2 * parts[0].type.count), range(2 * parts[0].type.count))
         parts = [builder.shuffle_vector(*parts[i : i + 2], lanes) for i in range(0, len(parts), 2)]
@@ -80,7 +84,7 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
     """Return the colour indices of the 16 pixels (48 bytes) at `picture`."""
     # Four pixels for each 16 bytes of the vector; the last four are loaded so that nothing behind them is.
     starts = (0, 12, 24, 32)
-    loaded = joined(builder, [load(builder, picture, start, ir.VectorType(I8, 16)) for start in starts])
+    loaded = concatenated(builder, [load(builder, picture, start, ir.VectorType(I8, 16)) for start in starts])
     lanes: list[int] = []
     for four, start in enumerate(starts):
         for pixel in range(4):
@@ -94,21 +98,21 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
         shift = builder.sub(ir.Constant(I32, 8 * (place + 1)), builder.mul(bits, ir.Constant(I32, place + 1)))
         ones = builder.sub(builder.shl(ir.Constant(I32, 1), bits), ir.Constant(I32, 1))
         mask = builder.shl(ones, builder.mul(bits, ir.Constant(I32, place)))
-        return builder.and_(builder.lshr(codes, spread(builder, shift, WORDS)), spread(builder, mask, WORDS))
+        return builder.and_(builder.lshr(codes, broadcast(builder, shift, WORDS)), broadcast(builder, mask, WORDS))
 
     return builder.or_(builder.or_(field(0), field(1)), field(2))
 
 
 def _digits(builder: Builder, word: Value, keys: Sequence[Value], count: Value) -> tuple[Value, ...]:
     """Return the choices of the first and the second 16 pixels of a group; the rule is that of `choice.py`."""
-    numbers = builder.add(spread(builder, word, WORDS), constant(WORDS, range(LANES)))
-    h = builder.xor(numbers, spread(builder, keys[0], WORDS))
+    numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
+    h = builder.xor(numbers, broadcast(builder, keys[0], WORDS))
     h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
     for key, shift, multiplier in zip(keys[1:], (16, 15), _MULTIPLIERS[1:], strict=True):
-        h = builder.xor(h, spread(builder, key, WORDS))
+        h = builder.xor(h, broadcast(builder, key, WORDS))
         h = builder.xor(h, builder.lshr(h, constant(WORDS, shift)))
         h = builder.mul(h, constant(WORDS, multiplier))
-    counts = spread(builder, count, WORDS)
+    counts = broadcast(builder, count, WORDS)
 
     def upper(numbers: Value) -> Value:
         """Return the upper halves of the products with `count`, even and odd lanes by one 64-bit product each."""
@@ -142,9 +146,9 @@ def void(emit: Callable[..., None], *kinds: Any) -> Any:
 
 @intrinsic
 def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, bits: Any, target: Any) -> Any:
-    """Write where in a light's samples the 32 pixels at `picture` find theirs: uint32 offsets in bytes, at `target`.
+    """Write to `target` the offsets, uint32 bytes, of the samples chosen for the 32 pixels at `picture`.
 
-    `word` is the number of the group's first word; reads 96 bytes, writes 128.
+    `word` is the number of the group's first word; 96 bytes are read, 128 written.
     """
     del typing, picture, word, k0, k1, k2, count, bits, target
     number = types.uint32
@@ -160,7 +164,7 @@ def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, coun
         bits: Value,
         target: Value,
     ) -> None:
-        stride = spread(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
+        stride = broadcast(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
         for half, choices in enumerate(_digits(builder, word, (k0, k1, k2), count)):
             begin = builder.add(picture, ir.Constant(I64, 3 * LANES * half))
             colours = builder.mul(_colours(builder, begin, bits), stride)
@@ -171,7 +175,7 @@ def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, coun
 
 
 @intrinsic
-def name_colours(
+def write_colours(
     typing: Any, picture: Any, bits: Any, stride: Any, target: Any, other_stride: Any, other_target: Any
 ) -> Any:
     """Write the colours of the 32 pixels at `picture` as uint32: their indices times each stride, at each target."""
@@ -189,13 +193,13 @@ def name_colours(
         for half in range(2):
             colours = _colours(builder, builder.add(picture, ir.Constant(I64, 3 * LANES * half)), bits)
             for factor, place in ((stride, target), (other_stride, other_target)):
-                store(builder, builder.mul(colours, spread(builder, factor, WORDS)), place, 4 * LANES * half)
+                store(builder, builder.mul(colours, broadcast(builder, factor, WORDS)), place, 4 * LANES * half)
 
     return void(emit, ADDRESS, types.uint32, types.uint32, ADDRESS, types.uint32, ADDRESS)
 
 
 @intrinsic
-def choose_named(typing: Any, colours: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, target: Any) -> Any:
+def choose_for_colours(typing: Any, colours: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, target: Any) -> Any:
     """Write what `choose` writes for the 32 pixels whose colours stand at `colours`, times the bytes of a colour."""
     del typing, colours, word, k0, k1, k2, count, target
     number = types.uint32
@@ -263,11 +267,11 @@ def copy_line(typing: Any, source: Any, target: Any) -> Any:
 
 @intrinsic
 def stream_line(typing: Any, source: Any, target: Any) -> Any:
-    """Copy a line's bytes past the caches to `target`, a multiple of `LINE`; others see them after `settle`."""
+    """Copy a line's bytes past the caches to `target`, a multiple of `LINE`; to be followed by `store_fence`."""
     del typing, source, target
 
     def emit(builder: Builder, source: Value, target: Value) -> None:
-        written = builder.store(load(builder, source, 0, _LINE), at(builder, target, 0, _LINE))
+        written = builder.store(load(builder, source, 0, _LINE), pointer_at(builder, target, 0, _LINE))
         written.align = LINE
         written.set_metadata("nontemporal", builder.module.add_metadata([ir.Constant(I32, 1)]))
 
@@ -275,8 +279,8 @@ def stream_line(typing: Any, source: Any, target: Any) -> Any:
 
 
 @intrinsic
-def settle(typing: Any) -> Any:
-    """Wait until what was streamed can be seen by all."""
+def store_fence(typing: Any) -> Any:
+    """Wait until all threads can see what was streamed."""
     del typing
 
     def emit(builder: Builder) -> None:
@@ -316,7 +320,7 @@ def _channels(builder: Builder, samples: Value, offsets: Value, step: int) -> li
     return [builder.sitofp(number, _EIGHT_FLOATS) for number in numbers]
 
 
-def least(builder: Builder, first: Value, second: Value) -> Value:
+def minimum(builder: Builder, first: Value, second: Value) -> Value:
     """Return the smaller of two numbers in each lane."""
     return builder.select(builder.fcmp_ordered("<", first, second), first, second)
 
@@ -327,9 +331,9 @@ def _planes8(step: int) -> Callable[..., None]:
     def emit(
         builder: Builder, samples: Value, offsets: Value, scale: Value, red: Value, green: Value, blue: Value
     ) -> None:
-        factor, one = spread(builder, scale, _EIGHT_FLOATS), ir.Constant(_EIGHT_FLOATS, [1.0] * EIGHT)
+        factor, one = broadcast(builder, scale, _EIGHT_FLOATS), ir.Constant(_EIGHT_FLOATS, [1.0] * EIGHT)
         for channel, target in zip(_channels(builder, samples, offsets, step), (red, green, blue), strict=True):
-            store(builder, least(builder, builder.fmul(channel, factor), one), target, 0)
+            store(builder, minimum(builder, builder.fmul(channel, factor), one), target, 0)
 
     return emit
 
@@ -342,8 +346,8 @@ def planes8(typing: Any, samples: Any, offsets: Any, scale: Any, red: Any, green
 
 
 @intrinsic
-def mirrored8(typing: Any, samples: Any, offsets: Any, scale: Any, red: Any, green: Any, blue: Any) -> Any:
-    """Do `planes8` from right to left: `offsets` leads to the first pixel's, those of the others stand before it."""
+def planes8_mirrored(typing: Any, samples: Any, offsets: Any, scale: Any, red: Any, green: Any, blue: Any) -> Any:
+    """Do `planes8` from right to left: `offsets` points to the first pixel's offset, the others' stand before it."""
     del typing, samples, offsets, scale, red, green, blue
     return void(_planes8(-4), ADDRESS, ADDRESS, types.float32, ADDRESS, ADDRESS, ADDRESS)
 
@@ -355,33 +359,33 @@ def plane1(typing: Any, source: Any, scale: Any, target: Any) -> Any:
 
     def emit(builder: Builder, source: Value, scale: Value, target: Value) -> None:
         value = builder.uitofp(load(builder, source, 0, I16), F32)
-        store(builder, least(builder, builder.fmul(value, scale), ir.Constant(F32, 1.0)), target, 0)
+        store(builder, minimum(builder, builder.fmul(value, scale), ir.Constant(F32, 1.0)), target, 0)
 
     return void(emit, ADDRESS, types.float32, ADDRESS)
 
 
-def _asking(locality: int) -> Callable[..., None]:
-    """Return what emits the asking for memory that is to be kept near (3) or not at all (0)."""
+def _prefetching(locality: int) -> Callable[..., None]:
+    """Return an emitter of LLVM's prefetch with that locality: 3 keeps the line in every cache, 0 in none."""
 
     def emit(builder: Builder, address: Value) -> None:
         pointer = I8.as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [pointer, I32, I32, I32])
         function = builder.module.declare_intrinsic("llvm.prefetch", [pointer], kind)
         numbers = [ir.Constant(I32, number) for number in (0, locality, 1)]  # to read, how near, data
-        builder.call(function, [at(builder, address, 0, I8), *numbers])
+        builder.call(function, [pointer_at(builder, address, 0, I8), *numbers])
 
     return emit
 
 
 @intrinsic
 def prefetch(typing: Any, address: Any) -> Any:
-    """Ask for the memory at `address` to be at hand soon; nothing happens where there is none."""
+    """Prefetch the line of `address` into all caches; an address without memory is ignored."""
     del typing, address
-    return void(_asking(3), ADDRESS)
+    return void(_prefetching(3), ADDRESS)
 
 
 @intrinsic
 def prefetch_once(typing: Any, address: Any) -> Any:
-    """Do `prefetch` for what is read once, so that it takes no place in the larger caches."""
+    """Prefetch a line that is read once, so that it takes no place in the larger caches."""
     del typing, address
-    return void(_asking(0), ADDRESS)
+    return void(_prefetching(0), ADDRESS)

@@ -1,4 +1,4 @@
-"""Steps of `mixing.py` written in LLVM's own terms; see `vector.py` for the laws that hold here too."""
+"""Steps of `mixing.py` written in LLVM's own terms; the rules at the head of `vector.py` hold here too."""
 
 from __future__ import annotations
 
@@ -24,36 +24,37 @@ from generator.kernels.vector import (
     WORDS,
     Builder,
     Value,
+    broadcast,
+    concatenated,
     constant,
-    joined,
-    least,
     load,
-    spread,
+    minimum,
     store,
     void,
 )
 
 BLOCK: Final = 8
-"""Pixels that are mixed at a time."""
+"""Pixels that are mixed at a time: their weights under two lights fill a vector of 16."""
 MEAN_BYTES: Final = 16
-"""Of a colour's mean under one light: red, green, blue and nothing, float32."""
-PLAN: Final = 6
-"""Addresses that `mix` wants of a pair of lights."""
-FAULTS: Final = 4 * LANES
-"""Bytes that tell faulty weights."""
+"""Bytes of a colour's mean under one light: red, green, blue and padding, float32."""
+PLAN_ENTRIES: Final = 6
+"""Addresses that `mix` takes of each pair of lights."""
+FAULT_BYTES: Final = 4 * LANES
+"""Bytes of the 16 float32 that become NaN where a weight is faulty."""
 
-_FOUR: Final = 4
+_QUAD: Final = 4
+"""Numbers of a pixel in a vector, a quarter of it: red, green, blue and padding."""
 _SHORTS: Final = ir.VectorType(I16, 2 * LANES)
 _EIGHT_WORDS: Final = ir.VectorType(I32, BLOCK)
-_COUPLES: Final = ((0, 2), (4, 6), (1, 3), (5, 7))
-"""Which two of eight pixels share a vector: so pixels are packed without crossing its quarters."""
-_ORDER: Final = tuple((_COUPLES[lane % _FOUR][lane // (2 * _FOUR)], lane // _FOUR % 2) for lane in range(LANES))
-"""Pixel and light of each of a block's weights as they are lined up: in the quarters where a couple is mixed."""
+_PIXEL_PAIRS: Final = ((0, 2), (4, 6), (1, 3), (5, 7))
+"""Which two of eight pixels share a vector, so that pixels are packed without crossing its quarters."""
+_ORDER: Final = tuple((_PIXEL_PAIRS[lane % _QUAD][lane // (2 * _QUAD)], lane // _QUAD % 2) for lane in range(LANES))
+"""Pixel and light of each of a block's weights in the order of `arrange_weights`, in the quarters of `_PIXEL_PAIRS`."""
 
 
 @intrinsic
 def mean4(typing: Any, source: Any, count: Any, target: Any) -> Any:
-    """Write the mean of `count` ≥ 1 samples in a row as four float32, the fourth without meaning.
+    """Write the mean of `count` ≥ 1 samples in a row as four float32, the fourth is padding.
 
     Returns the largest number of the samples.
     """
@@ -62,18 +63,18 @@ def mean4(typing: Any, source: Any, count: Any, target: Any) -> Any:
     def generate(context: Any, builder: Builder, signature: Any, arguments: Sequence[Value]) -> Value:
         del context, signature
         source, count, target = arguments
-        wide, real = ir.VectorType(I64, _FOUR), ir.VectorType(ir.DoubleType(), _FOUR)
-        total, most = (cgutils.alloca_once_value(builder, ir.Constant(wide, [0] * _FOUR)) for _ in range(2))
+        wide, real = ir.VectorType(I64, _QUAD), ir.VectorType(ir.DoubleType(), _QUAD)
+        total, most = (cgutils.alloca_once_value(builder, ir.Constant(wide, [0] * _QUAD)) for _ in range(2))
         with cgutils.for_range(builder, count) as loop:
             at = builder.add(source, builder.mul(loop.index, ir.Constant(I64, SAMPLE_BYTES)))
-            sample = builder.zext(load(builder, at, 0, ir.VectorType(I16, _FOUR)), wide)
+            sample = builder.zext(load(builder, at, 0, ir.VectorType(I16, _QUAD)), wide)
             builder.store(builder.add(builder.load(total), sample), total)
             before = builder.load(most)
             builder.store(builder.select(builder.icmp_unsigned(">", sample, before), sample, before), most)
         mean = builder.fdiv(
-            builder.sitofp(builder.load(total), real), spread(builder, builder.sitofp(count, ir.DoubleType()), real)
+            builder.sitofp(builder.load(total), real), broadcast(builder, builder.sitofp(count, ir.DoubleType()), real)
         )
-        store(builder, builder.fptrunc(mean, ir.VectorType(F32, _FOUR)), target, 0)
+        store(builder, builder.fptrunc(mean, ir.VectorType(F32, _QUAD)), target, 0)
         largest = ir.Constant(I64, 0)
         for channel in range(3):
             value = builder.extract_element(builder.load(most), ir.Constant(I32, channel))
@@ -83,13 +84,13 @@ def mean4(typing: Any, source: Any, count: Any, target: Any) -> Any:
     return types.int64(ADDRESS, types.int64, ADDRESS), generate
 
 
-def _each_line(builder: Builder, weights: Value, count: Value, do: Callable[[Value, Value], None]) -> None:
-    """Do something with each eight pixels' weights of a pair of lights, and their number."""
+def _for_each_line(builder: Builder, weights: Value, count: Value, do: Callable[[Value, Value], None]) -> None:
+    """Call `do` with the weights of each eight pixels under a pair of lights, WORDS, and the number of those eight."""
     with _blocks(builder, count) as (block, begin):
         do(load(builder, builder.add(weights, builder.shl(begin, ir.Constant(I64, 3))), 0, WORDS), block)
 
 
-def _some(builder: Builder, words: Value) -> Value:
+def _any_nonzero(builder: Builder, words: Value) -> Value:
     """Return two bits: whether one of the even lanes, and whether one of the odd lanes, is not 0."""
     answer = ir.Constant(I64, 0)
     for light in range(2):
@@ -102,11 +103,11 @@ def _some(builder: Builder, words: Value) -> Value:
 
 
 @intrinsic
-def look(typing: Any, weights: Any, count: Any) -> Any:
-    """Return which of two lights' weights, two float32 for each of `count` ≥ 8 pixels, are not all 0 and not all 1.
+def weight_flags(typing: Any, weights: Any, count: Any) -> Any:
+    """Return four bits on the weights of two lights, two float32 for each of `count` ≥ 8 pixels.
 
-    Bits 0 and 1 are set where some weight of the first and of the second light is not 0, bits 2 and 3 where one of
-    theirs is not 1.
+    Bits 0 and 1 are set where some weight of the first and of the second light is not 0, bits 2 and 3 where some weight
+    of theirs is not 1.
     """
     del typing, weights, count
 
@@ -120,16 +121,16 @@ def look(typing: Any, weights: Any, count: Any) -> Any:
             for seen, other in zip(found, (line, builder.xor(line, ones)), strict=True):
                 builder.store(builder.or_(builder.load(seen), other), seen)
 
-        _each_line(builder, arguments[0], arguments[1], see)
-        lit, less = (_some(builder, builder.load(seen)) for seen in found)
+        _for_each_line(builder, arguments[0], arguments[1], see)
+        lit, less = (_any_nonzero(builder, builder.load(seen)) for seen in found)
         return builder.or_(lit, builder.shl(less, ir.Constant(I64, 2)))
 
     return types.int64(ADDRESS, types.int64), generate
 
 
 @intrinsic
-def interleave8(typing: Any, first: Any, first_step: Any, second: Any, second_step: Any, target: Any) -> Any:
-    """Write eight pixels' weights of a pair of lights as `look` takes them; each light's are so many bytes apart."""
+def interleave_weights(typing: Any, first: Any, first_step: Any, second: Any, second_step: Any, target: Any) -> Any:
+    """Write eight pixels' weights of two lights by turns, as `weight_flags` takes them; steps are bytes to the next."""
     del typing, first, first_step, second, second_step, target
 
     def emit(
@@ -146,10 +147,10 @@ def interleave8(typing: Any, first: Any, first_step: Any, second: Any, second_st
 
 
 @intrinsic
-def line_up(typing: Any, weights: Any, count: Any, target: Any) -> Any:
-    """Write the weights that `look` takes as `mix` takes them: 64 bytes for each eight pixels that it takes at a time.
+def arrange_weights(typing: Any, weights: Any, count: Any, target: Any) -> Any:
+    """Write the weights that `weight_flags` takes in the order in which `mix` takes them, 64 bytes for eight pixels.
 
-    Returns the first two bits that `look` does.
+    Returns bits 0 and 1 of `weight_flags`.
     """
     del typing, weights, count, target
 
@@ -164,17 +165,17 @@ def line_up(typing: Any, weights: Any, count: Any, target: Any) -> Any:
             to = builder.add(target, builder.shl(block, ir.Constant(I64, 6)))
             store(builder, builder.shuffle_vector(line, line, lanes), to, 0)
 
-        _each_line(builder, weights, count, put)
-        return _some(builder, builder.load(seen))
+        _for_each_line(builder, weights, count, put)
+        return _any_nonzero(builder, builder.load(seen))
 
     return types.int64(ADDRESS, types.int64, ADDRESS), generate
 
 
 @contextmanager
 def _blocks(builder: Builder, count: Value) -> Generator[tuple[Value, Value]]:
-    """Go through `count` ≥ 8 pixels eight by eight: give the number of each eight, and the first of its pixels.
+    """Loop over `count` ≥ 8 pixels eight by eight: yield the number of each eight, and the first of its pixels.
 
-    The last eight are some of the ones before again where `count` is not whole eights.
+    Where `count` is no multiple of eight, the last eight overlap the ones before.
     """
     blocks = builder.lshr(builder.add(count, ir.Constant(I64, BLOCK - 1)), ir.Constant(I64, 3))
     last = builder.sub(count, ir.Constant(I64, BLOCK))
@@ -186,8 +187,8 @@ def _blocks(builder: Builder, count: Value) -> Generator[tuple[Value, Value]]:
 def _store_pixels(builder: Builder, even: Value, odd: Value, target: Value) -> None:
     """Write the red, green and blue of eight pixels as uint16, given those of even and of odd places as 32 bits."""
     both = builder.bitcast(builder.or_(even, builder.shl(odd, constant(WORDS, 16))), _SHORTS)
-    # Of each quarter: red, red, green, green, blue, blue of two pixels, and two without meaning.
-    lanes = [8 * quarter + lane for quarter in range(_FOUR) for lane in (0, 2, 4, 1, 3, 5)]
+    # Of each quarter: red, red, green, green, blue, blue of two pixels, and two of padding.
+    lanes = [8 * quarter + lane for quarter in range(_QUAD) for lane in (0, 2, 4, 1, 3, 5)]
     for part in (slice(0, 16), slice(16, 24)):
         kind = ir.VectorType(I32, len(lanes[part]))
         store(builder, builder.shuffle_vector(both, both, constant(kind, lanes[part])), target, 2 * part.start)
@@ -196,9 +197,9 @@ def _store_pixels(builder: Builder, even: Value, odd: Value, target: Value) -> N
 def _pair(
     builder: Builder, addresses: Sequence[Value], block: Value, place: Value, means: Value
 ) -> tuple[list[Value], Value]:
-    """Return what a pair of lights gives the pixels of even and of odd places, and what tells faulty weights.
+    """Return what a pair of lights adds to the pixels of even and of odd places, and a mark of faulty weights.
 
-    The latter is 16 float32 that are 0, but for faulty weights no numbers.
+    The mark is 16 float32: 0, or NaN where a weight is faulty.
     """
     weights, *rest = addresses
     offsets, samples, mean_base = rest[:2], rest[2:4], rest[4]
@@ -208,33 +209,33 @@ def _pair(
     weight = load(builder, builder.add(weights, builder.shl(block, ir.Constant(I64, 6))), 0, FLOATS)
     root = builder.call(root_of, [weight])
     remainder = builder.fsub(weight, root)
-    # The root of what is negative, and nothing times infinity, are no numbers.
+    # The root of a negative number, and 0 times infinity, are NaN.
     fault = builder.fmul(root, ir.Constant(FLOATS, [0.0] * LANES))
     sums: list[Value] = []
-    for lane, couple in enumerate(_COUPLES):
+    for lane, pixels in enumerate(_PIXEL_PAIRS):
 
         def found(base: Value, places: Value, pixel: int, kind: Any) -> Value:
             offset = builder.zext(load(builder, builder.add(places, place), 4 * pixel, I32), I64)
             return load(builder, builder.add(base, offset), 0, kind)
 
         def each(numbers: Value, lane: int = lane) -> Value:
-            """Return the numbers of a couple under both lights, four times each."""
-            lanes = [_FOUR * (place // _FOUR) + lane for place in range(LANES)]
+            """Return the numbers of a pair of pixels under both lights, four times each."""
+            lanes = [_QUAD * (place // _QUAD) + lane for place in range(LANES)]
             return builder.shuffle_vector(numbers, numbers, constant(WORDS, lanes))
 
         drawn = [
             found(base, places, pixel, ir.VectorType(I16, 4))
-            for pixel in couple
+            for pixel in pixels
             for base, places in zip(samples, offsets, strict=True)
         ]
-        mean = [found(mean_base, means, pixel, ir.VectorType(F32, 2 * _FOUR)) for pixel in couple]
-        noisy = builder.fmul(builder.sitofp(builder.zext(joined(builder, drawn), WORDS), FLOATS), each(root))
-        sums.append(builder.fadd(noisy, builder.fmul(joined(builder, mean), each(remainder))))
+        mean = [found(mean_base, means, pixel, ir.VectorType(F32, 2 * _QUAD)) for pixel in pixels]
+        noisy = builder.fmul(builder.sitofp(builder.zext(concatenated(builder, drawn), WORDS), FLOATS), each(root))
+        sums.append(builder.fadd(noisy, builder.fmul(concatenated(builder, mean), each(remainder))))
     totals: list[Value] = []
     for two in (sums[:2], sums[2:]):
         parts = [
             builder.shuffle_vector(
-                *two, constant(WORDS, [8 * pixel + _FOUR * light + i for pixel in range(4) for i in range(4)])
+                *two, constant(WORDS, [8 * pixel + _QUAD * light + i for pixel in range(4) for i in range(4)])
             )
             for light in range(2)
         ]
@@ -246,10 +247,10 @@ def _pair(
 def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any, white: Any, target: Any) -> Any:
     """Write `count` ≥ 8 pixels under pairs of lights as uint16, rounded, from 0 to `white`; see `mixing.py`.
 
-    `plan` leads to `PLAN` addresses a pair: of the weights as `line_up` has them, of the first and second light's
-    offsets in their samples, of the first and second light's samples, and of the means; `means` leads to the offsets in
-    the means. Some float32 at `faults` are no numbers from the moment that a
-    weight was negative, infinite or no number.
+    `plan` is the address of `PLAN_ENTRIES` addresses a pair: of the weights as `arrange_weights` has them, of the first
+    and second light's offsets in their samples, of the first and second light's samples, and of the means; `means` is
+    that of the offsets in the means. Of the 16 float32 at `faults` some become NaN as soon as a weight is negative,
+    infinite or NaN.
     """
     del typing, plan, pairs, count, means, faults, white, target
 
@@ -267,11 +268,11 @@ def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any,
             return ir.Constant(I64, value)
 
         def addresses(pair: Value) -> list[Value]:
-            entry = builder.add(plan, builder.mul(pair, number(8 * PLAN)))
-            return [load(builder, entry, 8 * i, I64) for i in range(PLAN)]
+            entry = builder.add(plan, builder.mul(pair, number(8 * PLAN_ENTRIES)))
+            return [load(builder, entry, 8 * i, I64) for i in range(PLAN_ENTRIES)]
 
         zero, half = ir.Constant(FLOATS, [0.0] * LANES), ir.Constant(FLOATS, [0.5] * LANES)
-        most = spread(builder, white, FLOATS)
+        most = broadcast(builder, white, FLOATS)
         fault = cgutils.alloca_once_value(builder, load(builder, faults, 0, FLOATS))
         sums = [cgutils.alloca_once(builder, FLOATS) for _ in range(2)]
 
@@ -281,7 +282,7 @@ def mix(typing: Any, plan: Any, pairs: Any, count: Any, means: Any, faults: Any,
                 for value in total(block, builder.shl(begin, number(2))):
                     lifted = builder.fadd(value, half)
                     lifted = builder.select(builder.fcmp_ordered(">", lifted, zero), lifted, zero)
-                    rounded.append(builder.fptosi(least(builder, lifted, most), WORDS))
+                    rounded.append(builder.fptosi(minimum(builder, lifted, most), WORDS))
                 _store_pixels(
                     builder, rounded[0], rounded[1], builder.add(target, builder.mul(begin, number(SAMPLE_BYTES)))
                 )

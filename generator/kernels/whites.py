@@ -1,4 +1,4 @@
-"""The light of each pixel, and of all together, where several lights share a picture."""
+"""Ground truths of pictures under several lights: the light of each pixel, and the mean weight of each light."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def _light_at(weights: Any, whites: Any, y: int, x: int) -> Any:
 
 
 @numba.njit(inline="always")
-def _whole(red: Any, green: Any, blue: Any, full: Any) -> Any:
-    """Return r, g and b as whole parts of `full`; green takes what rounding leaves."""
+def _quantised(red: Any, green: Any, blue: Any, full: Any) -> Any:
+    """Return r, g and b as whole parts of `full` that sum to it; green takes the errors of rounding."""
     total = red + green + blue
     first, last = np.int32(np.rint(red / total * full)), np.int32(np.rint(blue / total * full))
     return first, np.int32(np.int32(full) - first - last), last
@@ -43,28 +43,28 @@ def _chromaticities(weights: Any, whites: Any, out: Any) -> None:
 
 
 @compiled
-def _whole_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> None:
+def _quantise_chromaticities(weights: Any, whites: Any, full: Any, out: Any) -> None:
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1]):
             red, green, blue = _light_at(weights, whites, y, x)
-            out[y, x, 0], out[y, x, 1], out[y, x, 2] = _whole(red, green, blue, full)
+            out[y, x, 0], out[y, x, 1], out[y, x, 2] = _quantised(red, green, blue, full)
 
 
 @compiled
-def _whole_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: Any) -> None:
-    """Do the same for weights (H, 2 W) and `out` (H, 3 W), in a loop of which the compiler makes vectors."""
+def _quantise_chromaticities_of_two(weights: Any, whites: Any, full: Any, out: Any) -> None:
+    """Do the same for weights (H, 2 W) and `out` (H, 3 W), in a loop that the compiler vectorises."""
     for y in range(weights.shape[0]):
         for x in range(weights.shape[1] // 2):
             one, other = weights[y, 2 * x], weights[y, 2 * x + 1]
-            # From 0 on, as where lights are many.
+            # Added to 0 first, as for any number of lights, so that the bits are the same.
             red = _ZERO + one * whites[0, 0] + other * whites[1, 0]
             green = _ZERO + one * whites[0, 1] + other * whites[1, 1]
             blue = _ZERO + one * whites[0, 2] + other * whites[1, 2]
-            out[y, 3 * x], out[y, 3 * x + 1], out[y, 3 * x + 2] = _whole(red, green, blue, full)
+            out[y, 3 * x], out[y, 3 * x + 1], out[y, 3 * x + 2] = _quantised(red, green, blue, full)
 
 
 @compiled
-def _whole_weights(weights: Any, full: Any, out: Any) -> None:
+def _quantise_weights(weights: Any, full: Any, out: Any) -> None:
     for y in range(weights.shape[0]):
         for light in range(weights.shape[2]):
             for x in range(weights.shape[1]):
@@ -89,42 +89,81 @@ def chromaticities(weights: npt.NDArray[np.float32], whites: npt.NDArray[np.floa
     weights
         (H, W, K) float32 ≥ 0, not all 0 in a pixel.
     whites
-        (K, 3) linear camera RGB above 0.
+        (K, 3) float64, linear camera RGB above 0.
 
     Returns
     -------
     ndarray
         (H, W, 3) float32, r + g + b = 1, computed in float32, lights added up in their order.
+
+    Examples
+    --------
+    >>> whites = np.array([[400.0, 400.0, 200.0], [100.0, 400.0, 500.0]])
+    >>> chromaticities(np.array([[[1, 0], [0.5, 0.5]]], np.float32), whites)
+    array([[[0.4 , 0.4 , 0.2 ],
+            [0.25, 0.4 , 0.35]]], dtype=float32)
     """
     out = np.empty((*weights.shape[:2], 3), np.float32)
     _chromaticities(weights, whites.astype(np.float32), out)
     return out
 
 
-def whole_chromaticities(
+def quantised_chromaticities(
     weights: npt.NDArray[np.float32], whites: npt.NDArray[np.float64], full: int
 ) -> npt.NDArray[np.uint16]:
-    """Return `chromaticities` as whole parts of `full` ≤ 65535, rounded; green takes what is left: (H, W, 3) uint16."""
+    """Return `chromaticities` as whole parts of `full` ≤ 65535: (H, W, 3) uint16, of which each pixel sums to `full`.
+
+    Red and blue are rounded, green is the rest.
+
+    Parameters
+    ----------
+    weights
+        (H, W, K) float32 ≥ 0, not all 0 in a pixel.
+    whites
+        (K, 3) float64, linear camera RGB above 0.
+    full
+        What 1 becomes.
+
+    Examples
+    --------
+    >>> whites = np.array([[400.0, 400.0, 200.0], [100.0, 400.0, 500.0]])
+    >>> quantised_chromaticities(np.array([[[0.5, 0.5]]], np.float32), whites, 65535)
+    array([[[16384, 26214, 22937]]], dtype=uint16)
+    """
     height, width, lights = weights.shape
     out = np.empty((height, width, 3), np.uint16)
     numbers = whites.astype(np.float32), np.float32(full)
     if lights == 2:
-        _whole_chromaticities_of_two(weights.reshape(height, -1), *numbers, out.reshape(height, -1))
+        _quantise_chromaticities_of_two(weights.reshape(height, -1), *numbers, out.reshape(height, -1))
     else:
-        _whole_chromaticities(weights, *numbers, out)
+        _quantise_chromaticities(weights, *numbers, out)
     return out
 
 
-def whole_weights(weights: npt.NDArray[np.float32], full: int) -> npt.NDArray[np.uint16]:
-    """Return weights (H, W, K) float32 from 0 to 1 as whole parts of `full` ≤ 65535, rounded: (K, H, W) uint16."""
+def quantised_weights(weights: npt.NDArray[np.float32], full: int) -> npt.NDArray[np.uint16]:
+    """Return weights (H, W, K) float32 from 0 to 1 as whole parts of `full` ≤ 65535, rounded: (K, H, W) uint16.
+
+    Examples
+    --------
+    >>> quantised_weights(np.array([[[0.25, 0.75]]], np.float32), 1000)
+    array([[[250]],
+    <BLANKLINE>
+           [[750]]], dtype=uint16)
+    """
     height, width, lights = weights.shape
     out = np.empty((lights, height, width), np.uint16)
-    _whole_weights(weights, np.float32(full), out)
+    _quantise_weights(weights, np.float32(full), out)
     return out
 
 
 def mean_weights(weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-    """Return the mean (K,) float64 of weights (H, W, K) float32, H and W ≥ 1."""
+    """Return the mean (K,) float64 of weights (H, W, K) float32, H and W ≥ 1.
+
+    Examples
+    --------
+    >>> mean_weights(np.array([[[1, 0], [0.5, 0.5]]], np.float32))
+    array([0.75, 0.25])
+    """
     out = np.zeros(weights.shape[2], np.float64)
     _sums(weights, out)
     return out / (weights.shape[0] * weights.shape[1])

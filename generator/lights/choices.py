@@ -3,7 +3,7 @@
 Every picture under the same listed lights, each under some drawn at random from the table or from a distribution, or
 each under the light of a ground truth of another data set (paper, section 4.3), the nearest of the table or one mixed
 to match; one at a time, or several together, each in its part of the picture. A choice depends on the picture's
-position in the list of sources, and on nothing else but its seed.
+position in the list of sources and on a seed, and on nothing else.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
-from generator.kernels import philox
+from generator import philox
 from generator.lights.distributions import Distribution
 from generator.lights.gamut import Gamut, Match, Outside, OutsideGamutError, black_body, rgb_of
 from generator.lights.ground_truths import load_ground_truths
 from generator.lights.lighting import LightChoice, Lighting, Mixture, parse_mixture, plain
-from generator.lights.options import parse_numbers
+from generator.masks.weights import MaskPlan
+from generator.named_numbers import parse_numbers
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
-    from generator.masks.making import MaskPlan
 
 __all__ = [
     "DrawnLights",
@@ -42,9 +42,12 @@ __all__ = [
 ]
 
 _BATCH: Final = 32
+"""Chromaticities drawn at a time: one of them lies in the gamut for all but narrow gamuts, and numpy is used well."""
 _BATCHES: Final = 2048
+"""Batches drawn at most for a light: 65 536 draws, of which none is in the gamut with probability e⁻⁶⁵ where a share of
+`_LEAST_WITHIN` is."""
 _LEAST_WITHIN: Final = 1e-3
-"""Share of a distribution that must lie in the gamut; with less, drawing again and again would take for ever."""
+"""Share of a distribution that must lie in the gamut; with less, a light would take thousands of draws."""
 
 
 @dataclass(frozen=True)
@@ -105,17 +108,17 @@ class FollowedLights:
 
     Attributes
     ----------
-    way
-        How a light was found for a ground truth: ``nearest`` of the table's own, or a mixture to ``match`` it.
+    method
+        How a light was found for a ground truth: the ``nearest`` of the table, or a mixture to ``match`` it.
     matches
-        For each ground truth the light, and how far it is.
+        For each ground truth the light, and its angle to it.
     file
-        What their origin is called.
+        Name of the file that they come from.
     each
         Images for each picture.
     """
 
-    way: Literal["nearest", "match"]
+    method: Literal["nearest", "match"]
     matches: tuple[Match, ...]
     file: str
     each: int = 1
@@ -135,7 +138,7 @@ class FollowedLights:
     def describe(self) -> dict[str, Any]:
         """Return the choice as plain values."""
         return {
-            "choice": self.way,
+            "choice": self.method,
             "file": self.file,
             "each": self.each,
             "lights": [match.mixture.label for match in self.matches],
@@ -255,6 +258,11 @@ def parse_lights(text: str, total: int) -> ListedLights:
     ------
     InputError
         An entry is no number or range, or the table has no such light.
+
+    Examples
+    --------
+    >>> parse_lights("0,5,12-14", total=707).lights
+    (0, 5, 12, 13, 14)
     """
     if text.strip().lower() == "all":
         return ListedLights(tuple(range(total)))
@@ -322,7 +330,7 @@ def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", ea
     truths
         (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length.
     file
-        What to call their origin.
+        Name of the file that they come from, for messages and the dataset's description.
     each
         Images for each picture.
     """
@@ -351,7 +359,7 @@ def matched_lights(
     truths
         (N, 3) float64 ≥ 0, linear RGB of the table's camera, of any length.
     file
-        What to call their origin.
+        Name of the file that they come from, for messages and the dataset's description.
     each
         Images for each picture.
     outside
@@ -363,16 +371,16 @@ def matched_lights(
         The table cannot make some of them, and the nearest was not asked for.
     """
     matches: list[Match] = []
-    lost: list[tuple[int, OutsideGamutError]] = []
+    outside_gamut: list[tuple[int, OutsideGamutError]] = []
     for number, truth in enumerate(truths):
         try:
             matches.append(gamut.match(truth, outside))
         except OutsideGamutError as error:
-            lost.append((number, error))
-    if lost:
-        number, worst = max(lost, key=lambda item: item[1].angle)
+            outside_gamut.append((number, error))
+    if outside_gamut:
+        number, worst = max(outside_gamut, key=lambda item: item[1].angle)
         raise InputError(
-            f"{len(lost)} of {len(truths)} ground truths{f' of {file}' if file else ''} cannot be made; "
+            f"{len(outside_gamut)} of {len(truths)} ground truths{f' of {file}' if file else ''} cannot be made; "
             f"the farthest is number {number + 1}: {worst}"
         ) from worst
     return FollowedLights("match", tuple(matches), file, each)

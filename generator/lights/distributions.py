@@ -1,7 +1,7 @@
 """Distributions of lights in the rb-chromaticity plane, from which a table's gamut is filled.
 
-A distribution turns random words into chromaticities; what falls outside the gamut is drawn again by whoever asks, so
-every distribution is cut to the gamut and keeps its shape within.
+A distribution turns random words into chromaticities; the caller draws again what falls outside the gamut, so
+that every distribution is cut to the gamut and keeps its shape within.
 """
 
 from __future__ import annotations
@@ -9,18 +9,19 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
-from generator.kernels.philox import Words
 from generator.lights.gamut import rb_of
-from generator.lights.options import parse_numbers
+from generator.named_numbers import parse_numbers
+from generator.philox import Words
 
 _Array = npt.NDArray[np.float64]
-_WORD = float(1 << 32)
+_WORD: Final = float(1 << 32)
+"""Values of a random word."""
 
 
 class Distribution(Protocol):
@@ -40,7 +41,7 @@ class Uniform:
     """Every chromaticity of the gamut equally likely: uniform over the triangle of all r, b ≥ 0 with r + b ≤ 1."""
 
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
-        """Return (N, 2) chromaticities."""
+        """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words."""
         r, b = ((word + 0.5) / _WORD for word in words[:2])
         # The upper half of the square is the lower half turned about its centre.
         over = r + b > 1
@@ -62,7 +63,7 @@ class Gaussian:
     correlation: float = 0.0
 
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
-        """Return (N, 2) chromaticities."""
+        """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words."""
         first, second = _normal(words).T
         across = self.correlation * first + np.sqrt(1 - self.correlation**2) * second
         return np.stack([self.r + self.sd_r * first, self.b + self.sd_b * across], axis=1)
@@ -91,7 +92,7 @@ class Fitted:
     root
         (2, 2) float64, lower triangular, times its transpose the kernel's covariance.
     file, sha256
-        What the file of the data was called, and the hash of the ground truths read from it.
+        Name of the file of the data, and the hash of the ground truths read from it.
     """
 
     rb: _Array
@@ -101,7 +102,7 @@ class Fitted:
 
     @classmethod
     def of(cls, truths: _Array, file: str = "") -> Fitted:
-        """Return the distribution of ground truths (N, 3), linear RGB of the table's camera, of any length.
+        """Return the distribution of ground truths (N, 3) float64, linear RGB of the table's camera, of any length.
 
         Raises
         ------
@@ -122,7 +123,7 @@ class Fitted:
         return cls(rb, root, file, hashlib.sha256(np.ascontiguousarray(truths, dtype="<f8").tobytes()).hexdigest())
 
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
-        """Return (N, 2) chromaticities."""
+        """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words."""
         chosen = (words[2].astype(np.uint64) * np.uint64(len(self.rb))) >> np.uint64(32)
         normal = _normal(words)
         aside = np.stack(
@@ -142,13 +143,13 @@ class Fitted:
 
 
 def _normal(words: tuple[Words, Words, Words, Words]) -> _Array:
-    """Return (N, 2) standard normal numbers from the first two words (G. E. P. Box and M. E. Muller, 1958)."""
+    """Return standard normal (N, 2) float64 from two words (N,) uint32 (G. E. P. Box and M. E. Muller, 1958)."""
     radius = np.sqrt(-2 * np.log((words[0] + 1.0) / _WORD))
     angle = 2 * np.pi * words[1] / _WORD
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
-_GAUSSIAN = {
+_GAUSSIAN: Final = {
     "r": (0.0, 1.0),
     "b": (0.0, 1.0),
     "sd": (1e-6, 1.0),
@@ -156,6 +157,7 @@ _GAUSSIAN = {
     "sd_b": (1e-6, 1.0),
     "corr": (-0.999999, 0.999999),
 }
+"""Ranges of the numbers of a Gaussian; without breadth, or with a correlation of 1, it would have no density."""
 
 
 def parse_distribution(text: str) -> Distribution:
@@ -170,6 +172,11 @@ def parse_distribution(text: str) -> Distribution:
         It names none.
     FormatError
         The file cannot be read or fitted.
+
+    Examples
+    --------
+    >>> parse_distribution("gaussian:r=.3,b=.25,sd=.02")
+    Gaussian(r=0.3, b=0.25, sd_r=0.02, sd_b=0.02, correlation=0.0)
     """
     from generator.lights.ground_truths import load_ground_truths
 

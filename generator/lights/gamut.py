@@ -31,14 +31,16 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 TOLERANCE_DEG: Final = 0.01
-"""How far one or two lights may be from what is wanted to be taken instead of three: about a table's own error."""
+"""Angle to a wanted light within which one light, or two, are taken instead of three, degrees: about a table's own
+error."""
 
 Outside = Literal["refuse", "nearest"]
 """What to do about a light that the table cannot make: refuse it, or take the nearest that it can."""
 
 _Array = npt.NDArray[np.float64]
 _THIN: Final = 1e-6
-"""Breadth over length of the lights' chromaticities below which they lie on a line."""
+"""Ratio of the singular values of the lights' chromaticities below which they lie on a line: far above what rounding
+makes of a line, far below the breadth of three lights of a projector."""
 
 
 class OutsideGamutError(InputError):
@@ -47,7 +49,7 @@ class OutsideGamutError(InputError):
     Attributes
     ----------
     angle
-        How far it is from the nearest that can be made, degrees.
+        Angle to the nearest light that can be made, degrees.
     nearest
         The mixture that makes the nearest.
     """
@@ -75,7 +77,7 @@ class Gamut:
     white
         (L, 3) float64 > 0, the ground truths of the lights in linear camera RGB.
     table
-        What to call the table in messages.
+        Name of the table in messages.
     """
 
     white: _Array
@@ -114,18 +116,18 @@ class Gamut:
         return np.unique(np.concatenate([corners[:, [0, 1]], corners[:, [0, 2]], corners[:, [1, 2]]]), axis=0)
 
     def contains(self, wanted: _Array) -> npt.NDArray[np.bool_]:
-        """Return whether three lights make each of (N, 3) or (N, 2) wanted lights: linear RGB, or r and b."""
+        """Return (N,) bool, whether three lights make each light: (N, 3) float64, linear RGB, or (N, 2), r and b."""
         rgb = wanted if wanted.shape[1] == 3 else rgb_of(wanted)
         shares = (self._inverses.reshape(-1, 3) @ rgb.T).reshape(-1, 3, len(rgb))
         return (shares.min(axis=1) >= 0).any(axis=0)
 
     def match(self, wanted: npt.ArrayLike, outside: Outside = "refuse") -> Match:
-        """Return the mixture of the fewest near lights for a wanted light; the rule stands at the head of this file.
+        """Return the mixture of the fewest near lights for a wanted light, by the rule at the head of this file.
 
         Parameters
         ----------
         wanted
-            (3,) ≥ 0, linear RGB of the table's camera, of any length.
+            (3,) float64 ≥ 0, linear RGB of the table's camera, of any length.
         outside
             What to do if no mixture makes it.
 
@@ -200,7 +202,14 @@ class Gamut:
         return Match(mixture_of({light: 1.0}), float(angles_deg(self.white[light], target)))
 
     def _pairs(self, target: _Array) -> tuple[npt.NDArray[np.int64], _Array, _Array]:
-        """Return the pairs between whose lights the target's foot falls, their shares, and the angles in degrees."""
+        """Return the pairs of neighbours between whose lights the target falls.
+
+        Returns
+        -------
+        tuple
+            Their lights (P, 2) int64, the shares (P, 2) float64 that make the nearest to the target, and its angle to
+            the target (P,) float64, degrees.
+        """
         at_u, at_v = (self.directions @ target)[self.edges.T]
         cosine = self._cosines
         area = np.maximum(1 - cosine**2, 1e-30)
@@ -211,7 +220,7 @@ class Gamut:
         return self.edges[between], shares[between], np.degrees(np.arccos(np.sqrt(np.minimum(common, 1))))
 
     def _found(self, lights: npt.NDArray[np.int64], shares: _Array, target: _Array) -> Match:
-        """Return the match of `shares` of the directions of `lights`."""
+        """Return the match of `shares` (K,) float64 of the directions of `lights` (K,) int64."""
         weights = np.maximum(shares, 0) / np.linalg.norm(self.white[lights], axis=1)
         mixture = mixture_of({int(light): float(weight) for light, weight in zip(lights, weights, strict=True)})
         made = np.asarray(mixture.weights) @ self.white[list(mixture.lights)]
@@ -219,17 +228,30 @@ class Gamut:
 
 
 def rb_of(rgb: _Array) -> _Array:
-    """Return the chromaticities (..., 2) r and b of linear RGB (..., 3)."""
+    """Return the chromaticities (..., 2) float64, r and b, of linear RGB (..., 3) float64 of any length.
+
+    Examples
+    --------
+    >>> rb_of(np.array([1.0, 2.0, 1.0])).tolist()
+    [0.25, 0.25]
+    """
     return rgb[..., [0, 2]] / rgb.sum(axis=-1, keepdims=True)
 
 
 def rgb_of(rb: npt.ArrayLike) -> _Array:
-    """Return (..., 3) float64 of sum 1 for chromaticities (..., 2) r and b."""
+    """Return linear RGB (..., 3) float64 of sum 1 for chromaticities (..., 2), r and b.
+
+    Examples
+    --------
+    >>> rgb_of([0.25, 0.25]).tolist()
+    [0.25, 0.5, 0.25]
+    """
     rb = np.asarray(rb, dtype=np.float64)
     return np.stack([rb[..., 0], 1 - rb[..., 0] - rb[..., 1], rb[..., 1]], axis=-1)
 
 
 def _unit(rgb: _Array) -> _Array:
+    """Return (..., 3) float64 at length 1."""
     return rgb / np.linalg.norm(rgb, axis=-1, keepdims=True)
 
 

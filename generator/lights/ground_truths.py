@@ -1,4 +1,4 @@
-"""Ground truths of other data sets, read from the files that users have them in."""
+"""Ground truths of other data sets, read from their files of text."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ import csv
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError
 
-_TRIPLES = (("gt_r", "gt_g", "gt_b"), ("r", "g", "b"), ("red", "green", "blue"), ("white_r", "white_g", "white_b"))
+_TRIPLES: Final = (
+    ("gt_r", "gt_g", "gt_b"),
+    ("r", "g", "b"),
+    ("red", "green", "blue"),
+    ("white_r", "white_g", "white_b"),
+)
 
 
 def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:

@@ -1,10 +1,10 @@
-"""What falls on a picture: a mixture of the table's lights, or several mixtures, each in its part of the picture.
+"""The light on a picture: a mixture of the table's lights, or several mixtures, each in its part of the picture.
 
 Light adds, so a mixture with weights from 0 is a real light, its ground truth the same mixture of the ground truths.
-The laws that hold inside:
+Rules that hold inside:
 
 - The weights of a mixture sum to 1. So it is as bright as its lights are and never brighter than the brightest, the
-  stray light that every exposure holds once is in the mixture once, and the noise is that of one exposure (`mixing`).
+  stray light of an exposure is in the mixture once, and the noise is that of one exposure (`kernels.mixed_table`).
 - Weights are whole billionths, so that a label gives back the mixture to the last bit.
 - What masks give for a pixel sums to 1 in whole 65535ths, so that a 16-bit file holds it without loss.
 """
@@ -20,14 +20,13 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
+from generator.masks.weights import MaskMaker
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
-FULL: Final = 65535
-"""A pixel's weight 1 as it is written to a file."""
-
 _BILLION: Final = 10**9
+"""Parts of a weight: as many decimals as a label has."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +44,11 @@ class Mixture:
     ------
     InputError
         The lights do not ascend, or the weights are not above 0 or do not sum to 1 within a millionth.
+
+    Examples
+    --------
+    >>> Mixture((12, 40), (0.25, 0.75)).label
+    '12:0.25+40:0.75'
     """
 
     lights: tuple[int, ...]
@@ -83,7 +87,7 @@ class Mixture:
         return np.asarray(self.weights) @ lut.white[list(self.lights)]
 
     def samples(self, lut: Lut, seed: int = 0, picture: npt.NDArray[np.uint8] | None = None) -> npt.NDArray[np.uint16]:
-        """Return the samples (8**bits, S, 3) uint16 of this light, as `kernel.draw_samples` takes them.
+        """Return the samples (8**bits, S, 3) uint16 of this light, as `kernels.rendering.draw_samples` takes them.
 
         Parameters
         ----------
@@ -100,16 +104,16 @@ class Mixture:
         InputError
             The table has no such light.
         """
-        from generator.kernels.mixing import mixed_table
+        from generator.kernels.mixed_table import mixed_table
         from generator.kernels.palette import colours_in
-        from generator.kernels.rendering import WHOLE_LIGHT, read_light
+        from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, read_light
 
         self._require(lut)
-        pixels = WHOLE_LIGHT if picture is None else picture.shape[0] * picture.shape[1]
+        pixels = WHOLE_LIGHT_PIXELS if picture is None else picture.shape[0] * picture.shape[1]
         if len(self.lights) == 1:
             return read_light(lut, self.lights[0], pixels)
         colours = None
-        if picture is not None and pixels < WHOLE_LIGHT:
+        if picture is not None and pixels < WHOLE_LIGHT_PIXELS:
             # To find the colours of a large picture takes as long as to mix all.
             colours = colours_in(picture, lut.provenance.bits)
         tables = [lut.samples[light] for light in self.lights]
@@ -123,12 +127,18 @@ class Mixture:
 
 
 def plain(light: int) -> Mixture:
-    """Return light number `light` alone."""
+    """Return light number `light` alone: a mixture of one."""
     return Mixture((light,), (1.0,))
 
 
 def mixture_of(parts: Mapping[int, float]) -> Mixture:
-    """Return the mixture of lights in the proportion of `parts` ≥ 0 (light to share); shares of 0 are left out."""
+    """Return the mixture of lights in the proportion of `parts` ≥ 0 (light to share); shares of 0 are left out.
+
+    Examples
+    --------
+    >>> mixture_of({40: 3, 12: 1, 7: 0}).label
+    '12:0.25+40:0.75'
+    """
     total = sum(parts.values())
     kept = {light: parts[light] / total for light in sorted(parts) if parts[light] / total * _BILLION >= 0.5}
     total = sum(kept.values())
@@ -142,6 +152,11 @@ def parse_mixture(label: str) -> Mixture:
     ------
     InputError
         The text is no such label.
+
+    Examples
+    --------
+    >>> parse_mixture("12:0.25+40:0.75")
+    Mixture(lights=(12, 40), weights=(0.25, 0.75))
     """
     if re.fullmatch(r"\d{1,9}", label, re.ASCII):
         return plain(int(label))
@@ -153,18 +168,9 @@ def parse_mixture(label: str) -> Mixture:
     return Mixture(tuple(ordered), tuple(parts[light] for light in ordered))
 
 
-@runtime_checkable
-class MaskMaker(Protocol):
-    """Where in one picture each of its lights falls."""
-
-    def weights(self, height: int, width: int, lights: int) -> npt.NDArray[np.float32]:
-        """Return (height, width, lights) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel."""
-        ...
-
-
 @dataclass(frozen=True)
 class Lighting:
-    """One image's light.
+    """The light of one image.
 
     Attributes
     ----------
@@ -195,9 +201,9 @@ class Lighting:
         return np.array([mixture.white(lut) for mixture in self.mixtures])
 
     def overall(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Return the light that falls on the picture on the average, (3,) float64, linear camera RGB, not normalised.
+        """Return the mean light of the picture, (3,) float64, linear camera RGB, not normalised.
 
-        The one ground truth of an image of several lights, for methods that know of one only.
+        The one ground truth of an image of several lights, for methods that estimate one.
 
         Parameters
         ----------
@@ -211,7 +217,7 @@ class Lighting:
         return np.asarray(mean_weights(weights) @ self.whites(lut))
 
     def ground_truth_map(self, lut: Lut, weights: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Return the ground truth of each pixel.
+        """Return the ground truth (H, W, 3) float32 of each pixel.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""What a user asks of light, as it is written on a command line, and the choice of lights that it comes to."""
+"""The options of light, as they are written on a command line, and the choice of lights that they ask for."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from generator.lights.distributions import parse_distribution
 from generator.lights.gamut import Gamut, Outside
 from generator.lights.ground_truths import load_ground_truths
 from generator.lights.lighting import LightChoice
+from generator.masks.request import parse_masks
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -31,16 +32,16 @@ MASKS: Final = "smooth"
 
 @dataclass(frozen=True)
 class LightRequest:
-    """Options about light, each None or empty where it was not given; named as on the command line.
+    """The options of light, each None or empty where it was not given; named as on the command line.
 
     Attributes
     ----------
     illuminations
         Lights of the table for every picture: ``0,5,12-20`` or ``all``.
     light
-        Lights for every picture, each as `illuminant.parse_light` reads it.
+        Lights for every picture, each as `choices.parse_light` reads it.
     random
-        Images of each picture under lights of its own: of the table, or of `distribution`. One if not said.
+        Images of each picture under lights of its own: of the table, or of `distribution`. One if None.
     distribution
         Where those lights are drawn from; see `lights.distributions.parse_distribution`.
     nearest, match
@@ -50,7 +51,7 @@ class LightRequest:
     lights_per_image
         Lights that fall on one image: that many, in the order of the lists, share each image.
     masks
-        Where each falls; see `masks.making.parse_masks`.
+        Where each falls; see `masks.request.parse_masks`.
     """
 
     illuminations: str | None = None
@@ -82,13 +83,11 @@ class LightRequest:
         choice = self._lights(lut, seed, together)
         if together == 1:
             return choice
-        from generator.masks.making import parse_masks
-
         return TogetherLights(choice, together, parse_masks(self.masks or MASKS, together, seed))
 
     def _lights(self, lut: Lut, seed: int, together: int) -> LightChoice:
         """Return the choice of lights with as many for each picture as its images have together."""
-        ways = {
+        choices = {
             "--illuminations": self.illuminations is not None,
             "--light": bool(self.light),
             "--nearest": self.nearest is not None,
@@ -96,10 +95,10 @@ class LightRequest:
             "--distribution": self.distribution is not None,
             "--random": self.random is not None and self.distribution is None,
         }
-        given = [name for name, is_given in ways.items() if is_given]
+        given = [name for name, is_given in choices.items() if is_given]
         if len(given) > 1:
             raise InputError(
-                f"{' and '.join(given)} were both given; choose lights in one way (--random may go with --distribution)"
+                f"{' and '.join(given)} were both given; give one of them (only --random may go with --distribution)"
             )
         count = together * (1 if self.random is None else self.random)
         if self.illuminations is not None:

@@ -1,7 +1,7 @@
 """Kinds of masks: half planes and soft edges, spots, random smooth fields, windows.
 
 A shape draws its places from an image's dice, and gives a function from places in the picture to the lights' shares.
-Pixels see +, −, ×, ÷ and √ alone; see `making`.
+Pixels are computed with +, −, ×, ÷ and √ alone; see `making`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.compiled import compiled
-from generator.kernels import philox
+from generator import philox
 
 Array = npt.NDArray[np.floating[Any]]
 """float32: what is computed from float32 arrays and Python's own numbers stays float32."""
@@ -25,9 +25,9 @@ _HALF: Final = np.float32(0.5)
 _ONE: Final = np.float32(1)
 _THREE: Final = np.float32(3)
 _STEP: Final = 64
-"""Numbers that one shape may draw."""
+"""Numbers of one stream: as many as the largest shape draws, 1 + 3 · 20 of the spots, and some."""
 _BAR: Final = 0.06
-"""Breadth of the bars between a window's panes, as a share of the window."""
+"""Breadth of the bars between a window's panes, as a share of the window: 6 cm of a metre, as glazing bars are."""
 
 Shares = Callable[[Array], Array]
 """From v (h, 1), rows' distances from the picture's centre, shares of its longer side, to lights' shares (K, h, W)."""
@@ -35,13 +35,13 @@ Shares = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Dice:
-    """Uniform random numbers of one image; `stream` keeps apart what shares it out to."""
+    """Uniform random numbers of one image; each `stream` of them is independent of the others."""
 
     seed: int
     number: int
 
     def uniform(self, stream: int, count: int = _STEP) -> npt.NDArray[np.float64]:
-        """Return `count` numbers between 0 and 1."""
+        """Return (count,) float64 between 0 and 1."""
         word = philox.words(self.seed, np.arange(count), stream, self.number, philox.MASKS)[0]
         return (word + 0.5) / (1 << 32)
 
@@ -50,7 +50,7 @@ class Shape(Protocol):
     """A kind of masks: from the dice of an image to where its lights fall."""
 
     def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function that fills a picture's rows.
+        """Return the function from rows v (h, 1) to the lights' shares (K, h, W) float32 of their pixels.
 
         Parameters
         ----------
@@ -63,7 +63,7 @@ class Shape(Protocol):
         pixel
             Size of a pixel, a share of the longer side.
         u
-            (1, W), the columns' distances from the picture's centre, shares of the longer side.
+            (1, W) float32, the columns' distances from the picture's centre, shares of the longer side.
         """
         ...
 
@@ -74,7 +74,7 @@ class Shape(Protocol):
 
 @numba.njit(inline="always")
 def stepped(x: Any) -> Any:
-    """Return of a float32 0 below 0, 1 above 1, and 3x² − 2x³ between."""
+    """Return for float32 x 0 below 0, 1 above 1, and 3x² − 2x³ between (the cubic Hermite step)."""
     x = min(max(x, _ZERO), _ONE)
     return x * x * (_THREE - x - x)
 
@@ -95,7 +95,7 @@ class HalfPlanes:
     width: float | None = 0.0
 
     def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function that fills a picture's rows."""
+        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
         drawn: list[float] = dice.uniform(0).tolist()
         angle = math.radians(360 * drawn[0] if self.angle is None else self.angle)
         width = max(0.1 + 0.5 * drawn[1] if self.width is None else self.width, pixel)
@@ -136,7 +136,7 @@ class Spots:
     softness: float = 0.8
 
     def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function that fills a picture's rows."""
+        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
         discs: list[list[tuple[float, float, float, float]]] = []
         for light in range(1, lights):
             drawn = dice.uniform(light)
@@ -179,7 +179,7 @@ class SmoothFields:
     contrast: float = 2.0
 
     def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function that fills a picture's rows."""
+        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
         del half, pixel
         knots = math.ceil(2 / self.scale) + 4
         fields: list[Array] = []
@@ -199,7 +199,7 @@ class SmoothFields:
         return {"masks": "smooth", "scale": self.scale, "contrast": self.contrast}
 
     def _splined(self, knots: Array, at: Array) -> Array:
-        """Return (n, m) for `knots` (K, m), their first index running over places `at` (n,) from −0.5 to 0.5."""
+        """Return (n, m) float32 for `knots` (K, m), whose first index runs over places `at` (n,) from −0.5 to 0.5."""
         place = (at + 0.5) * (2 / self.scale)
         first = np.floor(place)
         index = first.astype(np.intp)
@@ -233,7 +233,7 @@ class Windows:
     softness: float | None = None
 
     def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
-        """Return the function that fills a picture's rows."""
+        """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
         windows = [self._window(dice.uniform(light), half, pixel) for light in range(1, lights)]
 
         def fill(v: Array) -> Array:
@@ -255,7 +255,10 @@ class Windows:
     def _window(
         self, drawn: npt.NDArray[np.float64], half: tuple[float, float], pixel: float
     ) -> tuple[list[list[float]], int, int, float]:
-        """Return the homography (3, 3) from the picture to the window's unit square, its panes, and its softness."""
+        """Return the homography (3, 3) from the picture to the window's unit square, its panes, and its softness.
+
+        `drawn` (64,) float64 are random numbers between 0 and 1.
+        """
         size = 0.45 + 0.35 * drawn[0]
         shape = 0.7 + 0.7 * drawn[1]
         width, height = size * math.sqrt(shape), size / math.sqrt(shape)
@@ -311,6 +314,7 @@ def _add_splines(knots: Any, index: Any, weights: Any, total: Any) -> None:
 
 @compiled
 def _grow(levels: Any) -> None:
+    """Replace float32 x in `levels` (n, m) by (x + √(1 + x²))²."""
     for y in range(levels.shape[0]):
         for x in range(levels.shape[1]):
             level = levels[y, x]
@@ -320,13 +324,13 @@ def _grow(levels: Any) -> None:
 
 
 def _growth(levels: Array) -> Array:
-    """Return (x + √(1 + x²))² in the place of float32 x: it grows from 0 to ∞ as an exponential does, without one."""
+    """Return (x + √(1 + x²))² for each float32 x, in place: it grows from 0 to ∞ as an exponential, of √ alone."""
     _grow(levels)
     return levels
 
 
 def _homography(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the (3, 3) that takes four places (4, 2), clockwise, to the corners of the unit square."""
+    """Return the homography (3, 3) float64 from four places (4, 2), clockwise, to the corners of the unit square."""
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     rows: list[list[float]] = []
     for (u, v), (x, y) in zip(corners.tolist(), square.tolist(), strict=True):
@@ -336,6 +340,7 @@ def _homography(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 @compiled
 def _add_panes(at: Any, sides: Any, soft: Any, light: Any) -> None:
+    """Add to `light` (n, m) float32 the panes between `sides` (P, 2) at places `at` (n, m), and clip it to 0 … 1."""
     for y in range(at.shape[0]):
         for pane in range(sides.shape[0]):
             left, right = sides[pane, 0], sides[pane, 1]
@@ -346,7 +351,7 @@ def _add_panes(at: Any, sides: Any, soft: Any, light: Any) -> None:
 
 
 def _panes(at: Array, count: int, soft: float) -> Array:
-    """Return the light along one side of a window at places `at`, 0 to 1 from edge to edge."""
+    """Return the light (n, m) float32 through `count` panes at places `at` (n, m) float32, 0 … 1 across the window."""
     sides = [
         (
             pane / count + (_BAR / 2 if pane else 0.0),
@@ -360,7 +365,7 @@ def _panes(at: Array, count: int, soft: float) -> Array:
 
 
 def _over_the_first(shares: Array) -> Array:
-    """Return the lights' shares (K, h, W), the first light's, all 1, less what of the others falls over it."""
+    """Return the lights' shares (K, h, W) float32, in place: the first light's, all 1, times what the others leave."""
     for light in shares[1:]:
         shares[0] *= 1 - light
     return shares

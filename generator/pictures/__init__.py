@@ -1,1 +1,1 @@
-"""Source pictures: found, read, converted to sRGB codes, and shown to the eye."""
+"""Source pictures: found, read, converted to sRGB codes; and the tone mapping that makes raw images visible."""

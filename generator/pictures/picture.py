@@ -1,12 +1,12 @@
 """A picture file becomes 8-bit sRGB codes, as a printer would be given them.
 
-What is done to a file's values, in this order, so that one picture always gives the same codes::
+These steps turn a file's values into codes, in this order, so that one picture always gives the same codes::
 
     channels      the first three as R, G, B; a single one as grey; of several images in a file the first
-    depth         8-bit codes as they are; 16-bit codes v become ⌊(v + 128) / 257⌋; floating-point values are linear
+    depth         8-bit codes are kept; 16-bit codes v become ⌊(v + 128) / 257⌋; floating-point values are linear
                   light, 1 = white, clipped and encoded with the sRGB curve (IEC 61966-2-1) unless the file calls itself
                   sRGB
-    transparency  white shows through, as the paper does in a print; mixed in the values the file holds
+    transparency  white shows through, as paper does in a print; mixed in the values that the file holds
     profile       codes of another colour space become those of sRGB; see `generator.pictures.profiles`
     orientation   turned as the file's EXIF or TIFF orientation asks
     size          only ever made smaller, on request, by averaging areas of codes
@@ -28,25 +28,25 @@ import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
 from foundation.srgb import srgb_codes
-from generator.kernels import philox
+from generator import philox
 from generator.pictures.profiles import ADOBE_RGB, ASSUMED, from_adobe_rgb, to_srgb
 
 Picture = npt.NDArray[np.uint8]
 
 LARGEST_SIDE: Final = 65535
-"""Longest side of a crop or a random scene, px."""
+"""Longest side of a crop or a random scene, px: what 16 bits count."""
 LARGEST_PICTURE: Final = 1 << 29
-"""Most pixels of a picture: a small file can hold more than any memory, and one such file is to stop no data set."""
+"""Most pixels of a picture, 1.6 GB of codes: a small file can claim more than memory holds."""
 
 _UNCALIBRATED: Final = 0xFFFF
-"""EXIF 2.3, tag 40961 ColorSpace: not sRGB."""
+"""Value of the tag ColorSpace (EXIF 2.3, tag 40961) for a space that is not sRGB."""
 _MULTIPLIED: Final = frozenset({"dpx", "iff", "openexr", "rla", "tiff"})
-"""Formats whose colours are multiplied by alpha unless the file says otherwise; those of others are as they are."""
+"""Formats whose colours are multiplied by alpha unless the file says otherwise, by OpenImageIO's names."""
 
 
 @dataclass(frozen=True, slots=True)
 class Preparation:
-    """What is done to pictures on request.
+    """How pictures are prepared on request: made smaller, cut, taken as sRGB.
 
     Attributes
     ----------
@@ -84,61 +84,97 @@ class Preparation:
                 f"a crop of {self.crop[0]}x{self.crop[1]} was asked for, expected sides of 1 to {LARGEST_SIDE} px"
             )
         if self.crop is None and (self.cover or self.crop_at == "random"):
-            raise InputError("covering a crop, or a crop at random, wants the crop's size, such as 512x512")
+            raise InputError("no crop was given to cover or to cut at random; give its size, such as 512x512")
 
     def describe(self) -> dict[str, Any]:
-        """Return what differs from doing nothing, as JSON holds it."""
-        told: dict[str, Any] = {"profiles": self.profiles}
+        """Return the options that are set, as a JSON object."""
+        options: dict[str, Any] = {"profiles": self.profiles}
         if self.max_side is not None:
-            told["max_side"] = self.max_side
+            options["max_side"] = self.max_side
         if self.crop is not None:
-            told |= {"crop": list(self.crop), "cover": self.cover, "crop_at": self.crop_at}
-        return told
+            options |= {"crop": list(self.crop), "cover": self.cover, "crop_at": self.crop_at}
+        return options
 
 
-AS_THEY_ARE: Final = Preparation()
+UNPREPARED: Final = Preparation()
+"""Nothing is done on request: the whole picture in its own size, profiles honoured."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Reading:
-    """A picture as it was read: codes (H, W, 3) uint8, and what was done about its colour profile, in words."""
+    """A picture as it was read.
+
+    Attributes
+    ----------
+    picture
+        (H, W, 3) uint8, sRGB codes.
+    profile
+        How its colour profile was treated, in words, such as ``"Display P3, converted to sRGB"``.
+    """
 
     picture: Picture
     profile: str
 
 
 def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
-    """Return the sRGB codes (H, W, 3) uint8 of a picture file, its longest side at most `max_side`; see `open_picture`.
+    """Return the sRGB codes (H, W, 3) uint8 of a picture file; the head of this file lists the steps.
+
+    Parameters
+    ----------
+    path
+        Any file that OpenImageIO reads.
+    max_side
+        Longest side allowed, px; a larger picture is made smaller. None allows any.
 
     Raises
     ------
     FormatError
         The file cannot be read as a picture.
+
+    Examples
+    --------
+    >>> from PIL import Image
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "orange.png"
+    ...     Image.new("RGB", (40, 20), (255, 128, 0)).save(path)
+    ...     codes = read_picture(path, max_side=10)
+    >>> codes.shape, codes.dtype, codes[0, 0]
+    ((5, 10, 3), dtype('uint8'), array([255, 128,   0], dtype=uint8))
     """
     return open_picture(Path(path), Preparation(max_side=max_side)).picture
 
 
-def open_picture(path: Path, preparation: Preparation = AS_THEY_ARE, name: str | None = None) -> Reading:
-    """Return the sRGB codes of a picture file; the head of this file says what is done to its values.
+def open_picture(path: Path, preparation: Preparation = UNPREPARED, name: str | None = None) -> Reading:
+    """Return the sRGB codes of a picture file and how its profile was treated; the head of this file lists the steps.
 
     Parameters
     ----------
     path
         Any file that OpenImageIO reads.
     preparation
-        What else to do.
+        How the picture is prepared besides.
     name
-        What the picture is called, for the place of a random crop; its file's name if None.
+        Name of the picture, which chooses the place of a random crop; its file's name if None.
 
     Returns
     -------
     Reading
-        (H, W, 3) uint8, sRGB codes, with a word on its profile.
+        The codes (H, W, 3) uint8 and the treatment of its profile.
 
     Raises
     ------
     FormatError
         The file cannot be read as a picture, with OpenImageIO's reason, or is smaller than the crop.
+
+    Examples
+    --------
+    >>> from PIL import Image
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "orange.png"
+    ...     Image.new("RGB", (40, 20), (255, 128, 0)).save(path)
+    ...     reading = open_picture(path, Preparation(crop=(8, 8)))
+    >>> reading.picture.shape, reading.profile
+    ((8, 8, 3), 'none, taken as sRGB')
     """
     values = _read(path)
     light = values.light
@@ -169,7 +205,7 @@ def open_picture(path: Path, preparation: Preparation = AS_THEY_ARE, name: str |
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Values:
-    """What a file holds: `light` (H, W, 3) 0 … 255 or linear 0 … 1, `alpha` (H, W) 0 … 1 or None."""
+    """Values of a file: `light` (H, W, 3) uint8 or float64, 0 … 255 or linear 0 … 1; `alpha` (H, W) float64 0 … 1."""
 
     light: npt.NDArray[Any]
     alpha: npt.NDArray[np.float64] | None
@@ -190,9 +226,9 @@ def _read(path: Path) -> _Values:
 def _read_named(path: Path, name: str) -> _Values:
     import OpenImageIO as oiio  # noqa: N813
 
-    wish = oiio.ImageSpec()
-    wish.attribute("oiio:UnassociatedAlpha", 1)
-    stream = oiio.ImageInput.open(name, wish)
+    request = oiio.ImageSpec()
+    request.attribute("oiio:UnassociatedAlpha", 1)
+    stream = oiio.ImageInput.open(name, request)
     if stream is None:
         reason = _reason(oiio.geterror()).replace(name, str(path))
         raise FormatError(f"cannot read {path}: {reason}; use another picture, or convert it to PNG")
@@ -252,7 +288,7 @@ def _read_named(path: Path, name: str) -> _Values:
 
 @contextmanager
 def _named_in_text(path: Path) -> Generator[str]:
-    """Give a name for a file that OpenImageIO takes: it knows no names with bytes that are no UTF-8."""
+    """Yield a name of a file that OpenImageIO takes: a link to the file where its own name is not UTF-8."""
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -274,13 +310,13 @@ def _interoperability(path: Path) -> str:
         with Image.open(path) as picture:
             index = picture.getexif().get_ifd(IFD.Interop).get(1, "")
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        # Damaged data say nothing, nor do pictures too large for Pillow; OpenImageIO has read the picture.
+        # Damaged data, or a picture too large for Pillow: it has no index then. OpenImageIO has read the picture.
         return ""
     return str(index).strip("\0 ")
 
 
 def _jpeg(path: Path) -> npt.NDArray[np.uint8] | None:
-    """Return the pixels of a common colour JPEG in half of OpenImageIO's time, the same codes; None to let it do it."""
+    """Return the pixels (H, W, 3) uint8 of a usual colour JPEG in half of OpenImageIO's time, or None for another."""
     import simplejpeg
 
     data = path.read_bytes()
@@ -289,17 +325,17 @@ def _jpeg(path: Path) -> npt.NDArray[np.uint8] | None:
             return None
         return simplejpeg.decode_jpeg(data, strict=True)
     except ValueError:
-        # OpenImageIO will say what is wrong with it, or know better.
+        # OpenImageIO reads it, or names the fault.
         return None
 
 
 def _reason(message: str) -> str:
-    """Return a library's message as part of our sentence."""
+    """Return a library's message on one line without its full stop, to be a part of our sentence."""
     return " ".join(message.split()).rstrip(".") or "no known picture format"
 
 
 def _turn(picture: Picture, orientation: int) -> Picture:
-    """Return `picture` as it is meant to be seen (TIFF 6.0, tag 274 Orientation)."""
+    """Return `picture` (H, W, 3) uint8 turned upright (TIFF 6.0, tag Orientation)."""
     turned = {
         2: lambda: picture[:, ::-1],
         3: lambda: picture[::-1, ::-1],
@@ -313,7 +349,7 @@ def _turn(picture: Picture, orientation: int) -> Picture:
 
 
 def _fit(picture: Picture, preparation: Preparation, path: Path, name: str) -> Picture:
-    """Return `picture` made smaller and cut."""
+    """Return `picture` (H, W, 3) uint8 made smaller and cut."""
     height, width = picture.shape[:2]
     scale = 1.0 if preparation.max_side is None else preparation.max_side / max(height, width)
     if preparation.crop is None:
@@ -337,7 +373,7 @@ def _fit(picture: Picture, preparation: Preparation, path: Path, name: str) -> P
 
 
 def _shrink(picture: Picture, scale: float) -> Picture:
-    """Return `picture` scaled by `scale` where that is below 1, each pixel the mean of the area it covers."""
+    """Return `picture` (H, W, 3) uint8 scaled by `scale` if below 1, each pixel the mean of the area that it covers."""
     if scale >= 1:
         return picture
     import cv2

@@ -1,4 +1,4 @@
-"""Colour profiles of source pictures: their codes become sRGB codes, or a word says why not.
+"""Colour profiles of source pictures: codes of other spaces become sRGB codes, or a remark says why not.
 
 A chart is printed from sRGB codes, so a picture in another space, such as Adobe RGB (1998) or Display P3, has to be
 converted or its colours come out dull. LittleCMS converts, by relative colorimetry (ICC.1:2022, clause 6.3.2), in 8
@@ -22,12 +22,13 @@ if TYPE_CHECKING:
     from PIL.ImageCms import ImageCmsTransform
 
 ASSUMED: Final = "none, taken as sRGB"
-"""What is said of a picture without a profile."""
+"""Remark on a picture without a profile."""
 
 ADOBE_RGB: Final = "Adobe RGB (1998) by EXIF, converted to sRGB"
-"""What is said of a picture that a camera made in that space."""
+"""Remark on a picture that a camera made in that space."""
 
 _PROBE_STEPS: Final = 9
+"""Codes of each channel, every 32nd, of the grid of 729 colours that shows whether a profile is sRGB."""
 _ADOBE_GAMMA: Final = 563 / 256
 """Adobe RGB (1998) Color Image Encoding, clause 4.3.1.2."""
 _ADOBE_TO_SRGB: Final = np.array(
@@ -35,11 +36,13 @@ _ADOBE_TO_SRGB: Final = np.array(
 )
 """Of linear light: the matrices of Adobe RGB (1998), clause 4.3.5.3, and IEC 61966-2-1; both have the white D65."""
 _STEPS: Final = 65535
+"""Steps of the table of encoded linear light: where the curve is steepest a step is a twentieth of a code."""
 _ROWS: Final = 256
+"""Rows that are converted together, so that their float32 take little memory beside the picture."""
 
 
 def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArray[np.uint8], str]:
-    """Return the sRGB codes of a picture, and what was done about its profile.
+    """Return the sRGB codes of a picture, and how its profile was treated.
 
     Parameters
     ----------
@@ -51,8 +54,13 @@ def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArra
     Returns
     -------
     tuple
-        (H, W, 3) uint8, the same array where nothing had to be done; and a few words, such as
-        ``"Display P3, converted to sRGB"``.
+        (H, W, 3) uint8, the same array if no code changes; and a remark, such as ``"Display P3, converted to sRGB"``.
+
+    Examples
+    --------
+    >>> codes, remark = to_srgb(np.zeros((2, 2, 3), np.uint8), icc=None)
+    >>> remark
+    'none, taken as sRGB'
     """
     if icc is None:
         return codes, ASSUMED
@@ -69,7 +77,14 @@ def to_srgb(codes: npt.NDArray[np.uint8], icc: bytes | None) -> tuple[npt.NDArra
 
 
 def from_adobe_rgb(codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return the sRGB codes (H, W, 3) uint8 of codes of Adobe RGB (1998), clipped where sRGB ends."""
+    """Return the sRGB codes (H, W, 3) uint8 of Adobe RGB (1998) codes (H, W, 3) uint8, clipped to the gamut of sRGB.
+
+    Examples
+    --------
+    >>> from_adobe_rgb(np.array([[[128, 128, 128], [200, 100, 50]]], np.uint8))
+    array([[[129, 129, 129],
+            [227, 100,  42]]], dtype=uint8)
+    """
     linear = (np.arange(256, dtype=np.float32) / 255) ** _ADOBE_GAMMA
     encoded = srgb_codes(np.arange(_STEPS + 1) / _STEPS)
     out = np.empty_like(codes)
@@ -81,7 +96,7 @@ def from_adobe_rgb(codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 @lru_cache(maxsize=16)
 def _transform(icc: bytes) -> tuple[ImageCmsTransform | None, str, str]:
-    """Return the transform of a profile or None, the mode of its pictures, and what to say."""
+    """Return the transform of a profile or None, the mode of its pictures, and the remark."""
     from PIL import Image, ImageCms
 
     try:

@@ -1,4 +1,4 @@
-"""Where source pictures come from: files, folders of any size, stores past this machine, or random colours."""
+"""Where source pictures come from: files, folders of any size, remote stores, or random colours."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from foundation.errors import FormatError, InputError, StorageError
-from generator.dataset.store import DESCRIPTION, filesystem, is_remote, local_path
-from generator.kernels import philox
-from generator.pictures.picture import AS_THEY_ARE, LARGEST_SIDE, Picture, Preparation, open_picture
+from generator import philox
+from generator.pictures.picture import LARGEST_SIDE, UNPREPARED, Picture, Preparation, open_picture
+from generator.stores.places import DESCRIPTION, filesystem, is_remote, local_path
 
 if TYPE_CHECKING:
     from fsspec.spec import AbstractFileSystem
@@ -26,16 +26,16 @@ SUFFIXES: Final = frozenset(
     {".avif", ".bmp", ".dpx", ".exr", ".gif", ".hdr", ".heic", ".heif", ".j2k", ".jp2", ".jpe", ".jpeg", ".jpg"}
     | {".jxl", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".psd", ".rgbe", ".sgi", ".tga", ".tif", ".tiff", ".webp"}
 )
-"""What a folder is searched for, in lower or upper case; a file that is named itself may end as it likes."""
+"""Ends of the names for which a folder is searched, in either case; a file that is named itself may have any end."""
 
-_OF_THE_MACHINE: Final = frozenset(
+_MACHINE_ERRORS: Final = frozenset(
     {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN}
 )
-"""Errors of reading that say nothing of a file."""
+"""Errors of reading that have their cause in the machine or its store, not in the file."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Scene:
+class SourcePicture:
     """A source picture as it was read.
 
     Attributes
@@ -45,7 +45,7 @@ class Scene:
     sha256
         Hash of the file's bytes; None where there is no file.
     profile
-        What was done about its colour profile, in words; None where there is no file.
+        How its colour profile was treated, in words; None where there is no file.
     """
 
     picture: Picture
@@ -54,19 +54,19 @@ class Scene:
 
 
 class Source(Protocol):
-    """Something that gives one picture."""
+    """One picture that can be read, from wherever."""
 
     @property
     def name(self) -> str:
-        """What the dataset calls it."""
+        """The picture's name in the dataset."""
         ...
 
-    def read(self) -> Scene:
-        """Return the picture; a FormatError says why it cannot be had."""
+    def read(self) -> SourcePicture:
+        """Return the picture, codes (H, W, 3) uint8; a FormatError says why it cannot be read."""
         ...
 
-    def told(self) -> dict[str, Any]:
-        """Return how it is made or read, as JSON holds it, but not where a file lies."""
+    def to_json(self) -> dict[str, Any]:
+        """Return as a JSON object how the picture is made or read, without the place of a file."""
         ...
 
 
@@ -81,23 +81,23 @@ class PictureFile:
     below
         Path below the root with forward slashes; empty where the file was named itself.
     preparation
-        What is done to it.
+        How it is prepared.
     """
 
     root: str
     below: str
-    preparation: Preparation = AS_THEY_ARE
+    preparation: Preparation = UNPREPARED
 
     @property
     def name(self) -> str:
-        """What the dataset calls it: its path below the folder, a byte that is no text as its hexadecimal escape."""
+        """Its name in the dataset: its path below the folder, with hexadecimal escapes for bytes that are no text."""
         name = self.below or PurePosixPath(self.root.replace(os.sep, "/")).name
         text = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-        # Many readers of CSV take a carriage return for the end of a line, quoted or not.
+        # Many readers of CSV end a line at a carriage return, quoted or not.
         return text.replace("\r", "\\r")
 
-    def told(self) -> dict[str, Any]:
-        """Return its name and its preparation."""
+    def to_json(self) -> dict[str, Any]:
+        """Return its name and its preparation as a JSON object."""
         return {"picture": self.name, **self.preparation.describe()}
 
     @property
@@ -105,20 +105,20 @@ class PictureFile:
         """The file's path or URL."""
         return f"{self.root.rstrip('/')}/{self.below}" if self.below else self.root
 
-    def read(self) -> Scene:
-        """Return the picture; see `picture.open_picture`.
+    def read(self) -> SourcePicture:
+        """Return the picture, codes (H, W, 3) uint8; see `picture.open_picture`.
 
         Raises
         ------
         FormatError
-            It is no picture, may not be read, or is gone from among others.
+            It is no picture, may not be read, or is missing from a folder that holds others.
         InputError
             There is not enough memory for it.
         StorageError
-            Its bytes cannot be had for a reason that is not its own: a disk that is not mounted, a store that does not
-            answer. Then no picture may be passed over as if it were damaged.
+            Its bytes cannot be read for a reason that is not the file's own: a disk that is not mounted, a store that
+            does not answer. The picture must not be left out then as if it were damaged.
         """
-        with _at_hand(self.location) as path:
+        with _local_file(self.location) as path:
             digest = hashlib.sha256()
             try:
                 with path.open("rb") as stream:
@@ -128,17 +128,17 @@ class PictureFile:
             except FormatError as error:
                 raise FormatError(str(error).replace(str(path), self.location)) from error
             except OSError as error:
-                raise _unread(self.location, error, _is_of_the_file(path, error)) from error
+                raise _unreadable(self.location, error, _is_of_the_file(path, error)) from error
             except MemoryError as error:
                 raise InputError(
                     f"there is not enough memory to read {self.location}; use fewer workers, or leave it out"
                 ) from error
-        return Scene(reading.picture, digest.hexdigest(), reading.profile)
+        return SourcePicture(reading.picture, digest.hexdigest(), reading.profile)
 
 
 @contextmanager
-def _at_hand(location: str) -> Generator[Path]:
-    """Give a file of this machine; one of a store is copied for as long as it is wanted."""
+def _local_file(location: str) -> Generator[Path]:
+    """Yield the path of a file of this machine; one of a store is copied, and the copy removed at the end."""
     if not is_remote(location):
         yield Path(location)
         return
@@ -146,20 +146,20 @@ def _at_hand(location: str) -> Generator[Path]:
     try:
         copy = tempfile.NamedTemporaryFile(prefix="crop-", suffix=PurePosixPath(location).suffix)  # noqa: SIM115
     except OSError as error:
-        raise _unread(location, error, own=False) from error
+        raise _unreadable(location, error, of_the_file=False) from error
     with copy:
         try:
             store.get_file(path, copy.name)
         except Exception as error:
             # Every store raises errors of its own.
             gone = isinstance(error, FileNotFoundError)
-            raise _unread(location, error, own=gone and _folder_is_there(store, path)) from error
+            raise _unreadable(location, error, of_the_file=gone and _folder_is_there(store, path)) from error
         yield Path(copy.name)
 
 
 def _is_of_the_file(path: Path, error: OSError) -> bool:
-    """Return whether a file cannot be read for what it is itself, and not for where it lies or who reads it."""
-    if error.errno in _OF_THE_MACHINE:
+    """Return whether the cause of the error is the file itself, not the machine or the disk."""
+    if error.errno in _MACHINE_ERRORS:
         return False
     # The folder of a disk that is not mounted, or fails, is missing, empty or cannot be listed.
     try:
@@ -178,10 +178,10 @@ def _folder_is_there(store: AbstractFileSystem, path: str) -> bool:
         return False
 
 
-def _unread(location: str, error: Exception, own: bool) -> FormatError | StorageError:
-    """Return what to raise where a picture's bytes cannot be had, be it for a reason of its `own` or not."""
+def _unreadable(location: str, error: Exception, of_the_file: bool) -> FormatError | StorageError:
+    """Return the exception for a picture that cannot be read, whether the cause is the file itself or not."""
     reason = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split()).rstrip(".")
-    if own:
+    if of_the_file:
         return FormatError(f"cannot read {location}: {reason}; name a picture")
     return StorageError(
         f"cannot read {location}: {reason}; see that every machine that works on the dataset can read it, then run the "
@@ -195,6 +195,15 @@ class RandomScene:
 
     Codes R, G, B of pixel (x, y) are the three high bytes, highest first, of word x mod 4 of Philox4x32-10 with counter
     (⌊x/4⌋, y, number, 2) and the seed as key.
+
+    Attributes
+    ----------
+    number
+        0 … 2³² − 1; scenes of different numbers are independent.
+    width, height
+        Size, px.
+    seed
+        0 … 2⁶⁴ − 1.
     """
 
     number: int
@@ -204,21 +213,21 @@ class RandomScene:
 
     @property
     def name(self) -> str:
-        """What the dataset calls it."""
+        """The picture's name in the dataset."""
         return f"random-{self.number:06d}"
 
-    def told(self) -> dict[str, Any]:
-        """Return its number, size and seed."""
+    def to_json(self) -> dict[str, Any]:
+        """Return its number, size and seed as a JSON object."""
         return {"random": self.number, "size": [self.width, self.height], "seed": self.seed}
 
-    def read(self) -> Scene:
-        """Return the picture."""
+    def read(self) -> SourcePicture:
+        """Return the picture, codes (H, W, 3) uint8."""
         places = np.arange((self.width + 3) // 4)
         rows = np.arange(self.height)[:, None]
         four = philox.words(self.seed, places, rows, self.number, philox.SCENES)
         words = np.stack(four, axis=-1).reshape(self.height, -1)[:, : self.width]
         codes = np.stack([words >> np.uint32(24), words >> np.uint32(16), words >> np.uint32(8)], axis=-1)
-        return Scene(codes.astype(np.uint8))
+        return SourcePicture(codes.astype(np.uint8))
 
 
 def random_scenes(count: int, width: int, height: int, seed: int = 0) -> tuple[RandomScene, ...]:
@@ -228,6 +237,12 @@ def random_scenes(count: int, width: int, height: int, seed: int = 0) -> tuple[R
     ------
     InputError
         A number is out of range.
+
+    Examples
+    --------
+    >>> first, second = random_scenes(2, width=4, height=3)
+    >>> second.name, second.read().picture.shape
+    ('random-000001', (3, 4, 3))
     """
     if count < 1:
         raise InputError(f"{count} random scenes were asked for, expected 1 or more")
@@ -237,31 +252,39 @@ def random_scenes(count: int, width: int, height: int, seed: int = 0) -> tuple[R
 
 
 def find_pictures(
-    places: Sequence[Path | str] | Path | str, preparation: Preparation = AS_THEY_ARE
+    places: Sequence[Path | str] | Path | str, preparation: Preparation = UNPREPARED
 ) -> tuple[PictureFile, ...]:
     """Return the pictures of folders and files.
 
-    A folder is searched with all folders below it, but for hidden ones, data sets and links to folders, for
-    files that end in one of `SUFFIXES`, sorted by their path below it, code point by code point. The order of `places`
-    is kept. Nothing is opened: a million files take about 0.2 GB.
+    A folder is searched with all folders below it, except hidden ones, data sets and links to folders, for files whose
+    names end in one of `SUFFIXES`. They are sorted by their path below it, code point by code point; the order of
+    `places` is kept. No file is opened; a million of them take about 0.2 GB of memory.
 
     Parameters
     ----------
     places
         Paths of this machine, or URLs that fsspec knows, such as ``s3://bucket/folder``; or a single one.
     preparation
-        What is done to each.
+        How each is prepared.
 
     Raises
     ------
     InputError
         A place is missing or neither file nor folder, a folder holds no picture, or two pictures would have one name.
+
+    Examples
+    --------
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     for name in ("b.png", "a.JPG", "notes.txt"):
+    ...         Path(folder, name).touch()
+    ...     [picture.name for picture in find_pictures(folder)]
+    ['a.JPG', 'b.png']
     """
     found: list[PictureFile] = []
     named = (places,) if isinstance(places, Path | str) else places
     for place in named:
         remote = is_remote(str(place))
-        # Whole, since a worker may have been started in another folder.
+        # Absolute, since a worker may have been started in another folder.
         root = str(place) if remote else os.path.abspath(local_path(place))  # noqa: PTH100  keeps no link's target
         if not remote and not os.path.lexists(root):
             raise InputError(f"there is no {place}; name a picture or a folder of pictures")
@@ -281,7 +304,7 @@ def find_pictures(
 
 
 def _refuse_names(found: Sequence[PictureFile]) -> None:
-    """Raise an InputError that tells two pictures of one name."""
+    """Raise an InputError that names two pictures of one name, if there are any."""
     seen: dict[str, PictureFile] = {}
     for picture in found:
         if (other := seen.setdefault(picture.name, picture)) is not picture:
@@ -296,10 +319,10 @@ def _is_picture(name: str) -> bool:
 
 
 def _below_folder(folder: str, prefix: str = "") -> Iterator[str]:
-    """Give the pictures below a folder in the order of their whole paths, one folder's list in memory at a time."""
+    """Yield the pictures below a folder in the order of their paths, with one folder's list in memory at a time."""
     try:
         with os.scandir(folder) as entries:
-            # A folder sorts as its path goes on: with the slash.
+            # A folder is sorted with the slash that follows it in a path.
             listed = sorted(
                 f"{entry.name}/" if entry.is_dir(follow_symlinks=False) else entry.name
                 for entry in entries
@@ -313,7 +336,7 @@ def _below_folder(folder: str, prefix: str = "") -> Iterator[str]:
     except OSError as error:
         raise InputError(f"cannot look into {folder}: {error.strerror}; name a folder that may be read") from error
     if DESCRIPTION in listed:
-        # A data set among the pictures, the one made of them perhaps: its images are no sources.
+        # A data set among the pictures, perhaps the one that is made of them: its images are no sources.
         if prefix:
             return
         listed.remove(DESCRIPTION)
@@ -325,7 +348,7 @@ def _below_folder(folder: str, prefix: str = "") -> Iterator[str]:
 
 
 def _is_file(entry: os.DirEntry[str]) -> bool:
-    """Return whether an entry is a file or leads to one; a link that leads round in a circle does not."""
+    """Return whether an entry is a file or a link to one; a link in a circle of links is none."""
     try:
         return entry.is_file()
     except OSError as error:

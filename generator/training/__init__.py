@@ -1,1 +1,6 @@
-"""Training crops drawn in memory, with or without PyTorch."""
+"""Training crops drawn in memory; `generator.training.torch_crops`, which needs PyTorch, is not imported here."""
+
+from generator.training.crops import Batch, Crops
+from generator.training.gallery import Gallery, gallery_of, open_gallery, save_gallery
+
+__all__ = ["Batch", "Crops", "Gallery", "gallery_of", "open_gallery", "save_gallery"]

@@ -5,12 +5,13 @@ samples item i of an epoch has is a pure function of (seed, epoch, i): the words
 (i, epoch, k, 7), k = 0 picture, column, row, light; k = 1 mirror and gain; k = 2 the kernel's seed. So the items are
 the same however many workers share them.
 
-Needs no PyTorch; `CropDataset` and `CropStream`, which do, are loaded when they are first used::
+Needs no PyTorch; `torch_crops` has the data sets that do::
 
     from torch.utils.data import DataLoader
-    from generator.training.crops import CropDataset, Crops, collated
+    from generator.training import Crops, open_gallery
+    from generator.training.torch_crops import CropDataset, collated
 
-    crops = Crops(lut, open_gallery(Path("gallery")), (128, 128), length=100_000, exposure=(0.5, 2.0))
+    crops = Crops(lut, open_gallery("gallery"), (128, 128), length=100_000, exposure=(0.5, 2.0))
     for batch in DataLoader(CropDataset(crops), batch_size=64, shuffle=True, num_workers=2, collate_fn=collated):
         batch["image"]          # (64, 3, 128, 128) float32, linear camera RGB, 1 = saturation
         batch["illuminant"]     # (64, 3) float32, r + g + b = 1
@@ -20,26 +21,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
-from generator.kernels import philox
-from generator.kernels.palette import fit_picture
+from generator import philox
+from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.planar import draw_batch
 from generator.lights.lighting import Mixture
 from generator.training.recycling import Recycled
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from calibration.table.lut import Lut
     from generator.training.gallery import Gallery
-    from generator.training.torch_crops import CropDataset, CropStream, collated
 
-__all__ = ["Batch", "CropDataset", "CropStream", "Crops", "collated"]
+__all__ = ["Batch", "Crops"]
 
-_HALF = np.uint64(32)
+_HALF: Final = np.uint64(32)
+"""Bits of a random word."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +59,15 @@ class Batch:
         (N,) int64, place of each item's light in `Crops.lights`.
     pictures
         (N,) int64, place of each item's picture in the gallery.
+
+    Examples
+    --------
+    >>> from generator import open_lut, read_picture
+    >>> from generator.training import gallery_of
+    >>> crops = Crops(open_lut("lut"), gallery_of([read_picture("cat.png")]), (8, 8), lights=[3])
+    >>> batch = crops.batch([0])
+    >>> batch.lights, batch.pictures, batch.illuminants.sum(axis=1)
+    (array([0]), array([0]), array([1.], dtype=float32))
     """
 
     images: npt.NDArray[np.float32]
@@ -96,6 +108,15 @@ class Crops:
     ------
     InputError
         A number is out of range, a light is not in the table, or a picture is smaller than a crop.
+
+    Examples
+    --------
+    >>> from generator import open_lut, read_picture
+    >>> from generator.training import gallery_of
+    >>> crops = Crops(open_lut("lut"), gallery_of([read_picture("cat.png")]), (16, 24), length=100, seed=1)
+    >>> batch = crops.batch([0, 99])
+    >>> batch.images.shape, batch.images.dtype, batch.illuminants.shape
+    ((2, 3, 16, 24), dtype('float32'), (2, 3))
     """
 
     def __init__(
@@ -144,34 +165,15 @@ class Crops:
         self.threads = threads
         self._memory = Recycled()
         self._truths = (whites / whites.sum(axis=1, keepdims=True)).astype(np.float32)
-        self._prepare()
-
-    def _prepare(self) -> None:
-        """Map or make what a pickle leaves out."""
-        if all(len(mixture.lights) == 1 for mixture in self.lights):
-            self._tables = self.lut.samples
-            self._rows = np.array([mixture.lights[0] for mixture in self.lights], dtype=np.int64)
-        else:
-            self._tables = np.stack([mixture.samples(self.lut, self.seed) for mixture in self.lights])
-            self._rows = np.arange(len(self.lights))
+        self._tables, self._rows = _tables_of(lut, self.lights, seed)
         self._pictures = [
-            fit_picture(self.gallery.picture(number), self.lut.provenance)[0] for number in range(len(self.gallery))
+            replace_unfit_colours(gallery.picture(number), lut.provenance)[0] for number in range(len(gallery))
         ]
 
-    def __getstate__(self) -> dict[str, Any]:
-        made = ("_tables", "_rows", "_pictures", "_memory")
-        kept = {name: value for name, value in vars(self).items() if name not in made}
+    def __reduce__(self) -> tuple[Any, ...]:
         # The table is gigabytes; its folder is enough to map it again.
-        kept["lut"] = self.lut.folder
-        return kept
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        from calibration.table.lut import open_lut
-
-        vars(self).update(state)
-        self.lut = open_lut(state["lut"])
-        self._memory = Recycled()
-        self._prepare()
+        options = {name: getattr(self, name) for name in _OPTIONS}
+        return _reopened, (self.lut.folder, self.gallery, self.size, options)
 
     @staticmethod
     def _checked_epoch(epoch: int) -> int:
@@ -180,7 +182,7 @@ class Crops:
         return epoch
 
     def set_epoch(self, epoch: int) -> None:
-        """Make these the items of another epoch, as PyTorch's distributed samplers are told.
+        """Make these the items of another epoch, as PyTorch's distributed samplers are.
 
         Raises
         ------
@@ -242,7 +244,7 @@ class Crops:
         Raises
         ------
         IndexError
-            There is no such item, as Python's loops want to be told.
+            There is no such item; a loop over the items ends there.
         """
         if not 0 <= item < self.length:
             raise IndexError(f"item {item} of {self.length}")
@@ -251,13 +253,22 @@ class Crops:
 
 
 def _below(words: npt.NDArray[np.uint32], bound: int | npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return numbers from 0 up to bounds, from random words."""
+    """Return whole numbers (N,) int64, 0 … bound − 1, from random words (N,) uint32."""
     return (words.astype(np.uint64) * np.asarray(bound, dtype=np.uint64) >> _HALF).astype(np.int64)
 
 
-def __getattr__(name: str) -> object:
-    if name in ("CropDataset", "CropStream", "collated"):
-        from generator.training import torch_crops as torch_batches
+_OPTIONS: Final = ("length", "lights", "exposure", "flip", "seed", "epoch", "threads")
+"""Keywords of `Crops`, each kept in an attribute of its name."""
 
-        return getattr(torch_batches, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def _reopened(folder: Path, gallery: Gallery, size: tuple[int, int], options: dict[str, Any]) -> Crops:
+    from calibration.table.lut import open_lut
+
+    return Crops(open_lut(folder), gallery, size, **options)
+
+
+def _tables_of(lut: Lut, lights: Sequence[Mixture], seed: int) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.int64]]:
+    """Return tables of samples (T, 8**bits, S, 3) uint16, and for each light its row in them (N,) int64."""
+    if all(len(mixture.lights) == 1 for mixture in lights):
+        return lut.samples, np.array([mixture.lights[0] for mixture in lights], dtype=np.int64)
+    return np.stack([mixture.samples(lut, seed) for mixture in lights]), np.arange(len(lights))

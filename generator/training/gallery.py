@@ -1,8 +1,8 @@
 """Many pictures unpacked once, so that training can cut crops from them without decoding.
 
 A gallery is a folder of two files: `codes.u8`, the sRGB codes of all pictures one after another, row by row, R, G, B;
-and `gallery.json`, which says where each begins. It is memory-mapped, so workers share one copy and what is not looked
-at costs no memory.
+and `gallery.json`, with the size of each. It is memory-mapped, so workers share one copy, and pictures
+that are not read take no memory.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,8 +21,8 @@ from foundation.files import storage_error, whole_folder, write_whole
 from generator.pictures.picture import Picture
 from generator.pictures.sources import Source
 
-FORMAT = "crop.gallery"
-VERSION = 1
+FORMAT: Final = "crop.gallery"
+VERSION: Final = 1
 
 
 class _Entry(BaseModel):
@@ -50,15 +50,20 @@ class Gallery:
     Attributes
     ----------
     names
-        What each picture is called, P of them.
+        The pictures' names, P of them.
     codes
-        (N,) uint8, all pictures' codes.
+        (N,) uint8, the sRGB codes of all pictures one after another.
     sizes
         (P, 2) int64, height and width, px.
     offsets
-        (P,) int64, where each picture begins in `codes`.
+        (P,) int64, index in `codes` of each picture's first value.
     folder
-        Where it is kept; None for one in memory.
+        The gallery's folder; None for one in memory.
+
+    Examples
+    --------
+    >>> Gallery(("grey",), np.full(12, 128, np.uint8), np.array([[2, 2]]), np.array([0])).picture(0).shape
+    (2, 2, 3)
     """
 
     names: tuple[str, ...]
@@ -72,7 +77,7 @@ class Gallery:
         return len(self.names)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A worker maps the file anew rather than being sent what may be gigabytes.
+        # A worker maps the file again rather than being sent gigabytes.
         if self.folder is not None:
             return open_gallery, (self.folder,)
         return Gallery, (self.names, self.codes, self.sizes, self.offsets)
@@ -92,15 +97,21 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
     pictures
         (H, W, 3) uint8 each, sRGB codes.
     names
-        What they are called; numbers if None.
+        Their names; numbers if None.
 
     Raises
     ------
     InputError
         There is none, one is of another shape or type, or there are not as many names.
+
+    Examples
+    --------
+    >>> gallery = gallery_of([np.zeros((4, 6, 3), np.uint8), np.ones((2, 2, 3), np.uint8)], ["dark", "other"])
+    >>> len(gallery), gallery.codes.shape, gallery.picture(1).shape
+    (2, (84,), (2, 2, 3))
     """
     if not pictures:
-        raise InputError("a gallery wants pictures, none were given")
+        raise InputError("a gallery of no pictures was asked for, expected 1 or more")
     if names is not None and len(names) != len(pictures):
         raise InputError(f"{len(pictures)} pictures of a gallery have {len(names)} names, expected one each")
     for picture in pictures:
@@ -113,6 +124,7 @@ def gallery_of(pictures: Sequence[Picture], names: Sequence[str] | None = None) 
 
 
 def _offsets(sizes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return the index (P,) int64 of the first value of each picture of `sizes` (P, 2) int64."""
     return np.concatenate([[0], np.cumsum(3 * sizes.prod(axis=1))[:-1]]).astype(np.int64)
 
 
@@ -124,7 +136,7 @@ def save_gallery(
     Parameters
     ----------
     sources
-        The pictures; see `scene.find_pictures`. One that cannot be read is passed over and listed.
+        The pictures; see `pictures.sources.find_pictures`. One that cannot be read is left out and listed.
     folder
         Where the gallery is to be; must be free. It appears when it is complete.
     on_skip
@@ -138,6 +150,15 @@ def save_gallery(
         No source can be read.
     StorageError
         The disk is full or gone; nothing is left behind.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from generator import find_pictures
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     gallery = save_gallery(find_pictures("cat.png"), Path(folder) / "gallery")
+    >>> gallery.names, gallery.sizes.tolist()
+    (('cat.png',), [[40, 50]])
     """
     entries: list[_Entry] = []
     skipped: list[str] = []
@@ -172,6 +193,15 @@ def open_gallery(folder: Path | str) -> Gallery:
     ------
     FormatError
         The folder is none, or its files disagree.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from generator import find_pictures
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = save_gallery(find_pictures("cat.png"), Path(folder) / "gallery")
+    ...     open_gallery(Path(folder) / "gallery").picture(0).shape
+    (40, 50, 3)
     """
     folder = Path(folder)
     path = folder / "gallery.json"

@@ -1,8 +1,8 @@
 """Large arrays in memory that is used again: the system clears each page that a program has not had before.
 
-Clearing takes as long as half of the drawing of a training batch. An array from `Recycled.array` gives its memory back
-when it and all views of it are gone, as any other does, and the next one of its size has it; what is still looked at is
-never touched.
+Clearing takes half as long as the drawing of a training batch. An array from `Recycled.array` gives its memory back
+when it and all views of it are gone, as any other does, and the next array of its size takes it; memory to which a view
+still refers is never used again.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ import contextlib
 import mmap
 import weakref
 from collections import deque
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-KEPT = 2
-"""Pieces of memory that are kept for later: a loop lets go of one batch while it has the next."""
+KEPT: Final = 2
+"""Pieces of memory that are kept for later: a loop still refers to one batch while it gets the next."""
 
 
 class Recycled:
@@ -26,7 +27,7 @@ class Recycled:
         self._free: deque[mmap.mmap] = deque(maxlen=KEPT)
 
     def array(self, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
-        """Return an array of any content.
+        """Return an array float32 of any content.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Training batches as PyTorch takes them; the only file that imports it, and nobody imports this one unasked."""
+"""Training batches as PyTorch takes them: the only module that imports it, and no other imports this one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from generator.training.crops import Batch, Crops
 
 
 class TorchMissingError(InputError, ImportError):
-    """PyTorch is not installed: one sentence for who runs a command, an ImportError for who asks by one."""
+    """PyTorch is not installed.
+
+    An InputError, so that a command reports it in one sentence, and an ImportError for callers that can do without.
+    """
 
 
 try:
@@ -22,7 +25,8 @@ except ImportError as error:
     raise TorchMissingError("training batches for PyTorch need it: pip install 'croplab[torch]'") from error
 
 Item = dict[str, Any]
-"""``image`` (3, height, width) float32 and ``illuminant`` (3,) float32, r + g + b = 1; of a batch with N before."""
+"""``image`` (3, height, width) float32, linear camera RGB, 1 = saturation, and ``illuminant`` (3,) float32,
+r + g + b = 1; a batch has N as its first dimension."""
 
 
 def _tensors(batch: Batch) -> Item:
@@ -48,13 +52,13 @@ class CropDataset(Dataset[Item]):
             raise IndexError(f"item {item} of {len(self)}")
         return {name: tensor[0] for name, tensor in _tensors(self.crops.batch([item])).items()}
 
-    def __getitems__(self, items: Sequence[int]) -> _Made:
-        """Return a batch of items, as a sequence that `collated` takes apart for nothing."""
-        return _Made(_tensors(self.crops.batch(items)))
+    def __getitems__(self, items: Sequence[int]) -> _WholeBatch:
+        """Return a batch of items as one sequence, which `collated` returns without a copy."""
+        return _WholeBatch(_tensors(self.crops.batch(items)))
 
 
-class _Made(Sequence[Item]):
-    """A batch that looks like a list of its items, which is what a loader expects."""
+class _WholeBatch(Sequence[Item]):
+    """A batch as the sequence of its items, which is what a loader expects."""
 
     def __init__(self, whole: Item) -> None:
         self.whole = whole
@@ -68,11 +72,11 @@ class _Made(Sequence[Item]):
         return {name: tensor[at] for name, tensor in self.whole.items()}
 
 
-def collated(made: Any) -> Item:
+def collated(items: Any) -> Item:
     """Return the batch that `CropDataset` made; give it to a loader as ``collate_fn``."""
-    if isinstance(made, _Made):
-        return made.whole
-    return torch.utils.data.default_collate(made)
+    if isinstance(items, _WholeBatch):
+        return items.whole
+    return torch.utils.data.default_collate(items)
 
 
 class CropStream(IterableDataset[Item]):
@@ -104,7 +108,7 @@ class CropStream(IterableDataset[Item]):
         return -(-len(self.crops) // self.items)
 
     def __iter__(self) -> Iterator[Item]:
-        """Give this worker's batches."""
+        """Yield the batches of this worker."""
         worker = get_worker_info()
         first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
         for number in range(first, len(self), step):

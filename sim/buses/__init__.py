@@ -1,1 +1,1 @@
-"""The simulated ends of a camera's cables: USB, USB/IP, PTP/IP, memory."""
+"""The simulated ends of cables, USB, USB/IP, PTP/IP, serial and memory, and what goes wrong on them."""

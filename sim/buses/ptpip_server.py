@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from drivers.links.link import Link
 from drivers.links.tcp import LOOPBACK, TcpServer
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.messages import Request, Response
+from drivers.ptp.messages import PtpRequest, PtpResponse
 from drivers.ptp.ptpip import (
     PORT,
     Cancel,
@@ -45,7 +45,7 @@ from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.responder import Answer, NoAnswer, Responder
 
 GUID = bytes(range(16))
-"""What a simulated device calls itself unless told otherwise."""
+"""What a simulated device calls itself unless another is given."""
 DATA_PIECE = 256 * 1024
 """Bytes of data in a packet to the initiator; what fits goes out in one EndData."""
 
@@ -64,7 +64,7 @@ def serve_ptpip(
 ) -> TcpServer:
     """Put a device on a TCP port; 0 picks a free one.
 
-    Use the result in a ``with`` block; its `address` tells host and port, both connections go there.
+    Use the result in a ``with`` block; its `address` is host and port, both connections go there.
 
     Raises
     ------
@@ -159,18 +159,18 @@ class PtpIpService:
                 case _:
                     pass
 
-    def _operate(self, initiator: _Initiator, packets: _Incoming, request: Request, sends_data: bool) -> None:
+    def _operate(self, initiator: _Initiator, packets: _Incoming, request: PtpRequest, sends_data: bool) -> None:
         initiator.forget_cancellation()
         data: bytes | None = None
         if sends_data:
             data = _collect(packets)
             if data is None:
                 self._responder.cancelled(request.transaction)
-                response = Response(ResponseCode.TRANSACTION_CANCELLED, request.transaction)
+                response = PtpResponse(ResponseCode.TRANSACTION_CANCELLED, request.transaction)
                 _send(initiator.command, response)
                 return
         if data is None and self._responder.takes_data(request):
-            answer = Answer(Response(ResponseCode.GENERAL_ERROR, request.transaction))
+            answer = Answer(PtpResponse(ResponseCode.GENERAL_ERROR, request.transaction))
         else:
             try:
                 answer = self._responder.answer(request, data)
@@ -182,7 +182,7 @@ class PtpIpService:
                 if initiator.gave_up(request.transaction):
                     _send(initiator.command, EndData(request.transaction))
                     self._responder.cancelled(request.transaction)
-                    response = Response(ResponseCode.TRANSACTION_CANCELLED, request.transaction)
+                    response = PtpResponse(ResponseCode.TRANSACTION_CANCELLED, request.transaction)
                     _send(initiator.command, response)
                     return
                 initiator.command.write(packet, _PATIENCE_S)

@@ -9,14 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 
 
 @dataclass(frozen=True)
 class Answer:
     """A response, and the data phase before it; None where there is none (an empty one is b"")."""
 
-    response: Response
+    response: PtpResponse
     data: bytes | None = None
 
 
@@ -27,11 +27,11 @@ class NoAnswer(Exception):
 class Responder(Protocol):
     """A device that answers one request at a time."""
 
-    def takes_data(self, request: Request) -> bool:
+    def takes_data(self, request: PtpRequest) -> bool:
         """Return whether the initiator sends a data phase with this operation."""
         ...
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Carry out a request; `data` is the initiator's data phase.
 
         Raises
@@ -41,7 +41,7 @@ class Responder(Protocol):
         """
         ...
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come up since the last call."""
         ...
 

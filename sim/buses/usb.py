@@ -84,7 +84,7 @@ _ENDPOINT_FIELDS = (
 )
 
 
-class UsbDevice(Protocol):
+class PluggedDevice(Protocol):
     """What the bus asks of a device; `sim.buses.usb_device.PtpUsbDevice` says what each method does."""
 
     def device_descriptor(self) -> bytes: ...  # noqa: D102
@@ -106,7 +106,7 @@ class UsbDevice(Protocol):
 class Place:
     """Where a device is plugged in, and since when: two places of one device differ in their address."""
 
-    device: UsbDevice
+    device: PluggedDevice
     port: int
     address: int
 
@@ -126,45 +126,45 @@ class SimulatedBus(IBackend):
         self._places: list[Place] = []
         self._addresses = 1
         self._claims: dict[Place, Handle] = {}
-        self._held: set[UsbDevice] = set()
-        self._locked: set[UsbDevice] = set()
-        self._kernel: set[UsbDevice] = set()
+        self._held: set[PluggedDevice] = set()
+        self._locked: set[PluggedDevice] = set()
+        self._kernel: set[PluggedDevice] = set()
 
-    def plug(self, device: UsbDevice, port: int = 1) -> None:
+    def plug(self, device: PluggedDevice, port: int = 1) -> None:
         """Plug a device in."""
         self._addresses += 1
         self._places.append(Place(device, port, self._addresses))
 
-    def unplug(self, device: UsbDevice) -> None:
+    def unplug(self, device: PluggedDevice) -> None:
         """Pull a device out; does nothing if it is not plugged in."""
         for place in [place for place in self._places if place.device is device]:
             self._places.remove(place)
             self._claims.pop(place, None)
             device.unplugged()
 
-    def replug(self, device: UsbDevice) -> None:
+    def replug(self, device: PluggedDevice) -> None:
         """Pull a device out and plug it in again at its port, as it does itself when it restarts."""
         port = next((place.port for place in self._places if place.device is device), 1)
         self.unplug(device)
         self.plug(device, port)
 
-    def hold(self, device: UsbDevice, held: bool = True) -> None:
+    def hold(self, device: PluggedDevice, held: bool = True) -> None:
         """Have another program hold the device's interface, or let go of it."""
         (self._held.add if held else self._held.discard)(device)
 
-    def lock(self, device: UsbDevice, locked: bool = True) -> None:
+    def lock(self, device: PluggedDevice, locked: bool = True) -> None:
         """Take away the permission to open the device, or give it."""
         (self._locked.add if locked else self._locked.discard)(device)
 
-    def bind_kernel_driver(self, device: UsbDevice) -> None:
+    def bind_kernel_driver(self, device: PluggedDevice) -> None:
         """Have the system's own driver sit on the interface."""
         self._kernel.add(device)
 
-    def kernel_driver_sits_on(self, device: UsbDevice) -> bool:
+    def kernel_driver_sits_on(self, device: PluggedDevice) -> bool:
         """Return whether the system's own driver sits on the interface."""
         return device in self._kernel
 
-    def is_claimed(self, device: UsbDevice) -> bool:
+    def is_claimed(self, device: PluggedDevice) -> bool:
         """Return whether the interface is claimed on this bus."""
         return any(place.device is device for place in self._claims)
 

@@ -18,12 +18,12 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from drivers.links.pipes import STILL_IMAGE_CLASS
 from drivers.ptp.codes import VENDOR_CANON_USB, ResponseCode
 from drivers.ptp.container import (
     HIGH_SPEED_PACKET,
-    INTERFACE_CLASS,
     ContainerReader,
     ControlRequest,
     DataPiece,
@@ -35,7 +35,7 @@ from drivers.ptp.container import (
     encode_data_header,
     ends_with_empty_packet,
 )
-from drivers.ptp.messages import Request
+from drivers.ptp.messages import PtpRequest
 from foundation.errors import ProtocolError
 from sim.buses.responder import NoAnswer, Responder
 
@@ -86,6 +86,30 @@ class Setup:
         return cls(*struct.unpack("<BBHHH", data))
 
 
+@dataclass
+class _Exchange:
+    """What a device remembers of its pipes, until the host or a pulled cable makes it start over.
+
+    Attributes
+    ----------
+    reader
+        Cuts what the host sends into containers.
+    request, payload
+        The operation whose data phase comes in, and as much of it as has come.
+    complete
+        An operation that is whole but for the end of its transfer, with its data phase.
+    outgoing, events
+        Transfers to the host on the bulk and on the interrupt pipe.
+    """
+
+    reader: ContainerReader = field(default_factory=lambda: ContainerReader(PACKET))
+    request: PtpRequest | None = None
+    payload: bytearray = field(default_factory=bytearray)
+    complete: tuple[PtpRequest, bytes | None] | None = None
+    outgoing: deque[memoryview] = field(default_factory=deque[memoryview])
+    events: deque[memoryview] = field(default_factory=deque[memoryview])
+
+
 class PtpUsbDevice:
     """A still image device of one configuration and one interface, at high speed."""
 
@@ -94,7 +118,7 @@ class PtpUsbDevice:
         self._responder = responder
         self._halted: set[int] = set()
         self._configuration = 1
-        self._start_over()
+        self._exchange = _Exchange()
 
     def device_descriptor(self) -> bytes:
         """Return the 18 bytes that name the device."""
@@ -105,7 +129,7 @@ class PtpUsbDevice:
 
     def configuration_descriptor(self) -> bytes:
         """Return the descriptors of the configuration, its interface and the three endpoints."""
-        interface = struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 3, *INTERFACE_CLASS, 0)
+        interface = struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 3, *STILL_IMAGE_CLASS, 0)
         endpoints = (
             struct.pack("<BBBBHB", 7, 5, BULK_IN, _BULK, PACKET, 0),
             struct.pack("<BBBBHB", 7, 5, BULK_OUT, _BULK, PACKET, 0),
@@ -135,27 +159,28 @@ class PtpUsbDevice:
         """Take packets from the host: `data` in full packets, the last perhaps short or, for b"", empty."""
         if BULK_OUT in self._halted:
             raise Stalled
+        exchange = self._exchange
         try:
-            for message in self._reader.feed(data):
+            for message in exchange.reader.feed(data):
                 self._take(message)
         except ProtocolError as error:
             self._halted |= {BULK_OUT, BULK_IN}
             raise Stalled from error
-        self._transfer_open = bool(data) and len(data) % PACKET == 0
-        if self._complete is not None and not self._transfer_open:
-            request, payload = self._complete
-            self._complete = None
+        unfinished = bool(data) and len(data) % PACKET == 0
+        if exchange.complete is not None and not unfinished:
+            request, payload = exchange.complete
+            exchange.complete = None
             self._answer(request, payload)
 
     def bulk_in(self, limit: int) -> bytes | None:
         """Return up to `limit` bytes of a transfer to the host, None where there is nothing yet."""
-        return self._packets(BULK_IN, self._outgoing, PACKET, limit)
+        return self._packets(BULK_IN, self._exchange.outgoing, PACKET, limit)
 
     def interrupt_in(self, limit: int) -> bytes | None:
         """Return up to `limit` bytes of events, None where there are none."""
         for event in self._responder.events():
-            self._events.append(memoryview(encode(event)))
-        return self._packets(INTERRUPT_IN, self._events, INTERRUPT_PACKET, limit)
+            self._exchange.events.append(memoryview(encode(event)))
+        return self._packets(INTERRUPT_IN, self._exchange.events, INTERRUPT_PACKET, limit)
 
     def halt(self, endpoint: int) -> None:
         """Stall a pipe until the host clears it."""
@@ -163,37 +188,29 @@ class PtpUsbDevice:
 
     def unplugged(self) -> None:
         """Forget everything: the cable was pulled, or the bus was reset."""
-        self._start_over()
+        self._exchange = _Exchange()
         self._halted.clear()
         self._responder.unplugged()
 
-    def _start_over(self) -> None:
-        self._reader = ContainerReader(PACKET)
-        self._request: Request | None = None
-        self._payload = bytearray()
-        self._complete: tuple[Request, bytes | None] | None = None
-        self._transfer_open = False
-        self._outgoing: deque[memoryview] = deque()
-        self._events: deque[memoryview] = deque()
-
     def _take(self, message: Message) -> None:
+        exchange = self._exchange
         match message:
-            case Request() if self._responder.takes_data(message):
-                self._request = message
-                self._payload.clear()
-            case Request():
-                self._complete = (message, None)
-            case DataStart() if self._request is not None:
+            case PtpRequest() if self._responder.takes_data(message):
+                exchange.request = message
+                exchange.payload.clear()
+            case PtpRequest():
+                exchange.complete = (message, None)
+            case DataStart() if exchange.request is not None:
                 pass
-            case DataPiece(piece, last) if self._request is not None:
-                self._payload += piece
+            case DataPiece(piece, last) if exchange.request is not None:
+                exchange.payload += piece
                 if last:
-                    self._complete = (self._request, bytes(self._payload))
-                    self._request = None
+                    exchange.complete = (exchange.request, bytes(exchange.payload))
+                    exchange.request = None
             case _:
                 raise ProtocolError(f"{type(message).__name__} was not due")
 
-    def _answer(self, request: Request, payload: bytes | None) -> None:
+    def _answer(self, request: PtpRequest, payload: bytes | None) -> None:
         try:
             answer = self._responder.answer(request, payload)
         except NoAnswer:
@@ -204,9 +221,9 @@ class PtpUsbDevice:
         self._send(encode(answer.response))
 
     def _send(self, transfer: bytes) -> None:
-        self._outgoing.append(memoryview(transfer))
+        self._exchange.outgoing.append(memoryview(transfer))
         if ends_with_empty_packet(len(transfer), PACKET):
-            self._outgoing.append(memoryview(b""))
+            self._exchange.outgoing.append(memoryview(b""))
 
     def _packets(self, endpoint: int, queue: deque[memoryview], packet: int, limit: int) -> bytes | None:
         """Return what one transfer of the host takes from `queue`: until a packet that is not full, or `limit`."""
@@ -278,7 +295,7 @@ class PtpUsbDevice:
                     transaction = decode_cancel(data)
                 except ProtocolError as error:
                     raise Stalled from error
-                self._start_over()
+                self._exchange = _Exchange()
                 self._responder.cancelled(transaction)
                 return b""
             case ControlRequest.RESET_DEVICE:

@@ -49,7 +49,7 @@ _EREMOTEIO = 121
 def serve_usbip(devices: Sequence[PtpUsbDevice], port: int = PORT, *, host: str = LOOPBACK) -> TcpServer:
     """Lend devices under the bus ids 1-1, 1-2, …; port 0 picks a free one.
 
-    Use the result in a ``with`` block; its `address` tells host and port.
+    Use the result in a ``with`` block; its `address` is host and port.
 
     Raises
     ------

@@ -20,13 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
-from drivers.tiff.reading import CFA
+from drivers.tiff.tags import CFA, D65, TiffTag
 from drivers.tiff.writing import Kind, Tags, head, rationals, text
-from sim.camera.sensors import Body
+from sim.world.sensors import Body
 
 SOFTWARE = "CroP simulated camera"
-
-_D65 = 21
 
 # dcraw 9.28 `adobe_coeff`: XYZ to camera RGB under D65, 1/10000; converters make a viewable picture with it.
 _COLOUR_MATRICES = {
@@ -73,45 +71,45 @@ def write_dng(
     rows, columns = body.sensor
     stamp = text(taken_at.astimezone(UTC).strftime("%Y:%m:%d %H:%M:%S"))
     exif: Tags = {
-        33434: rationals(settings.shutter_s),  # ExposureTime
-        33437: rationals(settings.aperture),  # FNumber
-        34855: (Kind.SHORT, [settings.iso]),  # PhotographicSensitivity
-        36864: (Kind.UNDEFINED, b"0232"),  # ExifVersion
-        36867: stamp,  # DateTimeOriginal
-        36881: text("+00:00"),  # OffsetTimeOriginal
-        42033: text(serial),  # BodySerialNumber
+        TiffTag.EXPOSURE_TIME: rationals(settings.shutter_s),
+        TiffTag.F_NUMBER: rationals(settings.aperture),
+        TiffTag.PHOTOGRAPHIC_SENSITIVITY: (Kind.SHORT, [settings.iso]),
+        TiffTag.EXIF_VERSION: (Kind.UNDEFINED, b"0232"),
+        TiffTag.DATE_TIME_ORIGINAL: stamp,
+        TiffTag.OFFSET_TIME_ORIGINAL: text("+00:00"),
+        TiffTag.BODY_SERIAL_NUMBER: text(serial),
     }
     matrix = _COLOUR_MATRICES[body.sensitivities]
     main: Tags = {
-        254: (Kind.LONG, [0]),  # NewSubfileType: the picture itself
-        256: (Kind.LONG, [columns]),
-        257: (Kind.LONG, [rows]),
-        258: (Kind.SHORT, [16]),  # BitsPerSample
-        259: (Kind.SHORT, [1]),  # Compression: none
-        262: (Kind.SHORT, [CFA]),
-        271: text(body.maker),
-        272: text(body.model),
-        274: (Kind.SHORT, [1]),  # Orientation: as it lies
-        277: (Kind.SHORT, [1]),  # SamplesPerPixel
-        278: (Kind.LONG, [rows]),  # RowsPerStrip
-        284: (Kind.SHORT, [1]),  # PlanarConfiguration
-        305: text(SOFTWARE),
-        306: stamp,
-        33421: (Kind.SHORT, [2, 2]),  # CFARepeatPatternDim
-        33422: (Kind.BYTE, ["RGB".index(letter) for letter in body.pattern]),  # CFAPattern
-        50706: (Kind.BYTE, [1, 4, 0, 0]),  # DNGVersion
-        50707: (Kind.BYTE, [1, 1, 0, 0]),  # DNGBackwardVersion
-        50708: text(body.model),  # UniqueCameraModel
-        50710: (Kind.BYTE, [0, 1, 2]),  # CFAPlaneColor
-        50711: (Kind.SHORT, [1]),  # CFALayout: rectangular
-        50714: (Kind.SHORT, [body.black]),  # BlackLevel
-        50717: (Kind.SHORT, [body.saturation]),  # WhiteLevel
-        50721: (Kind.SRATIONAL, [part for entry in matrix for part in (entry, 10000)]),  # ColorMatrix1
-        50728: rationals(*_neutral(matrix)),  # AsShotNeutral
-        50735: text(serial),  # CameraSerialNumber
-        50778: (Kind.SHORT, [_D65]),  # CalibrationIlluminant1
-        50829: (Kind.LONG, _edges(*body.visible)),  # ActiveArea
-        50830: (Kind.LONG, [edge for area in body.masked for edge in _edges(*area)]),  # MaskedAreas
+        TiffTag.NEW_SUBFILE_TYPE: (Kind.LONG, [0]),  # the picture itself
+        TiffTag.IMAGE_WIDTH: (Kind.LONG, [columns]),
+        TiffTag.IMAGE_LENGTH: (Kind.LONG, [rows]),
+        TiffTag.BITS_PER_SAMPLE: (Kind.SHORT, [16]),
+        TiffTag.COMPRESSION: (Kind.SHORT, [1]),  # none
+        TiffTag.PHOTOMETRIC_INTERPRETATION: (Kind.SHORT, [CFA]),
+        TiffTag.MAKE: text(body.maker),
+        TiffTag.MODEL: text(body.model),
+        TiffTag.ORIENTATION: (Kind.SHORT, [1]),  # as it lies
+        TiffTag.SAMPLES_PER_PIXEL: (Kind.SHORT, [1]),
+        TiffTag.ROWS_PER_STRIP: (Kind.LONG, [rows]),
+        TiffTag.PLANAR_CONFIGURATION: (Kind.SHORT, [1]),
+        TiffTag.SOFTWARE: text(SOFTWARE),
+        TiffTag.DATE_TIME: stamp,
+        TiffTag.CFA_REPEAT_PATTERN_DIM: (Kind.SHORT, [2, 2]),
+        TiffTag.CFA_PATTERN: (Kind.BYTE, ["RGB".index(letter) for letter in body.pattern]),
+        TiffTag.DNG_VERSION: (Kind.BYTE, [1, 4, 0, 0]),
+        TiffTag.DNG_BACKWARD_VERSION: (Kind.BYTE, [1, 1, 0, 0]),
+        TiffTag.UNIQUE_CAMERA_MODEL: text(body.model),
+        TiffTag.CFA_PLANE_COLOR: (Kind.BYTE, [0, 1, 2]),
+        TiffTag.CFA_LAYOUT: (Kind.SHORT, [1]),  # rectangular
+        TiffTag.BLACK_LEVEL: (Kind.SHORT, [body.black]),
+        TiffTag.WHITE_LEVEL: (Kind.SHORT, [body.saturation]),
+        TiffTag.COLOR_MATRIX_1: (Kind.SRATIONAL, [part for entry in matrix for part in (entry, 10000)]),
+        TiffTag.AS_SHOT_NEUTRAL: rationals(*_neutral(matrix)),
+        TiffTag.CAMERA_SERIAL_NUMBER: text(serial),
+        TiffTag.CALIBRATION_ILLUMINANT_1: (Kind.SHORT, [D65]),
+        TiffTag.ACTIVE_AREA: (Kind.LONG, _edges(*body.visible)),
+        TiffTag.MASKED_AREAS: (Kind.LONG, [edge for area in body.masked for edge in _edges(*area)]),
     }
     stream.write(head(main, counts.nbytes, exif))
     stream.write(np.ascontiguousarray(counts, dtype="<u2").data)

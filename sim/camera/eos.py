@@ -24,16 +24,17 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import replace
 
-from drivers.canon.records import ImageFormat, Notice, number_of, number_value
+from drivers.canon.records import Notice
+from drivers.canon.values import ImageFormat, number_of, number_value
 from drivers.ptp.codes import AeMode, EosEvent, FocusMode, Operation, Property, ReleaseButton, ResponseCode
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from foundation.clock import Clock
 from foundation.errors import LinkClosed
 from sim.buses.responder import Answer
-from sim.camera.eos_bodies import EosBody
+from sim.camera.eos_model import EosModel
 from sim.camera.eos_release import EosRelease
 from sim.camera.eos_settings import EosSettings
-from sim.camera.eos_state import CARD, Arguments, Declined, Reply
+from sim.camera.eos_state import CARD, Arguments, OperationRefusal, OperationResult
 from sim.camera.film import Film
 
 _SHUTDOWN_WARNING_S = 10.0
@@ -67,14 +68,14 @@ class SimulatedEos(EosSettings, EosRelease):
     forgetful
         Whether frames in the camera's memory are lost with the session. Assumed to be kept: users report memories
         that stay full after a host was killed.
-    darkroom
+    executor
         Where the film is developed. None does it while the release is answered, and is what tests want; a camera on
         a real cable hands in an executor of one thread, so that a large frame does not hold up the answers.
     """
 
     def __init__(
         self,
-        body: EosBody,
+        body: EosModel,
         film: Film,
         clock: Clock,
         *,
@@ -85,7 +86,7 @@ class SimulatedEos(EosSettings, EosRelease):
         shutter_count: int = 5000,
         without: Iterable[int] = (),
         forgetful: bool = False,
-        darkroom: Executor | None = None,
+        executor: Executor | None = None,
     ) -> None:
         super().__init__(
             body,
@@ -97,14 +98,14 @@ class SimulatedEos(EosSettings, EosRelease):
             battery=battery,
             shutter_count=shutter_count,
             forgetful=forgetful,
-            darkroom=darkroom,
+            executor=executor,
         )
         self._guard = threading.RLock()
         self._operations = self._handlers(frozenset(without))
 
     # The cable.
 
-    def takes_data(self, request: Request) -> bool:
+    def takes_data(self, request: PtpRequest) -> bool:
         """Return whether the initiator sends a data phase with this operation."""
         return request.code in (
             Operation.SET_DEVICE_PROP_VALUE,
@@ -113,7 +114,7 @@ class SimulatedEos(EosSettings, EosRelease):
             Operation.SEND_OBJECT,
         )
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Carry out a request.
 
         Raises
@@ -127,12 +128,12 @@ class SimulatedEos(EosSettings, EosRelease):
                 raise LinkClosed(f"the simulated {self.body.model} has switched itself off; wake it up")
             try:
                 reply = self._carry_out(request, data)
-            except Declined as no:
-                return Answer(Response(no.code, request.transaction, no.parameters))
-            return Answer(Response(ResponseCode.OK, request.transaction, reply.parameters), reply.data)
+            except OperationRefusal as no:
+                return Answer(PtpResponse(no.code, request.transaction, no.parameters))
+            return Answer(PtpResponse(ResponseCode.OK, request.transaction, reply.parameters), reply.data)
 
-    def events(self) -> tuple[Event, ...]:
-        """Return hints that GetEvent has something to tell, one for a queue that was empty."""
+    def events(self) -> tuple[PtpEvent, ...]:
+        """Return hints that GetEvent has something to report, one for a queue that was empty."""
         with self._guard:
             self._move()
             hints, self._hints = tuple(self._hints), []
@@ -178,7 +179,7 @@ class SimulatedEos(EosSettings, EosRelease):
             self._renew_exposure_lists()
 
     def switch_focus(self, automatic: bool, finds: bool = True) -> None:
-        """Move the lens's switch to AF or MF; `finds` tells whether AF will find anything to focus on."""
+        """Move the lens's switch to AF or MF; `finds` says whether AF will find anything to focus on."""
         with self._guard:
             self._move()
             self._finds_focus = finds
@@ -193,7 +194,7 @@ class SimulatedEos(EosSettings, EosRelease):
             if Property.EOS_MIRROR_UP_SETTING in self._properties:
                 self._change(Property.EOS_MIRROR_UP_SETTING, number_value(int(on)))
             else:
-                self._tell(Property.EOS_CUSTOM_FUNCTIONS)
+                self._report(Property.EOS_CUSTOM_FUNCTIONS)
 
     def set_menu(self, code: int, value: int | ImageFormat) -> None:
         """Set a property by the camera's own menu, which no list restricts."""
@@ -243,13 +244,13 @@ class SimulatedEos(EosSettings, EosRelease):
 
     # Operations.
 
-    def _carry_out(self, request: Request, data: bytes | None) -> Reply:
+    def _carry_out(self, request: PtpRequest, data: bytes | None) -> OperationResult:
         operation = self._operations.get(request.code)
         if operation is None:
-            raise Declined(ResponseCode.OPERATION_NOT_SUPPORTED)
+            raise OperationRefusal(ResponseCode.OPERATION_NOT_SUPPORTED)
         if request.code not in (Operation.GET_DEVICE_INFO, Operation.OPEN_SESSION):
             if not self._session:
-                raise Declined(ResponseCode.SESSION_NOT_OPEN)
+                raise OperationRefusal(ResponseCode.SESSION_NOT_OPEN)
             self._check_transaction(request.transaction)
         elif self._session and request.code == Operation.GET_DEVICE_INFO and request.transaction:
             self._check_transaction(request.transaction)
@@ -260,13 +261,13 @@ class SimulatedEos(EosSettings, EosRelease):
 
     def _check_transaction(self, transaction: int) -> None:
         """Refuse a number that is none or was used: one may be skipped, for a request can be lost on its way."""
-        ahead = (transaction - self._last_transaction) & 0xFFFFFFFF
-        if transaction in (0, 0xFFFFFFFF) or not 0 < ahead < 1 << 31:
-            raise Declined(ResponseCode.INVALID_TRANSACTION_ID)
+        advance = (transaction - self._last_transaction) & 0xFFFFFFFF
+        if transaction in (0, 0xFFFFFFFF) or not 0 < advance < 1 << 31:
+            raise OperationRefusal(ResponseCode.INVALID_TRANSACTION_ID)
         self._last_transaction = transaction
 
-    def _handlers(self, without: frozenset[int]) -> dict[int, Callable[[Arguments], Reply]]:
-        operations: dict[int, Callable[[Arguments], Reply]] = {
+    def _handlers(self, without: frozenset[int]) -> dict[int, Callable[[Arguments], OperationResult]]:
+        operations: dict[int, Callable[[Arguments], OperationResult]] = {
             Operation.GET_DEVICE_INFO: self._get_device_info,
             Operation.OPEN_SESSION: self._open_session,
             Operation.CLOSE_SESSION: self._close_session,
@@ -287,12 +288,12 @@ class SimulatedEos(EosSettings, EosRelease):
             Operation.EOS_GET_OBJECT: self._get_object,
             Operation.EOS_DELETE_OBJECT: self._delete_object,
             Operation.EOS_GET_PARTIAL_OBJECT: self._get_partial_object,
-            Operation.EOS_GET_DEVICE_INFO_EX: lambda _: Reply(self.body.info_ex.encode()),
+            Operation.EOS_GET_DEVICE_INFO_EX: lambda _: OperationResult(self.body.info_ex.encode()),
             Operation.EOS_GET_OBJECT_INFO_EX: self._get_object_info_ex,
             Operation.EOS_REMOTE_RELEASE: self._remote_release,
             Operation.EOS_SET_DEVICE_PROP_VALUE_EX: self._set_device_prop_value_ex,
             Operation.EOS_REQUEST_DEVICE_PROP_VALUE: self._request_device_prop_value,
-            Operation.EOS_GET_REMOTE_MODE: lambda _: Reply(parameters=(self._remote_mode,)),
+            Operation.EOS_GET_REMOTE_MODE: lambda _: OperationResult(parameters=(self._remote_mode,)),
             Operation.EOS_SET_REMOTE_MODE: self._set_remote_mode,
             Operation.EOS_SET_EVENT_MODE: self._set_event_mode,
             Operation.EOS_GET_EVENT: self._get_event,
@@ -300,11 +301,11 @@ class SimulatedEos(EosSettings, EosRelease):
             Operation.EOS_CANCEL_TRANSFER: self._transfer_complete,
             Operation.EOS_RESET_TRANSFER: self._reset_transfer,
             Operation.EOS_PC_HDD_CAPACITY: self._pc_hdd_capacity,
-            Operation.EOS_SET_UI_LOCK: lambda _: Reply(),
-            Operation.EOS_RESET_UI_LOCK: lambda _: Reply(),
-            Operation.EOS_KEEP_DEVICE_ON: lambda _: Reply(),
+            Operation.EOS_SET_UI_LOCK: lambda _: OperationResult(),
+            Operation.EOS_RESET_UI_LOCK: lambda _: OperationResult(),
+            Operation.EOS_KEEP_DEVICE_ON: lambda _: OperationResult(),
             Operation.EOS_AF_CANCEL: self._cancel_focus,
-            Operation.EOS_RESET_MIRROR_LOCKUP_STATE: lambda _: Reply(),
+            Operation.EOS_RESET_MIRROR_LOCKUP_STATE: lambda _: OperationResult(),
             Operation.EOS_REMOTE_RELEASE_ON: self._remote_release_on,
             Operation.EOS_REMOTE_RELEASE_OFF: self._remote_release_off,
         }
@@ -312,24 +313,24 @@ class SimulatedEos(EosSettings, EosRelease):
 
     # Device and session.
 
-    def _get_device_info(self, _: Arguments) -> Reply:
+    def _get_device_info(self, _: Arguments) -> OperationResult:
         known = tuple(code for code in self.body.info.operations if code in self._operations)
         digits = hashlib.md5(self.serial.encode(), usedforsecurity=False).hexdigest()
-        return Reply(replace(self.body.info, operations=known, serial_number=digits).encode())
+        return OperationResult(replace(self.body.info, operations=known, serial_number=digits).encode())
 
-    def _open_session(self, arguments: Arguments) -> Reply:
+    def _open_session(self, arguments: Arguments) -> OperationResult:
         if not arguments.one:
-            raise Declined(ResponseCode.INVALID_PARAMETER)
+            raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
         if self._session:
-            raise Declined(ResponseCode.SESSION_ALREADY_OPEN, self._session)
+            raise OperationRefusal(ResponseCode.SESSION_ALREADY_OPEN, self._session)
         self._session = arguments.one
         self._last_transaction = 0
         self._touch()
-        return Reply()
+        return OperationResult()
 
-    def _close_session(self, _: Arguments) -> Reply:
+    def _close_session(self, _: Arguments) -> OperationResult:
         self._end_session()
-        return Reply()
+        return OperationResult()
 
     def _end_session(self) -> None:
         self._session = 0
@@ -344,27 +345,27 @@ class SimulatedEos(EosSettings, EosRelease):
         self._let_go(ReleaseButton.HALF_AND_FULL)
         self._renew_destinations()
 
-    def _set_remote_mode(self, arguments: Arguments) -> Reply:
+    def _set_remote_mode(self, arguments: Arguments) -> OperationResult:
         self._remote_mode = arguments.one
         if not self._remote_mode:
             self._let_go(ReleaseButton.HALF_AND_FULL)
-        return Reply()
+        return OperationResult()
 
-    def _set_event_mode(self, arguments: Arguments) -> Reply:
+    def _set_event_mode(self, arguments: Arguments) -> OperationResult:
         self._event_mode = arguments.one
         self._queue.clear()
         if self._event_mode:
             self._tell_everything()
-        return Reply()
+        return OperationResult()
 
     def _tell_everything(self) -> None:
         for code, known in self._properties.items():
-            if known.told:
-                self._tell(code)
+            if known.reported:
+                self._report(code)
         if self._card is not None:
             self._record(Notice(EosEvent.CTG_INFO_CHECK_COMPLETE, CARD))
         for code in self._properties:
-            self._tell_list(code)
+            self._report_list(code)
         # Assumed: a frame that nobody fetched is offered to the next who listens.
         for item in self._memory.values():
             self._offer_transfer(item)

@@ -3,10 +3,8 @@
 A body is a table of facts, without behaviour. Nobody has published a recording of an EOS 550D or a 6D Mark II on the
 wire, so that much is borrowed from the one body that was recorded, an EOS 60D; each table says what. The laws:
 
-- `operations` of the device info are those that `sim.camera.eos` answers, in the 60D's order, and no others: a real
-  body has more (uploads, live view, formatting).
-- A property is told in the order in which the 60D tells it; a value of None has a list record but is told on request
-  only, as the 60D has it.
+- Properties stand in the order in which the 60D sends them; one whose value is None has a list record, but its value
+  is sent on request only, as by the 60D.
 
 Sources: a recorded EOS 60D (firmware 1.1.0); the settings of an EOS 550D (firmware 1.0.9) and a 6D Mark II (1.0.2) as
 users of libgphoto2 have listed them; battery and burst figures of Canon's specifications.
@@ -14,194 +12,38 @@ users of libgphoto2 have listed them; battery and burst figures of Canon's speci
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from types import MappingProxyType
 
 from drivers.canon import apex
-from drivers.canon.records import RAW_ONLY, DeviceInfoEx, ImageFile, ImageFormat, number_value, text_value
+from drivers.canon.values import RAW_ONLY, ImageFile, ImageFormat, number_value, text_value
 from drivers.ptp.codes import (
     VENDOR_CANON_USB,
     AeMode,
     CaptureDestination,
     DriveMode,
-    EosEvent,
-    EventCode,
     FocusMode,
     ObjectFormat,
-    Operation,
     Property,
     WhiteBalance,
 )
 from drivers.ptp.datasets import DeviceInfo
-
-NO_LIST = 1
-"""Kind of a list record: the property has no list; with few exceptions it cannot be set."""
-LIST = 3
-"""Kind of a list record: the property can be set to what the list holds; to nothing while it is empty."""
-FREE = 7
-"""Kind of a list record: no list; text, times and structures."""
-
-
-@dataclass(frozen=True)
-class PropertySpec:
-    """A property as a body tells it when it is asked for everything.
-
-    Attributes
-    ----------
-    code
-        One of `drivers.ptp.codes.Property`, or a number without a name.
-    value
-        As it travels; None where it is told on request only, `b""` where the state machine computes it.
-    kind
-        `NO_LIST`, `LIST` or `FREE`.
-    choices
-        What it can be set to, in the body's order.
-    formats
-        The same for image formats.
-    """
-
-    code: int
-    value: bytes | None
-    kind: int = NO_LIST
-    choices: tuple[int, ...] = ()
-    formats: tuple[ImageFormat, ...] = ()
-
-
-@dataclass(frozen=True)
-class EosBody:
-    """An EOS body as the wire knows it.
-
-    Attributes
-    ----------
-    info
-        Its DeviceInfo; the serial number is the state machine's to add.
-    usb
-        Vendor and product.
-    properties
-        Every property, as the body stands when it is switched on with its dial at M and the lens on manual focus.
-    shutter_codes, aperture_codes
-        What the lists of shutter times and apertures hold where the dial lets them be set.
-    burst
-        Raw frames that its memory holds.
-    frames_per_s
-        Pace of continuous drive.
-    frame_bytes
-        What it reckons with for one frame; sizes of real raw files vary.
-    write_s
-        Time from the end of an exposure until the file is ready.
-    shots_per_charge
-        Frames that a full battery lasts for.
-    wide_objects
-        Whether objects are announced by the records with sizes of 64 bits.
-    borrowed
-        What is not known of this very body, and where it was taken from.
-    """
-
-    info: DeviceInfo
-    usb: tuple[int, int]
-    properties: tuple[PropertySpec, ...]
-    shutter_codes: tuple[int, ...]
-    aperture_codes: tuple[int, ...]
-    burst: int
-    frames_per_s: float
-    frame_bytes: int
-    write_s: float
-    shots_per_charge: int
-    borrowed: tuple[str, ...]
-    wide_objects: bool = False
-
-    @property
-    def model(self) -> str:
-        """Its name, as in DeviceInfo."""
-        return self.info.model
-
-    @property
-    def info_ex(self) -> DeviceInfoEx:
-        """Its answer to GetDeviceInfoEx."""
-        return DeviceInfoEx(EVENTS_EX, tuple(spec.code for spec in self.properties), (0, 1, 2, 4))
-
-
-OPERATIONS = (
-    Operation.GET_DEVICE_PROP_DESC,
-    Operation.GET_DEVICE_PROP_VALUE,
-    Operation.SET_DEVICE_PROP_VALUE,
-    Operation.GET_DEVICE_INFO,
-    Operation.OPEN_SESSION,
-    Operation.CLOSE_SESSION,
-    Operation.GET_NUM_OBJECTS,
-    Operation.GET_STORAGE_IDS,
-    Operation.EOS_GET_STORAGE_IDS,
-    Operation.GET_STORAGE_INFO,
-    Operation.EOS_GET_STORAGE_INFO,
-    Operation.GET_OBJECT_HANDLES,
-    Operation.GET_OBJECT_INFO,
-    Operation.GET_OBJECT,
-    Operation.EOS_GET_OBJECT,
-    Operation.GET_THUMB,
-    Operation.GET_PARTIAL_OBJECT,
-    Operation.EOS_GET_PARTIAL_OBJECT,
-    Operation.DELETE_OBJECT,
-    Operation.EOS_DELETE_OBJECT,
-    Operation.EOS_SET_DEVICE_PROP_VALUE_EX,
-    Operation.EOS_REQUEST_DEVICE_PROP_VALUE,
-    Operation.EOS_GET_DEVICE_INFO_EX,
-    Operation.EOS_GET_OBJECT_INFO_EX,
-    Operation.EOS_REMOTE_RELEASE,
-    Operation.EOS_SET_EVENT_MODE,
-    Operation.EOS_SET_REMOTE_MODE,
-    Operation.EOS_GET_REMOTE_MODE,
-    Operation.EOS_GET_EVENT,
-    Operation.EOS_TRANSFER_COMPLETE,
-    Operation.EOS_CANCEL_TRANSFER,
-    Operation.EOS_RESET_TRANSFER,
-    Operation.EOS_KEEP_DEVICE_ON,
-    Operation.EOS_SET_UI_LOCK,
-    Operation.EOS_RESET_UI_LOCK,
-    Operation.EOS_PC_HDD_CAPACITY,
-    Operation.EOS_AF_CANCEL,
-    Operation.EOS_REMOTE_RELEASE_ON,
-    Operation.EOS_REMOTE_RELEASE_OFF,
-    Operation.EOS_RESET_MIRROR_LOCKUP_STATE,
+from sim.camera.eos_model import (
+    EVENTS,
+    FREE,
+    HALF_STOPS,
+    LIST,
+    OPERATIONS,
+    STANDARD_PROPERTIES,
+    EosModel,
+    PropertySpec,
+    custom_functions,
+    focus_points,
+    structure,
 )
-EVENTS = (
-    EventCode.REQUEST_OBJECT_TRANSFER,
-    EventCode.STORE_ADDED,
-    EventCode.STORE_REMOVED,
-    EventCode.OBJECT_REMOVED,
-    EventCode.OBJECT_ADDED,
-    EventCode.OBJECT_INFO_CHANGED,
-    EventCode.EOS_REQUEST_GET_EVENT,
-)
-EVENTS_EX = (
-    EosEvent.OBJECT_ADDED,
-    EosEvent.OBJECT_REMOVED,
-    EosEvent.REQUEST_GET_OBJECT_INFO,
-    EosEvent.STORAGE_STATUS_CHANGED,
-    EosEvent.STORAGE_INFO_CHANGED,
-    EosEvent.REQUEST_OBJECT_TRANSFER,
-    EosEvent.OBJECT_INFO_CHANGED,
-    EosEvent.OBJECT_CONTENT_CHANGED,
-    EosEvent.PROPERTY_CHANGED,
-    EosEvent.AVAILABLE_LIST_CHANGED,
-    EosEvent.CAMERA_STATUS_CHANGED,
-    EosEvent.WILL_SOON_SHUT_DOWN,
-    EosEvent.SHUTDOWN_TIMER_UPDATED,
-    EosEvent.REQUEST_CANCEL_TRANSFER,
-    EosEvent.REQUEST_OBJECT_TRANSFER_DT,
-    EosEvent.REQUEST_CANCEL_TRANSFER_DT,
-    0xC1A0,
-    0xC1A1,
-)
-STANDARD_PROPERTIES = (
-    Property.DEVICE_FRIENDLY_NAME,
-    Property.PERCEIVED_DEVICE_TYPE,
-    Property.SESSION_INITIATOR,
-    Property.USE_DEVICE_STAGE,
-    Property.BATTERY_LEVEL,
-)
+
 _IMAGE_FORMATS = (
     ObjectFormat.ASSOCIATION,
     ObjectFormat.SCRIPT,
@@ -235,43 +77,6 @@ def _device_info(model: str, version: str, manufacturer: str, extension_version:
 def _stops(scale: apex.Scale, first: int, last: int, thirds: bool = True) -> tuple[int, ...]:
     fractions = (0, 3, 5) if thirds else (0, 4)
     return tuple(step.code for step in scale.steps if first <= step.code <= last and step.code % 8 in fractions)
-
-
-def _structure(*numbers: int) -> bytes:
-    """Return numbers of 32 bits behind their length in bytes, itself included: how Canon packs many structures."""
-    return struct.pack(f"<{1 + len(numbers)}I", 4 + 4 * len(numbers), *numbers)
-
-
-HALF_STOPS = 0x0101
-"""Custom function: exposure is set in half stops, not thirds."""
-MIRROR_LOCKUP = 0x060F
-"""Custom function: the first press lifts the mirror, on bodies that do not have it in the menu (group 3)."""
-
-
-def custom_functions(group: int, functions: Mapping[int, int]) -> bytes:
-    """Return one group of custom functions (property 0xd1a0): number of a function → its setting."""
-    settings = [number for function, setting in functions.items() for number in (function, 1, setting)]
-    return _structure(1, group, 8 + 4 * len(settings), len(functions), *settings)
-
-
-FOCUS_POINTS = 9
-FOCUS_CENTRE = 4
-
-
-def focus_points(found: Iterable[int]) -> bytes:
-    """Return where the body is in focus (property 0xd1d3): of nine points in a cross, those numbered in `found`.
-
-    The layout is the 60D's, as libgphoto2 reads it: length, length − 4, version, points, points in use, two frame
-    sizes, then of all points heights, widths, x and y from the frame's centre, then a bit for each that is in focus.
-    """
-    xs = (-1720, -860, -860, 0, 0, 0, 860, 860, 1720)
-    ys = (0, 489, -489, 792, 0, -792, 489, -489, 0)
-    numbers = struct.pack(f"<18H{2 * FOCUS_POINTS}h", *(100,) * (2 * FOCUS_POINTS), *xs, *ys)
-    bits = sum(1 << point for point in found)
-    head = struct.pack("<2H4H", FOCUS_POINTS, FOCUS_POINTS, 5184, 3456, 5184, 3456)
-    body = struct.pack("<H", 0) + head + numbers + struct.pack("<II", bits, 0)
-    length = 4 + 2 + len(body)
-    return struct.pack("<IH", length, length - 4) + body
 
 
 _WHEEL = tuple(range(2500, 10001, 100))
@@ -317,8 +122,8 @@ def _properties(body: _Choices) -> tuple[PropertySpec, ...]:
     def fixed(code: int, value: int) -> PropertySpec:
         return PropertySpec(code, number(value))
 
-    style = _structure(0, 3, 0, 0, 0, 0)
-    own_style = _structure(0x81, 0, 3, 0, 0, 0, 0)
+    style = structure(0, 3, 0, 0, 0, 0)
+    own_style = structure(0x81, 0, 3, 0, 0, 0, 0)
     lockup = (listed(Property.EOS_MIRROR_UP_SETTING, 0, (0, 1)),) if body.mirror_lockup_in_menu else ()
     return (
         fixed(Property.EOS_AE_MODE, AeMode.MANUAL),
@@ -355,7 +160,7 @@ def _properties(body: _Choices) -> tuple[PropertySpec, ...]:
         listed(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.CARD, ()),
         *lockup,
         PropertySpec(Property.EOS_CUSTOM_FUNCTIONS, custom_functions(1, {HALF_STOPS: int(body.half_stops)}), FREE),
-        PropertySpec(0xD1A1, _structure(2, 1, 0x14, 2, 0x00030002), FREE),
+        PropertySpec(0xD1A1, structure(2, 1, 0x14, 2, 0x00030002), FREE),
         fixed(Property.EOS_LENS_STATUS, 1),
         fixed(Property.EOS_TEMPERATURE_STATUS, 0),
         listed(Property.EOS_EVF_OUTPUT_DEVICE, 0, body.outputs),
@@ -410,7 +215,7 @@ _CHOICES_550D = _Choices(
     lens="EF-S18-55mm f/3.5-5.6 IS",
 )
 
-EOS_550D = EosBody(
+EOS_550D = EosModel(
     info=_device_info("Canon EOS 550D", "3-1.0.9", "Canon Inc.", 200),
     usb=(VENDOR_CANON_USB, 0x31EA),
     properties=_properties(_CHOICES_550D),
@@ -423,7 +228,7 @@ EOS_550D = EosBody(
     shots_per_charge=440,
     borrowed=(
         "60D: vendor extension id, operations, events, third-stop apertures, white balance shifts, structures, order",
-        "60D: capture destinations 2, 4, 6; camera time and counters told as there",
+        "60D: capture destinations 2, 4, 6; camera time and counters reported as there",
         "factory settings (third stops, no highlight priority) and 30 s to power off: general knowledge of the body",
     ),
 )
@@ -443,7 +248,7 @@ EOS_550D_AS_LISTED = replace(
 
 _JPEGS_6D2 = _jpegs((0, True), (1, True), (14, True), (15, False))
 
-EOS_6D_MARK_II = EosBody(
+EOS_6D_MARK_II = EosModel(
     info=_device_info("Canon EOS 6D Mark II", "3-1.0.2", "Canon.Inc", 100),
     usb=(VENDOR_CANON_USB, 0x32CA),
     properties=_properties(
@@ -502,7 +307,7 @@ TEST_BODY = replace(
 )
 """A 550D with the small frames of the test sensor."""
 
-EOS_BODIES: Mapping[str, EosBody] = MappingProxyType(
+EOS_BODIES: Mapping[str, EosModel] = MappingProxyType(
     {"EOS 550D": EOS_550D, "EOS 6D Mark II": EOS_6D_MARK_II, "Test": TEST_BODY}
 )
-"""Every body by the name that settings and commands use, the same as in `sim.camera.sensors.BODIES`."""
+"""Every body by the name that settings and commands use, the same as in `sim.world.sensors.BODIES`."""

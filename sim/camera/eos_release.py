@@ -13,7 +13,8 @@ from io import BytesIO
 
 from drivers.camera import ExposureSettings
 from drivers.canon import apex
-from drivers.canon.records import ImageFormat, Notice, ObjectEvent
+from drivers.canon.records import Notice, ObjectEvent
+from drivers.canon.values import ImageFormat
 from drivers.ptp.codes import (
     AeMode,
     CameraStatus,
@@ -27,9 +28,9 @@ from drivers.ptp.codes import (
     ResponseCode,
 )
 from foundation.errors import CropError, DeviceError, DeviceRefused
-from sim.camera.eos_bodies import FOCUS_CENTRE, focus_points
 from sim.camera.eos_files import EosFiles
-from sim.camera.eos_state import BULB, CARD, FOLDER, Arguments, Declined, Reply, StoredObject
+from sim.camera.eos_model import FOCUS_CENTRE, focus_points
+from sim.camera.eos_state import BULB, CARD, FOLDER, Arguments, OperationRefusal, OperationResult, StoredObject
 
 _TIMERS_S: dict[int, float] = {
     DriveMode.TIMER_10_S: 10.0,
@@ -82,34 +83,34 @@ class _Frame:
 class EosRelease(EosFiles):
     """What a finger on the release does, at the camera or far away."""
 
-    def _remote_release_on(self, arguments: Arguments) -> Reply:
+    def _remote_release_on(self, arguments: Arguments) -> OperationResult:
         self._require_remote()
         if not 1 <= arguments.one <= ReleaseButton.HALF_AND_FULL:
-            raise Declined(ResponseCode.INVALID_PARAMETER)
+            raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
         if self._is_busy:
-            raise Declined(ResponseCode.DEVICE_BUSY)
+            raise OperationRefusal(ResponseCode.DEVICE_BUSY)
         automatic = arguments.two == 0
         if arguments.one & ReleaseButton.HALF and automatic:
             self._focus()
         if arguments.one & ReleaseButton.FULL:
             refusal = self._full_press(automatic)
             if refusal is not None:
-                raise Declined(refusal.response)
-        return Reply()
+                raise OperationRefusal(refusal.response)
+        return OperationResult()
 
-    def _remote_release_off(self, arguments: Arguments) -> Reply:
+    def _remote_release_off(self, arguments: Arguments) -> OperationResult:
         self._require_remote()
         if not 1 <= arguments.one <= ReleaseButton.HALF_AND_FULL:
-            raise Declined(ResponseCode.INVALID_PARAMETER)
+            raise OperationRefusal(ResponseCode.INVALID_PARAMETER)
         self._let_go(arguments.one)
-        return Reply()
+        return OperationResult()
 
-    def _remote_release(self, _: Arguments) -> Reply:
+    def _remote_release(self, _: Arguments) -> OperationResult:
         self._require_remote()
         self._focus()
         refusal = self._full_press(automatic=True)
         self._let_go(ReleaseButton.HALF_AND_FULL)
-        return Reply(parameters=(0 if refusal is None else refusal.result,))
+        return OperationResult(parameters=(0 if refusal is None else refusal.result,))
 
     @property
     def _has_autofocus(self) -> bool:
@@ -120,9 +121,9 @@ class EosRelease(EosFiles):
             self._focused = self._finds_focus
             self._change(Property.EOS_FOCUS_INFO, focus_points((FOCUS_CENTRE,) if self._focused else ()))
 
-    def _cancel_focus(self, _: Arguments) -> Reply:
+    def _cancel_focus(self, _: Arguments) -> OperationResult:
         self._focused = False
-        return Reply()
+        return OperationResult()
 
     def _full_press(self, automatic: bool) -> _Refusal | None:
         settings = self._settings()
@@ -257,8 +258,8 @@ class EosRelease(EosFiles):
                 return None
             return into.getvalue()
 
-        if self._darkroom is not None:
-            return self._darkroom.submit(develop)
+        if self._executor is not None:
+            return self._executor.submit(develop)
         done: Future[bytes | None] = Future()
         done.set_result(develop())
         return done
@@ -279,7 +280,7 @@ class EosRelease(EosFiles):
                     self._deliver(frame, index, f"{name}{suffix.upper()}", kind, raw)
                 else:
                     self._deliver(frame, index, f"{name}.JPG", ObjectFormat.EXIF_JPEG, _small_jpeg(name))
-        self._tell(Property.EOS_AVAILABLE_SHOTS, Property.EOS_SHUTTER_COUNTER, Property.EOS_BATTERY_POWER)
+        self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_SHUTTER_COUNTER, Property.EOS_BATTERY_POWER)
         if not self._is_busy:
             self._record(Notice(EosEvent.CAMERA_STATUS_CHANGED, CameraStatus.IDLE))
         self._idle_since = self._clock.monotonic()

@@ -16,30 +16,19 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
-from drivers.canon.records import (
-    IMAGE_FORMAT_PROPERTIES,
-    AvailableFormats,
-    AvailableValues,
-    ImageFormat,
-    Notice,
-    ObjectEntry,
-    PropertyChanged,
-    Record,
-    encode_events,
-    number_of,
-    number_value,
-    text_value,
-)
+from drivers.canon.datasets import ObjectEntry
+from drivers.canon.records import AvailableFormats, AvailableValues, Notice, PropertyChanged, Record, encode_events
+from drivers.canon.values import IMAGE_FORMAT_PROPERTIES, ImageFormat, number_of, number_value, text_value
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, EventCode, ObjectFormat, Property, ResponseCode
-from drivers.ptp.messages import Event
+from drivers.ptp.messages import PtpEvent
 from foundation.clock import Clock
-from sim.camera.eos_bodies import MIRROR_LOCKUP, EosBody, custom_functions
+from sim.camera.eos_model import MIRROR_LOCKUP, EosModel, custom_functions
 from sim.camera.film import Film
 
 CARD = 0x00020001
 """The store that is the card."""
 EMPTY_SLOT = 0x00020000
-"""What storage ids tell while there is no card."""
+"""The storage id while there is no card."""
 DCIM = 0x90000000
 FOLDER = 0x91900000
 """Handle of the folder 100CANON; files on the card are numbered from it, 16 apart."""
@@ -53,7 +42,7 @@ _MOST_SHOTS = 0x7FFFFFFF
 _TEXTS = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT)
 
 
-class Declined(Exception):
+class OperationRefusal(Exception):
     """Ends an operation with another response than OK."""
 
     def __init__(self, code: int, *parameters: int) -> None:
@@ -62,7 +51,7 @@ class Declined(Exception):
         self.parameters = parameters
 
 
-class Reply(NamedTuple):
+class OperationResult(NamedTuple):
     """What an operation that was carried out answers."""
 
     data: bytes | None = None
@@ -84,7 +73,7 @@ class PropertyState:
 
     value: bytes
     kind: int
-    told: bool
+    reported: bool
     choices: tuple[int, ...] = ()
     formats: tuple[ImageFormat, ...] = ()
 
@@ -123,12 +112,12 @@ class Card:
         return self.capacity - sum(len(item.data) for item in self.objects.values())
 
 
-class EosState:
+class SimulatedEosState:
     """The state of a body; see `sim.camera.eos.SimulatedEos` for the parameters."""
 
     def __init__(
         self,
-        body: EosBody,
+        body: EosModel,
         film: Film,
         clock: Clock,
         *,
@@ -138,13 +127,13 @@ class EosState:
         battery: float,
         shutter_count: int,
         forgetful: bool,
-        darkroom: Executor | None,
+        executor: Executor | None,
     ) -> None:
         self.body = body
         self.serial = serial
         self._film = film
         self._clock = clock
-        self._darkroom = darkroom
+        self._executor = executor
         self._forgetful = forgetful
         self._card = None if card_bytes is None else self._blank_card(card_bytes)
         self._battery = battery
@@ -164,7 +153,7 @@ class EosState:
         self._queue: list[Record] = []
         self._memory: dict[int, StoredObject] = {}
         self._host_bytes = 0
-        self._hints: list[Event] = []
+        self._hints: list[PtpEvent] = []
         self._idle_since = clock.monotonic()
         self._warned = False
         # What is under way: (when, order, what happens then), the earliest first.
@@ -210,21 +199,21 @@ class EosState:
 
     # Events.
 
-    def _get_event(self, _: Arguments) -> Reply:
+    def _get_event(self, _: Arguments) -> OperationResult:
         if self._bulb_since is not None and self._event_mode:
             open_s = int(self._clock.monotonic() - self._bulb_since[0])
             self._record(Notice(EosEvent.BULB_EXPOSURE_TIME, open_s))
         records, self._queue = self._queue, []
-        return Reply(encode_events(records))
+        return OperationResult(encode_events(records))
 
     def _record(self, record: Record) -> None:
         if not self._event_mode:
             return
         if not self._queue:
-            self._hints.append(Event(EventCode.EOS_REQUEST_GET_EVENT))
+            self._hints.append(PtpEvent(EventCode.EOS_REQUEST_GET_EVENT))
         self._queue.append(record)
 
-    def _tell_list(self, code: int) -> None:
+    def _report_list(self, code: int) -> None:
         known = self._properties[code]
         if code in IMAGE_FORMAT_PROPERTIES:
             self._record(AvailableFormats(code, known.formats, known.kind))
@@ -255,7 +244,7 @@ class EosState:
         known = self._properties.get(code)
         return 0 if known is None else number_of(known.value)
 
-    def _tell(self, *codes: int) -> None:
+    def _report(self, *codes: int) -> None:
         for code in codes:
             self._record(PropertyChanged(code, self._value(code)))
             if code == Property.EOS_CUSTOM_FUNCTIONS and Property.EOS_MIRROR_UP_SETTING not in self._properties:
@@ -264,12 +253,12 @@ class EosState:
 
     def _change(self, code: int, value: bytes) -> None:
         self._properties[code].value = value
-        self._tell(code)
+        self._report(code)
 
     def _offer(self, code: int, choices: tuple[int, ...]) -> None:
         if self._properties[code].choices != choices:
             self._properties[code].choices = choices
-            self._tell_list(code)
+            self._report_list(code)
 
     def _renew_exposure_lists(self) -> None:
         mode = self._number_of(Property.EOS_AE_MODE)
@@ -292,9 +281,9 @@ class EosState:
         choices = both if self._card is not None else (CaptureDestination.HOST,)
         self._offer(Property.EOS_CAPTURE_DESTINATION, choices)
         if not self._session or self._number_of(Property.EOS_CAPTURE_DESTINATION) not in choices:
-            # The 60D without a card tells the card as destination all the same.
+            # The 60D without a card reports the card as destination all the same.
             self._change(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.CARD))
-            self._tell(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
+            self._report(Property.EOS_AVAILABLE_SHOTS, Property.EOS_CURRENT_STORAGE, Property.EOS_CURRENT_FOLDER)
 
     def _battery_code(self) -> int:
         return next(
@@ -306,7 +295,7 @@ class EosState:
     def _require_remote(self) -> None:
         # Assumed: nothing shows what a body says to whoever has not taken control of it.
         if not self._remote_mode:
-            raise Declined(ResponseCode.EOS_OPERATION_REFUSED)
+            raise OperationRefusal(ResponseCode.EOS_OPERATION_REFUSED)
 
     def _blank_card(self, capacity: int) -> Card:
         now = self._clock.now()

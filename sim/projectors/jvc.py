@@ -8,6 +8,8 @@ Laws that hold inside:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from drivers.display import jvc
 from drivers.links.tcp import TcpLink, TcpServer
 from drivers.presenter import WHITE, Colour
@@ -18,6 +20,15 @@ _PATIENCE_S = 5.0
 _CHANNELS = {text: channel for channel, text in jvc.LEVELS.items()}
 
 
+@dataclass
+class _Connection:
+    """One connection: what was heard of a command that is not whole yet, whether it was let in, whether it is over."""
+
+    heard: bytes = b""
+    admitted: bool = False
+    closed: bool = False
+
+
 class JvcPeer:
     """The far side of the network port; keeps the contract of `drivers.links.memory.Peer`."""
 
@@ -25,40 +36,39 @@ class JvcPeer:
         self._screen = screen
         self._levels = dict.fromkeys(jvc.LEVELS, 255)
         self._flat = False
+        self._connection = _Connection()
         self._show()
-        self.connect()
 
     def connect(self) -> bytes:
         """Begin a new connection and return the greeting; the picture stays."""
-        self._waiting = b""
-        self._greeted = False
-        self._closed = False
+        self._connection = _Connection()
         return jvc.GREETING
 
     @property
     def closed(self) -> bool:
         """Whether it has hung up: on whoever does not ask to be let in."""
-        return self._closed
+        return self._connection.closed
 
     def hang_up(self) -> None:
         """Close the connection, as the projector does with one that is idle."""
-        self._closed = True
+        self._connection.closed = True
 
     def receive(self, data: bytes) -> bytes:
         """Take the next bytes and return the answers to the commands that they complete."""
-        self._waiting += data
+        connection = self._connection
+        connection.heard += data
         answer = b""
-        if not self._greeted:
-            if len(self._waiting) < len(jvc.REQUEST):
+        if not connection.admitted:
+            if len(connection.heard) < len(jvc.REQUEST):
                 return b""
-            if not self._waiting.startswith(jvc.REQUEST):
-                self._closed = True
+            if not connection.heard.startswith(jvc.REQUEST):
+                connection.closed = True
                 return jvc.REFUSED
-            self._waiting = self._waiting[len(jvc.REQUEST) :]
-            self._greeted = True
+            connection.heard = connection.heard[len(jvc.REQUEST) :]
+            connection.admitted = True
             answer = jvc.ACCEPTED
-        while b"\n" in self._waiting:
-            line, _, self._waiting = self._waiting.partition(b"\n")
+        while b"\n" in connection.heard:
+            line, _, connection.heard = connection.heard.partition(b"\n")
             answer += self._obey(line + b"\n")
         return answer
 

@@ -18,7 +18,7 @@ import usb.core
 
 from drivers.display import lightcrafter_wire as wire
 from drivers.display.lightcrafter import PRODUCTS, VENDOR
-from drivers.display.lightcrafter_wire import Command, Reply
+from drivers.display.lightcrafter_wire import LightCrafterCommand, LightCrafterReply
 from drivers.presenter import WHITE, Colour
 from foundation.errors import ProtocolError
 from sim.buses.usb import Handle, SimulatedBus
@@ -39,10 +39,10 @@ class Controller:
         self._behind = 0
         self._mode = bytes([1])
         self.registers: dict[int, bytes] = {
-            Command.TEST_PATTERN: bytes([8]),
-            Command.PATTERN_COLOUR: struct.pack("<6H", *(wire.FULL,) * 3, 0, 0, 0),
-            Command.INPUT_SOURCE: bytes([0]),
-            Command.DISPLAY_MODE: bytes([1]),
+            LightCrafterCommand.TEST_PATTERN: bytes([8]),
+            LightCrafterCommand.PATTERN_COLOUR: struct.pack("<6H", *(wire.FULL,) * 3, 0, 0, 0),
+            LightCrafterCommand.INPUT_SOURCE: bytes([0]),
+            LightCrafterCommand.DISPLAY_MODE: bytes([1]),
         }
         self._show()
 
@@ -50,12 +50,12 @@ class Controller:
         """Set a register; False where there is no such register, or it does not take that."""
         if len(data) != len(self.registers.get(command, b"")):
             return False
-        if command == Command.PATTERN_COLOUR:
+        if command == LightCrafterCommand.PATTERN_COLOUR:
             try:
                 wire.parse_colour(data)
             except ProtocolError:
                 return False
-        if command == Command.DISPLAY_MODE and data != self.registers[command]:
+        if command == LightCrafterCommand.DISPLAY_MODE and data != self.registers[command]:
             self._behind = self._lag
         self.registers[command] = data
         self._show()
@@ -63,7 +63,7 @@ class Controller:
 
     def read(self, command: int) -> bytes | None:
         """Return a register, None where there is no such one."""
-        if command != Command.DISPLAY_MODE:
+        if command != LightCrafterCommand.DISPLAY_MODE:
             return self.registers.get(command)
         if self._behind:
             self._behind -= 1
@@ -76,11 +76,11 @@ class Controller:
         registers = self.registers
         generates = (
             self._mode[0] == wire.MODE_VIDEO
-            and registers[Command.INPUT_SOURCE][0] & 7 == wire.SOURCE_TEST_PATTERN
-            and registers[Command.TEST_PATTERN][0] == wire.PATTERN_SOLID
+            and registers[LightCrafterCommand.INPUT_SOURCE][0] & 7 == wire.SOURCE_TEST_PATTERN
+            and registers[LightCrafterCommand.TEST_PATTERN][0] == wire.PATTERN_SOLID
         )
         if generates:
-            codes = wire.parse_colour(registers[Command.PATTERN_COLOUR])
+            codes = wire.parse_colour(registers[LightCrafterCommand.PATTERN_COLOUR])
             self._screen.colour = Colour(*(wire.eight_bits(code) for code in codes))
         else:
             self._screen.colour = VIDEO_INPUT
@@ -130,9 +130,11 @@ class LightCrafterUsb:
             raise Stalled from error
         if request.reads:
             answer = self._controller.read(request.command)
-            reply = Reply(request.sequence, answer or b"", refused=answer is None)
+            reply = LightCrafterReply(request.sequence, answer or b"", refused=answer is None)
         else:
-            reply = Reply(request.sequence, refused=not self._controller.write(request.command, request.data))
+            reply = LightCrafterReply(
+                request.sequence, refused=not self._controller.write(request.command, request.data)
+            )
         self._replies.append(wire.encode_reply(reply, reads=request.reads))
 
     def interrupt_in(self, limit: int) -> bytes | None:

@@ -2,30 +2,27 @@
 
 Rules that hold inside:
 
-- A peer knows bytes and no physics; what they do happens in `sim.projectors.pjlink.SimulatedProjector`.
+- A peer knows bytes and no physics; what they do happens in `sim.projectors.projector.SimulatedProjector`.
 - A serial cable has no connections: a peer goes on where it was when its cable is opened again, and forgets only a
   half-heard command.
 - `receive` with no bytes asks what a peer has to say by now: a late answer, or news. Whoever joins a peer to a cable
-  asks often.
+  asks often (`sim.buses.serial_cable`, `sim.buses.pty`).
 - Where the manuals leave open what a projector does, a peer does what is harder on the driver: it falls silent, or
   refuses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Protocol
 
-from drivers.links.memory import Peer, PeerLink
-from drivers.links.tcp import TcpLink, TcpServer
+from drivers.links.memory import Peer
 from drivers.projector import Power, Severity
 from drivers.serial_projectors import benq, epson, nec, optoma
-from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
-from sim.projectors.pjlink import SimulatedProjector
+from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
+from sim.projectors.projector import SimulatedProjector
 
 SERIAL_NUMBER = "CROP0000001"
-POLLING_S = 0.02
-"""How often a peer on a real cable is asked what it has to say by now."""
 
 _ON_THE_WAY = (Power.WARMING, Power.COOLING)
 
@@ -192,17 +189,17 @@ class OptomaPeer(_Listener):
 
     Parameters
     ----------
-    tells_mute
+    answers_mute
         Whether its model can be asked if it is muted.
     """
 
     MODEL = "1"
 
-    def __init__(self, projector: SimulatedProjector, tells_mute: bool = True) -> None:
+    def __init__(self, projector: SimulatedProjector, answers_mute: bool = True) -> None:
         super().__init__(projector)
-        self._tells_mute = tells_mute
-        self._told_power = projector.power()
-        self._told_faults: frozenset[str] = frozenset()
+        self._answers_mute = answers_mute
+        self._sent_power = projector.power()
+        self._sent_faults: frozenset[str] = frozenset()
 
     def receive(self, data: bytes) -> bytes:
         """Take the next bytes and return the answers to the lines that they complete, and the news."""
@@ -218,19 +215,19 @@ class OptomaPeer(_Listener):
     def _news(self) -> bytes:
         power = self._projector.power()
         broken = frozenset(fault.part for fault in self._projector.faults() if fault.severity is Severity.ERROR)
-        news = [optoma.info_of_fault(part) for part in sorted(broken - self._told_faults)]
-        if power is not self._told_power:
+        news = [optoma.info_of_fault(part) for part in sorted(broken - self._sent_faults)]
+        if power is not self._sent_power:
             news.append(optoma.info_of_power(power))
-        self._told_power, self._told_faults = power, broken
+        self._sent_power, self._sent_faults = power, broken
         return b"".join(optoma.encode_message(info) for info in news if info is not None)
 
-    def _answer(self, command: optoma.Command) -> optoma.Message:
+    def _answer(self, command: optoma.OptomaCommand) -> optoma.Message:
         try:
             return self._done(command)
         except (DeviceRefused, DeviceFault, ValueError):
-            return optoma.Done(False)
+            return optoma.PassFail(False)
 
-    def _done(self, command: optoma.Command) -> optoma.Message:
+    def _done(self, command: optoma.OptomaCommand) -> optoma.Message:
         projector = self._projector
         match command.number, command.value:
             case optoma.POWER, "1":
@@ -245,11 +242,11 @@ class OptomaPeer(_Listener):
                 return optoma.Value("1" if projector.power() is Power.ON else "0")
             case optoma.MODEL, "1":
                 return optoma.Value(self.MODEL)
-            case optoma.AV_MUTE_STATE, "1" if self._tells_mute:
+            case optoma.AV_MUTE_STATE, "1" if self._answers_mute:
                 return optoma.Value("1" if projector.muted() else "0")
             case _:
                 raise ValueError(command)
-        return optoma.Done(True)
+        return optoma.PassFail(True)
 
 
 class NecPeer(_Listener):
@@ -268,17 +265,17 @@ class NecPeer(_Listener):
             self._heard = b""
         return said
 
-    def _answer(self, command: nec.Command) -> nec.Reply:
+    def _answer(self, command: nec.NecCommand) -> nec.NecReply:
         try:
-            return nec.Reply(command.kind, command.code, self._done(command))
+            return nec.NecReply(command.kind, command.code, self._done(command))
         except DeviceRefused:
-            return nec.Reply(command.kind, command.code, failed=nec.POWER_IS_OFF)
+            return nec.NecReply(command.kind, command.code, failed=nec.POWER_IS_OFF)
         except DeviceFault:
-            return nec.Reply(command.kind, command.code, failed=nec.EXECUTION_FAILED)
+            return nec.NecReply(command.kind, command.code, failed=nec.EXECUTION_FAILED)
         except ValueError:
-            return nec.Reply(command.kind, command.code, failed=nec.UNKNOWN_COMMAND)
+            return nec.NecReply(command.kind, command.code, failed=nec.UNKNOWN_COMMAND)
 
-    def _done(self, command: nec.Command) -> bytes:
+    def _done(self, command: nec.NecCommand) -> bytes:
         projector = self._projector
         match command:
             case nec.POWER_ON:
@@ -310,36 +307,3 @@ class _PeerOf(Protocol):
 
 PEERS: Mapping[str, _PeerOf] = {"benq": BenqPeer, "epson": EpsonPeer, "nec": NecPeer, "optoma": OptomaPeer}
 """The far side for each of `drivers.serial_projectors.LANGUAGES`."""
-
-
-class SerialPeerLink(PeerLink):
-    """A cable to a peer in the same thread, which hears before each read what the peer has to say by now."""
-
-    def read(self, limit: int, timeout: float) -> bytes:
-        """Return up to `limit` bytes of what the peer has said."""
-        if self._open:
-            self._incoming += self._peer.receive(b"")
-        return super().read(limit, timeout)
-
-
-def serve_network(peer: Callable[[], Peer], port: int = 0) -> TcpServer:
-    """Return a running server that gives each connection a peer of its own; close it, or use it in a `with` block.
-
-    Raises
-    ------
-    LinkClosed
-        The port is taken.
-    """
-
-    def handle(link: TcpLink) -> None:
-        there = peer()
-        said = there.connect()
-        while True:
-            if said:
-                link.write(said, 5.0)
-            try:
-                said = there.receive(link.read(4096, POLLING_S))
-            except LinkTimeout:
-                said = there.receive(b"")
-
-    return TcpServer(handle, port)

@@ -1,4 +1,4 @@
-"""The two inner loops of the dark room: from a drawing to the light on every photosite, and from light to counts.
+"""The two inner loops of the simulated room: from a drawing to the light on every photosite, and from light to counts.
 
 Compiled by numba on first use, single-threaded and without the interpreter's lock; `sim.world.world` calls them for
 blocks of rows from as many threads as there are processors. A row's result depends on its own arguments only, so

@@ -1,4 +1,4 @@
-"""Light, ink and colour filters of the dark room, as spectra from 380 to 780 nm in steps of 5 nm.
+"""Light, ink and colour filters of the simulated room, as spectra from 380 to 780 nm in steps of 5 nm.
 
 Parametric models, each with its source; only the camera's sensitivities are measured data (`sim.data`). All spectra
 are relative: the exposure's scale is `sim.world.world`'s business. Pure functions, no state.
@@ -100,7 +100,7 @@ def _ink_densities() -> NDArray[np.float64]:
 
 
 def ink_coverage(rgb: ArrayLike) -> NDArray[np.float64]:
-    """Return the share of the paper that each ink is told to cover.
+    """Return the share of the paper that each ink is set to cover.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The dark room: a lit print in front of a camera. What is shown decides what is photographed.
+"""A lit print in front of a camera. What is shown decides what is photographed.
 
 Light adds. The signal of a photosite is linear in the drives of the projector's three primaries, so the room is
 rendered once for each primary alone (`_render`), and a frame is their weighted sum, its noise, and black. The laws:
@@ -18,10 +18,8 @@ import math
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
-from typing import Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,151 +27,27 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from foundation.processors import processor_count
-from sim.camera.sensors import Body
+from foundation.srgb import decode_srgb
+from sim.world.drawing import PAPER, Print, label_map
 from sim.world.geometry import Folded, View, Waviness
-from sim.world.spectra import Lamp, print_reflectance, projector_primaries, sensitivities
+from sim.world.room import REFERENCE_EXPOSURE, Room
+from sim.world.sensors import Body
+from sim.world.spectra import print_reflectance, projector_primaries, sensitivities
 from sim.world.wear import Fold, Stain
 
-REFERENCE_EXPOSURE = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
-"""The exposure at which `Room.white_level_share` holds."""
+_BACKDROP_REFLECTANCE: Final = 0.04
+"""Of what lies behind the print, at every wavelength: dark, as a backdrop should be."""
 
-_PAPER = (255, 255, 255)
-_A0_DIAGONAL_MM = math.hypot(1189, 841)
-_BACKDROP_REFLECTANCE = 0.04
-_BLOCK_ROWS = 64
-_FINEST_MM = 1e-3
-_MOST_LINES = 6000
-_CHANNELS = "RGB"
-_SLANT = 0.36
+_BLOCK_ROWS: Final = 64
+"""Rows that one thread works at. Noise is drawn block by block, so that another number gives other frames."""
+
+_CHANNELS: Final = "RGB"
+
+_A0_DIAGONAL_MM: Final = math.hypot(1189, 841)
+"""Of a sheet of A0 (ISO 216)."""
+
+_SLANT: Final = 0.36
 """Tangent of 20°: a projector beside the camera."""
-
-
-@dataclass(frozen=True, eq=False)
-class Print:
-    """A drawing on paper: rectangles of plain colour, each over those before it.
-
-    Attributes
-    ----------
-    page_mm
-        Width and height of the sheet; bare paper where no rectangle lies.
-    rectangles_mm
-        (N, 4) float64: left, top, right, bottom.
-    rgb
-        (N, 3) uint8, the code printed; (255, 255, 255) prints nothing.
-    """
-
-    page_mm: tuple[float, float]
-    rectangles_mm: NDArray[np.float64]
-    rgb: NDArray[np.uint8]
-
-    def __post_init__(self) -> None:
-        count = len(self.rectangles_mm)
-        if self.rectangles_mm.shape != (count, 4) or self.rgb.shape != (count, 3):
-            raise ValueError(
-                f"rectangles {self.rectangles_mm.shape} and codes {self.rgb.shape}; (N, 4), (N, 3) expected"
-            )
-        if np.any(self.rectangles_mm[:, 2:] < self.rectangles_mm[:, :2]):
-            raise ValueError("a rectangle's right or bottom lies before its left or top")
-
-
-@dataclass(frozen=True)
-class Room:
-    """Everything about the lab that is not the print and not the camera's body.
-
-    Attributes
-    ----------
-    seed
-        Of the paper's shape, the photosites' response and the noise; 0 or more.
-    fill
-        The print's extent over the frame's, along whichever axis is the tighter.
-    focal_diagonals
-        Focal length over the frame's diagonal; 1.3 is 35 mm on APS-C. With `fill` it gives the distance.
-    tilt_deg, pan_deg, roll_deg
-        How the print is turned against the camera.
-    k1, k2, p1, p2
-        Brown's distortion in normalised coordinates, as OpenCV has it.
-    waviness_mm
-        Peak-to-valley height of the paper's surface on an A0 sheet; on another in proportion to its diagonal, so that
-        small charts look like large ones.
-    blur_px
-        Standard deviation of the lens's blur, half-size pixels; the photosite's aperture is added to it.
-    vignetting
-        Share of the light that the lens loses at the frame's corner.
-    projector_falloff
-        Share of the projector's light that is missing a page's half diagonal from its brightest point.
-    primary_difference
-        How differently the primaries fall off: their `projector_falloff` spreads by this share of itself, and their
-        brightest points by as much of the page's half diagonal.
-    lamp_spectrum
-        ``uhp`` (mercury lamp and colour wheel) or ``led``.
-    transfer
-        From code to light: ``srgb`` (IEC 61966-2-1) or the exponent of a power law.
-    black_leak
-        Share of a primary's full light that is there at code 0: 1 / contrast.
-    ambient
-        Light from elsewhere, as a share of the projector's white; of its colour, for it is taken to be stray light.
-    white_level_share
-        Signal of bare paper in full white at `REFERENCE_EXPOSURE`, strongest channel, over saturation − black.
-    lamp_drift_per_hour
-        Share of its light that the lamp loses in an hour; the room has no time, so whoever does applies it as `lamp`.
-    response_spread
-        Standard deviation of the photosites' response (PRNU).
-    wheel_hz
-        Turns of the projector's colour wheel per second, each a third red, green and blue; 0 for steady light. With a
-        wheel, an exposure that is no whole number of turns, or starts and ends unsteadily, gets more of one primary
-        than of another, and frames differ from `signal` and `white` by that.
-    shutter_jitter_s
-        Standard deviation of the exposure time; matters with a wheel only.
-    stain_mm, stain_depth
-        Diameter of a stain somewhere on the print, 0 for none, and the share of blue light that it takes; of green it
-        takes six tenths of that, of red three. A thumb's is 25 mm across.
-    fold_mm
-        How far a crease across the print stands off its plane, 0 for none.
-    """
-
-    seed: int = 0
-    fill: float = 0.94
-    focal_diagonals: float = 1.3
-    tilt_deg: float = 2.0
-    pan_deg: float = -3.0
-    roll_deg: float = 0.5
-    k1: float = -0.03
-    k2: float = 0.01
-    p1: float = 2e-4
-    p2: float = -3e-4
-    waviness_mm: float = 3.0
-    blur_px: float = 0.5
-    vignetting: float = 0.25
-    projector_falloff: float = 0.15
-    primary_difference: float = 0.1
-    lamp_spectrum: Lamp = "uhp"
-    transfer: Literal["srgb"] | float = "srgb"
-    black_leak: float = 1 / 1500
-    ambient: float = 0.0
-    white_level_share: float = 0.70
-    lamp_drift_per_hour: float = 0.004
-    response_spread: float = 0.003
-    wheel_hz: float = 0.0
-    shutter_jitter_s: float = 0.0005
-    stain_mm: float = 0.0
-    stain_depth: float = 0.5
-    fold_mm: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}; 0 or more is expected")
-        for name in ("fill", "focal_diagonals", "white_level_share"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; more than 0 is expected")
-        for name in ("vignetting", "projector_falloff", "black_leak", "ambient", "stain_depth"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; 0 … below 1 is expected")
-        for name in (
-            "waviness_mm", "blur_px", "response_spread", "primary_difference", "wheel_hz", "shutter_jitter_s",
-            "stain_mm", "fold_mm",
-        ):  # fmt: skip
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is expected")
 
 
 class World:
@@ -201,7 +75,7 @@ class World:
         )
         self._primaries = projector_primaries(room.lamp_spectrum)
         self._sensitivities = sensitivities(body.sensitivities)
-        paper = np.einsum("pl,l,lc->c", self._primaries, print_reflectance([_PAPER])[0], self._sensitivities)
+        paper = np.einsum("pl,l,lc->c", self._primaries, print_reflectance([PAPER])[0], self._sensitivities)
         self._dn = room.white_level_share * (body.saturation - body.black) / float(paper.max())
         self._lens, self._falloff = self._shading()
         self._falloff[:, 3] = self._balance()
@@ -272,7 +146,7 @@ class World:
 
     def white(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float64]:
         """Return (3,) float64: R, G, B of bare paper in DN above black, without clipping, where `field` is 1."""
-        return self.reflected([_PAPER], colour, settings, lamp)[0]
+        return self.reflected([PAPER], colour, settings, lamp)[0]
 
     def reflected(
         self, rgb: ArrayLike, colour: Colour, settings: ExposureSettings, lamp: float = 1.0
@@ -403,10 +277,7 @@ class World:
     ) -> NDArray[np.float64]:
         """Return (3,) how much of each primary's reference light a frame collects, gain included."""
         codes = np.array([colour.red, colour.green, colour.blue]) / 255
-        if self.room.transfer == "srgb":
-            linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
-        else:
-            linear = codes**self.room.transfer
+        linear = decode_srgb(codes) if self.room.transfer == "srgb" else codes**self.room.transfer
         leak = self.room.black_leak
         shown = lamp * (leak + (1 - leak) * linear) + self.room.ambient
         reference = REFERENCE_EXPOSURE
@@ -432,7 +303,10 @@ class World:
         from sim.world.rendering import light
 
         visible, room = self.body.visible, self.room
-        drawing = self._drawing
+        drawing = label_map(self.sheet)
+        backdrop = np.full((1, len(self._sensitivities)), _BACKDROP_REFLECTANCE)
+        reflectance = np.concatenate([print_reflectance(drawing.codes), backdrop])
+        table = self._signals(reflectance).astype(np.float32)
         nodes = self._nodes()
         # A uniform aperture of one photosite has a variance of 1/12.
         sigma = ((2 * room.blur_px) ** 2 + 1 / 12) ** 0.5
@@ -445,8 +319,8 @@ class World:
             response += np.float32(1)
             if self.stain is not None or self.fold is not None:
                 response *= self._worn_rows(nodes, channels, first, last)
-            lines, table, rows = drawing.lines, drawing.signals, out[:, first:last]
-            lens, falloff = self._lens, self._falloff
+            rows, lens, falloff = out[:, first:last], self._lens, self._falloff
+            lines = drawing.x_lines, drawing.y_lines
             light(first, nodes, sigma, *lines, drawing.labels, table, channels, lens, falloff, response, rows)
 
         _in_blocks(visible.height, block)
@@ -486,49 +360,6 @@ class World:
         y, x = (np.arange(-1, (size - 1) // GRID_PX + 3) * GRID_PX for size in (visible.height, visible.width))
         photosites = np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)
         return self.view.locate((photosites - 0.5) / 2)
-
-    @cached_property
-    def _drawing(self) -> _Drawing:
-        sheet = self.sheet
-        codes, label = np.unique(np.concatenate([sheet.rgb, [_PAPER]]), axis=0, return_inverse=True)
-        reflectance = np.concatenate(
-            [print_reflectance(codes), np.full((1, len(self._sensitivities)), _BACKDROP_REFLECTANCE)]
-        )
-        backdrop = len(codes)
-        boxes = np.concatenate([sheet.rectangles_mm, [[0, 0, *sheet.page_mm]]])
-        boxes = np.clip(boxes, 0, [*sheet.page_mm, *sheet.page_mm])
-        (x_lines, left, right), (y_lines, top, bottom) = _lines(boxes[:, 0::2]), _lines(boxes[:, 1::2])
-        labels = np.full((len(y_lines) + 1, len(x_lines) + 1), backdrop, dtype=np.int32)
-        label = label.reshape(-1).astype(np.int32)
-        for k in (len(label) - 1, *range(len(label) - 1)):
-            labels[top[k] + 1 : bottom[k] + 1, left[k] + 1 : right[k] + 1] = label[k]
-        return _Drawing((x_lines, y_lines), labels, self._signals(reflectance).astype(np.float32))
-
-
-@dataclass(frozen=True, eq=False)
-class _Drawing:
-    """A print as `sim.world.rendering.light` reads it."""
-
-    lines: tuple[NDArray[np.float64], NDArray[np.float64]]
-    labels: NDArray[np.int32]
-    signals: NDArray[np.float32]
-
-
-def _lines(ends: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
-    """Return the sorted distinct coordinates of (N, 2) ends, and the index of each beginning and each end among them.
-
-    Coordinates within a micrometre are one; where a drawing has more than a few thousand, nearer ones are joined, each
-    then standing at the mean of those it stands for.
-    """
-    finest = _FINEST_MM
-    while True:
-        rounded, index = np.unique(np.round(ends / finest), return_inverse=True)
-        if len(rounded) <= _MOST_LINES:
-            break
-        finest *= 1.5
-    index = index.reshape(ends.shape)
-    count = np.bincount(index.ravel())
-    return np.bincount(index.ravel(), weights=ends.ravel()) / count, index[:, 0], index[:, 1]
 
 
 def _in_blocks(rows: int, work: Callable[[int, int], None]) -> None:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.config import CameraSettings, ProjectorCable, load_lab, parse_lab, require_whole_turns
+from acquisition.config import load_lab, parse_lab
+from acquisition.run.shutter import require_whole_turns
 from foundation.errors import ConfigurationError
 
 MINIMAL = 'rig = "simulated"\nchart = "c/chart.json"\nilluminations = "lights.csv"\n'
@@ -59,24 +60,6 @@ def test_replay_needs_a_recording(tmp_path: Path) -> None:
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"nowhere\.toml"):
         load_lab(tmp_path / "nowhere.toml")
-
-
-@pytest.mark.parametrize("shutter_s", [1 / 60, 0.25, 0.5, 0.6, 1.0, 2.0, 4.98])
-def test_whole_turns_of_the_wheel_are_accepted(shutter_s: float) -> None:
-    require_whole_turns(CameraSettings(shutter_s=shutter_s), ProjectorCable())
-
-
-@pytest.mark.parametrize(("shutter_s", "near"), [(1 / 125, "0.01667"), (1 / 8, "0.1167 or 0.1333"), (0.51, "0.5 or")])
-def test_a_part_of_a_turn_is_refused_with_what_is_near(shutter_s: float, near: str) -> None:
-    with pytest.raises(ConfigurationError, match=near):
-        require_whole_turns(CameraSettings(shutter_s=shutter_s), ProjectorCable())
-
-
-def test_a_projector_without_a_wheel_needs_whole_pictures() -> None:
-    steady = ProjectorCable(colour_wheel_hz=0, refresh_hz=50)
-    require_whole_turns(CameraSettings(shutter_s=0.02), steady)
-    with pytest.raises(ConfigurationError, match="50 a second"):
-        require_whole_turns(CameraSettings(shutter_s=1 / 60), steady)
 
 
 @pytest.mark.parametrize("name", ["demo.toml", "lab.toml"])

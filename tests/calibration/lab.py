@@ -17,13 +17,17 @@ from acquisition.chart.layout import A_SERIES_MM, design_chart
 from acquisition.chart.model import Chart
 from acquisition.chart.printing import drawing
 from acquisition.lights.illuminations import Illumination, plan_illuminations
-from acquisition.session.folder import ACCEPTED, Session, Step, plan_steps
+from acquisition.session.folder import Session
+from acquisition.session.journal import ACCEPTED
+from acquisition.session.plan import SessionStep, plan_steps
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from sim.camera.dng import write_dng
-from sim.camera.sensors import BODIES
-from sim.world.world import Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
 
 SETTINGS = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 Paint = Callable[[npt.NDArray[np.uint16]], None]
@@ -97,8 +101,8 @@ def take(
     folder: Path,
     lights: Sequence[Illumination],
     every: int = 25,
-    frame: Callable[[Step], bytes] | None = None,
-    verdict: Callable[[Step], str] | None = None,
+    frame: Callable[[SessionStep], bytes] | None = None,
+    verdict: Callable[[SessionStep], str] | None = None,
 ) -> Session:
     """Return an open session with an accepted frame for every step of the plan."""
     session = Session.create(folder, "rig = 'simulated'\n", lab.chart, lights)
@@ -106,7 +110,7 @@ def take(
         data = lab.dng(step.colour, step.number) if frame is None else frame(step)
         file = f"frames/{step.stem}.dng"
         at = TAKEN_AT + timedelta(seconds=4 * step.number)
-        attempt = session.begin(step, file, at)
+        attempt = session.journal.begin(step, file, at)
         (folder / file).write_bytes(data)
         session.commit(
             attempt,

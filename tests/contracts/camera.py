@@ -6,6 +6,7 @@ The camera photographs with a `SeededFilm`, so that each frame can be compared w
 from __future__ import annotations
 
 import io
+import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -102,6 +103,15 @@ class CameraContract:
             bench.camera.capture(io.BytesIO())
         bench.develop()
         assert bench.film.settings == told
+
+    def test_lists_the_shutter_times_that_it_takes(self, bench: Bench) -> None:
+        bench.camera.configure(SETTINGS)
+        speeds = bench.camera.shutter_speeds()
+        assert speeds == tuple(sorted(set(speeds)))
+        assert all(0 < speed < math.inf for speed in speeds)
+        assert any(abs(speed / SETTINGS.shutter_s - 1) < 0.01 for speed in speeds)
+        for speed in speeds[:: len(speeds) // 5]:
+            bench.camera.configure(replace(SETTINGS, shutter_s=speed))
 
     def test_writes_where_the_file_stands(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.ptp.codes import ResponseCode
-from drivers.ptp.messages import Event, Request, Response
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
 from drivers.ptp.transport import MAX_COLLECTED, Transport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 from sim.buses.responder import Answer, NoAnswer
@@ -71,37 +71,37 @@ def payload(size: int) -> bytes:
 class Echo:
     """A `sim.buses.responder.Responder` that does what it is told."""
 
-    raised: list[Event] = field(default_factory=list[Event])
+    raised: list[PtpEvent] = field(default_factory=list[PtpEvent])
     cancellations: list[int] = field(default_factory=list[int])
     unplugs: int = 0
 
-    def takes_data(self, request: Request) -> bool:
+    def takes_data(self, request: PtpRequest) -> bool:
         return request.code == TAKE
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         transaction = request.transaction
-        ok = Response(ResponseCode.OK, transaction)
+        ok = PtpResponse(ResponseCode.OK, transaction)
         match request.code:
             case 0x9F01:
-                return Answer(Response(ResponseCode.OK, transaction, request.parameters))
+                return Answer(PtpResponse(ResponseCode.OK, transaction, request.parameters))
             case 0x9F02:
                 return Answer(ok, payload(request.parameters[0]))
             case 0x9F03:
                 taken = data or b""
-                return Answer(Response(ResponseCode.OK, transaction, (len(taken), zlib.crc32(taken))))
+                return Answer(PtpResponse(ResponseCode.OK, transaction, (len(taken), zlib.crc32(taken))))
             case 0x9F05:
-                return Answer(Response(ResponseCode.INCOMPLETE_TRANSFER, transaction), payload(1000))
+                return Answer(PtpResponse(ResponseCode.INCOMPLETE_TRANSFER, transaction), payload(1000))
             case 0x9F06:
-                self.raised += [Event(0xC101, parameters=(number,)) for number in range(request.parameters[0])]
+                self.raised += [PtpEvent(0xC101, parameters=(number,)) for number in range(request.parameters[0])]
                 return Answer(ok)
             case 0x9F07:
                 raise NoAnswer
             case 0x9F08:
-                return Answer(Response(ResponseCode.OK, transaction + 1))
+                return Answer(PtpResponse(ResponseCode.OK, transaction + 1))
             case _:
-                return Answer(Response(ResponseCode.DEVICE_BUSY, transaction))
+                return Answer(PtpResponse(ResponseCode.DEVICE_BUSY, transaction))
 
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[PtpEvent, ...]:
         events = tuple(self.raised)
         self.raised.clear()
         return events
@@ -128,9 +128,9 @@ class TransportContract:
     def test_carries_a_transaction_without_data(self, bench: Bench) -> None:
         for count in range(6):
             parameters = tuple(0xFFFFFFFF - number for number in range(count))
-            request = Request(ECHO, 7 + count, parameters)
+            request = PtpRequest(ECHO, 7 + count, parameters)
             done = bench.transport.transact(request, timeout=PATIENCE_S)
-            assert done.response == Response(ResponseCode.OK, 7 + count, parameters)
+            assert done.response == PtpResponse(ResponseCode.OK, 7 + count, parameters)
             assert done.data == b""
 
     @pytest.mark.parametrize("size", EDGES)
@@ -152,7 +152,7 @@ class TransportContract:
 
     def test_pieces_add_up_to_the_data(self, bench: Bench) -> None:
         pieces: list[bytes] = []
-        request = Request(GIVE, 1, (5_000_000,))
+        request = PtpRequest(GIVE, 1, (5_000_000,))
         done = bench.transport.transact(request, receive=pieces.append, timeout=PATIENCE_S)
         assert done.response.ok
         assert done.data == b""
@@ -162,42 +162,42 @@ class TransportContract:
     def test_more_data_than_can_be_collected_is_refused(self, bench: Bench) -> None:
         _give(bench, MAX_COLLECTED)
         with pytest.raises(ProtocolError, match="at most"):
-            bench.transport.transact(Request(GIVE, 1, (MAX_COLLECTED + 1,)), timeout=PATIENCE_S)
+            bench.transport.transact(PtpRequest(GIVE, 1, (MAX_COLLECTED + 1,)), timeout=PATIENCE_S)
 
     def test_an_error_instead_of_data_is_the_response(self, bench: Bench) -> None:
-        done = bench.transport.transact(Request(REFUSE, 3), timeout=PATIENCE_S)
-        assert done.response == Response(ResponseCode.DEVICE_BUSY, 3)
+        done = bench.transport.transact(PtpRequest(REFUSE, 3), timeout=PATIENCE_S)
+        assert done.response == PtpResponse(ResponseCode.DEVICE_BUSY, 3)
         _give(bench, 100)
 
     def test_an_error_after_data_is_the_response(self, bench: Bench) -> None:
-        done = bench.transport.transact(Request(BREAK_OFF, 3), timeout=PATIENCE_S)
+        done = bench.transport.transact(PtpRequest(BREAK_OFF, 3), timeout=PATIENCE_S)
         assert done.response.code == ResponseCode.INCOMPLETE_TRANSFER
         _give(bench, 100)
 
     def test_events_come_once_and_in_order(self, bench: Bench) -> None:
         assert bench.transport.events() == ()
-        bench.transport.transact(Request(RAISE, 1, (20,)), timeout=PATIENCE_S)
+        bench.transport.transact(PtpRequest(RAISE, 1, (20,)), timeout=PATIENCE_S)
         assert [event.parameters for event in _awaited(bench, 20)] == [(number,) for number in range(20)]
         assert bench.transport.events() == ()
 
     def test_a_device_that_falls_silent_can_be_reset(self, bench: Bench) -> None:
         with pytest.raises(LinkTimeout):
-            bench.transport.transact(Request(HANG, 1), timeout=GIVE_UP_S)
+            bench.transport.transact(PtpRequest(HANG, 1), timeout=GIVE_UP_S)
         with pytest.raises(ProtocolError, match="reset"):
-            bench.transport.transact(Request(ECHO, 2), timeout=PATIENCE_S)
+            bench.transport.transact(PtpRequest(ECHO, 2), timeout=PATIENCE_S)
         bench.transport.reset()
         assert bench.device.unplugs == 1
         _give(bench, 100)
 
     def test_another_transactions_response_is_refused(self, bench: Bench) -> None:
         with pytest.raises(ProtocolError, match="transaction 6"):
-            bench.transport.transact(Request(MIX_UP, 5), timeout=PATIENCE_S)
+            bench.transport.transact(PtpRequest(MIX_UP, 5), timeout=PATIENCE_S)
         bench.transport.reset()
         _give(bench, 100)
 
     def test_a_caller_who_cannot_take_the_data_may_go_on(self, bench: Bench) -> None:
         with pytest.raises(_DiskFullError):
-            bench.transport.transact(Request(GIVE, 4, (3_000_000,)), receive=_full, timeout=PATIENCE_S)
+            bench.transport.transact(PtpRequest(GIVE, 4, (3_000_000,)), receive=_full, timeout=PATIENCE_S)
         _give(bench, 100)
         assert bench.device.unplugs == 0
 
@@ -206,18 +206,18 @@ class TransportContract:
         bench.pull()
         for _ in range(2):
             with pytest.raises(LinkClosed):
-                bench.transport.transact(Request(GIVE, 2, (100,)), timeout=PATIENCE_S)
+                bench.transport.transact(PtpRequest(GIVE, 2, (100,)), timeout=PATIENCE_S)
 
     def test_closed_is_closed(self, bench: Bench) -> None:
         bench.transport.close()
         bench.transport.close()
         with pytest.raises(LinkClosed):
-            bench.transport.transact(Request(ECHO, 1), timeout=PATIENCE_S)
+            bench.transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S)
 
     def test_messages_name_the_device(self, bench: Bench) -> None:
         assert bench.transport.label
         with pytest.raises(LinkTimeout, match=r".+"):
-            bench.transport.transact(Request(HANG, 1), timeout=GIVE_UP_S)
+            bench.transport.transact(PtpRequest(HANG, 1), timeout=GIVE_UP_S)
 
 
 class _DiskFullError(Exception):
@@ -228,9 +228,9 @@ def _full(piece: bytes) -> None:
     raise _DiskFullError
 
 
-def _awaited(bench: Bench, count: int) -> list[Event]:
+def _awaited(bench: Bench, count: int) -> list[PtpEvent]:
     """Return the next `count` events: on a network they travel beside the response and may come after it."""
-    found: list[Event] = []
+    found: list[PtpEvent] = []
     deadline = time.monotonic() + PATIENCE_S
     while len(found) < count and time.monotonic() < deadline:
         found.extend(bench.transport.events())
@@ -238,12 +238,12 @@ def _awaited(bench: Bench, count: int) -> list[Event]:
 
 
 def _give(bench: Bench, size: int) -> None:
-    done = bench.transport.transact(Request(GIVE, 1, (size,)), timeout=PATIENCE_S)
-    assert done.response == Response(ResponseCode.OK, 1)
+    done = bench.transport.transact(PtpRequest(GIVE, 1, (size,)), timeout=PATIENCE_S)
+    assert done.response == PtpResponse(ResponseCode.OK, 1)
     assert done.data == payload(size)
 
 
 def _take(bench: Bench, size: int) -> None:
     data = payload(size)
-    done = bench.transport.transact(Request(TAKE, 2), send=data, timeout=PATIENCE_S)
+    done = bench.transport.transact(PtpRequest(TAKE, 2), send=data, timeout=PATIENCE_S)
     assert done.response.parameters == (size, zlib.crc32(data))

@@ -15,14 +15,14 @@ from drivers.canon.camera import CanonEos
 from drivers.canon.records import OtherRecord, TransferRequest, decode_events, encode_events
 from drivers.links.pipes import UsbPipes
 from drivers.ptp.codes import Operation, ResponseCode
-from drivers.ptp.messages import Request, Response
+from drivers.ptp.messages import PtpRequest, PtpResponse
 from foundation.errors import DeviceError, DeviceRefused
 from foundation.files import whole_file
+from sim.buses.faults import CutOff, TroubledResponder
 from sim.buses.responder import Answer, NoAnswer, Responder
 from sim.camera.eos_bodies import EOS_550D
-from sim.faults import CutOff, TroubledResponder
 from tests.contracts.camera import SETTINGS
-from tests.drivers.eos_lab import Lab
+from tests.drivers.canon.eos_lab import Lab
 
 FRAMES = 707
 ATTEMPTS = 6
@@ -41,31 +41,31 @@ class BadDay(TroubledResponder):
         self._unplug = unplug
         self.happened: Counter[str] = Counter()
 
-    def answer(self, request: Request, data: bytes | None) -> Answer:
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
         if self._chance.random() >= TROUBLE:
             return super().answer(request, data)
         trouble = self._chance.choice((self._busy, self._ill, self._silent, self._lost, self._pulled, self._wrong))
         self.happened[trouble.__name__] += 1
         return trouble(request, data)
 
-    def _busy(self, request: Request, data: bytes | None) -> Answer:
-        return Answer(Response(ResponseCode.DEVICE_BUSY, request.transaction))
+    def _busy(self, request: PtpRequest, data: bytes | None) -> Answer:
+        return Answer(PtpResponse(ResponseCode.DEVICE_BUSY, request.transaction))
 
-    def _ill(self, request: Request, data: bytes | None) -> Answer:
-        return Answer(Response(ResponseCode.GENERAL_ERROR, request.transaction))
+    def _ill(self, request: PtpRequest, data: bytes | None) -> Answer:
+        return Answer(PtpResponse(ResponseCode.GENERAL_ERROR, request.transaction))
 
-    def _silent(self, request: Request, data: bytes | None) -> Answer:
+    def _silent(self, request: PtpRequest, data: bytes | None) -> Answer:
         raise NoAnswer
 
-    def _lost(self, request: Request, data: bytes | None) -> Answer:
+    def _lost(self, request: PtpRequest, data: bytes | None) -> Answer:
         super().answer(request, data)
         raise NoAnswer
 
-    def _pulled(self, request: Request, data: bytes | None) -> Answer:
+    def _pulled(self, request: PtpRequest, data: bytes | None) -> Answer:
         self._unplug()
         raise NoAnswer
 
-    def _wrong(self, request: Request, data: bytes | None) -> Answer:
+    def _wrong(self, request: PtpRequest, data: bytes | None) -> Answer:
         """Send too little or too much; of events lose, double and invent some."""
         answer = super().answer(request, data)
         if answer.data is None:

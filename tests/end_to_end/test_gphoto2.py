@@ -24,7 +24,7 @@ import pytest
 
 from drivers.camera import ExposureSettings
 from drivers.canon import apex
-from drivers.canon.records import RAW_ONLY, ImageFile, ImageFormat
+from drivers.canon.values import RAW_ONLY, ImageFile, ImageFormat
 from drivers.presenter import WHITE
 from drivers.ptp.codes import Property
 from drivers.raw.rawfile import read_raw
@@ -33,8 +33,10 @@ from sim.buses.ptpip_server import serve_ptpip
 from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D_AS_LISTED, TEST_BODY
 from sim.camera.film import Film, WorldFilm
-from sim.camera.sensors import BODIES
-from sim.world.world import Print, Room, World
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
 
 SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
 LIMIT_S = 60
@@ -121,8 +123,8 @@ def served(world: World, tmp_path: Path, request: pytest.FixtureRequest) -> Iter
     """Return a served camera; parametrise indirectly with another body than the test body."""
     body = getattr(request, "param", TEST_BODY)
     film = WitnessedFilm(WorldFilm(world, lambda: WHITE, lambda: 1.0, "1", {}))
-    with ThreadPoolExecutor(1) as darkroom:
-        eos = SimulatedEos(body, film, SystemClock(), serial="1", auto_power_off_s=0, darkroom=darkroom)
+    with ThreadPoolExecutor(1) as executor:
+        eos = SimulatedEos(body, film, SystemClock(), serial="1", auto_power_off_s=0, executor=executor)
         with serve_ptpip(eos, 0) as server:
             yield Served(eos, film, server.address[1], tmp_path)
 

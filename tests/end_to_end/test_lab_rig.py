@@ -21,25 +21,28 @@ import pytest
 from acquisition.chart.model import load_chart
 from acquisition.cli import main
 from acquisition.config import load_lab
-from acquisition.run.rig import open_rig, sheet, simulated_body, simulated_room
-from acquisition.run.taking import run_session
+from acquisition.run.rig.opening import open_rig
+from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
+from acquisition.run.run import run_session
 from acquisition.session.folder import Session
 from drivers.links.usb import open_usb
 from drivers.presenter import Colour
 from drivers.projector import Power
 from drivers.raw.rawfile import read_raw
-from foundation.clock import SystemClock
+from foundation.clock import Clock, SystemClock
 from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.pty import PseudoTerminal
+from sim.buses.serial_cable import serve_network
 from sim.buses.usb import SimulatedBus
 from sim.buses.usb_device import PtpUsbDevice
 from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_BODIES
 from sim.camera.film import WorldFilm
 from sim.clock import OPENING
-from sim.projectors.pjlink import SimulatedProjector, serve_pjlink
-from sim.projectors.pty import PseudoTerminal
+from sim.projectors.pjlink import serve_pjlink
+from sim.projectors.projector import SimulatedProjector
 from sim.projectors.screen import Screen, SimulatedPresenter
-from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer, serve_network
+from sim.projectors.serial import PEERS, BenqPeer, EpsonPeer
 from sim.world.world import World
 
 FRAMES = 10
@@ -52,10 +55,15 @@ white_level_share = 3.5
 """
 
 
+def simulated_display(display: str | int | None, clock: Clock) -> SimulatedPresenter:
+    """Stand in for `FullScreen`: whatever display this machine has stays dark."""
+    return SimulatedPresenter(Screen(), clock)
+
+
 @pytest.fixture(scope="module")
 def x_servers() -> ModuleType:
     """Return the module that runs X servers; it stands with the tests of the display."""
-    path = Path(__file__).parents[1] / "drivers" / "x_servers.py"
+    path = Path(__file__).parents[1] / "drivers" / "display" / "x_servers.py"
     spec = importlib.util.spec_from_file_location("x_servers_for_the_lab", path)
     assert spec is not None
     assert spec.loader is not None
@@ -89,9 +97,9 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
         beamer = SimulatedProjector(clock, power=Power.ON)
         world = World(sheet(load_chart(settings.chart)), simulated_body(settings), simulated_room(settings))
         film = WorldFilm(world, look, beamer.light, "0000000001", {})
-        darkroom = opened.enter_context(ThreadPoolExecutor(1))
+        executor = opened.enter_context(ThreadPoolExecutor(1))
         world.expose(Colour(0, 0, 0), settings.camera.exposure, key=(0,))  # renders before time counts
-        eos = SimulatedEos(EOS_BODIES["Test"], film, clock, auto_power_off_s=0, darkroom=darkroom)
+        eos = SimulatedEos(EOS_BODIES["Test"], film, clock, auto_power_off_s=0, executor=executor)
         bus = SimulatedBus()
         text = lab.read_text().replace('rig = "simulated"', 'rig = "lab"')
         text += "[sequence]\nsettle_s = 0.0\n" if "[sequence]" not in text else ""
@@ -107,7 +115,7 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
             text += '[lab.camera]\nconnection = "usb"\n'
             text += f'[lab.projector]\ncontrol = "benq"\ndevice = "{terminal.path}"\n'
         lab.write_text(text)
-        monkeypatch.setattr("acquisition.run.rig.open_usb", partial(open_usb, backend=bus))
+        monkeypatch.setattr("acquisition.run.rig.lab.open_usb", partial(open_usb, backend=bus))
         assert run_session(load_lab(lab), folder / "real", lambda done, total: None).complete
         assert beamer.power() is not Power.ON, "a complete session switches the lamp off"
         assert look() == Colour(0, 0, 0), "the screen is black when the lab is left"
@@ -122,25 +130,24 @@ def test_a_real_lab_takes_the_frames_of_the_simulated_one(
             assert theirs.taken_at > OPENING
 
 
-def test_a_look_tells_what_may_bend_the_light(
+def test_check_reports_what_may_alter_the_light(
     lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    class Doubting(SimulatedPresenter):
+    class WarningPresenter(SimulatedPresenter):
         def warnings(self) -> tuple[str, ...]:
             return ("the gamma ramp is not straight: switch off night light",)
 
-    monkeypatch.setattr("acquisition.run.rig.SimulatedPresenter", Doubting)
-    monkeypatch.setattr(sys, "argv", ["acquire", "check", str(lab)])
-    assert main() == 0
-    told = capsys.readouterr()
-    assert "gamma ramp is not straight" in told.out
-    assert "tags" in told.out
-    assert "warming up: the lamp was just lit and gets 1200 s" in told.err
+    monkeypatch.setattr("acquisition.run.rig.simulated.SimulatedPresenter", WarningPresenter)
+    assert main(["check", str(lab)]) == 0
+    printed = capsys.readouterr()
+    assert "gamma ramp is not straight" in printed.out
+    assert "tags" in printed.out
+    assert "warming up: the lamp was just lit; waiting 1200 s" in printed.err
 
 
 @pytest.mark.parametrize("maker", ["epson", "benq"])
 def test_a_makers_language_over_the_network(lab: Path, maker: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("acquisition.run.rig.FullScreen", lambda display, clock: SimulatedPresenter(Screen(), clock))  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", simulated_display)
     beamer = SimulatedProjector(SystemClock(), power=Power.ON)
     peer = partial(EpsonPeer, beamer, network=True) if maker == "epson" else partial(BenqPeer, beamer, network=True)
     with serve_network(peer) as server:

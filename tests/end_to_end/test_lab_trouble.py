@@ -18,7 +18,7 @@ if sys.platform == "win32":
     pytest.skip("Windows has no pseudo-terminals", allow_module_level=True)
 
 from acquisition.cli import main
-from drivers.display.fullscreen import Display, choose_display
+from drivers.display.displays import Display, choose_display
 from drivers.links.tcp import TcpLink, TcpServer
 from drivers.links.usb import open_usb
 from drivers.pjlink.projector import PjLinkProjector
@@ -26,12 +26,13 @@ from drivers.projector import Power
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceRefused
 from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.pty import PseudoTerminal
 from sim.buses.usb import SimulatedBus
 from sim.buses.usb_device import Identity, PtpUsbDevice
 from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_BODIES
-from sim.projectors.pjlink import SimulatedProjector, serve_pjlink
-from sim.projectors.pty import PseudoTerminal
+from sim.projectors.pjlink import serve_pjlink
+from sim.projectors.projector import SimulatedProjector
 from sim.projectors.screen import Screen, SimulatedPresenter
 from sim.projectors.serial import EpsonPeer
 from tests.contracts.camera import SeededFilm
@@ -70,8 +71,7 @@ class Bench:
         return self.lab.parent / "session"
 
     def _outcome(self, *arguments: str) -> tuple[int, str]:
-        self.monkeypatch.setattr(sys, "argv", ["acquire", *arguments])
-        code = main()
+        code = main(arguments)
         lines = [line for line in self.capsys.readouterr().err.splitlines() if line.startswith("error: ")]
         assert len(lines) == 1
         # What was left of a time limit is never twice the same.
@@ -86,8 +86,8 @@ def bench(lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
         choose_display(bench.displays, display)
         return SimulatedPresenter(Screen(), clock)
 
-    monkeypatch.setattr("acquisition.run.rig.FullScreen", presenter)
-    monkeypatch.setattr("acquisition.run.rig.open_usb", partial(open_usb, backend=bench.bus))
+    monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", presenter)
+    monkeypatch.setattr("acquisition.run.rig.lab.open_usb", partial(open_usb, backend=bench.bus))
     return bench
 
 
@@ -162,7 +162,7 @@ def test_a_port_that_answers_something_else(bench: Bench, camera: str) -> None:
 
 
 def test_a_projector_that_does_not_answer(bench: Bench, camera: str) -> None:
-    bench.monkeypatch.setattr("acquisition.run.rig.PjLinkProjector", partial(PjLinkProjector, timeout=0.05))
+    bench.monkeypatch.setattr("acquisition.run.rig.lab.PjLinkProjector", partial(PjLinkProjector, timeout=0.05))
 
     def say_nothing(link: TcpLink) -> None:
         link.read(1, 60.0)

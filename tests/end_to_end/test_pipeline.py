@@ -6,7 +6,6 @@ import csv
 import hashlib
 import importlib
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 from acquisition.config import load_lab
-from acquisition.run.rig import sheet, simulated_body, simulated_room
+from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
 from acquisition.session.folder import Session
 from calibration.table.lut import Lut, open_lut
 from foundation.errors import FormatError
@@ -38,12 +37,7 @@ def run() -> Run:
     """Return a function that runs a command as the shell would and returns its exit code."""
 
     def call(module: str, *arguments: object) -> int:
-        before = sys.argv
-        sys.argv = [module, *map(str, arguments)]
-        try:
-            return importlib.import_module(module).main()
-        finally:
-            sys.argv = before
+        return importlib.import_module(module).main([*map(str, arguments)])
 
     return call
 
@@ -147,7 +141,7 @@ def test_the_dataset_can_be_evaluated(built: Path, run: Run, capsys: pytest.Capt
 
 
 def test_an_interrupted_session_gives_the_same_table(built: Path, run: Run, lut: Lut) -> None:
-    from acquisition.run.taking import run_session
+    from acquisition.run.run import run_session
 
     settings = load_lab(built / "LAB.toml")
     session = built / "interrupted"
@@ -207,7 +201,7 @@ def test_a_table_of_another_version_is_named(built: Path, lut: Lut, tmp_path: Pa
 
 
 def test_a_session_without_frames_is_said(built: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    from acquisition.run.taking import open_session
+    from acquisition.run.run import open_session
 
     settings = load_lab(built / "LAB.toml")
     open_session(settings, built / "bare").close()

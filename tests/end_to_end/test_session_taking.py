@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 
 from acquisition.cli import main
 from acquisition.config import load_lab
-from acquisition.run.taking import run_session
+from acquisition.run.run import run_session
 from acquisition.session.folder import Session
 from drivers.canon.camera import CanonEos
 from drivers.pjlink.projector import PjLinkProjector
@@ -25,15 +26,14 @@ Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 KILLER = """
 import os, signal, sys
 from acquisition.cli import main
-import acquisition.session.folder, foundation.files
+import acquisition.session.folder, acquisition.session.journal, foundation.files
 
 place, count = sys.argv[1], int(sys.argv[2])
-del sys.argv[1:3]
 owner, name = {
     "renaming": (foundation.files.Path, "replace"),
     "committing": (acquisition.session.folder.Session, "commit"),
     "deriving": (acquisition.session.folder.Session, "write_frames_csv"),
-    "beginning": (acquisition.session.folder.Session, "begin"),
+    "beginning": (acquisition.session.journal.Journal, "begin"),
 }[place]
 real = getattr(owner, name)
 
@@ -47,20 +47,19 @@ def deadly(*args, **kwargs):
     return real(*args, **kwargs)
 
 setattr(owner, name, deadly)
-sys.exit(main())
+sys.exit(main(sys.argv[3:]))
 """
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["acquire", *map(str, arguments)])
-    return main()
+def run(*arguments: object) -> int:
+    return main(list(map(str, arguments)))
 
 
 def test_a_session_holds_every_frame_of_the_plan(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, frame_hashes: Hashes, capsys: pytest.CaptureFixture[str]
+    lab: Path, frame_hashes: Hashes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = lab.parent / "session"
-    assert run(monkeypatch, "run", lab, folder) == 0
+    assert run("run", lab, folder) == 0
     hashes = frame_hashes(folder)
     assert {key: len(files) for key, files in hashes.items()} == {
         ("light", "0"): 1,
@@ -73,34 +72,30 @@ def test_a_session_holds_every_frame_of_the_plan(
     everything = [digest for files in hashes.values() for digest in files]
     assert len(set(everything)) == len(everything), "two frames have the same noise"
     capsys.readouterr()
-    assert run(monkeypatch, "status", folder) == 0
+    assert run("status", folder) == 0
     assert "10 of 10" in capsys.readouterr().out
-    assert run(monkeypatch, "run", lab, folder) == 0, "a complete session is complete again"
+    assert run("run", lab, folder) == 0, "a complete session is complete again"
 
 
 @pytest.mark.parametrize(("place", "count"), [("renaming", 1), ("committing", 4), ("deriving", 6), ("beginning", 8)])
-def test_a_killed_session_ends_in_the_same_frames(
-    lab: Path, frame_hashes: Hashes, place: str, count: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_session_ends_in_the_same_frames(lab: Path, frame_hashes: Hashes, place: str, count: int) -> None:
     undisturbed, killed = lab.parent / "undisturbed", lab.parent / "killed"
-    assert run(monkeypatch, "run", lab, undisturbed) == 0
+    assert run("run", lab, undisturbed) == 0
     done = subprocess.run(
         [sys.executable, "-c", KILLER, place, str(count), "run", str(lab), str(killed)],
         capture_output=True,
         check=False,
     )
     assert done.returncode == -signal.SIGKILL, done.stderr
-    assert run(monkeypatch, "run", lab, killed) == 0
+    assert run("run", lab, killed) == 0
     assert frame_hashes(killed) == frame_hashes(undisturbed)
     assert (killed / "frames.csv").read_text() == (undisturbed / "frames.csv").read_text()
     assert not list(killed.rglob(".*partial*"))
 
 
-def test_ctrl_c_at_every_frame_ends_in_the_same_frames(
-    lab: Path, frame_hashes: Hashes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_at_every_frame_ends_in_the_same_frames(lab: Path, frame_hashes: Hashes) -> None:
     undisturbed, interrupted = lab.parent / "undisturbed", lab.parent / "interrupted"
-    assert run(monkeypatch, "run", lab, undisturbed) == 0
+    assert run("run", lab, undisturbed) == 0
     settings = load_lab(lab)
     for _ in range(50):
         last: list[int] = []
@@ -118,26 +113,24 @@ def test_ctrl_c_at_every_frame_ends_in_the_same_frames(
     assert frame_hashes(interrupted) == frame_hashes(undisturbed)
 
 
-def test_a_replayed_session_has_the_same_bytes(
-    lab: Path, frame_hashes: Hashes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_replayed_session_has_the_same_bytes(lab: Path, frame_hashes: Hashes) -> None:
     recorded, replayed = lab.parent / "recorded", lab.parent / "replayed"
-    assert run(monkeypatch, "run", lab, recorded) == 0
+    assert run("run", lab, recorded) == 0
     text = lab.read_text().replace('"simulated"', '"replay"')
     lab.write_text(text + '[replay]\nsession = "recorded"\n')
-    assert run(monkeypatch, "run", lab, replayed) == 0
+    assert run("run", lab, replayed) == 0
     assert frame_hashes(replayed) == frame_hashes(recorded)
 
 
 @pytest.mark.parametrize(("text", "said"), [(None, "No such file"), ("garbage", "expected lights under the columns")])
 def test_a_look_reads_the_lights_too(
-    lab: Path, text: str | None, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    lab: Path, text: str | None, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lights = lab.parent / "illuminations.csv"
     lights.unlink()
     if text is not None:
         lights.write_text(text)
-    assert run(monkeypatch, "check", lab) == 2
+    assert run("check", lab) == 2
     told = capsys.readouterr().err
     assert str(lights) in told
     assert said in told
@@ -171,32 +164,28 @@ def test_a_run_that_is_told_to_end_closes_its_devices(
     before = signal.getsignal(number)
     with monkeypatch.context() as patched:
         patched.setattr(Session, "commit", told_to_end)
-        assert run(monkeypatch, "run", lab, session) == 130
+        assert run("run", lab, session) == 130
     assert "interrupted; run the same command again to go on" in capsys.readouterr().err
     assert set(closed) == {"camera", "projector", "journal"}
     assert signal.getsignal(number) == before
-    assert run(monkeypatch, "run", lab, session) == 0
+    assert run("run", lab, session) == 0
 
 
-def test_an_imported_session_has_the_same_frames(
-    lab: Path, frame_hashes: Hashes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_imported_session_has_the_same_frames(lab: Path, frame_hashes: Hashes) -> None:
     taken, imported = lab.parent / "taken", lab.parent / "imported"
-    assert run(monkeypatch, "run", lab, taken) == 0
+    assert run("run", lab, taken) == 0
     rows = (taken / "frames.csv").read_text().replace(",accepted", ",")
     (taken / "list.csv").write_text(rows)
-    assert run(monkeypatch, "import", taken / "list.csv", lab.parent / "chart.json", imported) == 0
+    assert run("import", taken / "list.csv", lab.parent / "chart.json", imported) == 0
     assert frame_hashes(imported) == frame_hashes(taken)
 
 
-def test_an_import_of_a_damaged_file_leaves_nothing(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_import_of_a_damaged_file_leaves_nothing(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     taken, imported = lab.parent / "taken", lab.parent / "imported"
-    assert run(monkeypatch, "run", lab, taken) == 0
+    assert run("run", lab, taken) == 0
     victim = next((taken / "frames").glob("*light_002*"))
     victim.write_bytes(victim.read_bytes()[:-10])
-    assert run(monkeypatch, "import", taken / "frames.csv", lab.parent / "chart.json", imported) == 2
+    assert run("import", taken / "frames.csv", lab.parent / "chart.json", imported) == 2
     assert victim.name in capsys.readouterr().err
     assert not imported.exists()
 
@@ -209,34 +198,30 @@ def test_an_import_of_a_damaged_file_leaves_nothing(
     ],
 )
 def test_a_session_is_not_continued_with_other_settings(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], change: str, expected: str
+    lab: Path, capsys: pytest.CaptureFixture[str], change: str, expected: str
 ) -> None:
     folder = lab.parent / "session"
-    assert run(monkeypatch, "run", lab, folder) == 0
+    assert run("run", lab, folder) == 0
     before = (folder / "frames.csv").read_bytes()
     lab.write_text(lab.read_text() + change)
-    assert run(monkeypatch, "run", lab, folder) == 2
+    assert run("run", lab, folder) == 2
     assert expected in capsys.readouterr().err
     assert (folder / "frames.csv").read_bytes() == before
 
 
-def test_a_foreign_folder_is_left_alone(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_foreign_folder_is_left_alone(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = lab.parent / "thesis"
     folder.mkdir()
     (folder / "chapter1.tex").write_text("all my work")
-    assert run(monkeypatch, "run", lab, folder) == 2
+    assert run("run", lab, folder) == 2
     assert "already exists" in capsys.readouterr().err
     assert [path.name for path in folder.iterdir()] == ["chapter1.tex"]
 
 
-def test_overexposed_frames_are_refused_and_said(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_overexposed_frames_are_refused_and_said(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lab.write_text(lab.read_text() + "[camera]\nshutter_s = 2.0\n")
     folder = lab.parent / "session"
-    assert run(monkeypatch, "run", lab, folder) == 4
+    assert run("run", lab, folder) == 4
     message = capsys.readouterr().err
     assert "clipped" in message
     assert "0.1 % allowed" in message
@@ -249,10 +234,7 @@ def test_overexposed_frames_are_refused_and_said(
 def test_two_programs_do_not_take_the_same_session(lab: Path) -> None:
     settings = load_lab(lab)
     folder = lab.parent / "session"
-    code = (
-        "import sys\nfrom acquisition.cli import main\n"
-        f"sys.argv = ['acquire', 'run', {str(lab)!r}, {str(folder)!r}]\nsys.exit(main())"
-    )
+    code = f"import sys\nfrom acquisition.cli import main\nsys.exit(main(['run', {str(lab)!r}, {str(folder)!r}]))"
     answers: list[subprocess.CompletedProcess[str]] = []
 
     def meanwhile(done: int, total: int) -> None:
@@ -279,32 +261,49 @@ def test_a_full_disk_costs_nothing_taken(
         real(handle)
 
     monkeypatch.setattr(os, "fsync", fail)
-    assert run(monkeypatch, "run", lab, folder) == 5
+    assert run("run", lab, folder) == 5
     assert "No space left on device" in capsys.readouterr().err
     monkeypatch.setattr(os, "fsync", real)
     kept = frame_hashes(folder)
     assert kept
-    assert run(monkeypatch, "run", lab, folder) == 0
+    assert run("run", lab, folder) == 0
     after: dict[Any, list[str]] = frame_hashes(folder)
     assert all(set(files) <= set(after[key]) for key, files in kept.items())
 
 
-def test_a_replay_with_another_exposure_is_told_the_recordings(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(monkeypatch, "run", lab, lab.parent / "recorded") == 0
+def test_a_replay_with_another_exposure_is_told_the_recordings(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("run", lab, lab.parent / "recorded") == 0
     text = lab.read_text().replace('"simulated"', '"replay"')
     lab.write_text(text + '[replay]\nsession = "recorded"\n[camera]\nshutter_s = 1.0\n')
-    assert run(monkeypatch, "run", lab, lab.parent / "replayed") == 3
+    assert run("run", lab, lab.parent / "replayed") == 3
     assert "was taken with 0.5 s" in capsys.readouterr().err
 
 
 def test_a_series_longer_than_a_battery_lasts(lab: Path) -> None:
     from acquisition.chart.model import load_chart
-    from acquisition.run.rig import open_rig
+    from acquisition.run.rig.opening import open_rig
 
     settings = load_lab(lab)
     with open_rig(settings, load_chart(settings.chart)) as devices:
         devices.camera.configure(settings.camera.exposure)
         frames = {devices.camera.capture(io.BytesIO()).name for _ in range(430)}
     assert len(frames) == 430
+
+
+@pytest.mark.parametrize(("shutter_s", "looks"), [(0.02, 1), (1.3, 4)])
+def test_following_what_a_look_recommends_leads_to_a_good_exposure(
+    lab: Path, shutter_s: float, looks: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = lab.read_text() + "[limits]\nclipped_percent = 100\n[camera]\nshutter_s = "
+    # Of a clipped frame nobody knows how much too bright it is, so that it takes several steps.
+    for _ in range(looks):
+        lab.write_text(f"{text}{shutter_s}\n")
+        assert run("check", lab) == 0
+        found = re.findall(r"; 30% to 80% wanted, try camera\.shutter_s = (\S+)", capsys.readouterr().out)
+        if not found:
+            break
+        shutter_s = float(found[0])
+        assert abs(shutter_s * 60 - round(shutter_s * 60)) < 0.01, "whole turns of a wheel of 60 Hz"
+    lab.write_text(f"{text}{shutter_s}\n")
+    assert run("check", lab) == 0
+    assert "wanted" not in capsys.readouterr().out

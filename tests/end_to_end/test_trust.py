@@ -1,6 +1,6 @@
-"""A table whose samples are wrong is never accepted: rooms and sessions that go wrong, each refused, told, or right.
+"""A table whose samples are wrong is never accepted: what goes wrong is refused, remarked on or harmless.
 
-Each table that is built is held against the room cell by cell, with the noise of its 25 samples taken out, so that a
+Each table that is built is compared with the room cell by cell, with the noise of its 25 samples taken out, so that a
 grid a cell aside, a poster of another order or a hand in the light cannot pass.
 """
 
@@ -14,16 +14,18 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session.folder import Session, Step
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep
 from benchmarks.accuracy import Held, beyond_noise, hold, repeated_variance
 from benchmarks.rooms import random_case
-from calibration.pipeline.build import BuildResult, build
+from calibration.pipeline.build import build
 from calibration.table.lut import open_lut
+from calibration.verdict.result import BuildResult
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from foundation.angles import angles_deg
 from foundation.errors import CropError, QualityError
-from sim.world.world import Room
+from sim.world.room import Room
 from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang, renumbered, take
 
 FEW = renumbered([LIGHTS[4], LIGHTS[5], LIGHTS[0]])
@@ -36,12 +38,12 @@ def lab() -> Lab:
     return hang()
 
 
-def held_against(lab: Lab, session: Session, folder: Path) -> tuple[BuildResult, Held]:
-    """Build a session's table and hold it against the room."""
+def compared_with_truth(lab: Lab, session: Session, folder: Path) -> tuple[BuildResult, Held]:
+    """Return the result of building a session's table, and the table compared with the room."""
     result = build(session, folder / "lut")
     table = open_lut(folder / "lut")
     cells = lab.chart.centres_mm[lab.chart.cell_of_colour]
-    frames = {frame.record.illumination: frame for frame in result.frames if frame.record.kind == "light"}
+    frames = {frame.record.illumination: frame for frame in result.figures.frames if frame.record.kind == "light"}
     fields = [frames[number].paper.field.at(cells) for number in range(len(table.illuminations))]
     return result, hold(table, lab.world, lab.chart, fields, SETTINGS)
 
@@ -53,36 +55,36 @@ def wrong(held: Held) -> float:
     return max(beyond_noise(held.error[[n]], held.noise[[n]], chosen[[n]])[2] for n in one if chosen[n].any())
 
 
-def session_of(lab: Lab, folder: Path, frame: Callable[[Step], bytes]) -> Session:
+def session_of(lab: Lab, folder: Path, frame: Callable[[SessionStep], bytes]) -> Session:
     return take(lab, folder / "session", FEW, every=2, frame=frame)
 
 
-def later(step: Step) -> bool:
+def later(step: SessionStep) -> bool:
     """Return whether a step lies in the later half of these sessions."""
     return step.number >= 4
 
 
-def once(step: Step) -> bool:
+def once(step: SessionStep) -> bool:
     """Return whether a step is the first light's, between two white frames that know nothing of it."""
     return step.illumination == 0
 
 
-def swapped(lab: Lab, other: Lab, when: Callable[[Step], bool]) -> Callable[[Step], bytes]:
+def swapped(lab: Lab, other: Lab, when: Callable[[SessionStep], bool]) -> Callable[[SessionStep], bytes]:
     """Return frames of one room, and of another when it is time."""
     return lambda step: (other if when(step) else lab).dng(step.colour, step.number)
 
 
-def exposed(lab: Lab, settings: Callable[[Step], ExposureSettings]) -> Callable[[Step], bytes]:
+def exposed(lab: Lab, settings: Callable[[SessionStep], ExposureSettings]) -> Callable[[SessionStep], bytes]:
     """Return frames of which each has an exposure of its own."""
     return lambda step: lab.dng(step.colour, step.number, settings(step))
 
 
-def shaded(lab: Lab, left: float, when: Callable[[Step], bool]) -> Callable[[Step], bytes]:
+def shaded(lab: Lab, left: float, when: Callable[[SessionStep], bool]) -> Callable[[SessionStep], bytes]:
     """Return frames in which a hand's breadth of the print has so much of its light left when it is time."""
     visible = lab.world.body.visible
     area = np.s_[visible.top + 180 : visible.top + 300, visible.left + 300 : visible.left + 420]
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         def shade(counts: npt.NDArray[np.uint16]) -> None:
             if when(step):
                 light = counts[area].astype(np.float64) - lab.world.body.black
@@ -96,7 +98,7 @@ def shaded(lab: Lab, left: float, when: Callable[[Step], bool]) -> Callable[[Ste
 def test_cells_have_no_error_but_noise_s(lab: Lab, tmp_path: Path) -> None:
     """3 700 means above 300 counts; beyond 0.3 % of field, response and bleed, chance adds 0.1 % in 10⁴ runs."""
     with take(lab, tmp_path / "session", LIGHTS, every=6) as session:
-        _, held = held_against(lab, session, tmp_path)
+        _, held = compared_with_truth(lab, session, tmp_path)
         table = open_lut(tmp_path / "lut")
     total, alone, systematic, _ = beyond_noise(held.error, held.noise, held.where(300, np.inf))
     assert systematic < 0.004, f"{total:.4f} in all, {alone:.4f} of noise"
@@ -114,7 +116,7 @@ def test_cells_have_no_error_but_noise_s(lab: Lab, tmp_path: Path) -> None:
 def test_two_frames_of_a_light_differ_by_photons_and_read_noise(lab: Lab, tmp_path: Path) -> None:
     """Within 5 %: some 600 variances of 25 values have a mean good to 1.2 %, so chance fails once in 10⁴."""
     with take(lab, tmp_path / "session", renumbered([LIGHTS[5], LIGHTS[5]])) as session:
-        _, held = held_against(lab, session, tmp_path)
+        _, held = compared_with_truth(lab, session, tmp_path)
         result = open_lut(tmp_path / "lut")
         field = held.level[0] * 0 + 1
     ratio = repeated_variance(result.samples[0], result.samples[1], held.level[0], field, lab.world.body, SETTINGS.iso)
@@ -143,17 +145,17 @@ def test_a_random_room_is_refused_or_right(seed: int, tmp_path: Path) -> None:
     hung = hang(room=room, seed=seed)
     with take(hung, tmp_path / "session", FEW, every=2) as session:
         try:
-            result, held = held_against(hung, session, tmp_path)
+            result, held = compared_with_truth(hung, session, tmp_path)
         except QualityError:
             return
-    offset = result.registration.to_pixels(hung.chart.centres_mm) - hung.world.project(hung.chart.centres_mm)
+    offset = result.figures.registration.to_pixels(hung.chart.centres_mm) - hung.world.project(hung.chart.centres_mm)
     assert np.linalg.norm(offset, axis=1).max() < 0.7
     assert wrong(held) < WRONG
 
 
 @pytest.mark.parametrize("when", [later, once])
 def test_another_poster_that_is_hung_up_midway_is_refused(
-    lab: Lab, tmp_path: Path, when: Callable[[Step], bool]
+    lab: Lab, tmp_path: Path, when: Callable[[SessionStep], bool]
 ) -> None:
     """Its tags lie where those of the first lay, so that nothing seems to have moved."""
     frame = swapped(lab, hang(seed=7), when)
@@ -168,7 +170,7 @@ def test_a_chart_moved_by_a_cell_is_followed(lab: Lab, tmp_path: Path) -> None:
     visible = lab.world.body.visible
     seen = np.s_[visible.top : visible.top + visible.height, visible.left : visible.left + visible.width]
 
-    def frame(step: Step) -> bytes:
+    def frame(step: SessionStep) -> bytes:
         def move(counts: npt.NDArray[np.uint16]) -> None:
             if later(step):
                 counts[seen] = np.roll(counts[seen], 2 * round(across), axis=1)
@@ -176,15 +178,17 @@ def test_a_chart_moved_by_a_cell_is_followed(lab: Lab, tmp_path: Path) -> None:
         return lab.dng(step.colour, step.number, paint=move)
 
     with session_of(lab, tmp_path, frame) as session:
-        result, held = held_against(lab, session, tmp_path)
-    assert sum(figures.registered for figures in result.frames) == 1
+        result, held = compared_with_truth(lab, session, tmp_path)
+    assert sum(figures.reregistered for figures in result.figures.frames) == 1
     assert "moved_anew" in {row.threshold.name for row in result.verdict.remarks}
     # The light moves with the picture here, so its field fits the moved frames less well.
     assert wrong(held) < 0.05
 
 
 @pytest.mark.parametrize(("left", "when"), [(0.05, later), (0.05, once), (0.7, once), (0.85, once)])
-def test_a_hand_in_the_light_is_refused(lab: Lab, tmp_path: Path, left: float, when: Callable[[Step], bool]) -> None:
+def test_a_hand_in_the_light_is_refused(
+    lab: Lab, tmp_path: Path, left: float, when: Callable[[SessionStep], bool]
+) -> None:
     with session_of(lab, tmp_path, shaded(lab, left, when)) as session, pytest.raises(QualityError, match="no table"):
         build(session, tmp_path / "lut")
 
@@ -192,30 +196,30 @@ def test_a_hand_in_the_light_is_refused(lab: Lab, tmp_path: Path, left: float, w
 def test_a_frame_that_is_spoilt_is_named_with_the_place(lab: Lab, tmp_path: Path) -> None:
     with session_of(lab, tmp_path, shaded(lab, 0.8, once)) as session, pytest.raises(QualityError) as refused:
         build(session, tmp_path / "lut")
-    assert "frames/0002_light_000.dng about " in str(refused.value)
+    assert "frames/0002_light_000.dng, about " in str(refused.value)
     assert "a hand, a shadow or a reflection" in str(refused.value)
 
 
-def test_a_faint_shadow_is_told(lab: Lab, tmp_path: Path) -> None:
+def test_a_faint_shadow_is_remarked_on(lab: Lab, tmp_path: Path) -> None:
     """6 % less light on a hand's breadth is no reason to refuse a table, but to look at it."""
     with session_of(lab, tmp_path, shaded(lab, 0.94, once)) as session:
         result = build(session, tmp_path / "lut")
     assert "unlike_block" in {row.threshold.name for row in result.verdict.remarks}
 
 
-def test_a_lamp_that_flickers_is_told_and_harms_no_colour(lab: Lab, tmp_path: Path) -> None:
+def test_a_lamp_that_flickers_is_reported_and_harms_no_colour(lab: Lab, tmp_path: Path) -> None:
     """Every frame has its own brightness; each light's ground truth is of its own frame."""
     bright = {step: ExposureSettings(100, 8.0, 0.5 * (0.94 if step % 2 else 1.0)) for step in range(20)}
     frame = exposed(lab, lambda step: bright[step.number])
     with take(lab, tmp_path / "session", FEW, every=1, frame=frame) as session:
-        result, held = held_against(lab, session, tmp_path)
+        result, held = compared_with_truth(lab, session, tmp_path)
     assert wrong(held) < WRONG
     assert result.verdict.outcome != "refuse"
 
 
 @pytest.mark.parametrize(("blur_px", "when"), [(3.0, later), (1.5, later), (1.15, once), (2.5, once)])
 def test_a_focus_that_is_lost_midway_is_refused(
-    lab: Lab, tmp_path: Path, blur_px: float, when: Callable[[Step], bool]
+    lab: Lab, tmp_path: Path, blur_px: float, when: Callable[[SessionStep], bool]
 ) -> None:
     """1.15 px of blur set dark cells off by 4 %, 1.5 px by a sixth of their neighbours."""
     soft = hang(room=replace(lab.world.room, blur_px=blur_px))
@@ -223,7 +227,7 @@ def test_a_focus_that_is_lost_midway_is_refused(
         build(session, tmp_path / "lut")
 
 
-def test_a_focus_that_softens_is_told(lab: Lab, tmp_path: Path) -> None:
+def test_a_focus_that_softens_is_remarked_on(lab: Lab, tmp_path: Path) -> None:
     soft = hang(room=replace(lab.world.room, blur_px=0.72))
     with session_of(lab, tmp_path, swapped(lab, soft, once)) as session:
         result = build(session, tmp_path / "lut")
@@ -231,12 +235,12 @@ def test_a_focus_that_softens_is_told(lab: Lab, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shutter_s", [0.25, 0.8])
-def test_an_exposure_changed_midway_is_told_or_harms_nothing(lab: Lab, tmp_path: Path, shutter_s: float) -> None:
+def test_an_exposure_changed_midway_is_reported_or_harms_nothing(lab: Lab, tmp_path: Path, shutter_s: float) -> None:
     changed = ExposureSettings(100, 8.0, shutter_s)
     frame = exposed(lab, lambda step: changed if later(step) else SETTINGS)
     with session_of(lab, tmp_path, frame) as session:
         try:
-            _, held = held_against(lab, session, tmp_path)
+            _, held = compared_with_truth(lab, session, tmp_path)
         except CropError:
             return
     assert wrong(held) < WRONG
@@ -249,13 +253,13 @@ def test_frames_that_clip_list_their_cells(lab: Lab, tmp_path: Path) -> None:
     frame = exposed(lab, lambda step: long if step.colour == WHITE else SETTINGS)
     with take(lab, tmp_path / "session", lights, frame=frame) as session:
         try:
-            result, held = held_against(lab, session, tmp_path)
+            result, held = compared_with_truth(lab, session, tmp_path)
         except QualityError as refused:
             assert "saturation" in str(refused)  # noqa: PT017
             return
     table = open_lut(tmp_path / "lut")
     fit = table.samples[:, held.clean]
-    assert fit.max() < 1.2 * result.white_level
+    assert fit.max() < 1.2 * result.figures.sensor.white_level
     assert wrong(held) < WRONG
 
 
@@ -263,7 +267,7 @@ def test_a_softer_picture_is_registered_as_well(tmp_path: Path) -> None:
     """0.8 px of the lens's blur: whether samples suffer depends on the cells' size, their places do not."""
     soft = hang(room=Room(waviness_mm=0.5, blur_px=0.8))
     with take(soft, tmp_path / "session", FEW) as session:
-        result, held = held_against(soft, session, tmp_path)
-    offset = result.registration.to_pixels(soft.chart.centres_mm) - soft.world.project(soft.chart.centres_mm)
+        result, held = compared_with_truth(soft, session, tmp_path)
+    offset = result.figures.registration.to_pixels(soft.chart.centres_mm) - soft.world.project(soft.chart.centres_mm)
     assert np.sqrt((offset**2).sum(axis=1).mean()) < 0.05
     assert wrong(held) < WRONG

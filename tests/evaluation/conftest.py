@@ -1,9 +1,20 @@
-"""Real images for the tests of methods."""
+"""A small generated dataset, and real images for the tests of methods."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
 import pytest
 
+from acquisition.lights.illuminations import Illumination
+from calibration.table.lut import open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
+from drivers.presenter import Colour
+from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.pictures.sources import random_scenes
 from tests.evaluation.real_images import Collection, collections
 
 MAKERS = collections()
@@ -11,4 +22,36 @@ MAKERS = collections()
 
 @pytest.fixture(scope="session", params=MAKERS)
 def collection(request: pytest.FixtureRequest) -> Collection:
+    """Return a collection of real images and their ground truths."""
     return MAKERS[request.param]()
+
+
+LIGHTS = np.array([[2000.0, 3000, 1000], [1500, 3000, 2500]])
+
+
+@pytest.fixture
+def dataset(make_dataset: Callable[[int, int], Path]) -> Path:
+    """Return a dataset of images of 96 x 64 px."""
+    return make_dataset(96, 64)
+
+
+@pytest.fixture
+def make_dataset(tmp_path: Path) -> Callable[[int, int], Path]:
+    """Return a maker of datasets of 8 random scenes whose colours reflect as their code, under two lights, no noise."""
+    folder = tmp_path / "lut"
+    folder.mkdir()
+    index = np.arange(512)
+    code = np.stack([index >> 6, index >> 3 & 7, index & 7], axis=-1) / 7
+    writer = LutWriter(folder, 2, 512, 2)
+    for number, light in enumerate(LIGHTS):
+        writer.put(number, np.rint(code * light)[:, None, :].repeat(2, axis=1).astype(np.uint16))
+    known = Provenance(camera="Test", bits=3, white_level=9000, session_sha256="0", chart_sha256="0", software="test")
+    plan = [Illumination(number, "uniform", None, Colour(1, 2, 3)) for number in range(2)]
+    writer.finish(plan, LIGHTS, known)
+
+    def make(width: int, height: int) -> Path:
+        scenes = random_scenes(8, width, height)
+        generate_dataset(open_lut(folder), tmp_path / "made", scenes, [0, 1], options=DatasetOptions(previews=False))
+        return tmp_path / "made"
+
+    return make

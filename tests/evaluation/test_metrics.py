@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluation.metrics import recovery_error, reproduction_error, summarise
@@ -28,6 +28,7 @@ def test_reproduction_is_the_angle_of_the_corrected_white() -> None:
     assert reproduction_error([0, 1, 1], [1, 1, 1]) == pytest.approx(math.degrees(math.acos(1 / math.sqrt(3))))
 
 
+@settings(deadline=None)
 @given(lights, lights, st.floats(0.001, 1000))
 def test_brightness_does_not_matter(estimate: tuple[float, ...], truth: tuple[float, ...], scale: float) -> None:
     for error in (recovery_error, reproduction_error):
@@ -37,6 +38,7 @@ def test_brightness_does_not_matter(estimate: tuple[float, ...], truth: tuple[fl
         assert error(estimate, estimate) == pytest.approx(0, abs=1e-6)
 
 
+@settings(deadline=None)
 @given(lights, lights)
 def test_reproduction_does_not_change_with_the_light(estimate: tuple[float, ...], truth: tuple[float, ...]) -> None:
     # Finlayson's argument for it: a change of light scales estimate and truth alike.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -45,3 +46,60 @@ def test_a_change_in_a_file_that_was_compiled_into_a_function_is_seen(tmp_path: 
     assert "25 Counter({" in squared()
     (tmp_path / "kernels" / "power.py").write_text(POWER.format(exponent=3))
     assert squared() == "125 Counter()\n"
+
+
+NO_FOLDER = """
+import importlib, sys
+import numba
+from numba.core import caching
+
+class Nowhere:
+    @classmethod
+    def from_function(cls, function, file):
+        return None
+
+caching.CacheImpl._locator_classes = [Nowhere]
+try:
+    numba.njit(cache=True)(lambda number: number)
+except RuntimeError as error:
+    assert "cannot cache" in str(error)
+else:
+    sys.exit("numba still finds a folder for its cache")
+for module in sys.argv[1:]:
+    importlib.import_module(module)
+from foundation.compiled import compiled
+assert compiled(double)(21) == 42
+"""
+ROOT = Path(__file__).parents[2]
+
+
+def test_every_compiled_function_is_there_where_nothing_can_be_kept(tmp_path: Path) -> None:
+    """Numba refuses to make a cached function where neither the package's folder nor the home folder is writable."""
+    modules = [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for package in ("sim", "calibration", "generator")
+        for path in sorted((ROOT / package).rglob("*.py"))
+        if "njit" in path.read_text() or "foundation.compiled" in path.read_text()
+    ]
+    assert "sim.world.rendering" in modules
+    script = tmp_path / "script.py"
+    script.write_text("def double(number):\n    return 2 * number\n" + NO_FOLDER)
+    done = subprocess.run(
+        [sys.executable, script, *modules],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_only_the_decorator_keeps_machine_code() -> None:
+    """`cache=True` anywhere else would fail where there is no folder for it."""
+    caching = [
+        str(path.relative_to(ROOT))
+        for package in ("drivers", "sim", "acquisition", "calibration", "generator", "evaluation")
+        for path in (ROOT / package).rglob("*.py")
+        if "cache=True" in path.read_text()
+    ]
+    assert caching == []

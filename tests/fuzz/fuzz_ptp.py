@@ -19,7 +19,9 @@ from typing import TypeVar
 import atheris  # pyright: ignore[reportMissingModuleSource]  # installed by hand only
 
 with atheris.instrument_imports():
-    from drivers.canon import records as canon
+    from drivers.canon import records
+    from drivers.canon.datasets import DeviceInfoEx, decode_object_entries, encode_object_entries
+    from drivers.canon.values import ImageFormat, PropertySetting
     from drivers.ptp import container, ptpip
     from drivers.ptp.datasets import (
         DeviceInfo,
@@ -105,13 +107,13 @@ CHECKS: tuple[tuple[Callable[[bytes], None], tuple[bytes, ...]], ...] = (
     ),
     (_both(decode_u32_array, encode_u32_array), (b"\x01\0\0\0\x01\0\x02\0",)),
     (
-        _both(canon.decode_events, canon.encode_events),
+        _both(records.decode_events, records.encode_events),
         (examples.EOS_400D_SHOT[12:], examples.TRANSFER_REQUEST, examples.STATE),
     ),
-    (_both(canon.decode_object_entries, canon.encode_object_entries), (examples.OBJECT_ENTRIES,)),
-    (_both(canon.DeviceInfoEx.decode, canon.DeviceInfoEx.encode), (examples.DEVICE_INFO_EX,)),
-    (_both(canon.PropertySetting.decode, canon.PropertySetting.encode), (examples.SETTING, examples.IMAGE_SETTING)),
-    (_both(canon.ImageFormat.decode, canon.ImageFormat.encode), (examples.RAW_FORMAT,)),
+    (_both(decode_object_entries, encode_object_entries), (examples.OBJECT_ENTRIES,)),
+    (_both(DeviceInfoEx.decode, DeviceInfoEx.encode), (examples.DEVICE_INFO_EX,)),
+    (_both(PropertySetting.decode, PropertySetting.encode), (examples.SETTING, examples.IMAGE_SETTING)),
+    (_both(ImageFormat.decode, ImageFormat.encode), (examples.RAW_FORMAT,)),
     (_both(container.DeviceStatus.decode, container.DeviceStatus.encode), (b"\x08\0\x01\x20\x81\0\0\0",)),
     (_both(container.decode_cancel, container.encode_cancel), (b"\x01\x40\x05\0\0\0",)),
     (_both(ptpip.decode, ptpip.encode), examples.IP_PACKETS),

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from acquisition.lights.illuminations import Illumination
-from calibration.table.lut import Lut, LutWriter, Provenance, Unfit, open_lut
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance, Unfit
+from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
-from generator.kernels import philox
+from generator import philox
 
 SAMPLES = 25
 MakeLut = Callable[..., Lut]
@@ -66,6 +69,16 @@ def make_lut(tmp_path: Path) -> MakeLut:
         return open_lut(folder)
 
     return make
+
+
+@pytest.fixture
+def table_and_picture(make_lut: MakeLut, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Go to a folder that holds a table of four lights, `lut`, and a picture of 50 x 40 px, `cat.png`."""
+    make_lut()
+    codes = np.random.default_rng(3).integers(0, 256, (40, 50, 3)).astype(np.uint8)
+    (tmp_path / "cat.png").write_bytes(cv2.imencode(".png", codes)[1].tobytes())
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 @pytest.fixture

@@ -7,31 +7,17 @@ import re
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-
-if TYPE_CHECKING:
-    from calibration.table.lut import Lut
 
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture
-def here(make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Go to a folder with a table `lut` and a picture `cat.png`."""
-    make_lut()
-    codes = np.random.default_rng(3).integers(0, 256, (40, 50, 3)).astype(np.uint8)
-    (tmp_path / "cat.png").write_bytes(cv2.imencode(".png", codes)[1].tobytes())
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def test_the_lines_of_the_page_for_programmers(here: Path) -> None:
+@pytest.mark.usefixtures("table_and_picture")
+def test_the_lines_of_the_page_for_programmers() -> None:
     blocks = re.findall(r"(?:^    .*\n)+", (ROOT / "docs" / "library.md").read_text(), re.MULTILINE)
     assert len(blocks) == 3
     assert len(blocks[0].splitlines()) == 3
@@ -48,7 +34,8 @@ def test_the_lines_of_the_page_for_programmers(here: Path) -> None:
     assert names["entry"].truth == pytest.approx(tuple(lut.ground_truth[3]), abs=1e-9)
 
 
-def test_the_array_of_jobs(here: Path) -> None:
+@pytest.mark.usefixtures("table_and_picture")
+def test_the_array_of_jobs() -> None:
     script = ROOT / "examples" / "slurm" / "generate.sbatch"
     job = {"SLURM_ARRAY_TASK_ID": "0", "SLURM_ARRAY_TASK_COUNT": "1", "SLURM_CPUS_PER_TASK": "1"}
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foundation.errors import InputError
-from generator.kernels import philox
+from generator import philox
 
 # "philox4x32 10" of tests/kat_vectors in Random123 1.14.0: counter, key, words.
 KNOWN_ANSWERS = [

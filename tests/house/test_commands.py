@@ -29,7 +29,7 @@ HEAVY = (
 
 def call(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     code = (
-        f"import sys\nfrom {module} import main\nsys.argv = ['command', *{list(arguments)!r}]\ncode = main()\n"
+        f"import sys\nfrom {module} import main\ncode = main({list(arguments)!r})\n"
         f"print('LOADED', *sorted({HEAVY!r} & sys.modules.keys()), file=sys.stderr)\nsys.exit(code)"
     ).replace(f"{HEAVY!r} &", f"set({HEAVY!r}) &")
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -76,8 +76,7 @@ def shown(
     module, path = request.param
     room = import_module(module)
     monkeypatch.setenv("COLUMNS", "1000")
-    monkeypatch.setattr(sys, "argv", ["command", *path, "--help"])
-    assert room.main() == 0
+    assert room.main([*path, "--help"]) == 0
     return dict(commands_of(get_command(room.app)))[path], " ".join(capsys.readouterr().out.split())
 
 

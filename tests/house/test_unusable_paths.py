@@ -53,11 +53,10 @@ def as_anybody() -> Generator[None]:
         assert libc.capset(header, sets) == 0
 
 
-def failed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]) -> str:
+def failed(capsys: pytest.CaptureFixture[str], command: tuple[str, ...]) -> str:
     """Return the last line that a command says, which ends with 2."""
     module, *arguments = command
-    monkeypatch.setattr(sys, "argv", [module, *arguments])
-    assert import_module(module).main() == 2
+    assert import_module(module).main(arguments) == 2
     return " ".join(capsys.readouterr().err.split())
 
 
@@ -70,7 +69,7 @@ def test_a_folder_that_may_not_be_searched(
     theirs.mkdir(mode=0)
     try:
         with as_anybody():
-            said = failed(monkeypatch, capsys, tuple(part.format("theirs/it") for part in command))
+            said = failed(capsys, tuple(part.format("theirs/it") for part in command))
     finally:
         theirs.chmod(0o700)
     assert "error: cannot " in said
@@ -83,7 +82,7 @@ def test_a_name_that_is_too_long(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    said = failed(monkeypatch, capsys, tuple(part.format("x" * 300) for part in command))
+    said = failed(capsys, tuple(part.format("x" * 300) for part in command))
     assert "error: cannot " in said
     assert "x" * 300 in said
     assert "File name too long; " in said

@@ -1,4 +1,4 @@
-"""From the records of all shards to a dataset: its tables, its description, its hashes; and whether it is still so.
+"""From the records of all shards to a dataset: its tables, its description, its hashes.
 
 Records are read one after the other and nothing of them is kept that grows with the dataset, so a million images take
 no more memory than a thousand.
@@ -9,18 +9,23 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 from foundation.errors import FormatError
-from foundation.hashing import HashingWriter, stream_sha256
+from foundation.hashing import HashingWriter
 from foundation.version import software
 from generator.dataset.production.records import (
+    CARD,
+    GROUND_TRUTH,
+    GROUND_TRUTH_COLUMNS,
+    SOURCE_COLUMNS,
+    SOURCES,
     SPLITS,
+    SUMS,
+    TRUTHS,
     Description,
     ImageRecord,
     Light,
@@ -31,16 +36,9 @@ from generator.dataset.production.records import (
     image_key,
 )
 from generator.dataset.production.workplace import Workplace
-from generator.dataset.store import DESCRIPTION, Store, open_store
 from generator.files.formats import suffix_of
-
-GROUND_TRUTH = "ground_truth.csv"
-GROUND_TRUTH_COLUMNS = ("image", "source", "illumination", "r", "g", "b")
-SOURCES = "sources.csv"
-SOURCE_COLUMNS = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile")
-TRUTHS = "gt.txt"
-SUMS = "SHA256SUMS"
-CARD = "README.md"
+from generator.stores.places import DESCRIPTION
+from generator.stores.store import Store
 
 
 class NothingMadeError(FormatError):
@@ -151,10 +149,10 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
             sums.write(file.sum.encode())
         sums.write(f"{hashlib.sha256(text).hexdigest()}  {DESCRIPTION}\n".encode())
     names = [file.name for file in written]
-    place.files.settle([*names, SUMS])
+    place.files.sync([*names, SUMS])
     # In an object store this makes it a dataset, so everything else is there.
     place.files.put(DESCRIPTION, text)
-    place.files.settle([DESCRIPTION])
+    place.files.sync([DESCRIPTION])
     place.publish()
 
 
@@ -212,62 +210,3 @@ def _card(description: Description) -> str:
         f"light, made by {description.software}. Black is 0, saturation {description.table.white_level}; nothing is "
         "white balanced.\n"
     )
-
-
-def damage(place: str | Path, progress: Callable[[int, int], None] | None = None, *, workers: int = 1) -> Iterator[str]:
-    """Yield what of a dataset is not as it was made, each fault in words; reads every byte of it.
-
-    Parameters
-    ----------
-    place
-        Path or URL of the dataset.
-    progress
-        Told after each file how many were looked at, and how many there are.
-    workers
-        Threads that read and hash.
-
-    Raises
-    ------
-    FormatError
-        There is no dataset, or it has no list of hashes.
-    """
-    store = open_store(place)
-    if not store.has(DESCRIPTION):
-        raise FormatError(f"{place} is no dataset: it has no {DESCRIPTION}; make one with generate")
-    with store.open(SUMS) as listed:
-        total = sum(1 for _ in listed)
-    known: set[str] = {SUMS}
-    pending: deque[Future[str | None]] = deque()
-    looked_at = 0
-
-    def finished(most: int) -> Iterator[str]:
-        nonlocal looked_at
-        while len(pending) > most:
-            fault = pending.popleft().result()
-            if fault is not None:
-                yield fault
-            looked_at += 1
-            if progress is not None:
-                progress(looked_at, total)
-
-    with ThreadPoolExecutor(workers) as pool, store.open(SUMS) as listed:
-        for number, line in enumerate(listed, start=1):
-            digest, _, name = line.decode("utf-8", "replace").rstrip("\n").partition("  ")
-            if name:
-                known.add(name)
-                pending.append(pool.submit(_fault_of, store, name, digest))
-                yield from finished(4 * workers)
-            else:
-                yield f"{SUMS}, line {number}: expected a hash, two blanks and a name"
-        yield from finished(0)
-    for name in sorted(set(store.names()) - known):
-        yield f"{name} is no part of the dataset"
-
-
-def _fault_of(store: Store, name: str, digest: str) -> str | None:
-    try:
-        with store.open(name) as stream:
-            found = stream_sha256(stream)
-    except FormatError:
-        return f"{name} is missing or cannot be read"
-    return None if found == digest else f"{name} has changed"

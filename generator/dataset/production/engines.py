@@ -1,12 +1,11 @@
-"""Who makes the shards: threads of this program, or the workers of a Dask cluster.
+"""Shards made by threads of this program, or by the workers of a Dask cluster.
 
-An engine is handed shards that are not done and returns when they are, whatever died meanwhile. It knows nothing of
-what is in a shard; making one twice is harmless, see `shards`.
+An engine takes the shards that are not done and returns when they are, whatever died meanwhile. It knows nothing of
+what is in a shard; to make one twice is harmless, see `shards`.
 """
 
 from __future__ import annotations
 
-import re
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,132 +17,82 @@ from typing import TYPE_CHECKING, Final
 
 from foundation.errors import CropError, DeviceError, InputError
 from generator.dataset.production.plan import Plan
-from generator.dataset.production.shards import Done, OnImage, OnSkip, Stopped, make_elsewhere, make_shard
+from generator.dataset.production.shards import ShardCancelled, ShardDone, make_elsewhere, make_shard
+from generator.dataset.production.workers import SILENT, Callbacks, Workers
 from generator.dataset.production.workplace import Workplace
 
 if TYPE_CHECKING:
     import distributed
 
 ATTEMPTS: Final = 5
-"""How often a shard is handed out again after it was on several workers when they died."""
+"""How often a shard is submitted at most. Dask gives a task up once it was on four workers that died; after five times
+four it is the shard, and no accident, that kills them."""
 
 CONNECT_S: Final = 10.0
-"""How long a scheduler may take to answer, s."""
-
-OnWait = Callable[[str], None]
-"""Takes a sentence for the user on what the work waits for."""
+"""How long a scheduler may take to answer, s: one that runs answers in milliseconds, also on a busy network."""
 
 _Event = Callable[[], None]
 
 
-def parse_engine(text: str) -> str | None:
-    """Return the address of the Dask scheduler that an engine's name asks for.
-
-    Returns
-    -------
-    str or None
-        `tcp://HOST:PORT`; empty for a cluster on this machine; None for threads of this program.
-
-    Raises
-    ------
-    InputError
-        It is none of `local`, `dask`, `dask://HOST:PORT`.
-    """
-    if text == "local":
-        return None
-    if text == "dask":
-        return ""
-    match = re.fullmatch(r"dask://([^/\s]+:\d+)/?", text)
-    if not match:
-        raise InputError(f"{text!r} is no engine; use local, dask, or dask://HOST:PORT of a Dask scheduler")
-    return f"tcp://{match[1]}"
-
-
-def check_workers(engine: str, workers: int) -> str | None:
-    """Return what `parse_engine` returns, after looking at the number of workers too.
-
-    Raises
-    ------
-    InputError
-        There is no such engine, or no worker.
-    """
-    if workers < 1:
-        raise InputError(f"{workers} workers were asked for, expected 1 or more")
-    return parse_engine(engine)
-
-
 def make_shards(
-    engine: str,
-    plan: Plan,
-    shards: Sequence[int],
-    place: Workplace,
-    workers: int,
-    on_image: OnImage,
-    on_skip: OnSkip,
-    on_wait: OnWait,
+    plan: Plan, shards: Sequence[int], place: Workplace, workers: Workers, callbacks: Callbacks = SILENT
 ) -> None:
-    """Make shards that are not done, on an engine.
+    """Make shards of a plan that are not done.
 
     Parameters
     ----------
-    engine
-        See `parse_engine`.
     plan, shards
-        What to make of what.
+        The dataset, and the numbers of the shards to make.
     place
-        Where.
+        Where the dataset is being made.
     workers
-        Threads, or processes of a cluster on this machine; a cluster that is named has its own.
-    on_image, on_skip
-        Called after each image, and for each source that cannot be read, from the calling thread.
-    on_wait
-        Called with a sentence for the user when a scheduler that was named has no worker.
+        Who makes them.
+    callbacks
+        What is called meanwhile, from the calling thread.
 
     Raises
     ------
     InputError
-        There is no such engine, it cannot be reached, or its workers have another table or other libraries.
+        The engine cannot be reached, or its workers have another table or other libraries.
     DeviceError
         A shard has killed its workers time and again, or the cluster was lost.
     StorageError
         The disk is full, read-only or gone.
     """
-    address = check_workers(engine, workers)
     if not shards:
         return
-    if address is None:
-        _by_threads(plan, shards, place, workers, on_image, on_skip)
+    if workers.address is None:
+        _by_threads(plan, shards, place, workers.count, callbacks)
     else:
-        _by_dask(address, plan, shards, place, workers, on_image, on_skip, on_wait)
+        _by_dask(workers.address, plan, shards, place, workers.count, callbacks)
 
 
-def _by_threads(
-    plan: Plan, shards: Sequence[int], place: Workplace, workers: int, on_image: OnImage, on_skip: OnSkip
-) -> None:
+def _by_threads(plan: Plan, shards: Sequence[int], place: Workplace, workers: int, callbacks: Callbacks) -> None:
     """Make two shards at a time, so that the threads have work while one of the two is being finished."""
     events: SimpleQueue[_Event | None] = SimpleQueue()
-    stop = threading.Event()
+    cancelled = threading.Event()
     waiting = iter(shards)
     taking = threading.Lock()
     at_once = min(2, len(shards), workers)
     depth = -(-workers // at_once)
+    queued = Callbacks(
+        on_image=lambda: events.put(callbacks.on_image),
+        on_skip=lambda name, reason, images: events.put(partial(callbacks.on_skip, name, reason, images)),
+    )
 
     def drive(pool: ThreadPoolExecutor) -> None:
-        def skip(name: str, reason: str, images: int) -> None:
-            events.put(lambda: on_skip(name, reason, images))
-
         def fail(error: BaseException) -> None:
             raise error
 
         try:
-            while not stop.is_set():
+            while not cancelled.is_set():
                 with taking:
                     shard = next(waiting, None)
                     if shard is None:
                         return
                     job = plan.job(shard)
-                make_shard(job, plan.lut, place, pool, depth, lambda: events.put(on_image), skip, stop)
-        except Stopped:
+                make_shard(job, plan.lut, place, pool, depth, queued, cancelled)
+        except ShardCancelled:
             pass
         except BaseException as error:
             events.put(partial(fail, error))
@@ -157,18 +106,11 @@ def _by_threads(
                 while (event := events.get()) is not None:
                     event()
         finally:
-            stop.set()
+            cancelled.set()
 
 
 def _by_dask(
-    address: str,
-    plan: Plan,
-    shards: Sequence[int],
-    place: Workplace,
-    workers: int,
-    on_image: OnImage,
-    on_skip: OnSkip,
-    on_wait: OnWait,
+    address: str, plan: Plan, shards: Sequence[int], place: Workplace, workers: int, callbacks: Callbacks
 ) -> None:
     try:
         from distributed import KilledWorker, as_completed
@@ -179,14 +121,14 @@ def _by_dask(
     waiting: Iterator[int] = iter(shards)
     with _client(address, workers) as client:
 
-        def submit(shard: int) -> distributed.Future[Done]:
+        def submit(shard: int) -> distributed.Future[ShardDone]:
             attempts[shard] += 1
             key = f"crop-shard-{shard}-{attempts[shard]}-{plan.seed}-{id(plan)}"
             return client.submit(make_elsewhere, plan.job(shard), place, key=key, pure=False)
 
         threads = client.nthreads()
         if not threads:
-            on_wait(f"the Dask scheduler has no worker yet; start some with: dask worker {address}")
+            callbacks.on_wait(f"the Dask scheduler has no worker yet; start some with: dask worker {address}")
         # A few tasks a thread are handed out at a time: a plan may have more of them than memory has room for.
         at_once = max(4, 3 * sum(threads.values()))
         running = {submit(shard): shard for shard in islice(waiting, at_once)}
@@ -214,10 +156,10 @@ def _by_dask(
                         "command again to go on"
                     ) from error
                 raise
-            for told in done.skipped:
-                on_skip(*told)
+            for skipped in done.skipped:
+                callbacks.on_skip(*skipped)
             for _ in range(done.images):
-                on_image()
+                callbacks.on_image()
             following = next(waiting, None)
             if following is not None:
                 future = submit(following)

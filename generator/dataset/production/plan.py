@@ -11,17 +11,16 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from pydantic import BaseModel, ConfigDict
-
 from foundation.errors import InputError
 from foundation.version import software
+from generator.dataset.production.layouts.by_name import require_libraries
+from generator.dataset.production.options import DatasetOptions
 from generator.dataset.production.records import SPLITS, Layout, Light, Split, Table
 from generator.files.formats import Format, libraries_of
 
@@ -30,44 +29,13 @@ if TYPE_CHECKING:
     from generator.lights.lighting import LightChoice
     from generator.pictures.sources import Source
 
-SHARD_IMAGES: Final = 256
-"""Images of a shard unless said: what a kill costs at most, for each shard that was being made."""
-
 _WORD: Final = 1 << 64
-
-
-class Options(BaseModel):
-    """What a dataset is asked to be, beside its table, sources, lights and seed.
-
-    Attributes
-    ----------
-    form
-        File format of the images; see `encode`.
-    layout
-        How images lie: each in its file, or many in a tar or Parquet file.
-    previews
-        Whether tone-mapped pictures go with them.
-    split
-        Shares of train, validation and test; None leaves the dataset undivided.
-    shard_images
-        Images of one shard.
-    sources
-        How sources were read, as plain values; recorded only.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    form: Format = "png"
-    layout: Layout = "folder"
-    previews: bool = True
-    split: tuple[float, float, float] | None = None
-    shard_images: int = SHARD_IMAGES
-    sources: dict[str, Any] = {}
+"""Values of the eight bytes of a hash that place a source among the parts."""
 
 
 @dataclass(frozen=True)
 class ShardJob:
-    """All that a worker needs to make one shard, wherever it is.
+    """Everything that a worker on any machine needs to make one shard.
 
     Attributes
     ----------
@@ -80,9 +48,9 @@ class ShardJob:
     sources
         The sources that its images show.
     choice, seed, options
-        As of the plan.
+        Those of the plan.
     versions
-        What the bytes depend on beside all this; a worker must have the same.
+        Versions of the libraries that the bytes depend on; a worker must have the same.
     """
 
     table: Path
@@ -94,7 +62,7 @@ class ShardJob:
     sources: tuple[Source, ...]
     choice: LightChoice
     seed: int
-    options: Options
+    options: DatasetOptions
     versions: dict[str, str]
 
 
@@ -112,10 +80,10 @@ class Plan:
     sources: Sequence[Source]
     choice: LightChoice
     seed: int
-    options: Options
+    options: DatasetOptions
 
     def __post_init__(self) -> None:
-        from generator.kernels.philox import key_of
+        from generator.philox import key_of
 
         key_of(self.seed)
         if not self.sources or not self.choice.lights_each:
@@ -124,13 +92,7 @@ class Plan:
             )
         if self.total > 1 << 32:
             raise InputError(f"{self.total} images are more than a dataset holds, 2^32; make several, each with a seed")
-        if self.options.shard_images < 1:
-            raise InputError(f"shards of {self.options.shard_images} images were asked for, expected 1 or more")
-        if self.options.layout == "parquet":
-            from generator.dataset.production.parquet import require_pyarrow
-
-            require_pyarrow()
-        check_shares(self.options.split)
+        require_libraries(self.options.layout)
 
     @property
     def total(self) -> int:
@@ -188,7 +150,7 @@ class Plan:
         recorded = {
             "format": options.form,
             "layout": options.layout,
-            **options.sources,
+            **options.reading,
             "lights": self.choice.describe(),
             "previews": options.previews,
             "split": dict(zip(SPLITS, options.split, strict=True)) if options.split else None,
@@ -197,60 +159,11 @@ class Plan:
         return json.loads(json.dumps(recorded))
 
 
-def check_shares(shares: tuple[float, float, float] | None) -> None:
-    """Refuse shares of train, validation and test that are negative or do not sum to 1.
-
-    Raises
-    ------
-    InputError
-        They are so.
-    """
-    if shares is not None and not (min(shares) >= 0 and abs(sum(shares) - 1) < 1e-6):
-        told = ",".join(f"{share:g}" for share in shares)
-        raise InputError(f"the split {told} is to be three shares from 0 that sum to 1, such as 0.8,0.1,0.1")
-
-
-def parse_split(text: str) -> tuple[float, float, float]:
-    """Return the shares of train, validation and test of a text such as `0.8,0.1,0.1` or `80,10,10`.
-
-    Two numbers are train and test.
-
-    Raises
-    ------
-    InputError
-        The text is no such list.
-    """
-    try:
-        parts = [float(part) for part in text.split(",")]
-    except ValueError:
-        parts = []
-    if len(parts) == 2:
-        parts.insert(1, 0.0)
-    if len(parts) != 3 or not min(parts) >= 0 or not 0 < sum(parts) < float("inf"):
-        raise InputError(f"the split {text!r} is to be shares of train, validation and test, such as 0.8,0.1,0.1")
-    total = sum(parts)
-    return parts[0] / total, parts[1] / total, parts[2] / total
-
-
-def parse_share(text: str) -> tuple[int, int]:
-    """Return (i, n) of a text such as `3/16`: share i of n, i from 0.
-
-    Raises
-    ------
-    InputError
-        The text is no such share.
-    """
-    match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip(), re.ASCII)
-    if not match or not int(match[1]) < int(match[2]):
-        raise InputError(f"{text!r} is no share; write I/N with I from 0 to N - 1, such as 0/16")
-    return int(match[1]), int(match[2])
-
-
 def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str | None, name: str) -> Split | None:
     """Return the part of the dataset that a source belongs to.
 
-    Decided by the seed and the source's content, or its name where it has no file, so that no other source has a say
-    and two copies of one file, whatever they are called, are in the same part. The shares hold on average.
+    Decided by the seed and the source's content, or its name where it has no file, and by no other source, so that two
+    copies of one file, whatever their names, are in the same part. The shares hold on average.
 
     Parameters
     ----------
@@ -261,7 +174,7 @@ def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str |
     sha256
         Of the source's file.
     name
-        What it is called.
+        Its name.
     """
     if shares is None:
         return None
@@ -276,20 +189,23 @@ def split_of(shares: tuple[float, float, float] | None, seed: int, sha256: str |
 
 
 def sources_sha256(sources: Sequence[Source]) -> str:
-    """Return a hash over the list of sources: what each is called, and how it is made or read.
+    """Return a hash over the list of sources: the name of each, and how it is made or read.
 
     Where a file lies and what is in it are left out: a list is the same on every machine, and its files are hashed when
     they are read.
     """
     digest = hashlib.sha256()
     for source in sources:
-        digest.update(json.dumps(source.told(), sort_keys=True).encode() + b"\n")
+        digest.update(json.dumps(source.to_json(), sort_keys=True).encode() + b"\n")
     return digest.hexdigest()
 
 
 @lru_cache
 def versions(form: Format, layout: Layout) -> dict[str, str]:
-    """Return the versions of what decodes sources, finds lights and encodes images: others may give other bytes."""
+    """Return the versions of the libraries that decode sources, find lights and encode images, by their names.
+
+    Other versions may give other bytes.
+    """
     names = {"isal", "numpy", "OpenImageIO", "opencv-contrib-python-headless", "pillow", "scipy", "simplejpeg"}
     if layout == "parquet":
         names.add("pyarrow")
@@ -297,20 +213,20 @@ def versions(form: Format, layout: Layout) -> dict[str, str]:
 
 
 def table_of(lut: Lut) -> Table:
-    """Return what a dataset records of its table."""
-    known = lut.provenance
+    """Return the record of the table."""
+    provenance = lut.provenance
     return Table(
         sha256=lut.sha256,
-        camera=known.camera,
-        bits=known.bits,
+        camera=provenance.camera,
+        bits=provenance.bits,
         samples=lut.samples.shape[2],
-        white_level=known.white_level,
-        software=known.software,
+        white_level=provenance.white_level,
+        software=provenance.software,
     )
 
 
 def light_of(lut: Lut, light: int) -> Light:
-    """Return what a dataset records of light number `light` of its table."""
+    """Return the record of light number `light` of the table."""
     shown = lut.illuminations[light]
     red, green, blue = (float(part) for part in lut.white[light])
     return Light(

@@ -1,4 +1,4 @@
-"""What is written down about a dataset: its description, its lights and sources, and the record of each shard.
+"""Records of a dataset: its description, lights and sources, the record of each shard, and the names of its files.
 
 A shard is a range of planned image numbers that is made by one task. Its record is written when everything else of it
 is on the disk: a shard with a record is done, one without is not.
@@ -7,20 +7,31 @@ is on the disk: a shard with a record is done, one without is not.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-FORMAT = "crop.dataset"
-VERSION = 2
+FORMAT: Final = "crop.dataset"
+VERSION: Final = 2
+"""Version 1 listed the sources in `dataset.json`; they have a table of their own since."""
+
+GROUND_TRUTH: Final = "ground_truth.csv"
+GROUND_TRUTH_COLUMNS: Final = ("image", "source", "illumination", "r", "g", "b")
+SOURCES: Final = "sources.csv"
+SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile")
+TRUTHS: Final = "gt.txt"
+SUMS: Final = "SHA256SUMS"
+CARD: Final = "README.md"
 
 Triple = tuple[float, float, float]
 Layout = Literal["folder", "webdataset", "parquet"]
 Split = Literal["train", "validation", "test"]
-SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
 
 
 class _Record(BaseModel):
+    """A frozen value that is stored as JSON; what a later version adds is ignored."""
+
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
@@ -46,7 +57,7 @@ class Light(_Record):
 
     @property
     def label(self) -> str:
-        """Return what a person calls it: its temperature if a black body, else its codes."""
+        """Return its name for a reader: its temperature if a black body, else its codes."""
         return f"{self.cct_k:.0f} K" if self.cct_k is not None else "{} {} {}".format(*self.codes)
 
 
@@ -58,9 +69,9 @@ class SourceRecord(_Record):
     position
         Place in the list of sources, from 0; the choice of its lights depends on it.
     name, sha256
-        What it was called, and the hash of its file; no hash where it was made and not read.
+        Its name, and the hash of its file; no hash where it was made and not read.
     profile
-        What was done about its colour profile, in words; None where it was made and not read.
+        How its colour profile was used, in words; None where it was made and not read.
     width, height
         Size of its images, px.
     replaced_pixels
@@ -129,7 +140,7 @@ class Description(_Record):
     Attributes
     ----------
     seed, options
-        What the dataset was asked to be; with the table and the sources, enough to make every byte again.
+        What the dataset is; with the table and the sources, enough to make every byte again.
     planned, images
         Images planned and made; the numbers of the rest are free.
     sources, pixels, replaced_pixels
@@ -166,7 +177,7 @@ class Entry:
     Attributes
     ----------
     image
-        Its file name, or in shards what it would be called as a file.
+        Its file name; in shards the name it would have as a file.
     source
         Its source's name.
     lights
@@ -193,10 +204,10 @@ class Entry:
 
 
 def image_key(number: int) -> str:
-    """Return the number of an image as it stands in names: six digits, more where they are needed."""
+    """Return the number of an image as file names have it: six digits, more where they are needed."""
     return f"{number:06d}"
 
 
 def shard_key(shard: int) -> str:
-    """Return the number of a shard as it stands in names."""
+    """Return the number of a shard as file names have it."""
     return f"{shard:06d}"

@@ -1,10 +1,10 @@
 """One shard, from its sources to the record that says it is done.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A shard's bytes depend on its job alone: not on the workers, on other shards, or on how often it is made.
-- Its record is written last, when all else has been settled: a shard with a record is whole. It may be killed at any
-  instruction, and any number of programs may make it at once.
+- Its record is written last, when all else has been synchronised with the disk: a shard with a record is whole. The
+  program may be killed at any instruction, and any number of programs may make the same shard at once.
 - At most about three pictures are in memory for each worker.
 """
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,7 +25,8 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
-from generator.dataset.production.layouts import Sample, ShardWriter, open_writer
+from generator.dataset.production.layouts.by_name import open_writer
+from generator.dataset.production.layouts.samples import Sample, ShardWriter
 from generator.dataset.production.plan import ShardJob, light_of, split_of, versions
 from generator.dataset.production.records import (
     ImageRecord,
@@ -35,30 +36,29 @@ from generator.dataset.production.records import (
     SourceRecord,
     Triple,
 )
+from generator.dataset.production.workers import SILENT, Callbacks
 from generator.dataset.production.workplace import Workplace
-from generator.dataset.store import Pieces
 from generator.lights.lighting import Lighting
 from generator.pictures.picture import Picture
 from generator.pictures.sources import Source
+from generator.stores.store import Pieces
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
 _threads = threading.local()
 
-OnImage = Callable[[], None]
-OnSkip = Callable[[str, str, int], None]
-"""Takes the name of a source that cannot be read, the reason, and how many images there will not be."""
-
 
 @dataclass(frozen=True)
-class _Read:
+class _ReadSource:
+    """A source picture (H, W, 3) uint8, sRGB codes that the table has samples of, and what is recorded of it."""
+
     picture: Picture
     record: SourceRecord
 
 
-class Stopped(Exception):
-    """The work was given up because something else failed."""
+class ShardCancelled(Exception):
+    """A shard was given up because something else failed; whoever caused it handles it."""
 
 
 def make_shard(
@@ -67,11 +67,10 @@ def make_shard(
     place: Workplace,
     pool: ThreadPoolExecutor,
     workers: int,
-    on_image: OnImage | None = None,
-    on_skip: OnSkip | None = None,
-    stop: threading.Event | None = None,
+    callbacks: Callbacks = SILENT,
+    cancelled: threading.Event | None = None,
 ) -> ShardRecord:
-    """Make a shard and commit it.
+    """Make a shard and commit its record.
 
     Parameters
     ----------
@@ -83,51 +82,49 @@ def make_shard(
         Where the dataset is being made.
     pool, workers
         Threads that read, render, encode and write, and how many pieces of work to keep them busy with.
-    on_image, on_skip
-        Called after each image, and for each source that cannot be read, from the calling thread.
-    stop
-        When set, the work is given up.
+    callbacks
+        What is called after each image and for each source that cannot be read, from the calling thread.
+    cancelled
+        When set, the shard is given up.
 
     Raises
     ------
     StorageError
         The disk is full, read-only or gone.
-    Stopped
-        `stop` was set.
+    ShardCancelled
+        `cancelled` was set.
     """
     sources: list[SourceRecord] = []
     skipped: list[Skipped] = []
     images: list[ImageRecord] = []
     used: set[int] = set()
     pending: deque[Future[Sample]] = deque()
-    ahead: deque[Future[_Read]] = deque()
+    reading: deque[Future[_ReadSource]] = deque()
 
     def finish_one(writer: ShardWriter) -> None:
         sample = pending.popleft().result()
         writer.append(sample)
         images.append(sample.record)
-        if on_image:
-            on_image()
+        callbacks.on_image()
 
-    with open_writer(job, place.files) as writer, _cancelling(pending, ahead):
+    with _writer_of(job, place) as writer, _cancelling(pending, reading):
         for row, source in enumerate(job.sources):
-            while len(ahead) <= workers and row + len(ahead) < len(job.sources):
-                ahead.append(pool.submit(_read, job, lut, row + len(ahead)))
+            while len(reading) <= workers and row + len(reading) < len(job.sources):
+                reading.append(pool.submit(_read, job, lut, row + len(reading)))
             try:
-                got = ahead.popleft().result()
+                read = reading.popleft().result()
             except FormatError as error:
                 skipped.append(Skipped(position=job.position + row, name=source.name))
-                if on_skip:
-                    on_skip(source.name, str(error), len(_wanted(job, job.position + row)))
+                callbacks.on_skip(source.name, str(error), len(_wanted(job, job.position + row)))
                 continue
-            sources.append(got.record)
+            sources.append(read.record)
             for number, lighting in _wanted(job, job.position + row):
                 while len(pending) >= 2 * workers:
                     finish_one(writer)
-                if stop is not None and stop.is_set():
-                    raise Stopped
+                if cancelled is not None and cancelled.is_set():
+                    raise ShardCancelled
                 used.update(light for mixture in lighting.mixtures for light in mixture.lights)
-                pending.append(pool.submit(_make, job, lut, writer, number, got, lighting))
+                pending.append(pool.submit(_make, job, lut, writer, number, read, lighting))
         while pending:
             finish_one(writer)
         files = writer.close()
@@ -143,9 +140,14 @@ def make_shard(
     return record
 
 
+def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
+    maps = any(lighting.masks is not None for lighting in job.choice.lightings_of(job.position))
+    return open_writer(job.options.layout, place.files, job.shard, previews=job.options.previews, maps=maps)
+
+
 @contextmanager
 def _cancelling(*queues: deque[Future[Any]]) -> Generator[None]:
-    """Take back what waits for a thread if the block fails."""
+    """Cancel what still waits for a thread if the block fails."""
     try:
         yield
     except BaseException:
@@ -156,15 +158,15 @@ def _cancelling(*queues: deque[Future[Any]]) -> Generator[None]:
 
 
 @dataclass(frozen=True)
-class Done:
-    """What a task tells when its shard is done: how many images, and of `OnSkip` what could not be read."""
+class ShardDone:
+    """Result of a task: how many images its shard has, and of each source that cannot be read name, reason, images."""
 
     images: int
     skipped: tuple[tuple[str, str, int], ...]
 
 
-def make_elsewhere(job: ShardJob, place: Workplace) -> Done:
-    """Make a shard in a program of its own, with the table as that program finds it: the task of an engine.
+def make_elsewhere(job: ShardJob, place: Workplace) -> ShardDone:
+    """Make a shard in a program of its own, which opens the table itself: the task of an engine's worker.
 
     A shard that is done already is not made again.
 
@@ -174,7 +176,7 @@ def make_elsewhere(job: ShardJob, place: Workplace) -> Done:
         The table or a library is not that of the plan.
     """
     if place.has(job.shard):
-        return Done(len(place.load(job.shard).images), ())
+        return ShardDone(len(place.load(job.shard).images), ())
     found = versions(job.options.form, job.options.layout)
     if found != job.versions:
         differing = [name for name in job.versions if found.get(name) != job.versions[name]]
@@ -190,8 +192,8 @@ def make_elsewhere(job: ShardJob, place: Workplace) -> Done:
 
     lut = _table(job.table, job.table_sha256)
     with ThreadPoolExecutor(1) as pool:
-        record = make_shard(job, lut, place, pool, 1, on_skip=skip)
-    return Done(len(record.images), tuple(skipped))
+        record = make_shard(job, lut, place, pool, 1, Callbacks(on_skip=skip))
+    return ShardDone(len(record.images), tuple(skipped))
 
 
 @lru_cache(maxsize=2)
@@ -214,13 +216,13 @@ def _wanted(job: ShardJob, position: int) -> list[tuple[int, Lighting]]:
     return [(number, lighting) for number, lighting in numbered if job.first <= number < job.stop]
 
 
-def _read(job: ShardJob, lut: Lut, place: int) -> _Read:
+def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
     from generator.files.formats import smallest_side
-    from generator.kernels.palette import fit_picture
+    from generator.kernels.palette import replace_unfit_colours
 
     source: Source = job.sources[place]
     scene = source.read()
-    picture, replaced = fit_picture(scene.picture, lut.provenance)
+    picture, replaced = replace_unfit_colours(scene.picture, lut.provenance)
     height, width = picture.shape[:2]
     least = smallest_side(job.options.form)
     if min(height, width) < least:
@@ -238,19 +240,19 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _Read:
         replaced_pixels=replaced,
         split=split_of(job.options.split, job.seed, scene.sha256, source.name),
     )
-    return _Read(picture, record)
+    return _ReadSource(picture, record)
 
 
-def _make(job: ShardJob, lut: Lut, writer: ShardWriter, number: int, got: _Read, lighting: Lighting) -> Sample:
-    from generator.files.formats import Shot, encode_pieces, encode_preview, suffix_of
+def _make(job: ShardJob, lut: Lut, writer: ShardWriter, number: int, source: _ReadSource, lighting: Lighting) -> Sample:
+    from generator.files.formats import ImageMetadata, encode_pieces, encode_preview, suffix_of
     from generator.pictures.preview import preview_of
 
-    height, width = got.picture.shape[:2]
+    height, width = source.picture.shape[:2]
     white_level = lut.provenance.white_level
-    image, truth, maps = _photograph(lut, got.picture, lighting, job.seed, number)
-    shot = Shot(white_level, truth, lut.provenance.camera)
+    image, truth, maps = _photograph(lut, source.picture, lighting, job.seed, number)
+    metadata = ImageMetadata(white_level, truth, lut.provenance.camera)
     files: list[tuple[str, str, Pieces]] = [
-        ("images", suffix_of(job.options.form), encode_pieces(image, job.options.form, shot)),
+        ("images", suffix_of(job.options.form), encode_pieces(image, job.options.form, metadata)),
         *((kind, ending, (data,)) for kind, ending, data in maps),
     ]
     if job.options.previews:
@@ -258,17 +260,17 @@ def _make(job: ShardJob, lut: Lut, writer: ShardWriter, number: int, got: _Read,
     rows = [
         LightRow(illumination=mixture.label, truth=chromaticity(mixture.white(lut))) for mixture in lighting.mixtures
     ]
-    record = ImageRecord(number=number, position=got.record.position, truth=truth, lights=rows)
-    return writer.store(Sample(record, got.record.name, got.record.split, width, height, tuple(files)))
+    record = ImageRecord(number=number, position=source.record.position, truth=truth, lights=rows)
+    return writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
 
 
 def _photograph(
     lut: Lut, picture: Picture, lighting: Lighting, seed: int, number: int
 ) -> tuple[npt.NDArray[np.uint16], Triple, list[tuple[str, str, bytes]]]:
-    """Return the raw image, the mean of its lights, and the files that say where each of several lights falls."""
+    """Return the raw image (H, W, 3) uint16, the mean chromaticity of its lights, and the maps of several lights."""
     from generator.kernels.mixing import mix_samples
     from generator.kernels.rendering import draw_samples
-    from generator.masks.files import encode_maps
+    from generator.masks.maps import encode_maps
 
     # The hash of the table stands for its samples in the dataset's description.
     for mixture in lighting.mixtures:
@@ -276,24 +278,27 @@ def _photograph(
             lut.require_unchanged(light)
     tables = [mixture.samples(lut, seed, picture) for mixture in lighting.mixtures]
     if lighting.masks is None:
-        image = draw_samples(tables[0], picture, seed=seed, image=number, out=_room(picture.shape))
+        image = draw_samples(tables[0], picture, seed=seed, image=number, out=_reused(picture.shape))
         return image, chromaticity(lighting.whites(lut)[0]), []
     weights = lighting.weights_of(*picture.shape[:2])
     white_level = lut.provenance.white_level
     image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
-    return image, chromaticity(lighting.overall(lut, weights)), encode_maps(lut, lighting, weights)
+    return image, chromaticity(lighting.overall(lut, weights)), encode_maps(weights, lighting.whites(lut))
 
 
-def _room(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
-    """Return an array that the calling thread has again and again: fresh pages take as long as drawing into them."""
+def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
+    """Return an array uint16 of any content in memory of the calling thread, which its next call overwrites.
+
+    Fresh pages take as long to map as the drawing into them.
+    """
     size = math.prod(shape)
-    room: npt.NDArray[np.uint16] | None = getattr(_threads, "room", None)
-    if room is None or room.size < size:
-        _threads.room = room = np.empty(size, np.uint16)
-    return room[:size].reshape(shape)
+    memory: npt.NDArray[np.uint16] | None = getattr(_threads, "memory", None)
+    if memory is None or memory.size < size:
+        _threads.memory = memory = np.empty(size, np.uint16)
+    return memory[:size].reshape(shape)
 
 
 def chromaticity(white: npt.NDArray[np.float64]) -> Triple:
-    """Return (r, g, b) of sum 1 of linear RGB (3,)."""
+    """Return (r, g, b) of sum 1 of linear RGB (3,) float64."""
     red, green, blue = (float(part) for part in white / white.sum())
     return red, green, blue

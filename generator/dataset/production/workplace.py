@@ -1,16 +1,16 @@
-"""The place where a dataset is made, so that it can be gone on with, and appears when it is complete.
+"""The place where a dataset is made: work that was interrupted is continued there, and the dataset appears whole.
 
-On a disk everything happens in the hidden folder `.OUT.partial`: `dataset-MARK/` fills with files, `plan/` holds the
-plan and the records of the shards that are done. At the end `dataset-MARK/` gets its name by one rename, then the rest
-is removed. An object store has no rename: the files lie where they stay, the notes below `OUT/.plan/`, and
-`dataset.json`, written last, makes a dataset of them.
+On a disk everything happens in the hidden folder `.OUT.partial`: `dataset-ID/`, with the plan's identifier, fills with
+files, and `plan/` has the plan and the records of the shards that are done. At the end `dataset-ID/` gets its name by
+one rename, then the rest is removed. An object store has no rename: the files are written where they stay, plan and
+records below `OUT/.plan/`, and `dataset.json`, written last, makes a dataset of them.
 
-Laws that hold inside:
+Rules that hold inside:
 
-- A place belongs to one plan. Another plan is refused, and told in what it differs. A worker of a plan that was removed
-  from here may still be alive: its records bear the mark of its plan, so they are never taken for ours.
-- Whoever makes the whole dataset holds the folder alone; those who make a share each hold it together.
-- What holds no finished shard is not worth keeping and is removed when the work fails.
+- A place belongs to one plan. Another plan is refused with a message that says how the two differ. A worker of a plan
+  that was removed may still be alive: its records bear the identifier of its plan, so they are never taken for ours.
+- A program that makes the whole dataset locks the folder alone; programs that make shares of it share the lock.
+- A place without a finished shard is of no use later and is removed when the work fails.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from foundation.errors import FormatError, InputError
 from foundation.files import partial_path, publish_folder, require_free, storage_error
 from foundation.held_folders import LOCK_FILE, held_folder
 from generator.dataset.production.records import ShardRecord, shard_key
-from generator.dataset.store import DESCRIPTION, LocalStore, RemoteStore, Store, is_remote, local_path, open_store
+from generator.stores.places import DESCRIPTION, is_remote, local_path
+from generator.stores.store import LocalStore, RemoteStore, Store, open_store
 
 PLAN: Final = "plan.json"
 RECORDS: Final = "shards"
@@ -48,21 +49,21 @@ class Workplace:
     files
         What will be the dataset.
     notes
-        The plan and the shards' records, which will be thrown away.
+        The plan and the shards' records, which are removed at the end.
     out
         The dataset's place.
-    mark
-        Of the plan.
+    plan_id
+        Identifier of the plan; see `_plan_id`.
     """
 
     files: Store
     notes: Store
     out: str
-    mark: str
+    plan_id: str
 
     def done(self) -> set[int]:
         """Return the shards that are done."""
-        ending = f".{self.mark}.json"
+        ending = f".{self.plan_id}.json"
         found = (PurePosixPath(name).name for name in self.notes.names(RECORDS))
         return {int(name.removesuffix(ending)) for name in found if name.endswith(ending)}
 
@@ -90,10 +91,10 @@ class Workplace:
         """Bring the record of a shard to the disk whose files are there: from here on it is done."""
         name = self._record_name(record.shard)
         self.notes.put(name, record.model_dump_json().encode())
-        self.notes.settle([name])
+        self.notes.sync([name])
 
     def discard(self) -> None:
-        """Forget the shards that are done, since going on would lead to the same end."""
+        """Remove the records of the shards that are done, since to continue would end the same."""
         self.notes.remove(RECORDS)
 
     def publish(self) -> None:
@@ -114,26 +115,23 @@ class Workplace:
         _remove_notes(self.notes)
 
     def _record_name(self, shard: int) -> str:
-        return f"{RECORDS}/{shard_key(shard)}.{self.mark}.json"
+        return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}.json"
 
 
 def finished(out: str | Path, identity: Identity) -> bool:
-    """Return whether the dataset of this plan is complete and only its notes are left, which are removed then.
-
-    A program that is killed between the two leaves it so.
-    """
+    """Return whether the dataset of this plan is complete; notes that a killed program left are removed then."""
     notes = _notes(out)
     if not open_store(out).has(DESCRIPTION):
         return False
-    known = notes.has(PLAN)
-    if known and list(_differences(_load(notes), _plain(identity))):
+    planned = notes.has(PLAN)
+    if planned and list(_differences(_load(notes), _plain(identity))):
         return False
     _remove_notes(notes)
-    return known
+    return planned
 
 
 def _remove_notes(notes: Store) -> None:
-    """Remove the notes, the plan last: until then a program that is run again knows that the dataset is its own."""
+    """Remove the notes, the plan last: until then a program that is run again finds that the dataset is its own."""
     notes.remove(RECORDS)
     if isinstance(notes, LocalStore):
         shutil.rmtree(notes.root.parent, ignore_errors=True)
@@ -163,12 +161,12 @@ def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Genera
     identity
         Of the plan; see `plan.Plan.identity`.
     alone
-        Whether no other program may be at the same dataset.
+        Whether no other program may work on the same dataset.
 
     Raises
     ------
     InputError
-        The place is taken, belongs to another plan, or another program is at it.
+        The place is taken, belongs to another plan, or another program works on it.
     StorageError
         The disk is full, read-only or gone.
     """
@@ -183,13 +181,13 @@ def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Genera
     planned = None if alone else (folder / "plan" / PLAN).is_file
     with held_folder(folder, busy, share_if=planned) as lock:
         notes = LocalStore(folder / "plan")
-        mark = _mark(identity)
-        place = Workplace(LocalStore(folder / f"dataset-{mark}"), notes, str(path), mark)
+        plan_id = _plan_id(identity)
+        place = Workplace(LocalStore(folder / f"dataset-{plan_id}"), notes, str(path), plan_id)
         try:
             if not notes.has(PLAN):
-                _begin(folder, mark)
+                _begin(folder, plan_id)
                 notes.put(PLAN, _text(identity))
-                notes.settle([PLAN])
+                notes.sync([PLAN])
             _require_same(notes, identity, path, f"remove {folder}")
             if not alone:
                 lock.share()
@@ -222,7 +220,7 @@ def _notes(out: str | Path) -> Store:
 
 def _remote(out: str, identity: Identity) -> Generator[Workplace]:
     files, notes = RemoteStore(out), RemoteStore(f"{out.rstrip('/')}/{_NOTES}")
-    place = Workplace(files, notes, out, _mark(identity))
+    place = Workplace(files, notes, out, _plan_id(identity))
     if files.has(DESCRIPTION):
         raise InputError(f"{out} already holds a dataset; name another place, or remove what is there")
     begun = notes.has(PLAN)
@@ -240,8 +238,8 @@ def _remote(out: str, identity: Identity) -> Generator[Workplace]:
         raise
 
 
-def _begin(folder: Path, mark: str) -> None:
-    """Make the folder's rooms; what lies there without a plan is a leftover from before the plan was written."""
+def _begin(folder: Path, plan_id: str) -> None:
+    """Make the folders inside; files that are there without a plan are left from before the plan was written."""
     try:
         for path in folder.iterdir():
             if path.name == LOCK_FILE:
@@ -250,8 +248,8 @@ def _begin(folder: Path, mark: str) -> None:
                 shutil.rmtree(path)
             else:
                 path.unlink()
-        for room in ("plan", f"dataset-{mark}"):
-            (folder / room).mkdir()
+        for inner in ("plan", f"dataset-{plan_id}"):
+            (folder / inner).mkdir()
     except OSError as error:
         raise storage_error(folder, error) from error
 
@@ -260,8 +258,8 @@ def _text(identity: Identity) -> bytes:
     return (json.dumps(identity, indent=1) + "\n").encode()
 
 
-def _mark(identity: Identity) -> str:
-    """Return by what a plan is known in names."""
+def _plan_id(identity: Identity) -> str:
+    """Return the first 16 hexadecimal digits of the SHA-256 of the plan's identity."""
     return hashlib.sha256(json.dumps(_plain(identity), sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -289,7 +287,7 @@ def _require_same(notes: Store, identity: Identity, out: str | Path, remedy: str
 
 
 def _differences(stored: Any, wanted: Any, name: str = "") -> Generator[str]:
-    """Yield in what two plans differ, each in words."""
+    """Yield each difference of two plans, in words."""
     if isinstance(stored, dict) and isinstance(wanted, dict):
         one, other = cast("dict[str, Any]", stored), cast("dict[str, Any]", wanted)
         for key in dict.fromkeys([*one, *other]):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from drivers.ptp.codes import AeMode, DriveMode, Operation, Property
-from drivers.ptp.messages import Request
+from drivers.ptp.messages import PtpRequest
 from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_550D
 from sim.clock import SimulatedClock
@@ -132,7 +132,7 @@ def simulated() -> list[Recorded]:
 def _answered(eos: SimulatedEos) -> Iterator[Recorded]:
     for entry in transcript():
         code, sent = int(entry["code"], 16), entry["data"]
-        request = Request(code, entry["tid"], tuple(entry["params"]))
+        request = PtpRequest(code, entry["tid"], tuple(entry["params"]))
         answer = eos.answer(request, bytes.fromhex(sent) if sent else None)
         assert f"{answer.response.code:04x}" == entry["rc"], entry
         if answer.data is not None:

@@ -1,0 +1,130 @@
+"""The real lab: every device that LAB.toml names, opened over its cable."""
+
+from __future__ import annotations
+
+import uuid
+from contextlib import ExitStack
+
+from acquisition.config import CameraCable, LabSettings, LightSource, ProjectorCable
+from acquisition.run.devices import Devices
+from acquisition.run.shutter import require_whole_turns
+from drivers.camera import Camera
+from drivers.canon.camera import CanonEos
+from drivers.display.fullscreen import FullScreen
+from drivers.display.jvc import PORT as JVC_PORT
+from drivers.display.jvc import JvcFlatField
+from drivers.display.lightcrafter import LightCrafter, find_lightcrafter
+from drivers.gphoto2_camera import Gphoto2Camera
+from drivers.links.pipes import UsbPipes
+from drivers.links.serial import SerialLink
+from drivers.links.tcp import TcpLink
+from drivers.links.usb import open_usb
+from drivers.pjlink.projector import PjLinkProjector
+from drivers.pjlink.wire import PORT as PJLINK_PORT
+from drivers.presenter import Presenter
+from drivers.projector import Projector
+from drivers.ptp.codes import VENDOR_CANON_USB
+from drivers.ptp.ip_transport import IpTransport
+from drivers.ptp.usb_transport import UsbTransport
+from drivers.serial_projectors import language
+from foundation.clock import Clock, SystemClock
+from foundation.errors import ConfigurationError
+
+CONNECT_S = 5.0
+"""How long a projector may take to accept a connection; on a lab's network it takes milliseconds."""
+
+
+def open_lab(settings: LabSettings, opened: ExitStack) -> Devices:
+    """Open the camera, the projector and its light that LAB.toml names.
+
+    Parameters
+    ----------
+    settings
+        As `acquisition.config.load_lab` returns them.
+    opened
+        Closes what was opened, in the opposite order.
+
+    Raises
+    ------
+    ConfigurationError
+        The settings name something that does not exist, or lack a name.
+    DeviceError
+        A device does not answer.
+    """
+    clock = SystemClock()
+    require_whole_turns(settings.camera, settings.lab.projector)
+    projector = _lab_projector(settings.lab.projector, clock, settings.file)
+    if projector is not None:
+        opened.callback(projector.close)
+    presenter = _lab_presenter(settings.lab.light, clock, settings.file)
+    opened.callback(presenter.close)
+    camera = _lab_camera(settings.lab.camera, clock, settings.file)
+    opened.callback(camera.close)
+    return Devices(camera, presenter, projector, clock)
+
+
+def _lab_camera(cable: CameraCable, clock: Clock, file: str) -> Camera:
+    match cable.connection:
+        case "usb":
+            return CanonEos(lambda: UsbTransport(_usb_pipes(cable), clock), clock)
+        case "ptpip":
+            host = _required(cable.host, "lab.camera.host", "the camera's address", file)
+            # A body remembers the computers it was paired with by this number.
+            guid = uuid.uuid5(uuid.NAMESPACE_DNS, f"croplab.{uuid.getnode()}").bytes
+            return CanonEos(
+                lambda: IpTransport.connect(
+                    host, cable.port, event_port=cable.event_port, guid=guid, name="CroP", clock=clock
+                ),
+                clock,
+            )
+        case "gphoto2":
+            return Gphoto2Camera(cable.gphoto2_port, cable.gphoto2_model, clock)
+
+
+def _usb_pipes(cable: CameraCable) -> UsbPipes:
+    return open_usb(vendor=VENDOR_CANON_USB, serial=cable.serial, port=cable.usb_port)
+
+
+def _lab_projector(cable: ProjectorCable, clock: Clock, file: str) -> Projector | None:
+    if cable.control == "none":
+        return None
+    if cable.control == "pjlink":
+        host = _required(cable.host, "lab.projector.host", "the projector's address", file)
+        port = cable.port or PJLINK_PORT
+        label = f"the projector at {host}:{port}"
+        return PjLinkProjector(lambda: TcpLink.connect(host, port, CONNECT_S), cable.password, label=label, clock=clock)
+    spoken = language(cable.control)
+    if cable.device is None and cable.host is not None and spoken.network is not None:
+        host, port = cable.host, cable.port or spoken.tcp_port
+        label = f"the projector at {host}:{port}"
+        return spoken.network(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
+    if cable.device is None and cable.host is not None:
+        raise ConfigurationError(
+            f"{file}: lab.projector.host: {spoken.maker} projectors are reached over a serial port only; "
+            "name lab.projector.device, acquire devices lists what is there"
+        )
+    device = _required(cable.device, "lab.projector.device", "the serial port", file)
+    return spoken.projector(
+        lambda: SerialLink.open(device, cable.baud or spoken.baud, spoken.parity),
+        label=f"the projector at {device}",
+        clock=clock,
+    )
+
+
+def _lab_presenter(light: LightSource, clock: Clock, file: str) -> Presenter:
+    match light.shown_by:
+        case "display":
+            return FullScreen(light.display, clock)
+        case "lightcrafter":
+            return LightCrafter(find_lightcrafter, clock)
+        case "jvc":
+            host = _required(light.host, "lab.light.host", "the projector's address", file)
+            port = light.port or JVC_PORT
+            label = f"the JVC projector at {host}:{port}"
+            return JvcFlatField(lambda: TcpLink.connect(host, port, CONNECT_S), label=label, clock=clock)
+
+
+def _required(value: str | None, key: str, what: str, file: str) -> str:
+    if value is None:
+        raise ConfigurationError(f"{file}: {key} is missing; name {what}, acquire devices lists what is there")
+    return value

@@ -1,0 +1,56 @@
+"""The door of the rig: opens what the settings name, and closes it whatever happens.
+
+`rig = "lab"` opens the devices that LAB.toml names, `rig = "simulated"` builds the simulated lab, `rig = "replay"` puts
+a recorded session into the same simulated camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager
+
+from acquisition.chart.model import Chart
+from acquisition.config import LabSettings
+from acquisition.run.devices import Devices
+from acquisition.session.folder import Session
+from foundation.errors import ConfigurationError
+
+
+@contextmanager
+def open_rig(
+    settings: LabSettings,
+    chart: Chart,
+    session: Session | None = None,
+) -> Generator[Devices]:
+    """Open every device that the settings name; close them all at the end, whatever the end.
+
+    Parameters
+    ----------
+    settings
+        As `acquisition.config.load_lab` returns them.
+    chart
+        What hangs on the wall, for the simulated lab.
+    session
+        The session that is taken up; None for a look that records nothing.
+
+    Raises
+    ------
+    ConfigurationError
+        The settings name something that does not exist.
+    DeviceError
+        A device does not answer.
+    """
+    if settings.rig == "imported":
+        raise ConfigurationError(
+            'rig = "imported" marks a session whose frames were taken by other means; nothing more can be taken of it'
+        )
+    with ExitStack() as opened:
+        # The drivers of a real lab and the simulated world are each loaded where they are opened, and not otherwise.
+        if settings.rig == "lab":
+            from acquisition.run.rig.lab import open_lab
+
+            yield open_lab(settings, opened)
+        else:
+            from acquisition.run.rig.simulated import open_simulated
+
+            yield open_simulated(settings, chart, session, opened)

@@ -1,0 +1,154 @@
+"""The simulated lab: real drivers over memory, with a camera, a projector and a room at the far end of their wires.
+
+A simulated lab that is taken up again is in the state that the session's journal gives: same time, lamp burning, same
+pictures taken; so an interrupted session ends in the same bytes as an undisturbed one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import ExitStack
+from dataclasses import fields, replace
+from datetime import datetime
+from pathlib import Path
+
+from pydantic import TypeAdapter, ValidationError
+
+from acquisition.chart.model import Chart
+from acquisition.chart.printing import drawing
+from acquisition.config import LabSettings, unknown_key
+from acquisition.run.devices import Devices
+from acquisition.session.folder import Session
+from drivers.canon.camera import CanonEos
+from drivers.pjlink.projector import PjLinkProjector
+from drivers.presenter import Colour
+from drivers.projector import Power
+from foundation.errors import ConfigurationError, FormatError
+from sim.buses.ptp_memory import MemoryTransport
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import EOS_BODIES
+from sim.camera.film import Film, WorldFilm
+from sim.camera.replay import RecordedFrame, ReplayFilm
+from sim.clock import OPENING, SimulatedClock
+from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.projector import SimulatedProjector
+from sim.projectors.screen import Screen, SimulatedPresenter
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES, Body
+from sim.world.world import World
+
+SERIAL = "0000000001"
+"""Serial number of the simulated body, on its wire and in its frames; one lab has one body."""
+
+
+def open_simulated(settings: LabSettings, chart: Chart, session: Session | None, opened: ExitStack) -> Devices:
+    """Build the simulated lab, or put a recorded session into its camera.
+
+    Parameters
+    ----------
+    settings
+        As `acquisition.config.load_lab` returns them.
+    chart
+        What hangs on the wall.
+    session
+        The session that is taken up; None for a look that records nothing.
+    opened
+        Closes what was opened, in the opposite order.
+
+    Raises
+    ------
+    ConfigurationError
+        The settings name a body, a room or an exposure that does not exist.
+    FormatError
+        The recorded session holds no frames.
+    """
+    exposed = _exposed(session)
+    clock = SimulatedClock(_last_moment(session) if session is not None else OPENING)
+    screen = Screen()
+    beamer = SimulatedProjector(clock, power=Power.ON if exposed else Power.STANDBY)
+    sensor = simulated_body(settings)
+    if settings.rig == "simulated":
+        world = World(sheet(chart), sensor, simulated_room(settings))
+        film: Film = WorldFilm(world, lambda: screen.colour, beamer.light, SERIAL, exposed)
+    else:
+        assert settings.replay is not None
+        film = ReplayFilm(_recording(settings.replay.session), lambda: screen.colour, exposed)
+        film.accept(settings.camera.exposure)
+    # On mains power, as a camera that takes 707 frames is.
+    body = replace(EOS_BODIES[settings.simulated.body], shots_per_charge=10**9)
+    eos = SimulatedEos(body, film, clock, serial=SERIAL, auto_power_off_s=0)
+    peer = PjLinkPeer(beamer)
+    projector = PjLinkProjector(lambda: memory_link(peer))
+    opened.callback(projector.close)
+    presenter = SimulatedPresenter(screen, clock)
+    opened.callback(presenter.close)
+    camera = CanonEos(lambda: MemoryTransport(eos), clock)
+    opened.callback(camera.close)
+    return Devices(camera, presenter, projector, clock)
+
+
+def sheet(chart: Chart) -> Print:
+    """Return the chart as the simulated room hangs it up."""
+    drawn = drawing(chart)
+    return Print(drawn.page_mm, drawn.rectangles_mm, drawn.rgb)
+
+
+def simulated_body(settings: LabSettings) -> Body:
+    """Return the simulated camera body that the settings name.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such body.
+    """
+    name = settings.simulated.body
+    if name not in BODIES:
+        raise ConfigurationError(f"{settings.file}: simulated.body = {name!r}: known are {', '.join(sorted(BODIES))}")
+    return BODIES[name]
+
+
+def simulated_room(settings: LabSettings) -> Room:
+    """Return the default room with the seed and the changes of the settings.
+
+    Raises
+    ------
+    ConfigurationError
+        A parameter is unknown or of the wrong type.
+    """
+    known = [field.name for field in fields(Room) if field.name != "seed"]
+    for key in settings.simulated.room:
+        if key not in known:
+            raise unknown_key(f"simulated.room.{key}", known, settings.file)
+    try:
+        return TypeAdapter(Room).validate_python({"seed": settings.simulated.seed, **settings.simulated.room})
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(["simulated.room", *(str(part) for part in first["loc"][:1])])
+        raise ConfigurationError(f"{settings.file}: {key}: {first['msg']}, got {first['input']!r}") from error
+
+
+def _exposed(session: Session | None) -> Counter[Colour]:
+    if session is None:
+        return Counter()
+    colours = {step.number: step.colour for step in session.steps}
+    return Counter(colours[attempt.step] for attempt in session.journal.attempts() if attempt.has_frame)
+
+
+def _last_moment(session: Session) -> datetime:
+    ends = [
+        attempt.ended_at for attempt in session.journal.attempts() if attempt.has_frame and attempt.ended_at is not None
+    ]
+    return max(ends, default=OPENING)
+
+
+def _recording(folder: Path) -> list[RecordedFrame]:
+    with Session.open(folder) as recording:
+        colours = {(step.kind, step.illumination): step.colour for step in recording.steps}
+        frames = [
+            RecordedFrame(colours[frame.kind, frame.illumination], folder / frame.file, frame.exposure_s)
+            for frame in recording.frames()
+        ]
+    if not frames:
+        raise FormatError(f"{folder} holds no frames; name a session in which some were taken")
+    return frames

@@ -1,0 +1,236 @@
+"""All figures of a build, or of a check, in named groups: what the verdict judges and report and table are made from.
+
+L lights, C colours, G levels of grey, S samples of a cell; counts are above black unless called raw.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration.checks.stains import Stains
+from calibration.figures.frame_figures import FrameFigures
+from calibration.figures.linearity_figures import LinearityFigures
+from calibration.radiometry.dark_frames import DarkSummary
+from calibration.radiometry.greys import tint_deg
+from calibration.radiometry.photon_transfer import PhotonTransfer
+from calibration.radiometry.primaries import Primaries
+from calibration.radiometry.sensor_range import black_drift
+from calibration.registration.registration import Registration
+from calibration.table.provenance import Unfit
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SessionFigures:
+    """What was read.
+
+    Attributes
+    ----------
+    folder
+        The session's folder.
+    camera
+        Maker and model as the raw files name it.
+    lights
+        Lights with an accepted frame.
+    registered_file
+        The frame that was registered first, relative to the session.
+    white_references
+        White references that the chart has.
+    """
+
+    folder: Path
+    camera: str
+    lights: int
+    registered_file: str
+    white_references: int
+
+
+@dataclass(frozen=True, eq=False)
+class LightFigures:
+    """What was measured of the lights, light by light; a check has one row, of the frame that it read.
+
+    Attributes
+    ----------
+    white, white_error
+        (L, 3) float64 counts, the ground truth and its standard error, in the units of the samples.
+    gains
+        (L, 3) float64, the lamp's light at each light over that in the first white frame; ones where it is not known.
+    subtracted
+        (L, 3) float64 counts, dark light of bare paper that was subtracted; None where none was to be.
+    share_at_zero
+        (L,) float64, share of each light's samples in the table that are 0; (0,) after a check.
+    additivity
+        (3,) float64, by how much the primaries together differ from white, relative to white; None where a frame
+        that is needed is missing.
+    off_codes_deg
+        (L,) float64 degrees, how far each white is from what its codes predict (`calibration.checks.light_codes`); None
+        where the lights are too few or were not exposed alike.
+    """
+
+    white: _Array
+    white_error: _Array
+    gains: _Array
+    subtracted: _Array | None
+    share_at_zero: _Array
+    additivity: _Array | None
+    off_codes_deg: _Array | None
+
+    @cached_property
+    def white_error_deg(self) -> _Array:
+        """(L,) float64 degrees, standard error of each ground truth's direction."""
+        return direction_error_deg(self.white, self.white_error)
+
+    def lights_off_codes(self, accepted_deg: float) -> list[int]:
+        """Return the lights further than `accepted_deg` from what their codes predict, the furthest first."""
+        if self.off_codes_deg is None:
+            return []
+        return [int(light) for light in np.argsort(-self.off_codes_deg) if self.off_codes_deg[light] > accepted_deg]
+
+
+@dataclass(frozen=True, eq=False)
+class GreyFigures:
+    """What was measured of the printed levels of grey.
+
+    Attributes
+    ----------
+    names
+        Of the G levels, brightest first.
+    values, errors
+        (L, G, 3) float64 counts under each light, field divided out, and their standard errors; NaN where no patch of
+        a level can be used.
+    """
+
+    names: tuple[str, ...]
+    values: _Array
+    errors: _Array
+
+    def tints_deg(self, white: _Array) -> _Array:
+        """Return (G,) degrees between each level and white, under the light with the most of its weakest channel.
+
+        `white` (L, 3) float64 is the ground truth.
+        """
+        if not self.names:
+            return np.zeros(0)
+        best = int(np.argmax(white.min(axis=1)))
+        return tint_deg(white[best], self.values[best])
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFigures:
+    """What was measured of the sensor.
+
+    Attributes
+    ----------
+    saturation_counts
+        Raw count of saturation.
+    saturation_measured
+        Whether a photosite of a cell reached it, so that the count is measured and not the raw file's statement.
+    white_level
+        Saturation as a sample value: counts above black.
+    noise
+        (3,) float64, median standard deviation of one sample under white, relative to paper white.
+    transfer
+        Photon-transfer curve of the frame that was registered first.
+    linearity
+        What a series of exposures shows; None where none was given.
+    """
+
+    saturation_counts: int
+    saturation_measured: bool
+    white_level: int
+    noise: _Array
+    transfer: PhotonTransfer
+    linearity: LinearityFigures | None
+
+
+@dataclass(frozen=True, eq=False)
+class CellFigures:
+    """What was found of the chart's cells.
+
+    Attributes
+    ----------
+    window
+        Pixels along the side of a cell's window; S = window².
+    unfit
+        Cells not to be used, each with its cause.
+    stains
+        Where the print does not have its codes' colours, in the order of colour indices.
+    """
+
+    window: int
+    unfit: tuple[Unfit, ...]
+    stains: Stains
+
+
+@dataclass(frozen=True, eq=False)
+class TableFigures:
+    """All that was measured by a build, or by a check.
+
+    Attributes
+    ----------
+    session, lights, greys, sensor, cells
+        The groups.
+    registration
+        Of the frame that was registered first.
+    frames
+        Figures of every light and white frame read, in the order taken.
+    dark_frames
+        What the dark frames show; of a check, the first of them.
+    primaries
+        The primaries each alone, by which the field of coloured cells is known apart from that of paper; None where
+        the plan has no light of each alone, or one is too dim.
+    """
+
+    session: SessionFigures
+    registration: Registration
+    frames: tuple[FrameFigures, ...]
+    lights: LightFigures
+    greys: GreyFigures
+    sensor: SensorFigures
+    dark_frames: DarkSummary
+    cells: CellFigures
+    primaries: Primaries | None
+
+    @property
+    def white_frames(self) -> tuple[FrameFigures, ...]:
+        """The white frames, in the order taken."""
+        return tuple(frame for frame in self.frames if frame.record.kind == "white")
+
+    @property
+    def largest_shift_px(self) -> float:
+        """The chart's largest movement between a frame and the registration that it was sampled by, half-size px."""
+        return max((frame.shift.length_px for frame in self.frames), default=0.0)
+
+    @property
+    def black_drift(self) -> float:
+        """Drift of the black level over the session, counts."""
+        return black_drift([*(frame.black for frame in self.frames), *self.dark_frames.blacks])
+
+    @property
+    def white_drift(self) -> float:
+        """Largest relative change of paper white between white frames, over the channels."""
+        whites = np.array([frame.paper.white for frame in self.white_frames])
+        return float((np.ptp(whites, axis=0) / whites.mean(axis=0)).max()) if len(whites) > 1 else 0.0
+
+
+def direction_error_deg(white: _Array, error: _Array) -> _Array:
+    """Return the standard error (L,) float64, degrees, of the direction of vectors with small independent errors.
+
+    The root of the mean square angle: of each component's error, the part across the vector counts (first-order
+    propagation of errors).
+
+    Parameters
+    ----------
+    white, error
+        (L, 3) float64 and its standard errors, in one unit.
+    """
+    length = np.linalg.norm(white, axis=1, keepdims=True)
+    along = white / np.maximum(length, 1e-9)
+    across = np.sqrt((error**2 * (1 - along**2)).sum(axis=1))
+    return np.degrees(across / np.maximum(length[:, 0], 1e-9))

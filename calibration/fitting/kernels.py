@@ -1,0 +1,116 @@
+"""The inner loops of least squares, compiled.
+
+Compiled for the processor at hand at the first call and kept on disk for the next. No state, no lock, and the
+interpreter's is released, so that each frame has a thread to itself. Without licence to reorder sums: a table's bytes
+depend on neither processor nor thread. They are called through `calibration.fitting.least_squares`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.compiled import compiled
+from foundation.robust import MAD_TO_SIGMA
+
+_POINTS_AT_A_TIME = 2048
+"""Points that the terms are added up for at a time: three channels of them, and a line of the basis, stay in the
+processor's second cache."""
+
+_RIDGE = 1e-10
+"""Share of the normal matrix's mean diagonal that is added to it: keeps equal columns solvable."""
+
+_CUT = 6.0
+"""Robust standard deviations from which on a residual has no weight (J. W. Tukey's biweight)."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@compiled
+def linear_combinations(basis: _Array, factors: _Array, out: _Array) -> None:
+    """Fill out (3, N) with the sums over k of factors[c, k] · basis[k, n]; basis (K, N), factors (3, K)."""
+    out[:] = 0
+    for start in range(0, basis.shape[1], _POINTS_AT_A_TIME):
+        end = min(start + _POINTS_AT_A_TIME, basis.shape[1])
+        for term in range(basis.shape[0]):
+            line = basis[term, start:end]
+            for channel in range(3):
+                factor = factors[channel, term]
+                if factor != 0:
+                    sums = out[channel, start:end]
+                    for point in range(end - start):
+                        sums[point] += factor * line[point]
+
+
+@compiled
+def weighted_fit(design: _Array, values: _Array, weights: _Array) -> _Array:
+    """Return the x (K,) that minimises Σ w (values − design x)²; design (N, K), values and weights (N,)."""
+    count, unknowns = design.shape
+    gram, solution = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    for point in range(count):
+        line = design[point]
+        for i in range(unknowns):
+            weighted = weights[point] * line[i]
+            solution[i] += weighted * values[point]
+            for j in range(i + 1):
+                gram[i, j] += weighted * line[j]
+    trace = 0.0
+    for i in range(unknowns):
+        trace += gram[i, i]
+    for i in range(unknowns):
+        gram[i, i] += _RIDGE * max(trace / unknowns, 1e-30)
+    _solve_positive_definite(gram, solution)
+    return solution
+
+
+@compiled
+def robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Array, _Array]:
+    """Return solution (K,), weights (N,) and residuals (N,) of a fit that outliers do not move.
+
+    Least squares by the normal equations, reweighted by Tukey's biweight.
+
+    Parameters
+    ----------
+    design
+        (N, K) float64, C order.
+    values
+        (N,) float64.
+    rounds
+        Solutions in a row.
+    """
+    count, unknowns = design.shape
+    weights, residual = np.ones(count), values.copy()
+    solution = np.zeros(unknowns)
+    for _ in range(rounds):
+        solution = weighted_fit(design, values, weights)
+        for point in range(count):
+            predicted = 0.0
+            for i in range(unknowns):
+                predicted += design[point, i] * solution[i]
+            residual[point] = values[point] - predicted
+        scale = MAD_TO_SIGMA * np.median(np.abs(residual)) + 1e-9
+        for point in range(count):
+            inside = max(1 - (residual[point] / (_CUT * scale)) ** 2, 0.0)
+            weights[point] = inside * inside
+    return solution, weights, residual
+
+
+@compiled
+def _solve_positive_definite(gram: _Array, solution: _Array) -> None:
+    """Replace a right side by the solution, given the lower half of a positive definite matrix (Cholesky)."""
+    unknowns = len(solution)
+    for j in range(unknowns):
+        for k in range(j):
+            for i in range(j, unknowns):
+                gram[i, j] -= gram[i, k] * gram[j, k]
+        pivot = np.sqrt(max(gram[j, j], 1e-300))
+        for i in range(j, unknowns):
+            gram[i, j] /= pivot
+    for i in range(unknowns):
+        for k in range(i):
+            solution[i] -= gram[i, k] * solution[k]
+        solution[i] /= gram[i, i]
+    for i in range(unknowns - 1, -1, -1):
+        for k in range(i + 1, unknowns):
+            solution[i] -= gram[k, i] * solution[k]
+        solution[i] /= gram[i, i]

@@ -1,0 +1,106 @@
+"""Weighted linear least squares and products of small matrices, without threads.
+
+Frames are decoded by threads of ours; a linear-algebra library that starts its own beside them is slower than one that
+starts none, for problems of a few dozen unknowns.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+_Array = npt.NDArray[np.float64]
+
+
+def product(matrix: _Array, vector: _Array) -> _Array:
+    """Return a matrix times a vector, or times the columns of another matrix, computed in this thread alone.
+
+    Parameters
+    ----------
+    matrix
+        (N, K) float64.
+    vector
+        (K,) or (K, M) float64.
+
+    Returns
+    -------
+    ndarray
+        (N,) or (N, M) float64.
+    """
+    return np.asarray(np.einsum("nk,k...->n...", matrix, vector), dtype=np.float64)
+
+
+def linear_combinations(basis: _Array, factors: _Array) -> _Array:
+    """Return the sums Σₖ factors[c, k] · basis[k, n], computed in this thread alone.
+
+    Parameters
+    ----------
+    basis
+        (K, N) float64, term by term, so that the compiled loop runs along the points.
+    factors
+        (3, K) float64; terms whose factor is 0 cost nothing.
+
+    Returns
+    -------
+    ndarray
+        (3, N) float64.
+    """
+    from calibration.fitting import kernels
+
+    sums = np.empty((len(factors), basis.shape[1]))
+    kernels.linear_combinations(basis, factors, sums)
+    return sums
+
+
+def least_squares(design: _Array, values: _Array, weights: _Array) -> _Array:
+    """Return the solution x (K,) float64 that minimises Σ w (values − design x)².
+
+    By the normal equations, whose condition is the square of the design's: fit for orthogonal-like bases of order
+    unity. A ridge of 1e-10 of the normal matrix's mean diagonal keeps equal columns solvable.
+
+    Parameters
+    ----------
+    design
+        (N, K) float64.
+    values
+        (N,) float64.
+    weights
+        (N,) float64, ≥ 0.
+    """
+    from calibration.fitting import kernels
+
+    return kernels.weighted_fit(*(_plain(array) for array in (design, values, weights)))
+
+
+def robust_least_squares(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Array, _Array]:
+    """Return the solution, weights and residuals of least squares that outliers do not move.
+
+    Iteratively reweighted by Tukey's biweight, cut at six robust standard deviations of the residuals (P. J. Huber,
+    E. M. Ronchetti, *Robust Statistics*, 2nd edition, chapter 7); otherwise as `least_squares`.
+
+    Parameters
+    ----------
+    design
+        (N, K) float64.
+    values
+        (N,) float64.
+    rounds
+        Solutions in a row, ≥ 1; the first has equal weights.
+
+    Returns
+    -------
+    solution
+        (K,) float64.
+    weights
+        (N,) float64, 0 … 1.
+    residuals
+        (N,) float64, values − design x.
+    """
+    from calibration.fitting import kernels
+
+    return kernels.robust_fit(_plain(design), _plain(values), rounds)
+
+
+def _plain(array: _Array) -> _Array:
+    """Return an array as one kind, whatever comes, so that there is one kind of machine code."""
+    return np.require(array, np.float64, ["C", "W"])

@@ -1,0 +1,230 @@
+"""What the frame that is registered first settles for all frames of a session.
+
+Its light's shape is the base of all others', its cells what every frame's are expected to look like, and the primaries'
+frames how the field of a coloured cell differs from that of paper. A baseline does not change, so threads share it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.chart.model import Chart
+from acquisition.framing.planes import CLIPPING_SHARE, Channel
+from calibration.checks.frame_consistency import ConsistencyCheck
+from calibration.pipeline.frames import DecodedFrame
+from calibration.pipeline.options import AS_IN_THE_PAPER, BuildOptions
+from calibration.pipeline.registered_frame import ChartPoints, RegisteredFrame, gauges_of, register_frame
+from calibration.radiometry.cell_field import field_of_cells
+from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances
+from calibration.radiometry.paper import MAX_ORDER, MAX_ORDER_AROUND, PaperReader
+from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer
+from calibration.radiometry.primaries import Primaries
+from calibration.registration.movement import Shift, shift_between
+from calibration.sampling.samples import Sites, gather
+from drivers.raw.rawfile import Area, Mosaic
+from foundation.errors import FormatError
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SensorLayout:
+    """What all frames of a session have in common: visible area, shape of the sensor, Bayer pattern."""
+
+    visible: Area
+    shape: tuple[int, ...]
+    pattern: str
+
+    @staticmethod
+    def of(mosaic: Mosaic) -> SensorLayout:
+        """Return the layout of a frame."""
+        return SensorLayout(mosaic.visible, mosaic.sensor.shape, mosaic.pattern)
+
+    def __str__(self) -> str:
+        return f"{self.shape[1]}×{self.shape[0]} photosites {self.pattern}"
+
+
+@dataclass(frozen=True, eq=False)
+class Baseline:
+    """What holds for all frames of a session; made by `baseline_of`.
+
+    Attributes
+    ----------
+    chart, points
+        The chart, and its points: C cells, W white and N grey references.
+    options
+        How the table is built.
+    layout
+        The sensor's, the same in all frames.
+    first
+        The frame that is registered first.
+    whites
+        (W, 3) float64 counts above black of its white references; NaN where one cannot be used.
+    means
+        (C + W + N, 3) float64 counts above black of its cells and references.
+    paper
+        Reads flat field and white of frames, with the shape of this one's as base.
+    transfer
+        Photon-transfer curve of its cells.
+    expectation
+        What its cells lead to expect of other frames'.
+    primaries
+        The primaries each alone; None where they were not given or cannot be used.
+    """
+
+    chart: Chart
+    points: ChartPoints
+    options: BuildOptions
+    layout: SensorLayout
+    first: RegisteredFrame
+    whites: _Array
+    means: _Array
+    paper: PaperReader
+    transfer: PhotonTransfer
+    expectation: ConsistencyCheck
+    primaries: Primaries | None = None
+
+    def require_layout(self, mosaic: Mosaic, what: str) -> None:
+        """Refuse a frame, called `what`, of another sensor or setting than the first.
+
+        Raises
+        ------
+        FormatError
+            Visible area, shape of the sensor or Bayer pattern differ.
+        """
+        found = SensorLayout.of(mosaic)
+        if found != self.layout:
+            raise FormatError(
+                f"{what}: the sensor has {found}, that of {self.first.file} {self.layout}; a session has one camera "
+                "with one setting, so take the session anew"
+            )
+
+    def register(self, decoded: DecodedFrame) -> RegisteredFrame:
+        """Return a later frame with the chart registered in it; errors are those of `register_frame`."""
+        # A chart without tags hangs as in the first frame, so that a build that goes on has it the same way up.
+        return register_frame(decoded, self.chart, self.points, self.options, self.first.registration)
+
+    def movement(self, mosaic: Mosaic, black: _Array, channel: Channel, what: str) -> Shift:
+        """Return how far the chart has moved in a frame since the first one.
+
+        Parameters
+        ----------
+        mosaic
+            The frame.
+        black
+            (2, 2) float64 counts.
+        channel
+            The channel to measure in.
+        what
+            The frame's name for messages.
+
+        Raises
+        ------
+        FormatError
+            The sensor is not that of the first frame.
+        """
+        self.require_layout(mosaic, what)
+        framing = self.first.registration.framing
+        return shift_between(self.first.gauges[channel], framing, gauges_of(mosaic, channel, black, framing))
+
+    def patches(self, mosaic: Mosaic, black: _Array) -> tuple[_Array, npt.NDArray[np.uint16]]:
+        """Return what a frame has where cells and references were in the first one.
+
+        Parameters
+        ----------
+        mosaic
+            The frame.
+        black
+            (2, 2) float64 counts.
+
+        Returns
+        -------
+        means
+            (C + W + N, 3) float64 counts above black; NaN where a patch does not lie in the frame.
+        highest
+            (C + W + N,) uint16, the highest raw count of each patch.
+        """
+        means: list[_Array] = []
+        peaks: list[npt.NDArray[np.uint16]] = []
+        for sites in (self.first.cells, self.first.references):
+            samples, highest = gather(mosaic, black, sites)
+            means.append(np.where(sites.inside[:, None], samples.mean(axis=1, dtype=np.float64), np.nan))
+            peaks.append(highest)
+        return np.concatenate(means), np.concatenate(peaks)
+
+    def subtraction(self) -> DarkLightEstimator:
+        """Return the estimate of the dark light before any dark frame, with the reflectances of the first frame."""
+        paper, shape = self.paper.read(self.whites, self.first.file)
+        field = np.concatenate([shape, paper.field.at(self.points.references_mm)])
+        inside = np.concatenate([self.first.cells.inside, self.first.references.inside])
+        return DarkLightEstimator(reflectances(self.means, field, paper.white), inside, self.options.samples)
+
+
+def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = AS_IN_THE_PAPER) -> Baseline:
+    """Return what the frame that is registered first settles; without primaries, which are measured by it.
+
+    Parameters
+    ----------
+    chart
+        The chart of the session.
+    first
+        A white frame, or the brightest light's.
+    options
+        How the table is built.
+
+    Raises
+    ------
+    RegistrationError
+        The chart is not found, or not the one expected.
+    QualityError
+        The white references cannot be used.
+    """
+    points = ChartPoints.of(chart)
+    registered = register_frame(first, chart, points, options)
+    cells = gather(first.mosaic, first.black, registered.cells)[0].astype(np.float64)
+    references, highest = gather(first.mosaic, first.black, registered.references)
+    level = cells.mean(axis=1)
+    whites = usable_means(references, highest, registered.references, first.saturation)[: len(points.whites_mm)]
+    there = registered.cells.inside & ~registered.registration.mismatched_cells[chart.cell_of_colour]
+    codes = chart.rgb[chart.cell_of_colour]
+    base = PaperReader(points.whites_mm, points.cells_mm, chart.page_mm).read(whites, first.record.file)[0].field
+    if not chart.tags:
+        # Its references are in the margin, and do not show what light there is in the middle.
+        base = field_of_cells(codes, points.cells_mm, level, there, points.whites_mm, whites, chart.page_mm)
+    order = MAX_ORDER if chart.tags else MAX_ORDER_AROUND
+    return Baseline(
+        chart=chart,
+        points=points,
+        options=options,
+        layout=SensorLayout.of(first.mosaic),
+        first=registered,
+        whites=whites,
+        means=np.concatenate([level, references.mean(axis=1, dtype=np.float64)]),
+        paper=PaperReader(points.whites_mm, points.cells_mm, chart.page_mm, base, order),
+        transfer=photon_transfer(level, cells.var(axis=1, ddof=1), options.samples),
+        expectation=ConsistencyCheck(codes, points.cells_mm, level / base.at(points.cells_mm), there),
+    )
+
+
+def usable_means(
+    samples: npt.NDArray[np.float32], highest: npt.NDArray[np.uint16], sites: Sites, saturation: int
+) -> _Array:
+    """Return the means (N, 3) float64, counts above black, of patches; NaN where one is cut off or clipped.
+
+    Parameters
+    ----------
+    samples
+        (N, S, 3) float32 counts above black.
+    highest
+        (N,) uint16, the highest raw count of each patch.
+    sites
+        Where the patches lie.
+    saturation
+        Raw count of saturation.
+    """
+    means = samples.mean(axis=1, dtype=np.float64)
+    means[~(sites.inside & (highest < CLIPPING_SHARE * saturation))] = np.nan
+    return means

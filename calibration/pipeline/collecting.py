@@ -1,0 +1,171 @@
+"""The figures of a whole table, or of a check, from what its frames have left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.session.folder import Session
+from calibration.checks.light_codes import angles_off_codes_deg
+from calibration.figures.frame_figures import FrameFigures
+from calibration.figures.linearity_figures import LinearityFigures
+from calibration.figures.table_figures import (
+    CellFigures,
+    GreyFigures,
+    LightFigures,
+    SensorFigures,
+    SessionFigures,
+    TableFigures,
+    direction_error_deg,
+)
+from calibration.pipeline.baseline import Baseline
+from calibration.pipeline.intake import Intake, TakenIn
+from calibration.radiometry.projector import additivity, drift_gains
+
+_SAME_EXPOSURE = 1.01
+"""Ratio below which two exposures count as one: shutter speeds differ by 1.26 at least, and are written rounded."""
+
+_LEAST_WHITE = 1e-3
+"""Counts that a channel's ground truth has at least, so that it is a direction even where no light is measured."""
+
+_Array = npt.NDArray[np.float64]
+
+
+def table_figures(intake: Intake, taken: TakenIn, camera: str, linearity: LinearityFigures | None) -> TableFigures:
+    """Return the figures of a table, all of whose frames have been taken in.
+
+    Parameters
+    ----------
+    intake, taken
+        The frames, and what they have left.
+    camera
+        Maker and model as the raw files name it.
+    linearity
+        What a series of exposures shows; None where none was given.
+    """
+    baseline, session = intake.baseline, intake.session
+    even = next((frame for frame in taken.frames if intake.selected.is_even(frame.record)), taken.frames[0])
+    lit = {frame.record.illumination: frame for frame in taken.frames if frame.record.kind == "light"}
+    by_light = [lit[light.index] for light in session.illuminations]
+    return _figures(
+        session=_session_figures(session, intake, camera, len(by_light)),
+        baseline=baseline,
+        taken=taken,
+        even=even,
+        lights=_light_figures(intake, taken, by_light),
+        greys=(np.array([frame.greys for frame in by_light]), np.array([frame.grey_errors for frame in by_light])),
+        linearity=linearity,
+    )
+
+
+def check_figures(intake: Intake, taken: TakenIn, camera: str, linearity: LinearityFigures | None) -> TableFigures:
+    """Return the figures of a check, which has taken in the frame that is registered, and a dark one where there is.
+
+    Parameters
+    ----------
+    intake, taken, camera, linearity
+        As for `table_figures`.
+    """
+    (frame,) = taken.frames
+    with_frame = len(intake.session.illuminations) - len(intake.selected.lights_without)
+    lights = LightFigures(
+        white=frame.paper.white[None],
+        white_error=frame.paper.error[None],
+        gains=np.ones((1, 3)),
+        subtracted=None,
+        share_at_zero=np.zeros(0),
+        additivity=None,
+        off_codes_deg=None,
+    )
+    return _figures(
+        session=_session_figures(intake.session, intake, camera, with_frame),
+        baseline=intake.baseline,
+        taken=taken,
+        even=frame,
+        lights=lights,
+        greys=(frame.greys[None], frame.grey_errors[None]),
+        linearity=linearity,
+    )
+
+
+def _session_figures(session: Session, intake: Intake, camera: str, lights: int) -> SessionFigures:
+    return SessionFigures(
+        folder=session.folder,
+        camera=camera,
+        lights=lights,
+        registered_file=intake.selected.registered.file,
+        white_references=len(session.chart.white_references),
+    )
+
+
+def _figures(
+    session: SessionFigures,
+    baseline: Baseline,
+    taken: TakenIn,
+    even: FrameFigures,
+    lights: LightFigures,
+    greys: tuple[_Array, _Array],
+    linearity: LinearityFigures | None,
+) -> TableFigures:
+    statistics, saturation = taken.statistics, taken.saturation
+    stains = statistics.stains(even.paper.field)
+    return TableFigures(
+        session=session,
+        registration=baseline.first.registration,
+        frames=taken.frames,
+        lights=lights,
+        greys=GreyFigures(baseline.points.levels.names, *greys),
+        sensor=SensorFigures(
+            saturation_counts=saturation,
+            saturation_measured=statistics.saturated(saturation),
+            white_level=round(saturation - float(np.mean([frame.black.mean() for frame in taken.frames]))),
+            noise=statistics.noise(),
+            transfer=baseline.transfer,
+            linearity=linearity,
+        ),
+        dark_frames=statistics.dark_summary(),
+        cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains), stains),
+        primaries=baseline.primaries,
+    )
+
+
+def _light_figures(intake: Intake, taken: TakenIn, by_light: Sequence[FrameFigures]) -> LightFigures:
+    """Return what was measured of the lights, whose frames are `by_light`."""
+    illuminations, subtract_dark = intake.session.illuminations, intake.subtracts_dark
+    error = np.array([frame.paper.error for frame in by_light])
+    # A channel without light may be measured at or below 0; its standard error is what is known of it.
+    white = np.maximum([frame.paper.white for frame in by_light], np.maximum(error, _LEAST_WHITE))
+    whites = [frame for frame in taken.frames if frame.record.kind == "white"]
+    gains = _gains(by_light, whites)
+    dark = np.zeros(3) if subtract_dark else taken.statistics.dark_summary().light
+    full_white = whites[0].paper.white if whites else None
+    return LightFigures(
+        white=white,
+        white_error=error,
+        gains=gains,
+        subtracted=np.array([frame.dark for frame in by_light]) if subtract_dark else None,
+        share_at_zero=np.array([frame.share_at_zero for frame in by_light]),
+        additivity=additivity(illuminations, white, full_white, dark, gains),
+        off_codes_deg=angles_off_codes_deg(illuminations, white / gains, direction_error_deg(white, error))
+        if _exposed_alike(by_light)
+        else None,
+    )
+
+
+def _gains(by_light: Sequence[FrameFigures], whites: Sequence[FrameFigures]) -> _Array:
+    """Return the lamp's light at each light over that in the first white frame, (L, 3) float64; ones without one."""
+    if not whites:
+        return np.ones((len(by_light), 3))
+    start = whites[0].record.taken_at
+    at_s, white_at_s = (
+        np.array([(frame.record.taken_at - start).total_seconds() for frame in frames]) for frames in (by_light, whites)
+    )
+    return drift_gains(at_s, white_at_s, np.array([frame.paper.white for frame in whites]))
+
+
+def _exposed_alike(by_light: Sequence[FrameFigures]) -> bool:
+    """Return whether all lights are known to have been exposed alike, which a prediction from their codes assumes."""
+    exposures = [frame.exposure for frame in by_light]
+    return min(exposures) > 0 and max(exposures) < _SAME_EXPOSURE * min(exposures)

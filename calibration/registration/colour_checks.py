@@ -1,0 +1,168 @@
+"""Whether cells have the chart's colours where a map has them: covered or damaged cells, and a map that has slipped.
+
+Colours are camera RGB, counts above black, against those that the frame's colour model expects.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from acquisition.chart.model import Chart
+from foundation.robust import MAD_TO_SIGMA
+
+MIN_COLOURS = 64
+"""Colours below which none is called mismatched: a model fitted on fewer is no judge of one of them."""
+
+_MISMATCH_SIGMA = 10.0
+"""Usual deviations of a cell from its model beyond which it is mismatched: the model's errors are no normal noise."""
+
+_MISMATCH_SHARE = 0.08
+"""Of paper white: the model's own errors at the gamut's corners stay below."""
+
+_NEIGHBOURS = 13
+"""A cell and the twelve within two cells of it."""
+
+_MISMATCH_NEIGHBOURS = 0.35
+"""Share of mismatched neighbours from which on a cell is taken for covered with them (judgement)."""
+
+_SLIP_CELLS = 16
+"""Cells along a part of the field that is tested for a slip, at most."""
+
+_SLIP = 0.5
+"""Cells by which a part must seem to be displaced: half the way to the next."""
+
+_SLIP_SIGMAS = 6.0
+"""Standard errors that a slip must have, too."""
+
+_PART_WORTH = 8
+"""Independent measurements that a part counts for: the misfit of the colours is alike over many cells."""
+
+_COLOUR_MISFIT, _MOST_NOISE = 0.003, 0.01
+"""Of paper white: what the model of the colours leaves, and what noise may add to it at most."""
+
+_MOST_MISFIT = 20.0
+"""Usual errors beyond which a cell's error counts no more."""
+
+_DIFFERENCE_TO_SIGMA = 1.0484
+"""Standard deviation of normal values over the median size of their neighbours' differences: 1 / (√2 Φ⁻¹(3/4))."""
+
+_Array = npt.NDArray[np.float64]
+_Mask = npt.NDArray[np.bool_]
+
+
+def mismatched(seen: _Array, expected: _Array, paper: _Array, chart: Chart) -> _Mask:
+    """Return which cells have not nearly the colour that the model expects: covered, damaged or misprinted ones.
+
+    Parameters
+    ----------
+    seen, expected
+        (C, 3) colours of the chart's cells, and perhaps (R, 3) of references after them, which set the usual error;
+        NaN outside the frame.
+    paper
+        (3,) of bare paper.
+    chart
+        The chart; of fewer than `MIN_COLOURS` colours none is called mismatched.
+
+    Returns
+    -------
+    ndarray
+        (C,) bool, in the chart's order, the cells amid mismatched ones included.
+    """
+    count = chart.colour_count
+    if count < MIN_COLOURS:
+        return np.zeros(count, dtype=np.bool_)
+    residual = np.abs(seen - expected)
+    usual = MAD_TO_SIGMA * np.nanmedian(residual, axis=0)
+    alone = ((residual > _MISMATCH_SIGMA * usual) & (residual > _MISMATCH_SHARE * paper)).any(axis=1)
+    return _with_neighbours(np.asarray(alone)[:count], chart.centres_mm / np.array(chart.cell_mm))
+
+
+def _with_neighbours(cells: _Mask, centres: _Array) -> _Mask:
+    """Return mismatched cells (N,) and the cells amid them, which a cover of their own colour would hide.
+
+    `centres` (N, 2) in cells.
+    """
+    near = cKDTree(centres).query(centres, k=min(_NEIGHBOURS, len(centres)))[1]
+    share = cells[np.asarray(near).reshape(len(centres), -1)].mean(axis=1)
+    return np.asarray(cells | (share > _MISMATCH_NEIGHBOURS))
+
+
+def agreement(seen: _Array, expected: _Array) -> float:
+    """Return the correlation of colours with those expected, the mean of the channels that carry most light.
+
+    Parameters
+    ----------
+    seen, expected
+        (N, 3), all finite.
+    """
+    light = np.median(seen, axis=0)
+    used = np.flatnonzero(light >= 0.3 * light.max())
+    return float(np.mean([np.corrcoef(seen[:, channel], expected[:, channel])[0, 1] for channel in used]))
+
+
+def slipped_parts(
+    seen: _Array,
+    expected: _Array,
+    paper: _Array,
+    ignored: _Mask,
+    place: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]],
+    shape: tuple[int, int],
+) -> tuple[_Array, int]:
+    """Return which parts of a grid of cells have the colours of their neighbours, and how many parts were compared.
+
+    By the level of the colours, which the matching leaves free: seen less expected colours are fitted, part by part and
+    by least squares, by what a displacement to the next cell would change.
+
+    Parameters
+    ----------
+    seen, expected
+        (C, 3) colours of the chart's cells.
+    paper
+        (3,) of bare paper.
+    ignored
+        (C,) bool, cells left out.
+    place
+        Row and column of each cell, (C,) each.
+    shape
+        Rows and columns of the grid.
+
+    Returns
+    -------
+    ndarray, int
+        (B, 2) float64 middles of the parts that have slipped, column then row, in cells from the grid's corner.
+    """
+    rows, columns = shape
+    row, column = place
+    grid = np.full((2, rows + 2, columns + 2, 3), np.nan)
+    for picture, colours in zip(grid, (seen, expected), strict=True):
+        picture[row + 1, column + 1] = colours
+    grid[0, row[ignored] + 1, column[ignored] + 1] = np.nan
+    error = (grid[0] - grid[1])[1:-1, 1:-1]
+    # Noise, from neighbour to neighbour, and what a model of colours leaves; a slip must not count as usual.
+    noise = _DIFFERENCE_TO_SIGMA * np.nanmedian(np.abs(np.diff(error, axis=1)), axis=(0, 1))
+    usual = np.hypot(np.minimum(noise, _MOST_NOISE * paper), _COLOUR_MISFIT * paper) + 1e-9
+    steps = (
+        (grid[1, 1:-1, 2:] - grid[1, 1:-1, :-2]) / 2 / usual,
+        (grid[1, 2:, 1:-1] - grid[1, :-2, 1:-1]) / 2 / usual,
+    )
+    error = np.clip(error / usual, -_MOST_MISFIT, _MOST_MISFIT)
+    places: list[_Array] = []
+    compared = 0
+    size = int(np.clip(min(rows, columns) // 2, 4, _SLIP_CELLS))
+    for top in range(0, rows, size):
+        for left in range(0, columns, size):
+            part = np.s_[top : top + size, left : left + size]
+            values = [picture[part].ravel() for picture in (*steps, error)]
+            known = np.isfinite(values).all(axis=0)
+            if known.sum() < size**2:
+                continue
+            compared += 1
+            design = np.stack([one[known] for one in values[:2]], axis=1)
+            gram = design.T @ design
+            slip = np.linalg.solve(gram + 1e-9 * np.eye(2), design.T @ values[2][known])
+            sure = np.sqrt(np.diag(gram) * _PART_WORTH / known.sum())
+            if ((np.abs(slip) > _SLIP) & (np.abs(slip) * sure > _SLIP_SIGMAS)).any():
+                places.append(np.array([left, top]) + size / 2)
+    return np.array(places).reshape(-1, 2), compared

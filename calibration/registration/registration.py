@@ -1,0 +1,94 @@
+"""The chart's place in a frame, as a value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.framing.finding import Framing
+from acquisition.framing.homography import rms
+from calibration.registration.blocks import Blocks
+from calibration.registration.colour_model import ColourModel
+from calibration.registration.displacement import Displacement
+from calibration.registration.lens import Lens
+
+SAMPLE_REACH_PX = 3.25
+"""From a cell's true centre to the outer edge of its 25 pixels: 2.5, rounding 0.5, registration 0.25."""
+
+CLEARANCE_PX = 1.75
+"""From there to the edge of a cell of 10 px, for which the limits of places were found."""
+
+_Array = npt.NDArray[np.float64]
+_Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The chart's place in a frame.
+
+    Attributes
+    ----------
+    framing
+        The tags, or the field's outline, as found.
+    lens, displacement
+        The two parts of the map.
+    marks_residual_px
+        (N, 2) float64, the tags' corners against the final map; of a chart without tags the field's outline, across.
+    lens_residual_px
+        RMS of the same against the lens alone: what the paper's waviness leaves.
+    blocks
+        Fit of the cells.
+    colours
+        The colour model of the frame.
+    mismatched_cells
+        (N,) bool, cells in the chart's order whose colour is not nearly the model's: covered, damaged, misprinted.
+    agreement
+        Correlation of the cells' colours with the model's, the mean of the channels that carry light.
+    blur_px
+        σ of the tags' edges, or of the field's.
+    cell_px
+        Half-size pixels per cell, the shorter side of the smallest.
+    shift_px
+        Movement since the frame that was registered, (dx, dy).
+    """
+
+    framing: Framing
+    lens: Lens
+    displacement: Displacement
+    marks_residual_px: _Array
+    lens_residual_px: float
+    blocks: Blocks
+    colours: ColourModel
+    mismatched_cells: _Mask
+    agreement: float
+    blur_px: float
+    cell_px: float
+    shift_px: tuple[float, float] = (0.0, 0.0)
+
+    def to_pixels(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return the half-size pixels (N, 2) float64, x then y, of points (N, 2) on the print."""
+        return self.lens.to_pixels(points_mm) + self.displacement.at(points_mm) + self.shift_px
+
+    def shifted(self, dx: float, dy: float) -> Registration:
+        """Return this registration for a frame in which the chart lies (dx, dy) px further."""
+        return replace(self, shift_px=(self.shift_px[0] + dx, self.shift_px[1] + dy))
+
+    @property
+    def marks_rms_px(self) -> float:
+        """RMS distance of the tags' corners, or the field's outline, from the final map."""
+        return rms(self.marks_residual_px)
+
+    @property
+    def block_rms_px(self) -> float:
+        """RMS displacement that the good blocks would still need: the registration's own estimate of its error."""
+        return rms(self.blocks.residual_px[self.blocks.good])
+
+    @property
+    def clearance(self) -> float:
+        """How much further samples are from their cells' edges than in cells of 10 px, ≥ 1: places matter less by it.
+
+        Cells of a hundred pixels are found to a pixel, which is nothing to them.
+        """
+        return max(1.0, (self.cell_px / 2 - SAMPLE_REACH_PX) / CLEARANCE_PX)

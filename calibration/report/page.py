@@ -1,0 +1,113 @@
+"""`report.html`: verdict, figures, pictures and unfit cells, all in one file that can be mailed."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from calibration.report.plots import INK
+from calibration.report.summary import summary
+from calibration.table.provenance import Unfit
+from calibration.verdict.result import BuildResult
+from calibration.verdict.verdict import JudgedValue, Outcome, Verdict, format_value
+
+MOST_UNFIT = 200
+"""Unfit cells that are listed; all of them are in lut.json, and a page of thousands is read by nobody."""
+
+_CLASSES: dict[Outcome, str] = {"accept": "accept", "accept with remarks": "remark", "refuse": "refuse"}
+"""Classes of the style sheet, and the words of the table's first column."""
+
+_STYLE = f"""
+body {{ font: 16px/1.5 system-ui, sans-serif; color: {INK}; max-width: 1100px; margin: 2rem auto; padding: 0 1rem }}
+h1 {{ font-size: 1.6rem; margin-bottom: .2rem }} h2 {{ font-size: 1.15rem; margin: 2.2rem 0 .6rem }}
+table {{ border-collapse: collapse; font-size: .95rem }} th {{ text-align: left; font-weight: 600 }}
+td, th {{ padding: .25rem 1.2rem .25rem 0; border-bottom: 1px solid #e3e6ea; vertical-align: top }}
+td {{ font-variant-numeric: tabular-nums }} .note, figcaption {{ color: #5b636d; font-size: .9rem }}
+.verdict {{ font-size: 1.15rem; font-weight: 600; padding: .5rem .8rem; margin: 1rem 0; border-left: 6px solid }}
+.accept {{ border-color: #2f8f46 }} .remark {{ border-color: #d9a400 }} .refuse {{ border-color: #c8382e }}
+td.accept, td.remark, td.refuse {{
+  border-color: #e3e6ea; border-left: 4px solid; padding-left: .6rem; white-space: nowrap }}
+td.accept {{ border-left-color: #2f8f46 }} td.remark {{ border-left-color: #d9a400 }}
+td.refuse {{ border-left-color: #c8382e; font-weight: 600 }}
+td.number {{ white-space: nowrap }} figure {{ margin: 0 }} img {{ max-width: 100%; height: auto }}
+"""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of the report, PNG, with its heading and what it shows."""
+
+    heading: str
+    caption: str
+    png: bytes
+
+
+def page(result: BuildResult, pictures: Sequence[Picture]) -> str:
+    """Return the text of `report.html`."""
+    session = result.figures.session
+    title = f"Table of {session.lights} lights, {session.camera}"
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>\n"
+        f'<h1>{html.escape(title)}</h1><p class="note">Session {html.escape(session.folder.name)}</p>\n'
+        f"{_verdict(result.verdict)}<h2>Figures</h2>{_summary(result)}"
+        f"{''.join(map(_picture, pictures))}{_unfit(result.figures.cells.unfit)}</body></html>\n"
+    )
+
+
+def _verdict(verdict: Verdict) -> str:
+    """Return the verdict and its table, the worst rows first."""
+    order: tuple[Outcome, ...] = ("refuse", "accept with remarks", "accept")
+    rows = "".join(_judged(row) for row in sorted(verdict.rows, key=lambda row: order.index(row.outcome)))
+    sentence = {
+        "accept": "Accepted: every figure is within its limit.",
+        "accept with remarks": f"Accepted with remarks on {len(verdict.remarks)} of {len(verdict.rows)} figures.",
+        "refuse": f"Refused: {len(verdict.refused)} of {len(verdict.rows)} figures are beyond what can be used.",
+    }[verdict.outcome]
+    return (
+        f"<p class='verdict {_CLASSES[verdict.outcome]}'>{sentence}</p><table><tr><th></th><th>figure</th>"
+        f"<th>measured</th><th>accepted</th><th>refused beyond</th><th>what goes wrong beyond</th></tr>{rows}</table>"
+    )
+
+
+def _judged(row: JudgedValue) -> str:
+    limit, name = row.threshold, _CLASSES[row.outcome]
+    refuse = "" if limit.refuse is None else format_value(limit.refuse, limit.unit)
+    remedy = f". <b>{html.escape(limit.remedy)}</b>" if row.outcome != "accept" and limit.remedy else ""
+    return (
+        f"<tr><td class='{name}'>{name}</td><th>{html.escape(limit.title)}</th>"
+        f"<td class='number'>{html.escape(format_value(row.value, limit.unit))}</td>"
+        f"<td class='number note'>{limit.sense} {html.escape(format_value(limit.accept, limit.unit))}</td>"
+        f"<td class='number note'>{html.escape(refuse)}</td>"
+        f"<td class='note' title='{html.escape(limit.source, quote=True)}'>{html.escape(limit.why)}{remedy}</td></tr>"
+    )
+
+
+def _summary(result: BuildResult) -> str:
+    rows = "".join(
+        f"<tr><th>{html.escape(row.name)}</th><td>{html.escape(row.value)}</td>"
+        f"<td class='note'>{html.escape(row.note)}</td></tr>"
+        for row in summary(result.figures)
+    )
+    return f"<table>{rows}</table>"
+
+
+def _picture(picture: Picture) -> str:
+    heading = html.escape(picture.heading)
+    return (
+        f"<figure><h2>{heading}</h2><img alt='{heading}' "
+        f"src='data:image/png;base64,{base64.b64encode(picture.png).decode()}'>"
+        f"<figcaption>{html.escape(picture.caption)}</figcaption></figure>"
+    )
+
+
+def _unfit(cells: Sequence[Unfit]) -> str:
+    if not cells:
+        return "<h2>Cells unfit for use</h2><p>None.</p>"
+    listed = cells[:MOST_UNFIT]
+    rows = "".join(f"<tr><td>{cell.colour}</td><td>{html.escape(cell.cause)}</td></tr>" for cell in listed)
+    more = f"<p>and {len(cells) - MOST_UNFIT} more in lut.json</p>" if len(cells) > MOST_UNFIT else ""
+    return f"<h2>Cells unfit for use</h2><table><tr><th>colour</th><th>cause</th></tr>{rows}</table>{more}"

@@ -1,0 +1,69 @@
+"""The report for programs: `report.json`, whose form is stated in docs/formats.md."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from calibration.figures.table_figures import TableFigures
+from calibration.sampling.windows import largest_window
+from calibration.verdict.result import BuildResult
+from calibration.verdict.values import judged_values
+
+FORMAT = "crop.report"
+VERSION = 1
+
+_Array = npt.NDArray[np.float64]
+
+
+def report_json(result: BuildResult) -> dict[str, Any]:
+    """Return the content of `report.json`: verdict, figures, and every limit with its reason."""
+    figures, verdict = result.figures, result.verdict
+    off_codes_deg, primaries = figures.lights.off_codes_deg, figures.primaries
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "verdict": verdict.outcome,
+        "session": figures.session.folder.name,
+        "camera": figures.session.camera,
+        "lights": figures.session.lights,
+        "channels": _channels(figures),
+        "off_codes_deg": None if off_codes_deg is None else [float(f"{angle:.3g}") for angle in off_codes_deg.tolist()],
+        "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
+        "figures": {name: _rounded(value) for name, value in judged_values(figures).items()},
+        "limits": [asdict(row.threshold) | {"outcome": row.outcome} for row in verdict.rows],
+    }
+
+
+def _channels(figures: TableFigures) -> dict[str, Any]:
+    """Return what is known for each channel; what could not be measured is null."""
+    transfer, dark, lights = figures.sensor.transfer, figures.dark_frames, figures.lights
+    linearity, registration = figures.sensor.linearity, figures.registration
+    return {
+        "window": figures.cells.window,
+        "largest_window": largest_window(registration.cell_px, registration.blur_px),
+        "linearity": None if linearity is None else linearity.to_json(),
+        "dark_frames": len(dark.files),
+        "dark_subtracted": lights.subtracted is not None,
+        "dark_counts": _numbers(dark.light),
+        "dark_error": _numbers(dark.error),
+        "dark_noise": _numbers(dark.noise),
+        "additivity": None if lights.additivity is None else _numbers(lights.additivity),
+        "gain_e_per_count": _numbers(transfer.gain_e),
+        "read_noise_counts": _numbers(transfer.read_noise),
+        "response_spread": _numbers(transfer.response),
+        "noisy_colours": np.flatnonzero(transfer.noisy).tolist(),
+        "grey_tint_deg": dict(zip(figures.greys.names, _numbers(figures.greys.tints_deg(lights.white)), strict=True)),
+    }
+
+
+def _numbers(values: _Array) -> list[float | None]:
+    """Return values (N,) with six significant digits; None for what is not finite, which JSON cannot hold."""
+    return [_rounded(value) if np.isfinite(value) else None for value in values.tolist()]
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")

@@ -1,0 +1,49 @@
+"""What a table is and what it was made from, in lines for people to read (`build-lut --info`)."""
+
+from __future__ import annotations
+
+from calibration.table.file_names import FRAMES
+from calibration.table.lut import Lut
+
+
+def describe(lut: Lut) -> list[tuple[str, str]]:
+    """Return what a table is and what it was made from: names and values, for people to read."""
+    known, lights = lut.provenance, lut.illuminations
+    black_bodies = [light.cct_k for light in lights if light.cct_k is not None]
+    kinds = f"{len(lights) - len(black_bodies)} uniform, {len(black_bodies)} black bodies"
+    if black_bodies:
+        kinds += f" {min(black_bodies):g} to {max(black_bodies):g} K"
+    causes: dict[str, int] = {}
+    for cell in known.unfit:
+        cause = cell.cause.split(":")[0]
+        causes[cause] = causes.get(cause, 0) + 1
+    brightest = lut.white.max(axis=1)
+    low, high = lut.ground_truth.min(axis=0), lut.ground_truth.max(axis=0)
+    chromaticities = ", ".join(
+        f"{channel} {least:.3f} to {most:.3f}"
+        for channel, least, most in zip("rgb", low.tolist(), high.tolist(), strict=True)
+    )
+    frames = f"{len(lut.frames)}, listed in {FRAMES}" if lut.frames else "not listed"
+    return [
+        ("Camera", known.camera),
+        ("Lights", f"{len(lights)}: {kinds}"),
+        ("Colours", f"{8**known.bits} ({known.bits} bits a channel), {lut.samples.shape[2]} samples each"),
+        ("Size", f"{lut.samples.nbytes / 1e9:.2f} GB of samples"),
+        (
+            "White",
+            f"{brightest.min():.0f} to {brightest.max():.0f} in the brightest channel, saturation {known.white_level}",
+        ),
+        ("Chromaticities", chromaticities),
+        (
+            "Cells unfit",
+            f"{len(known.unfit)} of {8**known.bits}"
+            + "".join(f", {count} {cause}" for cause, count in sorted(causes.items())),
+        ),
+        ("Corrections", ", ".join(str(correction.get("name", "?")) for correction in known.corrections)),
+        ("Software", known.software),
+        ("Frames", frames),
+        ("Session", known.session_sha256),
+        ("Chart", known.chart_sha256),
+        ("Samples", known.samples_sha256 or "no hash recorded"),
+        ("Table", lut.sha256),
+    ]

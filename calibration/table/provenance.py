@@ -1,0 +1,109 @@
+"""What `lut.json` holds: the camera, the corrections, the unfit cells, and the hashes that name and verify a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from foundation.errors import FormatError
+
+FORMAT: Final = "crop.lut"
+VERSION: Final = 1
+"""The only version so far: keys that were added since are optional."""
+
+
+class Unfit(BaseModel):
+    """A cell whose samples must not be used, and why."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    colour: int = Field(ge=0)
+    cause: str
+
+
+class Provenance(BaseModel):
+    """The content of `lut.json`.
+
+    Attributes
+    ----------
+    camera
+        Maker and model as the raw files name it.
+    bits
+        Bits kept of each channel; the table has 8**bits colours.
+    white_level
+        Sample value of sensor saturation: linear camera RGB after black subtraction.
+    corrections
+        What was applied to the counts, with its parameters, in order.
+    session_sha256
+        Hash over the frames' hashes (`calibration.table.source_frames.frames_sha256`).
+    chart_sha256
+        Hash of the chart.
+    software
+        Name and version of the program that built the table.
+    unfit
+        Cells unfit for use.
+    samples_sha256, illuminations_sha256
+        Of the files; None in tables made before they were recorded.
+    lights_sha256
+        Of each light's samples as they lie in the file, in the order of lights, so that damage can be traced to a
+        light; empty in tables made before they were recorded.
+    files_sha256
+        Of further files of the table, `references.csv`; empty in tables made before they were recorded.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    format: Literal["crop.lut"] = FORMAT
+    version: Literal[1] = VERSION
+    camera: str
+    bits: int = Field(ge=1, le=5)
+    white_level: int = Field(ge=1, le=65535)
+    corrections: list[dict[str, Any]] = []
+    session_sha256: str
+    chart_sha256: str
+    software: str
+    unfit: list[Unfit] = []
+    samples_sha256: str | None = None
+    illuminations_sha256: str | None = None
+    lights_sha256: list[str] = []
+    files_sha256: dict[str, str] = {}
+
+
+class _Head(BaseModel):
+    format: Any = None
+    version: Any = None
+
+
+def parse_provenance(text: bytes, path: Path) -> Provenance:
+    """Return the content of `lut.json` from its bytes.
+
+    Parameters
+    ----------
+    text
+        UTF-8.
+    path
+        Where it was read, for messages.
+
+    Raises
+    ------
+    FormatError
+        It is damaged, no table's, or of a version not known here.
+    """
+    try:
+        head = _Head.model_validate_json(text)
+    except ValidationError as error:
+        raise FormatError(f"{path} is no table's description: it is damaged; build the table again") from error
+    if head.format != FORMAT:
+        raise FormatError(f"{path} is no table of CroP: its format is not {FORMAT!r}; name a folder made by build-lut")
+    if head.version != VERSION:
+        raise FormatError(
+            f"{path.parent} is a table of version {head.version!r}, this software reads version {VERSION}; "
+            "build it again from its session with build-lut, or install the software that wrote it"
+        )
+    try:
+        return Provenance.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise FormatError(f"{path} is damaged: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error

@@ -1,0 +1,175 @@
+"""The writing of a table: samples light by light, then the ground truth, and last what makes the folder a table."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.lights.illuminations import COLUMNS, Illumination
+from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, SAMPLES
+from calibration.table.lut import WHITE_COLUMNS
+from calibration.table.provenance import Provenance
+from calibration.table.sample_hashes import light_sha256, samples_sha256
+from calibration.table.source_frames import SourceFrame, frames_csv
+from foundation.errors import StorageError
+from foundation.files import storage_error, write_whole
+from foundation.hashing import sha256_of
+
+
+class LutWriter:
+    """Fills a new LUT folder light by light; the folder is the caller's to rename into place.
+
+    The samples' whole size is claimed at the start, so that a full disk is met before the work and not in its midst.
+
+    Parameters
+    ----------
+    folder
+        Where the table is made.
+    lights, colours, samples
+        Its shape.
+    written
+        SHA-256 of the samples of lights that an earlier writer put into this folder; they are left as they are.
+
+    Attributes
+    ----------
+    sha256
+        SHA-256 of the samples of each light that was put, by its number.
+
+    Raises
+    ------
+    StorageError
+        The disk is full or read-only.
+    """
+
+    def __init__(
+        self, folder: Path, lights: int, colours: int, samples: int, written: dict[int, str] | None = None
+    ) -> None:
+        self._folder = folder
+        self._path = folder / SAMPLES
+        self._shape = (lights, colours, samples, 3)
+        self._size = colours * samples * 6
+        self.sha256: dict[int, str] = dict(written or {})
+        header = io.BytesIO()
+        np.lib.format.write_array_header_1_0(header, {"descr": "<u2", "fortran_order": False, "shape": self._shape})
+        self._offset = len(header.getvalue())
+        try:
+            with self._path.open("wb" if written is None else "r+b") as stream:
+                stream.write(header.getvalue())
+                stream.flush()
+                os.posix_fallocate(stream.fileno(), self._offset, lights * self._size)
+        except OSError as error:
+            raise storage_error(self._path, error) from error
+
+    def put(self, light: int, samples: npt.NDArray[np.uint16]) -> None:
+        """Store the samples (colours, samples, 3) uint16 of light number `light`.
+
+        Raises
+        ------
+        StorageError
+            The disk is full or read-only.
+        """
+        data = np.ascontiguousarray(np.broadcast_to(samples, self._shape[1:]), dtype="<u2").tobytes()
+        try:
+            with self._path.open("r+b") as stream:
+                stream.seek(self._offset + light * self._size)
+                stream.write(data)
+        except OSError as error:
+            raise storage_error(self._path, error) from error
+        self.sha256[light] = sha256_of(data)
+
+    def flush(self) -> None:
+        """Wait until the disk holds what was put (`fsync`).
+
+        Raises
+        ------
+        StorageError
+            It cannot.
+        """
+        try:
+            with self._path.open("r+b") as stream:
+                os.fsync(stream.fileno())
+        except OSError as error:
+            raise storage_error(self._path, error) from error
+
+    def damaged(self) -> list[int]:
+        """Return the lights whose samples on the disk are not what was put."""
+        samples = np.load(self._path, mmap_mode="r", allow_pickle=False)
+        return [light for light, known in self.sha256.items() if light_sha256(samples[light]) != known]
+
+    def finish(
+        self,
+        illuminations: Sequence[Illumination],
+        white: npt.NDArray[np.float64],
+        provenance: Provenance,
+        frames: Sequence[SourceFrame] = (),
+        files: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        """Write the frames, the ground truth and the provenance; after this the folder is a table.
+
+        Parameters
+        ----------
+        illuminations
+            The L lights.
+        white
+            (L, 3) float64, the ground truth.
+        provenance
+            The content of `lut.json`; the hashes of samples and lights are added here.
+        frames
+            What the table was made from, in the order taken.
+        files
+            Further files of the table, their text by name.
+
+        Raises
+        ------
+        StorageError
+            The disk is full or read-only, or did not keep what was written to it.
+        """
+        self.flush()
+        whole, lights = samples_sha256(self._path, np.load(self._path, mmap_mode="r", allow_pickle=False))
+        lost = [light for light, known in self.sha256.items() if lights[light] != known]
+        if lost:
+            raise StorageError(
+                f"{self._path}: the samples of lights {', '.join(map(str, lost[:10]))} read back are not those "
+                "written; check the disk, then build the table on another"
+            )
+        truth = _ground_truth_csv(illuminations, white)
+        write_whole(self._folder / ILLUMINATIONS, truth)
+        if frames:
+            write_whole(self._folder / FRAMES, frames_csv(frames))
+        for name, text in files.items():
+            write_whole(self._folder / name, text)
+        hashes = {
+            "files_sha256": {name: sha256_of(text.encode()) for name, text in files.items()},
+            "samples_sha256": whole,
+            "illuminations_sha256": sha256_of(truth.encode()),
+            "lights_sha256": lights,
+        }
+        text = provenance.model_copy(update=hashes).model_dump_json(indent=2)
+        write_whole(self._folder / PROVENANCE, text + "\n")
+
+
+def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[np.float64]) -> str:
+    """Return the text of `illuminations.csv`: the lights with their whites (L, 3), six decimals."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*COLUMNS, *WHITE_COLUMNS])
+    for light, values in zip(illuminations, white, strict=True):
+        writer.writerow(
+            [
+                light.index,
+                light.kind,
+                "" if light.cct_k is None else f"{light.cct_k:g}",
+                light.colour.red,
+                light.colour.green,
+                light.colour.blue,
+                *(f"{value:.6f}" for value in values),
+            ]
+        )
+    return text.getvalue()

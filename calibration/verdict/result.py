@@ -1,0 +1,28 @@
+"""What a build, or a check, hands on: its figures, the verdict on them, and where the table is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from calibration.figures.table_figures import TableFigures
+from calibration.verdict.verdict import Verdict
+
+
+@dataclass(frozen=True, eq=False)
+class BuildResult:
+    """A table as measured and judged.
+
+    Attributes
+    ----------
+    figures
+        What was measured.
+    verdict
+        The judgement on the figures.
+    lut
+        The table's folder; None after a check.
+    """
+
+    figures: TableFigures
+    verdict: Verdict
+    lut: Path | None

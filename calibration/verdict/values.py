@@ -1,0 +1,132 @@
+"""The values that are judged, by the names of their thresholds, from the figures of a build or a check."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.checks.frame_consistency import has_enough_cells
+from calibration.figures.table_figures import TableFigures
+from calibration.registration.registration import Registration
+from calibration.sampling.windows import bleed
+from foundation.angles import angles_deg
+
+
+def judged_values(figures: TableFigures) -> dict[str, float]:
+    """Return the values that are judged, by name; in the units of `calibration.verdict.thresholds`.
+
+    Left out is what could not be measured: from one frame, on a chart without tags or with few colours, without dark
+    frames or a series of exposures.
+    """
+    return {
+        **_registration_values(figures),
+        **_cell_values(figures),
+        **_frame_values(figures),
+        **_light_values(figures),
+        **_dark_values(figures),
+        **_sensor_values(figures),
+    }
+
+
+def _registration_values(figures: TableFigures) -> dict[str, float]:
+    """Return how well the chart was found in the frame that was registered first."""
+    registration = figures.registration
+    values = {
+        "cell_px": registration.cell_px,
+        "bleed": bleed(registration.cell_px, registration.blur_px, figures.cells.window),
+        "tag_residual_px": registration.lens_residual_px,
+        "tag_final_px": registration.marks_rms_px / registration.clearance,
+        "block_residual_px": registration.block_rms_px / registration.clearance,
+        "blocks_good": float(registration.blocks.good.mean()),
+        "agreement": registration.agreement,
+    }
+    if registration.framing.field is None:
+        found = len(registration.framing.tags)
+        values["tags_found"] = found / max(found + len(registration.framing.missing), 1)
+    return values
+
+
+def _cell_values(figures: TableFigures) -> dict[str, float]:
+    """Return how many cells are unfit, or doubtful."""
+    cells = figures.cells
+    values = {"unfit_share": len(cells.unfit) / max(_cell_count(figures), 1)}
+    if cells.stains.known:
+        values["doubtful_share"] = float(cells.stains.doubtful.mean())
+    return values
+
+
+def _frame_values(figures: TableFigures) -> dict[str, float]:
+    """Return the worst that happened between frames."""
+    frames, registration = figures.frames, figures.registration
+    used = min((frame.paper.references for frame in frames), default=0)
+    values = {
+        "softer_bleed": max(
+            (_added_bleed(registration, frame.blur_px, figures.cells.window) for frame in frames), default=0.0
+        ),
+        "black_drift_counts": figures.black_drift,
+        "references_used": used / max(figures.session.white_references, 1),
+    }
+    if len(frames) > 1:
+        values["moved_anew"] = float(sum(frame.reregistered for frame in frames))
+    if has_enough_cells(_cell_count(figures)):
+        values["unlike_scatter"] = max((frame.consistency.scatter for frame in frames), default=0.0)
+        values["unlike_block"] = max((frame.consistency.block for frame in frames), default=0.0)
+    whites = [frame.paper for frame in figures.white_frames]
+    if whites:
+        values["reference_spread"] = max(float(paper.spread[int(np.argmax(paper.white))]) for paper in whites)
+    if len(whites) > 1:
+        white = np.array([paper.white for paper in whites])
+        values["white_drift"] = figures.white_drift
+        values["white_drift_deg"] = float(angles_deg(white, np.broadcast_to(white[0], white.shape)).max())
+    return values
+
+
+def _light_values(figures: TableFigures) -> dict[str, float]:
+    """Return how well the lights are known."""
+    lights = figures.lights
+    paper = lights.white.max(axis=1)
+    values = {
+        "truth_median_deg": float(np.median(lights.white_error_deg)),
+        "truth_worst_deg": float(lights.white_error_deg.max()),
+        "brightest_share": float(paper.max()) / figures.sensor.white_level,
+        "darkest_counts": float(paper.min()),
+    }
+    if lights.additivity is not None:
+        values["additivity"] = float(np.abs(lights.additivity).max())
+    if lights.off_codes_deg is not None:
+        values["off_codes_deg"] = float(lights.off_codes_deg.max())
+    if (tint := figures.greys.tints_deg(lights.white)).size and np.isfinite(tint).any():
+        values["grey_tint_deg"] = float(np.nanmax(tint))
+    return values
+
+
+def _dark_values(figures: TableFigures) -> dict[str, float]:
+    """Return what light there is while the projector shows black, and how it changes."""
+    dark, white, lights = figures.dark_frames, [frame.paper.white for frame in figures.white_frames], figures.lights
+    full = np.mean(white, axis=0) if white else lights.white[int(np.argmax(lights.white.sum(axis=1)))]
+    values: dict[str, float] = {}
+    if np.isfinite(dark.light).all() and lights.subtracted is None:
+        values["leak_share"] = float(np.abs(dark.light / full).max())
+    if len(dark.lights) > 1:
+        values["dark_drift"] = float((np.ptp(dark.lights, axis=0) / full).max())
+    return values
+
+
+def _sensor_values(figures: TableFigures) -> dict[str, float]:
+    """Return how the sensor answers to light."""
+    sensor = figures.sensor
+    values = {
+        "noise_misfit": float(sensor.transfer.misfit.max()),
+        "noisy_share": float(sensor.transfer.noisy.mean()),
+    }
+    if sensor.linearity is not None:
+        values["linearity"] = sensor.linearity.worst
+    return values
+
+
+def _cell_count(figures: TableFigures) -> int:
+    return len(figures.registration.mismatched_cells)
+
+
+def _added_bleed(registration: Registration, blur_px: float, window: int) -> float:
+    """Return how much more light a frame's worst sample has from beyond its cell than that of the registered frame."""
+    return bleed(registration.cell_px, blur_px, window) - bleed(registration.cell_px, registration.blur_px, window)

@@ -1,0 +1,48 @@
+"""The methods that the command knows, with the constants that are usual in the field.
+
+    method              source                                                  n, p, σ of the Gray-Edge framework
+    White-Patch         B. Funt, L. Shi, "The rehabilitation of MaxRGB", 2010   0, ∞, 0
+    Gray-world          G. Buchsbaum, "A spatial processor model for object     0, 1, 0
+                        colour perception", 1980
+    Shades-of-Gray      G. Finlayson, E. Trezzi, "Shades of gray and colour     0, 2, 0
+                        constancy", 2004
+    General Gray-world  J. van de Weijer et al., 2007; see `gray_edge.py`       0, 9, 9
+    Gray-Edge, order 1  the same                                                1, 1, 6
+    Gray-Edge, order 2  the same                                                2, 1, 1
+    PCA                 D. Cheng et al., 2014; see `pca.py`                     -
+
+The paper's tables have the first three, Shades-of-Gray with p = 2 as here. The other constants are those with which the
+methods stand in the tables of the NUS dataset. Every method of the framework is built from its equation alone, without
+the preprocessing that a source may add (for White-Patch: no median filter).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from evaluation.methods.gray_edge import GrayEdge
+from evaluation.methods.method import Method
+from evaluation.methods.pca import BrightDark
+
+
+def standard_methods() -> Mapping[str, Method]:
+    """Return the methods by the short names that the command line knows; the paper's three first.
+
+    Examples
+    --------
+    >>> list(standard_methods())
+    ['white-patch', 'gray-world', 'shades-of-gray', 'general-gray-world', 'gray-edge-1', 'gray-edge-2', 'pca']
+    >>> standard_methods()["gray-edge-1"].name
+    '1st-order Gray-Edge'
+    """
+    return {
+        "white-patch": GrayEdge("White-Patch", 0, np.inf, 0),
+        "gray-world": GrayEdge("Gray-world", 0, 1, 0),
+        "shades-of-gray": GrayEdge("Shades-of-Gray (p=2)", 0, 2, 0),
+        "general-gray-world": GrayEdge("General Gray-world", 0, 9, 9),
+        "gray-edge-1": GrayEdge("1st-order Gray-Edge", 1, 1, 6),
+        "gray-edge-2": GrayEdge("2nd-order Gray-Edge", 2, 1, 1),
+        "pca": BrightDark(),
+    }

@@ -1,0 +1,1 @@
+"""The command `generate`: its options, and what it shows meanwhile."""

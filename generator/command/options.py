@@ -1,0 +1,281 @@
+"""The options of the command `generate`, a group for each panel of its help.
+
+Libraries that take long to load are imported when a group makes something of its options.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from foundation.errors import InputError
+from foundation.processors import processor_count
+from generator.command.grouping import option
+from generator.dataset.production.workers import Workers
+
+if TYPE_CHECKING:
+    from generator.dataset.production.options import DatasetOptions
+    from generator.lights.request import LightRequest
+    from generator.pictures.picture import Preparation
+    from generator.pictures.sources import Source
+
+_SOURCES = "Source pictures"
+_LIGHT = "Light"
+_IMAGES = "Images"
+_WORK = "Work"
+
+
+@dataclass(frozen=True)
+class Places:
+    """The arguments: the table, and the place of the dataset; None where an option needs neither."""
+
+    lut: Annotated[Path | None, typer.Argument(metavar="LUT", help="Folder of the table.", show_default=False)] = None
+    out: Annotated[
+        str | None, typer.Argument(metavar="OUT", help="Folder or URL to make; must not exist.", show_default=False)
+    ] = None
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """Which pictures are sources, and how they are prepared."""
+
+    sources: Annotated[
+        list[str] | None,
+        option(
+            "PLACE",
+            "A picture, or a folder that is searched with those below it, or a URL of either on a store that fsspec "
+            "knows; may be repeated.",
+            _SOURCES,
+        ),
+    ] = None
+    random_scenes: Annotated[int, option("N", "Add N pictures of uniformly random colours.", _SOURCES, min=0)] = 0
+    size: Annotated[str, option("WxH", "Size of the random pictures, px.", _SOURCES)] = "512x512"
+    max_side: Annotated[int | None, option("PX", "Make larger pictures this small first.", _SOURCES, min=1)] = None
+    crop: Annotated[str | None, option("WxH", "Cut pictures to this size; smaller ones are left out.", _SOURCES)] = None
+    cover: Annotated[
+        bool,
+        typer.Option(
+            "--cover",
+            help="Make pictures as small as still covers the crop before they are cut.",
+            rich_help_panel=_SOURCES,
+        ),
+    ] = False
+    crop_at: Annotated[
+        Literal["centre", "random"], option(None, "Where to cut; random is chosen by the seed.", _SOURCES)
+    ] = "centre"
+    profiles: Annotated[
+        Literal["honour", "ignore"],
+        option(
+            None, "Convert pictures with another colour profile to sRGB, or take their codes as they stand.", _SOURCES
+        ),
+    ] = "honour"
+
+    def preparation(self, seed: int) -> Preparation:
+        """Return what is done to each picture; an InputError says which option cannot be used."""
+        from generator.pictures.picture import Preparation
+
+        crop = None if self.crop is None else _size(self.crop, "--crop")
+        return Preparation(self.max_side, crop, self.cover, self.crop_at, self.profiles, seed)
+
+    def find(self, seed: int) -> tuple[Source, ...]:
+        """Return the sources: pictures that are found, then random ones.
+
+        Raises
+        ------
+        InputError
+            There is none, or options do not go together.
+        """
+        from generator.pictures.sources import find_pictures, random_scenes
+
+        preparation = self.preparation(seed)
+        places = self.sources or []
+        if not places and (preparation.crop or preparation.max_side):
+            raise InputError(
+                "--crop and --max-side are for pictures, and --sources names none; random ones have --size"
+            )
+        found: tuple[Source, ...] = find_pictures(places, preparation)
+        if self.random_scenes:
+            found += random_scenes(self.random_scenes, *_size(self.size, "--size"), seed)
+        if not found:
+            raise InputError("there is no source picture; name some with --sources or ask for --random-scenes")
+        return found
+
+
+@dataclass(frozen=True)
+class LightOptions:
+    """Which lights fall on which picture, and where."""
+
+    illuminations: Annotated[
+        str | None, option("LIST", "These lights for every picture: 0,5,12-20 or all.", _LIGHT)
+    ] = None
+    light: Annotated[
+        list[str] | None,
+        option(
+            "LIGHT",
+            "A light for every picture, mixed of the table's: 12, 12:0.25+40:0.75, 5600K, or a chromaticity "
+            "r=.3,b=.25; may be repeated.",
+            _LIGHT,
+        ),
+    ] = None
+    random: Annotated[
+        int | None,
+        option(
+            "K",
+            "K images of each picture, under distinct random lights of the table, or under lights drawn from "
+            "--distribution. \\[default: 1]",
+            _LIGHT,
+        ),
+    ] = None
+    distribution: Annotated[
+        str | None,
+        option(
+            "NAME",
+            "Draw chromaticities from uniform, gaussian:r=.3,b=.25,sd=.02 (or sd_r, sd_b and corr for sd), or the "
+            "normal distribution fitted to a file of ground truths as of --nearest.",
+            _LIGHT,
+        ),
+    ] = None
+    nearest: Annotated[
+        Path | None,
+        option(
+            "GT.csv",
+            "For the picture at place i the light nearest in angle to ground truth i of this file "
+            "(columns GT_R,GT_G,GT_B or r,g,b, or lines of three numbers).",
+            _LIGHT,
+        ),
+    ] = None
+    match: Annotated[
+        Path | None, option("GT.csv", "The same with a mixture of lights that matches the ground truth.", _LIGHT)
+    ] = None
+    outside: Annotated[
+        Literal["refuse", "nearest"], option(None, "What to do about lights that the table cannot make.", _LIGHT)
+    ] = "refuse"
+    lights_per_image: Annotated[
+        int | None, option("K", "Let K lights fall on each image. \\[default: 1; 2 with --masks]", _LIGHT)
+    ] = None
+    masks: Annotated[
+        str | None,
+        option(
+            "KIND",
+            "Where each of several lights falls: half-plane or soft-edge (angle, width), spots (count, radius, "
+            "softness), smooth (scale, contrast), window (columns, rows, softness), with numbers where wanted, as in "
+            "spots:count=3,radius=.1; or a folder of masks. \\[default: smooth]",
+            _LIGHT,
+        ),
+    ] = None
+
+    def request(self) -> LightRequest:
+        """Return the options as the generator's lights take them."""
+        from generator.lights.request import LightRequest
+
+        return LightRequest(
+            illuminations=self.illuminations,
+            light=tuple(self.light or ()),
+            random=self.random,
+            distribution=self.distribution,
+            nearest=self.nearest,
+            match=self.match,
+            outside=self.outside,
+            lights_per_image=self.lights_per_image,
+            masks=self.masks,
+        )
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """What is written, and the seed of everything random."""
+
+    seed: Annotated[int, option(None, "Seed of everything random.", _IMAGES)] = 0
+    format: Annotated[
+        Literal["png", "tiff", "exr", "jxl", "dng"],
+        option(
+            None, "PNG; uncompressed TIFF, fast and large; OpenEXR; JPEG XL, small; or raw files, Bayer DNG.", _IMAGES
+        ),
+    ] = "png"
+    layout: Annotated[
+        Literal["folder", "webdataset", "parquet"],
+        option(
+            None,
+            "Each image in a file of its own, or those of a shard in a tar file (WebDataset) or in a Parquet file "
+            "(Hugging Face datasets).",
+            _IMAGES,
+        ),
+    ] = "folder"
+    split: Annotated[
+        str | None,
+        option("SHARES", "Divide by source into train, validation and test, such as 0.8,0.1,0.1.", _IMAGES),
+    ] = None
+    preview: Annotated[bool, option(None, "Write tone-mapped previews.", _IMAGES)] = True
+    contact_sheet: Annotated[
+        Path | None,
+        option("PATH", "Write a page of previews to this PNG file; with --verify of a dataset that is there.", _IMAGES),
+    ] = None
+
+    def dataset_options(self, shard_images: int, reading: Mapping[str, Any]) -> DatasetOptions:
+        """Return what the dataset is to be; an InputError says which option cannot be used."""
+        from generator.dataset.production.options import DatasetOptions, parse_split
+
+        return DatasetOptions(
+            form=self.format,
+            layout=self.layout,
+            previews=self.preview,
+            split=None if self.split is None else parse_split(self.split),
+            shard_images=shard_images,
+            reading=reading,
+        )
+
+
+@dataclass(frozen=True)
+class WorkOptions:
+    """Who does the work and which part of it."""
+
+    workers: Annotated[
+        int | None, option("N", "Threads, or processes of the engine dask. \\[default: one a processor]", _WORK)
+    ] = None
+    engine: Annotated[
+        str,
+        option(
+            "NAME",
+            "local, dask (a cluster on this machine), or dask://HOST:PORT of a scheduler; docs/clusters.md.",
+            _WORK,
+        ),
+    ] = "local"
+    shard_images: Annotated[int, option("N", "Images of a shard: what a kill may cost.", _WORK, min=1)] = 256
+    shard: Annotated[
+        str | None,
+        option(
+            "I/N", "Make share I of N only, I from 0, beside other programs that make theirs; then --finish.", _WORK
+        ),
+    ] = None
+    finish: Annotated[
+        str | None,
+        option(
+            "OUT",
+            "Make the dataset OUT of its shards when all shares are done; no other argument is needed.",
+            _WORK,
+        ),
+    ] = None
+    verify: Annotated[
+        str | None,
+        option(
+            "OUT",
+            "Hash every file of the dataset OUT again and name those that have changed; no other argument is needed.",
+            _WORK,
+        ),
+    ] = None
+
+    def makers(self) -> Workers:
+        """Return who makes the images: as many as there are processors unless a number is given."""
+        return Workers(self.engine, processor_count() if self.workers is None else self.workers)
+
+
+def _size(text: str, name: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d+)[xX×](\d+)", text)
+    if not match:
+        raise InputError(f"{name} is {text!r}, expected width x height such as 512x512")
+    return int(match[1]), int(match[2])

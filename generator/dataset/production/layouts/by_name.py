@@ -1,0 +1,75 @@
+"""Writers and readers of the layouts, by the layout's name."""
+
+from __future__ import annotations
+
+from generator.dataset.production.layouts.plain_files import FolderWriter
+from generator.dataset.production.layouts.samples import ShardWriter
+from generator.dataset.production.records import Layout
+from generator.stores.store import Store
+
+
+def require_libraries(layout: Layout) -> None:
+    """Refuse a layout whose library is not installed.
+
+    Raises
+    ------
+    InputError
+        It is not; the message says how to install it.
+    """
+    if layout == "parquet":
+        from generator.dataset.production.layouts.parquet import require_pyarrow
+
+        require_pyarrow()
+
+
+def open_writer(layout: Layout, store: Store, shard: int, *, previews: bool, maps: bool) -> ShardWriter:
+    """Return the writer of a shard.
+
+    Parameters
+    ----------
+    layout
+        How its images lie.
+    store
+        Where its files are to be.
+    shard
+        Its number.
+    previews, maps
+        Whether its images have previews, and masks with maps of the ground truth.
+    """
+    match layout:
+        case "folder":
+            return FolderWriter(store)
+        case "webdataset":
+            from generator.dataset.production.layouts.webdataset import TarWriter
+
+            return TarWriter(store, shard)
+        case "parquet":
+            from generator.dataset.production.layouts.parquet import ParquetWriter
+
+            return ParquetWriter(store, shard, previews, maps)
+
+
+def read_member(layout: str, store: Store, container: str, file: str) -> bytes:
+    """Return the bytes of a file of an image that lies with others in one file of a shard.
+
+    Parameters
+    ----------
+    layout
+        ``webdataset`` or ``parquet``.
+    store, container
+        Where the dataset is, and the name of the shard's file in it.
+    file
+        As `samples.member_name` returns it.
+
+    Raises
+    ------
+    FormatError
+        The shard's file is missing or damaged, or there is no such image in it.
+    """
+    if layout == "webdataset":
+        from generator.dataset.production.layouts import webdataset
+
+        return webdataset.read_member(store, container, file)
+    from generator.dataset.production.layouts import parquet
+
+    return parquet.read_member(store, container, file)

@@ -1,0 +1,293 @@
+"""Files below one place: a folder of this machine, or any object store that fsspec reaches.
+
+Rules that hold inside:
+
+- A file is there whole or not at all. Two programs may write one name at once: the later file replaces the earlier.
+- Only files that were synchronised (`Store.sync`) are sure to survive a loss of power. To synchronise many at once
+  costs one wait, not many.
+- An object store has no rename and needs none: an object appears when its last byte has arrived.
+
+A name is a path below the store's place, with forward slashes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+import tempfile
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
+
+from foundation.errors import CropError, FormatError, StorageError
+from foundation.files import is_partial, partial_path, storage_error, sync_folder
+from generator.stores.places import filesystem, is_remote, local_path
+
+Pieces = Iterable[bytes | memoryview]
+"""A file's bytes in order; a piece is valid until the next is asked for."""
+
+_SYNC_THREADS: Final = 16
+"""Files synchronised at a time: a file system commits its journal once for all that wait, so that sixteen waits cost
+little more than one."""
+
+if TYPE_CHECKING:
+    from fsspec.spec import AbstractFileSystem
+
+
+class Store(Protocol):
+    """Files below one place."""
+
+    @property
+    def place(self) -> str:
+        """The path or URL, as a user writes it."""
+        ...
+
+    def put(self, name: str, data: bytes | Pieces) -> None:
+        """Write a file; a StorageError says why it cannot be."""
+        ...
+
+    def create(self, name: str) -> contextlib.AbstractContextManager[BinaryIO]:
+        """Open a file to be written in order; it appears when the block ends well."""
+        ...
+
+    def sync(self, names: Iterable[str]) -> None:
+        """Wait until these files would survive a loss of power."""
+        ...
+
+    def get(self, name: str) -> bytes:
+        """Return a file's bytes; a FormatError says why they cannot be read."""
+        ...
+
+    def open(self, name: str) -> contextlib.AbstractContextManager[BinaryIO]:
+        """Open a file to be read in order; a FormatError says why it cannot be."""
+        ...
+
+    def has(self, name: str) -> bool:
+        """Return whether there is such a file."""
+        ...
+
+    def names(self, folder: str = "") -> Iterator[str]:
+        """Return the names of all files below `folder`, in no order; writes that never finished are left out."""
+        ...
+
+    def remove(self, folder: str) -> None:
+        """Remove a folder with all that is below it, if it is there."""
+        ...
+
+
+@dataclass(frozen=True)
+class LocalStore:
+    """A folder of this machine. The folder itself is never made here: a dataset that was finished stays finished."""
+
+    root: Path
+
+    @property
+    def place(self) -> str:
+        """The folder."""
+        return str(self.root)
+
+    def put(self, name: str, data: bytes | Pieces) -> None:
+        """Write a file."""
+        with self.create(name) as stream:
+            for piece in (data,) if isinstance(data, bytes) else data:
+                stream.write(piece)
+
+    @contextmanager
+    def create(self, name: str) -> Generator[BinaryIO]:
+        """Open a file to be written; it appears when the block ends well, and is on the disk once synchronised."""
+        path = self.root / name
+        # Named by chance, because two programs may be at the same shard; see `foundation.files.is_partial`.
+        hidden = partial_path(path.with_name(f"{path.name}.{secrets.token_hex(8)}"))
+        try:
+            try:
+                stream = hidden.open("wb")
+            except FileNotFoundError:
+                self._make_folder(path.parent)
+                stream = hidden.open("wb")
+            with stream:
+                yield stream
+            hidden.replace(path)
+        except BaseException as error:
+            with contextlib.suppress(OSError):
+                hidden.unlink(missing_ok=True)
+            if isinstance(error, OSError) and not isinstance(error, CropError):
+                raise storage_error(path, error) from error
+            raise
+
+    def _make_folder(self, folder: Path) -> None:
+        if not self.root.is_dir():
+            raise StorageError(f"{self.root} is gone: the dataset was finished or removed meanwhile")
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def sync(self, names: Iterable[str]) -> None:
+        """Wait until these files and their names are on the disk."""
+        paths = [self.root / name for name in names]
+        with ThreadPoolExecutor(_SYNC_THREADS) as pool:
+            list(pool.map(_sync_file, paths))
+        for folder in {path.parent for path in paths}:
+            sync_folder(folder)
+
+    def get(self, name: str) -> bytes:
+        """Return a file's bytes."""
+        with self.open(name) as stream:
+            return stream.read()
+
+    @contextmanager
+    def open(self, name: str) -> Generator[BinaryIO]:
+        """Open a file to be read."""
+        path = self.root / name
+        try:
+            with path.open("rb") as stream:
+                yield stream
+        except OSError as error:
+            raise FormatError(f"cannot read {path}: {error.strerror or error}; make the dataset again") from error
+
+    def has(self, name: str) -> bool:
+        """Return whether there is such a file."""
+        return (self.root / name).is_file()
+
+    def names(self, folder: str = "") -> Iterator[str]:
+        """Return the names of all files below `folder`."""
+        for path, _, files in os.walk(self.root / folder):
+            below = Path(path).relative_to(self.root)
+            yield from ((below / file).as_posix() for file in files if not is_partial(Path(file)))
+
+    def remove(self, folder: str) -> None:
+        """Remove a folder with all that is below it, if it is there."""
+        shutil.rmtree(self.root / folder, ignore_errors=True)
+
+    def sweep(self) -> None:
+        """Remove writes that never finished; nobody else may be writing."""
+        for path, _, files in os.walk(self.root):
+            for file in files:
+                if is_partial(Path(file)):
+                    (Path(path) / file).unlink(missing_ok=True)
+
+
+def _sync_file(path: Path) -> None:
+    try:
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise storage_error(path, error) from error
+
+
+@dataclass(frozen=True)
+class RemoteStore:
+    """A place of an object store.
+
+    Raises
+    ------
+    InputError
+        Its URL is of no kind that fsspec knows.
+    """
+
+    url: str
+
+    def __post_init__(self) -> None:
+        _ = self._root
+
+    @property
+    def place(self) -> str:
+        """The URL."""
+        return self.url.rstrip("/")
+
+    @property
+    def _files(self) -> AbstractFileSystem:
+        # Asked for each time: fsspec keeps one for each URL, and what is sent to a worker must not hold one.
+        return filesystem(self.url)[0]
+
+    @property
+    def _root(self) -> str:
+        return filesystem(self.url)[1].rstrip("/")
+
+    def put(self, name: str, data: bytes | Pieces) -> None:
+        """Write an object."""
+        whole = data if isinstance(data, bytes) else joined(data)
+        with self._translated_errors(name):
+            self._files.pipe_file(self._path(name), whole)
+
+    @contextmanager
+    def create(self, name: str) -> Generator[BinaryIO]:
+        """Open a temporary file to be written; it becomes the object when the block ends well."""
+        # Objects are sent from a file of this machine, so that a block that fails sends nothing.
+        with tempfile.NamedTemporaryFile(prefix="crop-") as stream:
+            yield cast("BinaryIO", stream)
+            stream.flush()
+            with self._translated_errors(name):
+                self._files.put_file(stream.name, self._path(name))
+
+    def sync(self, names: Iterable[str]) -> None:
+        """Return at once: a store that accepted an object keeps it."""
+        del names
+
+    def get(self, name: str) -> bytes:
+        """Return an object's bytes."""
+        with self._translated_errors(name, reading=True):
+            return self._files.cat_file(self._path(name))
+
+    @contextmanager
+    def open(self, name: str) -> Generator[BinaryIO]:
+        """Open an object to be read."""
+        with self._translated_errors(name, reading=True):
+            stream = self._files.open(self._path(name), "rb")
+        with stream:
+            yield stream
+
+    def has(self, name: str) -> bool:
+        """Return whether there is such an object."""
+        with self._translated_errors(name, reading=True):
+            return self._files.exists(self._path(name))
+
+    def names(self, folder: str = "") -> Iterator[str]:
+        """Return the names of all objects below `folder`."""
+        with self._translated_errors(folder, reading=True):
+            found = self._files.find(self._path(folder))
+        return (path[len(self._root) :].lstrip("/") for path in found)
+
+    def remove(self, folder: str) -> None:
+        """Remove all objects below `folder`."""
+        with self._translated_errors(folder):
+            if self._files.exists(self._path(folder)):
+                self._files.rm(self._path(folder), recursive=True)
+
+    def _path(self, name: str) -> str:
+        return f"{self._root}/{name}" if name else self._root
+
+    @contextmanager
+    def _translated_errors(self, name: str, reading: bool = False) -> Generator[None]:
+        """Raise any error of a store's library as a FormatError or StorageError that names the object and a remedy."""
+        try:
+            yield
+        except (CropError, MemoryError):
+            raise
+        except Exception as error:
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            if reading:
+                raise FormatError(
+                    f"cannot read {self.place}/{name}: {reason}; check the address and that you may read there"
+                ) from error
+            raise StorageError(
+                f"cannot write {self.place}/{name}: {reason}; check the address and that you may write there, then run "
+                "the same command again"
+            ) from error
+
+
+def joined(pieces: Pieces) -> bytes:
+    """Return pieces of a file as one."""
+    return b"".join([bytes(piece) for piece in pieces])
+
+
+def open_store(place: str | Path) -> Store:
+    """Return the store at a path or URL; nothing is looked at yet."""
+    if isinstance(place, str) and is_remote(place):
+        return RemoteStore(place)
+    return LocalStore(local_path(place))

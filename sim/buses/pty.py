@@ -1,0 +1,100 @@
+"""A pseudo-terminal: a serial port without hardware, on Linux and macOS, with a simulated device at its far end.
+
+Rules that hold inside:
+
+- One thread serves the device; it is joined when the terminal is closed.
+- To close it is to pull the cable out: whoever has the port open finds it gone.
+- What nobody reads is lost when the system's buffer is full, as on a cable without flow control.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import threading
+import tty
+from types import TracebackType
+from typing import Final
+
+from drivers.links.memory import Peer
+from foundation.errors import LinkClosed
+from sim.buses.serial_cable import POLLING_S
+
+_WAKE: Final = b"w"
+_END: Final = b"e"
+"""What rings the serving thread: to say when it has caught up, and to end."""
+
+_PATIENCE_S: Final = 10.0
+"""Longest wait for the thread to catch up; it takes milliseconds unless the machine is overloaded."""
+
+
+class PseudoTerminal:
+    """A serial port at `path` whose far end is `peer`, until closed; use it in a `with` block.
+
+    Raises
+    ------
+    LinkClosed
+        The system has no pseudo-terminal left.
+    """
+
+    def __init__(self, peer: Peer) -> None:
+        self._peer = peer
+        try:
+            self._master, self._slave = os.openpty()
+        except OSError as error:
+            raise LinkClosed(f"the system gives no pseudo-terminal: {error}; close programs that use them") from error
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        """The port's name, as any serial software takes it."""
+        self._bell, self._ringer = os.pipe()
+        self._caught_up = threading.Event()
+        self._closed = False
+        self._thread = threading.Thread(target=self._serve, name=f"serving {self.path}", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> PseudoTerminal:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def catch_up(self) -> None:
+        """Return when all that was sent has been answered and nothing more comes: before and after a clock leaps."""
+        self._caught_up.clear()
+        os.write(self._ringer, _WAKE)
+        self._caught_up.wait(_PATIENCE_S)
+
+    def close(self) -> None:
+        """Pull the cable out and wait for the thread; a second call does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        os.write(self._ringer, _END)
+        self._thread.join()
+        for end in (self._master, self._slave, self._bell, self._ringer):
+            os.close(end)
+
+    def _serve(self) -> None:
+        self._say(self._peer.connect())
+        awaited = False
+        while True:
+            ready, _, _ = select.select([self._master, self._bell], [], [], POLLING_S)
+            rung = os.read(self._bell, 1) if self._bell in ready else b""
+            if rung == _END:
+                return
+            awaited = awaited or rung == _WAKE
+            heard = os.read(self._master, 4096) if self._master in ready else b""
+            self._say(self._peer.receive(heard))
+            if awaited and not ready:
+                # The system takes a moment to carry bytes across: only silence shows that none are on their way.
+                awaited = False
+                self._caught_up.set()
+
+    def _say(self, data: bytes) -> None:
+        with contextlib.suppress(BlockingIOError):
+            while data:
+                data = data[os.write(self._master, data) :]

@@ -1,0 +1,239 @@
+"""The simulated projector itself: a lamp that takes its time.
+
+Rules that hold inside:
+
+- It is physics and knows no bytes; `sim.projectors.pjlink` and `sim.projectors.serial` speak for it.
+- State moves with the time that is handed in, and only when somebody looks.
+- What the world needs is `light`: how much of the full light reaches the screen now.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+from drivers.pjlink.wire import FAULT_PARTS, Input, NoResolution, Resolution
+from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
+from foundation.clock import Clock
+from foundation.errors import DeviceFault, DeviceRefused
+
+WARM_UP_S = 30.0
+COOL_DOWN_S = 60.0
+IDENTITY = ProjectorIdentity("CroP", "Simulated Projector", "dark room")
+INPUTS = (
+    Input("11", "Computer"),
+    Input("31", "HDMI 1"),
+    Input("32", "HDMI 2"),
+    Input("3A", "HDBaseT"),
+    Input("61", "Test pattern"),
+)
+PANEL = Resolution(1920, 1080)
+MAX_VOLUME = 20
+
+
+@dataclass(frozen=True)
+class ProjectorTraits:
+    """What does not change about a simulated projector.
+
+    `lamp_hours` is what its lamp has burnt at the start; `filter_hours` is None for a projector without filter;
+    `inputs` beyond class 1 are hidden in a projector of class 1; `sha256` is what PJLink 2.10 adds.
+    """
+
+    identity: ProjectorIdentity = IDENTITY
+    warm_up_s: float = WARM_UP_S
+    cool_down_s: float = COOL_DOWN_S
+    lamp_hours: float = 120.0
+    inputs: tuple[Input, ...] = INPUTS
+    pjlink_class: int = 2
+    sha256: bool = False
+    serial_number: str = "SIM0000001"
+    software_version: str = "1.00"
+    filter_hours: int | None = 45
+    lamp_model: str = "LAMP-1"
+    filter_model: str = "FILTER-1"
+    panel: Resolution = PANEL
+    mac: str = "02:00:00:00:00:01"
+
+
+class SimulatedProjector:
+    """A lamp projector. It keeps the contract of `drivers.projector.Projector`, and may be used from several threads.
+
+    Parameters
+    ----------
+    clock
+        The time by which the lamp warms up and cools down.
+    power
+        The state in which it is found, `Power.ON` or `Power.STANDBY`.
+    """
+
+    def __init__(self, clock: Clock, power: Power = Power.STANDBY, traits: ProjectorTraits | None = None) -> None:
+        self.clock = clock
+        self.traits = traits or ProjectorTraits()
+        self._guard = threading.RLock()
+        self._power = power
+        self._since = clock.monotonic()
+        self._lit_s = self.traits.lamp_hours * 3600.0
+        self._muted = False
+        self._faults: dict[str, Severity] = {}
+        self._input = "31"
+        self._frozen = False
+        self.signal: Resolution | NoResolution = self.traits.panel
+        """What arrives at its input; change it at will."""
+        self.speaker = MAX_VOLUME // 2
+        self.microphone = MAX_VOLUME // 2
+
+    def identity(self) -> ProjectorIdentity:
+        """Return maker, model and name."""
+        return self.traits.identity
+
+    def power(self) -> Power:
+        """Return the power state now."""
+        with self._guard:
+            self._move()
+            return self._power
+
+    def switch_on(self) -> None:
+        """Strike the lamp; refused while it cools."""
+        with self._guard:
+            self._begin(Power.WARMING, Power.ON, "cooling down")
+
+    def switch_off(self) -> None:
+        """Put the lamp out; refused while it warms up."""
+        with self._guard:
+            self._begin(Power.COOLING, Power.STANDBY, "warming up")
+
+    def muted(self) -> bool:
+        """Return whether the picture is blanked; refused unless it is on."""
+        with self._guard:
+            self._require_on()
+            return self._muted
+
+    def set_muted(self, muted: bool) -> None:
+        """Blank the picture, or show it; refused unless it is on."""
+        with self._guard:
+            self._require_on()
+            self._muted = muted
+
+    def input(self) -> str:
+        """Return the code of the input that is shown (PJLink INPT); refused unless it is on."""
+        with self._guard:
+            self._require_on()
+            return self._input
+
+    def set_input(self, code: str) -> None:
+        """Show another of the inputs in its traits; refused unless it is on."""
+        with self._guard:
+            self._require_on()
+            if code not in [source.code for source in self.traits.inputs]:
+                raise ValueError(code)
+            self._input = code
+
+    def input_resolution(self) -> Resolution | NoResolution:
+        """Return the resolution of the signal at its input, or why there is none; refused unless it is on."""
+        with self._guard:
+            self._require_on()
+            return self.signal
+
+    def frozen(self) -> bool:
+        """Return whether the picture is frozen; refused unless it is on."""
+        with self._guard:
+            self._require_on()
+            return self._frozen
+
+    def set_frozen(self, frozen: bool) -> None:
+        """Freeze the picture, or let it move; refused unless it is on."""
+        with self._guard:
+            self._require_on()
+            self._frozen = frozen
+
+    def turn_speaker(self, step: int) -> None:
+        """Turn the speaker by `step`, as far as it goes; refused unless it is on."""
+        with self._guard:
+            self._require_on()
+            self.speaker = min(max(self.speaker + step, 0), MAX_VOLUME)
+
+    def turn_microphone(self, step: int) -> None:
+        """Turn the microphone by `step`, as far as it goes; refused unless it is on."""
+        with self._guard:
+            self._require_on()
+            self.microphone = min(max(self.microphone + step, 0), MAX_VOLUME)
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Return every fault that has been injected and not repaired."""
+        with self._guard:
+            return tuple(Fault(part, self._faults[part]) for part in FAULT_PARTS if part in self._faults)
+
+    def lamps(self) -> tuple[Lamp, ...]:
+        """Return its one lamp."""
+        with self._guard:
+            self._move()
+            burning = self.clock.monotonic() - self._since if self._lit() else 0.0
+            return (Lamp(int((self._lit_s + burning) / 3600.0), self._lit()),)
+
+    def close(self) -> None:
+        """Do nothing: it is the thing itself, not a connection to it."""
+
+    def light(self) -> float:
+        """Return the fraction of the full light that reaches the screen now, 0 … 1.
+
+        0 when off, muted or with a dead lamp; rises in proportion to time while the lamp warms up.
+        """
+        with self._guard:
+            self._move()
+            if self._muted or not self._lit():
+                return 0.0
+            if self._power is Power.WARMING:
+                return (self.clock.monotonic() - self._since) / self.traits.warm_up_s
+            return 1.0
+
+    def break_part(self, part: str, severity: Severity) -> None:
+        """Inject a fault in one of `drivers.pjlink.wire.FAULT_PARTS`; an error of the lamp puts it out."""
+        if part not in FAULT_PARTS:
+            raise ValueError(f"{part} is no part that can be reported; choose of {', '.join(FAULT_PARTS)}")
+        with self._guard:
+            self._move()
+            self._faults[part] = severity
+            if part == "lamp" and severity is Severity.ERROR and self._power in (Power.ON, Power.WARMING):
+                self._enter(Power.COOLING, self.clock.monotonic())
+
+    def repair(self) -> None:
+        """Take away every fault."""
+        with self._guard:
+            self._faults.clear()
+
+    def _begin(self, change: Power, settled: Power, busy: str) -> None:
+        self._move()
+        if self._power is settled:
+            return
+        if self._power in (Power.WARMING, Power.COOLING):
+            if self._power is change:
+                busy = self._power.value
+            raise DeviceRefused(f"the simulated projector is {busy}; wait until it is done")
+        if change is Power.WARMING and self._faults.get("lamp") is Severity.ERROR:
+            raise DeviceFault("the lamp of the simulated projector is dead; repair it")
+        self._enter(change, self.clock.monotonic())
+
+    def _require_on(self) -> None:
+        self._move()
+        if self._power is not Power.ON:
+            raise DeviceRefused(f"the simulated projector is in {self._power.value}; wait until it is on")
+
+    def _lit(self) -> bool:
+        return self._power in (Power.ON, Power.WARMING)
+
+    def _move(self) -> None:
+        """Let the state follow the time that has passed."""
+        passed = self.clock.monotonic() - self._since
+        if self._power is Power.WARMING and passed >= self.traits.warm_up_s:
+            self._enter(Power.ON, self._since + self.traits.warm_up_s)
+        elif self._power is Power.COOLING and passed >= self.traits.cool_down_s:
+            self._enter(Power.STANDBY, self._since + self.traits.cool_down_s)
+
+    def _enter(self, power: Power, at: float) -> None:
+        if self._lit():
+            self._lit_s += at - self._since
+        self._power = power
+        self._since = at
+        if power is Power.STANDBY:
+            self._muted = False
+            self._frozen = False

@@ -1,0 +1,112 @@
+"""The simulated lab around print and camera: light, lens, paper and what is wrong with them, as one frozen value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from drivers.camera import ExposureSettings
+from sim.world.spectra import Lamp
+
+REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
+"""The exposure at which `Room.white_level_share` holds."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """Everything about the lab that is not the print and not the camera's body.
+
+    Attributes
+    ----------
+    seed
+        Of the paper's shape, the photosites' response and the noise; 0 or more.
+    fill
+        The print's extent over the frame's, along whichever axis is the tighter.
+    focal_diagonals
+        Focal length over the frame's diagonal; 1.3 is 35 mm on APS-C. With `fill` it gives the distance.
+    tilt_deg, pan_deg, roll_deg
+        How the print is turned against the camera.
+    k1, k2, p1, p2
+        Brown's distortion in normalised coordinates, as OpenCV has it.
+    waviness_mm
+        Peak-to-valley height of the paper's surface on an A0 sheet; on another in proportion to its diagonal, so that
+        small charts look like large ones.
+    blur_px
+        Standard deviation of the lens's blur, half-size pixels; the photosite's aperture is added to it.
+    vignetting
+        Share of the light that the lens loses at the frame's corner.
+    projector_falloff
+        Share of the projector's light that is missing a page's half diagonal from its brightest point.
+    primary_difference
+        How differently the primaries fall off: their `projector_falloff` spreads by this share of itself, and their
+        brightest points by as much of the page's half diagonal.
+    lamp_spectrum
+        ``uhp`` (mercury lamp and colour wheel) or ``led``.
+    transfer
+        From code to light: ``srgb`` (IEC 61966-2-1) or the exponent of a power law.
+    black_leak
+        Share of a primary's full light that is there at code 0: 1 / contrast.
+    ambient
+        Light from elsewhere, as a share of the projector's white; of its colour, for it is taken to be stray light.
+    white_level_share
+        Signal of bare paper in full white at `REFERENCE_EXPOSURE`, strongest channel, over saturation − black.
+    lamp_drift_per_hour
+        Share of its light that the lamp loses in an hour; the room has no time, so whoever does applies it as `lamp`.
+    response_spread
+        Standard deviation of the photosites' response (PRNU).
+    wheel_hz
+        Turns of the projector's colour wheel per second, each a third red, green and blue; 0 for steady light. With a
+        wheel, an exposure that is no whole number of turns, or starts and ends unsteadily, gets more of one primary
+        than of another, and frames differ from `signal` and `white` by that.
+    shutter_jitter_s
+        Standard deviation of the exposure time; matters with a wheel only.
+    stain_mm, stain_depth
+        Diameter of a stain somewhere on the print, 0 for none, and the share of blue light that it takes; of green it
+        takes six tenths of that, of red three. A thumb's is 25 mm across.
+    fold_mm
+        How far a crease across the print stands off its plane, 0 for none.
+    """
+
+    seed: int = 0
+    fill: float = 0.94
+    focal_diagonals: float = 1.3
+    tilt_deg: float = 2.0
+    pan_deg: float = -3.0
+    roll_deg: float = 0.5
+    k1: float = -0.03
+    k2: float = 0.01
+    p1: float = 2e-4
+    p2: float = -3e-4
+    waviness_mm: float = 3.0
+    blur_px: float = 0.5
+    vignetting: float = 0.25
+    projector_falloff: float = 0.15
+    primary_difference: float = 0.1
+    lamp_spectrum: Lamp = "uhp"
+    transfer: Literal["srgb"] | float = "srgb"
+    black_leak: float = 1 / 1500
+    ambient: float = 0.0
+    white_level_share: float = 0.70
+    lamp_drift_per_hour: float = 0.004
+    response_spread: float = 0.003
+    wheel_hz: float = 0.0
+    shutter_jitter_s: float = 0.0005
+    stain_mm: float = 0.0
+    stain_depth: float = 0.5
+    fold_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ValueError(f"seed is {self.seed}; 0 or more is expected")
+        for name in ("fill", "focal_diagonals", "white_level_share"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; more than 0 is expected")
+        for name in ("vignetting", "projector_falloff", "black_leak", "ambient", "stain_depth"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; 0 … below 1 is expected")
+        for name in (
+            "waviness_mm", "blur_px", "response_spread", "primary_difference", "wheel_hz", "shutter_jitter_s",
+            "stain_mm", "fold_mm",
+        ):  # fmt: skip
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is expected")

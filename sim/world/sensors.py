@@ -1,0 +1,147 @@
+"""The camera bodies that the simulated room can be photographed with: their sensors, colour filters and noise.
+
+A body is a table of facts, without behaviour. Photosites count from the sensor's top-left corner, masked borders
+included, unless said; a count is what the raw file holds (DN).
+
+Sizes and margins: dcraw 9.28 (`adobe_coeff` and the Canon table in `identify`), masked rectangles: rawspeed's
+cameras.xml. Saturation: RawTherapee's camconst.json. Conversion gain and read noise: of the order that EMVA 1288 photon
+transfer gives for sensors of these generations; plausible, not measured on these bodies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
+
+
+class Rectangle(NamedTuple):
+    """A rectangle of photosites: first row and column, then the number of rows and columns."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+
+@dataclass(frozen=True)
+class Body:
+    """A camera body.
+
+    Attributes
+    ----------
+    maker, model
+        As the body writes them into its files, e.g. ``Canon`` and ``Canon EOS 550D``.
+    sensor
+        Rows and columns of the raw frame, masked borders included.
+    visible
+        The photosites that see light, as the raw converters have them.
+    pattern
+        Colour filters of the 2×2 block at the top-left of `visible`, row by row, e.g. ``RGGB``.
+    black
+        Count of a photosite without light, DN.
+    saturation
+        Count that no photosite exceeds, DN.
+    bits
+        Bits of a count.
+    electrons_per_dn
+        Electrons that raise the count by one at ISO 100; at another speed ×100/ISO.
+    read_noise_dn
+        Standard deviation of a dark count at ISO 100, DN.
+    sensor_noise_e
+        The share of the read noise that arises before the amplifier, electrons: it grows with the ISO speed in DN, the
+        rest does not.
+    sensitivities
+        Name of the spectral sensitivities in `sim.data`, see `sim.world.spectra.sensitivities`.
+    masked
+        Rectangles of the sensor that are covered and measure black.
+    """
+
+    maker: str
+    model: str
+    sensor: tuple[int, int]
+    visible: Rectangle
+    pattern: str
+    black: int
+    saturation: int
+    bits: int
+    electrons_per_dn: float
+    read_noise_dn: float
+    sensor_noise_e: float
+    sensitivities: str
+    masked: tuple[Rectangle, ...]
+
+    def __post_init__(self) -> None:
+        rows, columns = self.sensor
+        for area in (self.visible, *self.masked):
+            if min(area) < 0 or area.top + area.height > rows or area.left + area.width > columns:
+                raise ValueError(f"{self.model}: {area} lies outside the sensor of {columns}×{rows} photosites")
+        if sorted(self.pattern) != ["B", "G", "G", "R"]:
+            raise ValueError(f"{self.model}: pattern is {self.pattern!r}; one R, two G and one B are expected")
+
+    @property
+    def half_size(self) -> tuple[int, int]:
+        """Rows and columns of the half-size image, whole 2×2 blocks of the visible mosaic."""
+        return self.visible.height // 2, self.visible.width // 2
+
+    def gain_e(self, iso: int) -> float:
+        """Return electrons per DN at an ISO speed."""
+        return self.electrons_per_dn * 100 / iso
+
+    def noise_dn(self, iso: int) -> float:
+        """Return the standard deviation of a dark count at an ISO speed, DN."""
+        late = self.read_noise_dn**2 - (self.sensor_noise_e / self.electrons_per_dn) ** 2
+        return (late + (self.sensor_noise_e / self.gain_e(iso)) ** 2) ** 0.5
+
+
+_EOS_550D = Body(
+    maker="Canon",
+    model="Canon EOS 550D",
+    sensor=(3516, 5344),
+    visible=Rectangle(51, 142, 3465, 5202),
+    pattern="RGGB",
+    black=2048,
+    saturation=13584,
+    bits=14,
+    electrons_per_dn=1.8,
+    read_noise_dn=6.0,
+    sensor_noise_e=2.8,
+    sensitivities="Canon_EOS_600D",
+    masked=(Rectangle(0, 0, 3516, 140),),
+)
+
+_EOS_6D_MARK_II = Body(
+    maker="Canon",
+    model="Canon EOS 6D Mark II",
+    sensor=(4224, 6384),
+    visible=Rectangle(44, 120, 4180, 6264),
+    pattern="RGGB",
+    black=2048,
+    saturation=16383,
+    bits=14,
+    electrons_per_dn=5.2,
+    read_noise_dn=4.6,
+    sensor_noise_e=2.4,
+    sensitivities="Canon_EOS_200D",
+    masked=(Rectangle(0, 0, 4224, 118),),
+)
+
+_TEST = Body(
+    maker="Canon",
+    model="CroP Test",
+    sensor=(609, 846),
+    visible=Rectangle(51, 46, 557, 800),
+    pattern="RGGB",
+    black=2048,
+    saturation=13584,
+    bits=14,
+    electrons_per_dn=1.8,
+    read_noise_dn=6.0,
+    sensor_noise_e=2.8,
+    sensitivities="Canon_EOS_600D",
+    masked=(Rectangle(0, 0, 609, 44),),
+)
+
+BODIES: Mapping[str, Body] = MappingProxyType({"EOS 550D": _EOS_550D, "EOS 6D Mark II": _EOS_6D_MARK_II, "Test": _TEST})
+"""Every body by the name that settings use. ``Test`` is a small frame with the colours and noise of the EOS 550D."""

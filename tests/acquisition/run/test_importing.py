@@ -1,0 +1,95 @@
+"""Sessions from raw files taken by other means: what their list may say."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pytest
+
+from acquisition.chart.layout import design_chart
+from acquisition.cli import main
+from acquisition.lights.illuminations import Illumination, save_illuminations
+from acquisition.run.importing import Imported, import_session
+from acquisition.session.folder import FRAME_COLUMNS, Session
+from drivers.presenter import Colour
+from foundation.errors import FormatError
+
+LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(3))
+Row = Mapping[str, object]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder with a chart, lights, and a raw file for each; their content does not matter, it is judged."""
+    design_chart(bits=1).save(tmp_path / "chart.json")
+    save_illuminations(LIGHTS, tmp_path / "illuminations.csv")
+    for light in LIGHTS:
+        (tmp_path / f"{light.index}.cr2").write_bytes(b"raw of light %d" % light.index)
+    return tmp_path
+
+
+def light(number: int, **cells: object) -> Row:
+    return {"kind": "light", "illumination": number, "file": f"{number}.cr2", "verdict": "accepted", **cells}
+
+
+def import_rows(folder: Path, rows: Sequence[Row]) -> Imported:
+    write(folder, rows)
+    return import_session(folder / "list.csv", folder / "chart.json", folder / "session")
+
+
+def write(folder: Path, rows: Sequence[Row]) -> None:
+    with (folder / "list.csv").open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(FRAME_COLUMNS)
+        writer.writerows([row.get(column, "") for column in FRAME_COLUMNS] for row in rows)
+
+
+def test_listed_frames_make_a_session(folder: Path) -> None:
+    rows = [light(0), light(1, verdict="refused: a hand"), light(2), light(2), {"kind": "white", "file": "0.cr2"}]
+    imported = import_rows(folder, [*rows[:-1], {**rows[-1], "verdict": "accepted"}])
+    assert imported == Imported(("1.cr2: a hand",), ("light 1",))
+    with Session.open(folder / "session") as session:
+        assert [frame.accepted for frame in session.frames()] == [True, False, True, True, True]
+        assert [frame.verdict for frame in session.frames()][1] == "refused: a hand"
+
+
+def test_two_lights_of_one_file_leave_nothing(folder: Path) -> None:
+    (folder / "2.cr2").write_bytes((folder / "0.cr2").read_bytes())
+    with pytest.raises(FormatError, match=r"list\.csv: lights 0 and 2 have the same raw file, 0\.cr2 and 2\.cr2; list"):
+        import_rows(folder, [light(0), light(1), light(2)])
+    assert not (folder / "session").exists()
+
+
+@pytest.mark.parametrize("exposure_s", ["nan", "inf", "-5"])
+def test_an_exposure_that_is_no_time_is_refused(folder: Path, exposure_s: str) -> None:
+    with pytest.raises(FormatError, match=rf"list\.csv, line 3: exposure_s is {exposure_s}, expected seconds"):
+        import_rows(folder, [light(0), light(1, exposure_s=exposure_s)])
+    assert not (folder / "session").exists()
+
+
+@pytest.mark.parametrize("verdict", ["ok", "Accepted", "rubbish", "refused:dark"])
+def test_a_verdict_that_is_none_is_refused(folder: Path, verdict: str) -> None:
+    with pytest.raises(FormatError, match=f"line 2: verdict is '{verdict}', expected accepted, refused: REASON, or"):
+        import_rows(folder, [light(0, verdict=verdict)])
+
+
+def test_a_refusal_without_a_reason_is_one(folder: Path) -> None:
+    assert import_rows(folder, [light(0, verdict="refused")]).refused == ("0.cr2: for no reason that is listed",)
+
+
+def test_a_list_that_is_missing_is_named_itself(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"cannot read the list of frames .*nowhere\.csv: No such file"):
+        import_session(tmp_path / "nowhere.csv", tmp_path / "chart.json", tmp_path / "session")
+
+
+@pytest.mark.parametrize(("verdict", "code"), [("refused: a hand", 4), ("accepted", 0)])
+def test_a_light_without_an_accepted_frame_is_told_by_the_exit_code(
+    folder: Path, verdict: str, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another frame of the light may be refused."""
+    write(folder, [light(0), light(1, verdict="refused: a hand"), light(1, verdict=verdict)])
+    arguments = ("import", folder / "list.csv", folder / "chart.json", folder / "session")
+    assert main(list(map(str, arguments))) == code
+    assert ("1 are without an accepted frame: light 1; list other files" in capsys.readouterr().err) == (code == 4)

@@ -1,0 +1,112 @@
+"""Exposure is judged on counts: clipping, darkness, stray light."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquisition.config import LimitSettings
+from acquisition.run.judging import Exposure, disagreement, measure_exposure, refusal
+from drivers.camera import ExposureSettings
+from drivers.raw.rawfile import Mosaic, read_raw
+from sim.camera.dng import write_dng
+from sim.world.sensors import BODIES
+
+BODY = BODIES["Test"]
+RANGE = BODY.saturation - BODY.black
+LIMITS = LimitSettings()
+
+
+def mosaic_of(tmp_path: Path, level: int, clipped: int = 0) -> Mosaic:
+    """Return a frame of one level above black with `clipped` saturated photosites in the visible area."""
+    counts = np.full(BODY.sensor, BODY.black, dtype=np.uint16)
+    top, left, height, width = BODY.visible
+    visible = counts[top : top + height, left : left + width]
+    visible[:] = BODY.black + level
+    places = np.random.default_rng(1).choice(height * width, clipped, replace=False)
+    visible[places // width, places % width] = BODY.saturation
+    stream = io.BytesIO()
+    write_dng(stream, counts, BODY, settings=ExposureSettings(100, 8, 0.5), taken_at=datetime(2026, 1, 1, tzinfo=UTC))
+    path = tmp_path / "frame.dng"
+    path.write_bytes(stream.getvalue())
+    return read_raw(path)
+
+
+def test_the_measure_is_that_of_the_counts(tmp_path: Path) -> None:
+    exposure = measure_exposure(mosaic_of(tmp_path, 4000, clipped=4456))
+    photosites = BODY.visible.height * BODY.visible.width
+    assert exposure.clipped == pytest.approx(4456 / photosites)
+    exposure = measure_exposure(mosaic_of(tmp_path, 4000))
+    assert exposure.clipped == 0
+    assert exposure.brightest_dn == pytest.approx(4000, abs=1e-6)
+    assert exposure.level == pytest.approx(4000 / RANGE, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("clipped", "brightest", "kind", "expected"),
+    [
+        (0.0, 8000, "light", None),
+        (0.001, 8000, "light", None),
+        (0.0011, 8000, "light", "0.1% of the photosites are clipped, 0.1 % allowed"),
+        (0.031, 8000, "white", "3.1% of the photosites are clipped"),
+        (0.0, 99, "light", "are 99 counts above black, at least 100 expected"),
+        (0.0, 100, "white", None),
+        (0.0, 8, "dark", None),
+        (0.0, 0.06 * RANGE, "dark", "6.0% of saturation, 5 % allowed"),
+    ],
+)
+def test_a_refusal_says_value_and_limit(clipped: float, brightest: float, kind: str, expected: str | None) -> None:
+    reason = refusal(Exposure(clipped, brightest, RANGE), kind, LIMITS)  # pyright: ignore[reportArgumentType]
+    if expected is None:
+        assert reason is None
+    else:
+        assert reason is not None
+        assert expected in reason
+
+
+ASKED = ExposureSettings(iso=100, aperture=8, shutter_s=0.5)
+
+
+def test_a_file_that_states_what_was_asked_agrees(tmp_path: Path) -> None:
+    assert disagreement(mosaic_of(tmp_path, 4000), ASKED) is None
+
+
+@pytest.mark.parametrize(
+    ("asked", "stated"),
+    [  # nominal value on the dial, exact value in the file: 2^(n/8) s, 2^(n/16), 100 · 2^(n/8)
+        ({"shutter_s": 30.0}, {"shutter_s": 32.0}),
+        ({"shutter_s": 1 / 60}, {"shutter_s": 1 / 64}),
+        ({"shutter_s": 0.6}, {"shutter_s": 2**-0.625}),
+        ({"shutter_s": 0.3}, {"shutter_s": 2**-1.5}),
+        ({"aperture": 3.5}, {"aperture": 2 ** (29 / 16)}),
+        ({"aperture": 1.8}, {"aperture": 2 ** (12 / 16)}),
+        ({"iso": 1250}, {"iso": 1270}),
+        ({}, {"iso": None, "aperture": None, "shutter_s": None}),
+        ({}, {"aperture": 0.0}),
+    ],
+)
+def test_a_nominal_value_agrees_with_the_exact_one_behind_it(
+    tmp_path: Path, asked: dict[str, float], stated: dict[str, float | None]
+) -> None:
+    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyright: ignore[reportArgumentType] - names from the table
+    assert disagreement(mosaic, replace(ASKED, **asked)) is None  # pyright: ignore[reportArgumentType] - likewise
+
+
+@pytest.mark.parametrize(
+    ("stated", "expected"),
+    [
+        ({"shutter_s": 0.4}, "the file states shutter time in s 0.4 instead of 0.5; was a dial of the camera turned?"),
+        ({"shutter_s": 0.6}, "shutter time in s 0.6 instead of 0.5"),
+        ({"aperture": 9.0}, "aperture 9 instead of 8"),
+        ({"iso": 125}, "ISO speed 125 instead of 100"),
+        ({"iso": 200, "shutter_s": 0.25}, "ISO speed 200 instead of 100, shutter time in s 0.25 instead of 0.5"),
+    ],
+)
+def test_a_dial_turned_by_one_third_of_a_stop_is_seen(tmp_path: Path, stated: dict[str, float], expected: str) -> None:
+    mosaic = replace(mosaic_of(tmp_path, 4000), **stated)  # pyright: ignore[reportArgumentType] - names from the table
+    assert expected in (disagreement(mosaic, ASKED) or "")

@@ -1,0 +1,99 @@
+"""The simulated lab is built from LAB.toml; what it does not know is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from acquisition.chart.layout import design_chart
+from acquisition.config import LabSettings, load_lab, parse_lab
+from acquisition.run.rig.attached import attached_devices
+from acquisition.run.rig.opening import open_rig
+from acquisition.run.rig.simulated import simulated_body, simulated_room
+from foundation.clock import Clock
+from foundation.errors import ConfigurationError
+from sim.projectors.screen import Screen, SimulatedPresenter
+
+HEAD = 'rig = "simulated"\nchart = "c.json"\nilluminations = "l.csv"\n'
+
+
+def simulated_display(display: str | int | None, clock: Clock) -> SimulatedPresenter:
+    """Stand in for `FullScreen`: whatever display this machine has stays dark."""
+    return SimulatedPresenter(Screen(), clock)
+
+
+def settings(text: str) -> LabSettings:
+    return parse_lab(HEAD + text, "LAB.toml")
+
+
+def test_the_room_takes_what_the_file_says() -> None:
+    room = simulated_room(settings("[simulated]\nseed = 5\n[simulated.room]\nwaviness_mm = 6\ntransfer = 2.2\n"))
+    assert (room.seed, room.waviness_mm, room.transfer) == (5, 6.0, 2.2)
+    assert simulated_room(settings("[simulated.room]\ntransfer = 'srgb'\n")).transfer == "srgb"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("wavines_mm = 3", "did you mean 'waviness_mm'?"),
+        ("blur_px = -1", "blur_px"),
+        ("vignetting = 1.5", "vignetting"),
+        ("waviness_mm = 'much'", "simulated.room.waviness_mm"),
+        ("transfer = 'log'", "simulated.room.transfer"),
+        ("seed = 3", "unknown key 'simulated.room.seed'"),
+    ],
+)
+def test_a_wrong_parameter_is_named(text: str, expected: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        simulated_room(settings(f"[simulated.room]\n{text}\n"))
+    assert expected in str(caught.value)
+
+
+def test_the_file_that_is_wrong_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "e.toml"
+    path.write_text(HEAD + "[simulated.room]\nwavines_mm = 3\n")
+    with pytest.raises(ConfigurationError, match=rf"^{path}: unknown key 'simulated\.room\.wavines_mm'; did you mean"):
+        simulated_room(load_lab(path))
+
+
+def test_an_unknown_body_is_named_with_the_known_ones() -> None:
+    with pytest.raises(ConfigurationError, match="EOS 550D, EOS 6D Mark II"):
+        simulated_body(settings('[simulated]\nbody = "EOS 7D"\n'))
+
+
+def test_an_imported_session_cannot_be_taken() -> None:
+    imported = LabSettings(rig="imported", chart=Path("c"), illuminations=Path("l"))
+    with pytest.raises(ConfigurationError, match="other means"), open_rig(imported, design_chart(bits=1)):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('[lab.camera]\nconnection = "ptpip"\n', "lab.camera.host is missing"),
+        ('[lab.projector]\ncontrol = "pjlink"\n', "lab.projector.host is missing"),
+        ('[lab.projector]\ncontrol = "epson"\n', "lab.projector.device is missing"),
+        ('[lab.light]\nshown_by = "jvc"\n', "lab.light.host is missing"),
+        ("[camera]\nshutter_s = 0.51\n", "whole turns"),
+    ],
+)
+def test_a_cable_that_is_not_named_is_said(text: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("acquisition.run.rig.lab.FullScreen", simulated_display)
+    real = parse_lab(HEAD.replace("simulated", "lab") + text, "LAB.toml")
+    with pytest.raises(ConfigurationError, match=expected), open_rig(real, design_chart(bits=1)):
+        pass
+
+
+def test_an_unknown_language_is_named_with_the_known_ones() -> None:
+    with pytest.raises(ConfigurationError, match="'pjlink', 'epson', 'benq', 'optoma' or 'nec'"):
+        parse_lab(HEAD + '[lab.projector]\ncontrol = "klingon"\n', "LAB.toml")
+
+
+def test_what_cannot_be_asked_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    kinds = {attached.kind: attached for attached in attached_devices(search_s=0)}
+    assert list(kinds) == ["cameras on USB", "serial ports", "displays"]
+    assert kinds["displays"].found == ()
+    assert kinds["displays"].trouble

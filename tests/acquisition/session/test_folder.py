@@ -1,0 +1,122 @@
+"""The session folder: what counts, what is set aside, what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from acquisition.chart.layout import design_chart
+from acquisition.lights.illuminations import Illumination, save_illuminations
+from acquisition.session.folder import Session
+from acquisition.session.plan import plan_steps
+from drivers.camera import CapturedFrame
+from drivers.presenter import Colour
+from foundation.errors import FormatError, InputError
+
+LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
+NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
+# printf white | sha256sum, printf light | sha256sum
+WHITE_SHA = "018fa96a44715c90bf93be148069cb28dd45d398f2cc75aa1565311f6e55d174"
+LIGHT_SHA = "99a7026172d42714d0293e5598ec1c8e8260d7d0c4b8582ad002c1883494e216"
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Session:
+    return Session.create(tmp_path / "s", "", design_chart(bits=1), LIGHTS, plan_steps(LIGHTS, 2))
+
+
+def test_the_plan_survives_the_disk(session: Session) -> None:
+    with Session.open(session.folder) as again:
+        assert again.steps == session.steps
+        assert again.illuminations == LIGHTS
+        assert again.chart.sha256 == session.chart.sha256
+
+
+def take(session: Session, number: int, content: bytes, verdict: str = "accepted", reason: str = "") -> None:
+    step = session.steps[number]
+    attempt = session.journal.begin(step, f"frames/{step.stem}", NOW)
+    received = session.receive(step.stem, lambda into: CapturedFrame("IMG_1.CR2", into.write(content), NOW))
+    session.commit(
+        attempt,
+        file=f"frames/{received.path.name}",
+        size=received.size,
+        sha256=received.sha256,
+        taken_at=NOW,
+        exposure_s=0.5,
+        ended_at=NOW,
+        verdict=verdict,
+        reason=reason,
+    )
+
+
+def test_frames_csv_is_as_the_format_says(session: Session) -> None:
+    take(session, 0, b"white")
+    take(session, 2, b"light", "refused", "too dark")
+    lines = (session.folder / "frames.csv").read_text().splitlines()
+    assert lines[0] == "kind,illumination,file,sha256,taken_at,exposure_s,verdict"
+    assert lines[1:] == [
+        f"white,,frames/0000_white.cr2,{WHITE_SHA},2026-01-01T09:30:00.000000+00:00,0.5,accepted",
+        f"light,0,frames/0002_light_000.cr2,{LIGHT_SHA},2026-01-01T09:30:00.000000+00:00,0.5,refused: too dark",
+    ]
+
+
+def test_what_counts_is_on_disk_and_in_the_journal(session: Session) -> None:
+    take(session, 0, b"frame")
+    take(session, 1, b"frame", "refused", "dark")
+    assert session.done_steps() == {0}
+    (session.frames_folder / "0000_white.cr2").write_bytes(b"fra")
+    assert session.done_steps() == set(), "a file that lost bytes is no frame"
+
+
+def test_strays_are_kept_aside_and_leftovers_removed(session: Session) -> None:
+    take(session, 0, b"frame")
+    stray = session.frames_folder / "0001_dark.cr2"
+    stray.write_bytes(b"complete, but no row counts it")
+    leftover = session.frames_folder / ".0002_light_000.partial"
+    leftover.write_bytes(b"half")
+    moved = session.set_aside_strays()
+    assert [path.read_bytes() for path in moved] == [b"complete, but no row counts it"]
+    assert sorted(path.name for path in session.frames_folder.iterdir()) == ["0000_white.cr2", "0001_dark.cr2.stray"]
+    assert session.set_aside_strays() == []
+    stray.write_bytes(b"again")
+    session.set_aside_strays()
+    assert len(list(session.frames_folder.glob("*.stray"))) == 2, "an earlier stray is never overwritten"
+
+
+def test_a_session_is_never_made_over_something(tmp_path: Path, session: Session) -> None:
+    with pytest.raises(InputError, match="already exists"):
+        Session.create(session.folder, "", design_chart(bits=1), LIGHTS)
+
+
+def test_no_session(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"holds no journal\.sqlite"):
+        Session.open(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("lights", "said"),
+    [
+        ((LIGHTS[0], replace(LIGHTS[1], colour=LIGHTS[2].colour), *LIGHTS[2:]), "planned as 255 1 0, the file says"),
+        (LIGHTS[:4], "light 4 was planned as 255 4 0, the file has no such light"),
+    ],
+)
+def test_lights_edited_since_are_refused(session: Session, lights: tuple[Illumination, ...], said: str) -> None:
+    session.close()
+    save_illuminations(lights, session.folder / "illuminations.csv")
+    with pytest.raises(FormatError, match=rf"illuminations\.csv is not what .*{said}.*; restore it from a copy"):
+        Session.open(session.folder)
+
+
+def test_a_session_without_its_settings(session: Session) -> None:
+    (session.folder / "session.toml").unlink()
+    with pytest.raises(FormatError, match=r"session\.toml, the settings of the session: No such file .*; restore it"):
+        session.settings()
+
+
+def test_a_session_without_its_frames(session: Session) -> None:
+    session.frames_folder.rmdir()
+    with pytest.raises(FormatError, match=r"frames is missing, .*; restore it from a copy"):
+        session.set_aside_strays()

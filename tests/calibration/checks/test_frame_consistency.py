@@ -1,0 +1,93 @@
+"""Frames compared with the frame that was registered, on colours that are made up.
+
+A healthy frame passes half of either limit; noise alone would need five standard errors, one frame in a million.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from calibration.checks.frame_consistency import ConsistencyCheck, FrameConsistency, has_enough_cells
+from calibration.verdict.thresholds import THRESHOLDS
+
+LIMITS = {limit.name: limit for limit in THRESHOLDS}
+_Array = npt.NDArray[np.float64]
+
+
+class Sheet:
+    """4096 colours at random over a sheet, and what two lights give of them."""
+
+    def __init__(self, seed: int = 1) -> None:
+        self.random = np.random.default_rng(seed)
+        self.rgb = np.stack(np.meshgrid(*[np.arange(0, 256, 16)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        place = self.random.permutation(len(self.rgb))
+        self.places: _Array = 5.0 * np.stack([place % 76, place // 76], axis=-1).astype(np.float64)
+        inks = (self.rgb / 255) @ np.array([[0.85, 0.1, 0.02], [0.1, 0.8, 0.15], [0.05, 0.1, 0.83]])
+        self.paint = 0.04 + 0.9 * inks**2.2
+        self.white = 8000 * self.paint
+        # Another light is other mixtures of what the three inks leave.
+        self.other = 5000 * self.paint @ np.array([[0.9, 0.2, 0.0], [0.1, 0.6, 0.1], [0.0, 0.2, 0.3]])
+
+    def seen(self, true: _Array) -> tuple[_Array, _Array]:
+        """Return the means of 25 samples and their variance."""
+        variance = (true / 1.8 + 36) / 25
+        return true + np.sqrt(variance) * self.random.standard_normal(true.shape), variance
+
+    def compared(self, true: _Array, usable: npt.NDArray[np.bool_] | None = None) -> FrameConsistency:
+        there = np.ones(len(true), dtype=np.bool_) if usable is None else usable
+        expected = ConsistencyCheck(self.rgb, self.places, self.seen(self.white)[0], there)
+        return expected.compare(*self.seen(true))
+
+
+@pytest.fixture(scope="module")
+def sheet() -> Sheet:
+    return Sheet()
+
+
+@pytest.mark.parametrize("level", [1.0, 0.3])
+def test_another_light_is_no_other_print(sheet: Sheet, level: float) -> None:
+    like = sheet.compared(level * sheet.other)
+    assert like.scatter < LIMITS["unlike_scatter"].accept
+    assert like.block < 0.5 * LIMITS["unlike_block"].accept
+
+
+def test_another_order_of_the_colours_is(sheet: Sheet) -> None:
+    like = sheet.compared(sheet.random.permutation(sheet.other))
+    assert like.scatter > 10 * (LIMITS["unlike_scatter"].refuse or np.inf)
+
+
+def test_a_neighbour_s_light_is_scatter(sheet: Sheet) -> None:
+    """4 % of a cell's light from another, as a lens out of focus gives."""
+    like = sheet.compared(0.96 * sheet.other + 0.04 * sheet.random.permutation(sheet.other))
+    assert like.scatter > 1.5 * LIMITS["unlike_scatter"].accept
+
+
+@pytest.mark.parametrize("left", [0.0, 0.3, 0.9])
+def test_a_shadow_is_found_where_it_lies(sheet: Sheet, left: float) -> None:
+    middle = np.array([260.0, 90.0])
+    under = np.abs(sheet.places - middle).max(axis=1) < 45
+    like = sheet.compared(sheet.other * np.where(under, left, 1.0)[:, None])
+    assert like.block > (LIMITS["unlike_block"].refuse or np.inf)
+    assert np.abs(np.array(like.at_mm) - middle).max() < 45
+
+
+def test_cells_that_were_covered_from_the_start_do_not_count(sheet: Sheet) -> None:
+    under = np.abs(sheet.places - [260.0, 90.0]).max(axis=1) < 45
+    like = sheet.compared(sheet.other * np.where(under, 0.2, 1.0)[:, None], usable=~under)
+    assert like.block < 0.5 * LIMITS["unlike_block"].accept
+
+
+def test_too_few_cells_say_nothing() -> None:
+    """64 cells of two inks that a plane through their codes cannot describe."""
+    sheet = Sheet()
+    few = np.flatnonzero((sheet.rgb % 80 == 0).all(axis=1))
+    expected = ConsistencyCheck(sheet.rgb[few], sheet.places[few], sheet.white[few], np.ones(len(few), dtype=np.bool_))
+    assert len(few) == 64
+    assert not has_enough_cells(64)
+    assert expected.compare(*sheet.seen(sheet.other[few])) == FrameConsistency()
+
+
+def test_a_dark_frame_says_nothing(sheet: Sheet) -> None:
+    assert sheet.compared(0.001 * sheet.other) == FrameConsistency()

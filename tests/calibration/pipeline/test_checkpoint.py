@@ -1,0 +1,251 @@
+"""A build that is stopped, anywhere, or that follows its session, ends in the bytes of an undisturbed one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import closing
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calibration.pipeline.build as building
+from acquisition.session.folder import Session
+from acquisition.session.plan import SessionStep
+from calibration.pipeline.build import TableProgress, append, build
+from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, unfinished_table
+from calibration.pipeline.frames import lost_frames
+from calibration.table.lut import open_lut
+from calibration.table.verification import find_faults
+from calibration.verdict.result import BuildResult
+from foundation.errors import FormatError, InputError
+from sim.world.room import Room
+from tests.calibration.lab import LIGHTS, Lab, hang, renumbered, take
+
+KILLER = """
+import os, signal, sys
+import calibration.pipeline.build, calibration.pipeline.checkpoint, calibration.table.writer, calibration.report.report
+from calibration.cli import main
+
+place, count = sys.argv[1], int(sys.argv[2])
+calibration.pipeline.build.CHECKPOINT_EVERY = 3
+calibration.report.report.write_report = lambda *_: None
+owner, name = {
+    "putting": (calibration.table.writer.LutWriter, "put"),
+    "saving": (calibration.pipeline.checkpoint.UnfinishedTable, "save"),
+    "finishing": (calibration.table.writer, "write_whole"),
+    "publishing": (calibration.pipeline.checkpoint.Path, "replace"),
+}[place]
+real = getattr(owner, name)
+
+def deadly(*args, **kwargs):
+    global count
+    if place == "publishing" and not args[0].is_dir():
+        return real(*args, **kwargs)
+    count -= 1
+    if count == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return real(*args, **kwargs)
+
+setattr(owner, name, deadly)
+sys.exit(main(sys.argv[3:]))
+"""
+
+
+@pytest.fixture(autouse=True)
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(building, "CHECKPOINT_EVERY", 3)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Return a table's files, but for the reports that only the command writes."""
+    assert not (folder / CHECKPOINT).exists()
+    return {path.name: path.read_bytes() for path in folder.iterdir() if not path.name.startswith("report")}
+
+
+@pytest.fixture(scope="module")
+def session(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Generator[Session]:
+    lights = renumbered(LIGHTS[3:10])
+    with take(lab, tmp_path_factory.mktemp("short") / "session", lights, every=3) as taken:
+        yield taken
+
+
+@pytest.fixture(scope="module")
+def undisturbed(session: Session, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("undisturbed") / "lut"
+    build(session, folder)
+    return files(folder)
+
+
+def interrupted_at(session: Session, out: Path, frame: int) -> None:
+    def progress(done: int, total: int, what: str) -> None:
+        if done == frame:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        build(session, out, progress)
+
+
+@pytest.mark.parametrize(("place", "count"), [("putting", 2), ("saving", 2), ("finishing", 3), ("publishing", 1)])
+def test_a_killed_build_goes_on_to_the_same_bytes(
+    session: Session, undisturbed: dict[str, bytes], tmp_path: Path, place: str, count: int
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", KILLER, place, str(count), str(session.folder), str(tmp_path / "lut")],
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert not (tmp_path / "lut").exists()
+    build(session, tmp_path / "lut")
+    assert files(tmp_path / "lut") == undisturbed
+    assert list(tmp_path.iterdir()) == [tmp_path / "lut"]
+
+
+def test_a_build_that_goes_on_does_not_start_over(
+    session: Session, undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    interrupted_at(session, tmp_path / "lut", 7)
+    done: list[int] = []
+    build(session, tmp_path / "lut", lambda number, total, what: done.append(number))
+    assert done[:2] == [0, 7]
+    assert files(tmp_path / "lut") == undisturbed
+
+
+@pytest.mark.parametrize("what", ["checkpoint", "samples"])
+def test_damage_to_what_was_done_is_noticed(
+    session: Session, undisturbed: dict[str, bytes], tmp_path: Path, what: str
+) -> None:
+    interrupted_at(session, tmp_path / "lut", 8)
+    path = tmp_path / ".lut.partial" / (CHECKPOINT if what == "checkpoint" else "samples.npy")
+    data = bytearray(path.read_bytes())
+    data[-1 if what == "checkpoint" else 128 + 7] ^= 1
+    path.write_bytes(data)
+    build(session, tmp_path / "lut")
+    assert files(tmp_path / "lut") == undisturbed
+
+
+def test_a_bump_before_the_interruption_is_remembered(lab: Lab, tmp_path: Path) -> None:
+    bumped = hang(room=Room(waviness_mm=0.5, roll_deg=0.7, fill=0.935))
+
+    def frame(step: SessionStep) -> bytes:
+        return (bumped if step.number >= 3 else lab).dng(step.colour, step.number)
+
+    with take(lab, tmp_path / "session", renumbered(LIGHTS[3:9]), frame=frame) as session:
+        build(session, tmp_path / "whole")
+        interrupted_at(session, tmp_path / "lut", 5)
+        result = build(session, tmp_path / "lut")
+    assert [figures.reregistered for figures in result.figures.frames].count(True) == 1
+    assert files(tmp_path / "lut") == files(tmp_path / "whole")
+
+
+@pytest.fixture
+def session_under_way(session: Session, tmp_path: Path) -> Generator[Session]:
+    """Lend a copy of the session, in which frames can be made to have come, or not yet."""
+    shutil.copytree(session.folder, tmp_path / "session")
+    with Session.open(tmp_path / "session") as copy:
+        yield copy
+
+
+def show(session: Session, frames: int) -> None:
+    """Let the first `frames` frames of a session have come."""
+    rows = [record.file for record in session.frames()]
+    changes: list[tuple[str, ...]] = [
+        ("accepted" if number < frames else "refused", file) for number, file in enumerate(rows)
+    ]
+    alter(session, "UPDATE attempts SET verdict=? WHERE file=?", changes)
+
+
+def alter(session: Session, change: str, rows: list[tuple[str, ...]]) -> None:
+    with closing(sqlite3.connect(session.folder / "journal.sqlite")) as journal, journal:
+        journal.executemany(change, rows)
+
+
+def test_a_table_follows_its_session(session_under_way: Session, undisturbed: dict[str, bytes], tmp_path: Path) -> None:
+    session, out = session_under_way, tmp_path / "lut"
+    every = len(session.frames())
+    lights = len(session.illuminations)
+    seen: list[tuple[int, int]] = []
+    for frames in (1, 5, 5, every - 3):
+        show(session, frames)
+        grown = append(session, out)
+        assert isinstance(grown, TableProgress)
+        seen.append((grown.lights, grown.new_frames))
+        assert not out.exists()
+        with pytest.raises(FormatError, match="in the making"):
+            open_lut(out)
+    assert seen == [(0, 1), (3, 4), (3, 0), (lights - 1, every - 8)]
+    with pytest.raises(FormatError, match=r"1 of \d+ lights have no accepted frame.*--append"):
+        build(session, out)
+    show(session, every)
+    assert isinstance(append(session, out), BuildResult)
+    assert files(out) == undisturbed
+
+
+def test_a_light_taken_again_is_taken_in_again(
+    session_under_way: Session, undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    """What had been taken in of it before must not stay."""
+    session = session_under_way
+    one, other = (next(r for r in session.frames() if r.illumination == light) for light in (2, 3))
+    show(session, 6)
+    append(session, tmp_path / "lut")
+    change = "UPDATE attempts SET sha256=?, file=? WHERE illumination=?"
+    alter(session, change, [(other.sha256, other.file, "2"), (one.sha256, one.file, "3")])
+    show(session, 100)
+    append(session, tmp_path / "lut")
+    lut, before = open_lut(tmp_path / "lut"), np.load(BytesIO(undisturbed["samples.npy"]))
+    assert np.array_equal(lut.samples[2], before[3])
+    assert np.array_equal(lut.samples[3], before[2])
+
+
+def test_two_programs_do_not_make_one_table(session: Session, tmp_path: Path) -> None:
+    with unfinished_table(tmp_path / "lut"), pytest.raises(InputError, match="made by another program"):
+        build(session, tmp_path / "lut")
+
+
+def test_a_checkpoint_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    values = {"value": 0.1 + 0.2, "tiny": 5e-324, "nothing": None}
+    with unfinished_table(tmp_path / "lut") as unfinished:
+        unfinished.save(Checkpoint({"a": "b"}, ["x"], values, {"sum": np.array([0.1, np.inf], np.float32)}))
+    assert (tmp_path / ".lut.partial").is_dir()
+    with unfinished_table(tmp_path / "lut") as unfinished:
+        back = unfinished.load()
+        unfinished.discard()
+    assert back is not None
+    assert (back.identity, back.frames, back.values) == ({"a": "b"}, ["x"], values)
+    assert back.arrays["sum"].tobytes() == np.array([0.1, np.inf], np.float32).tobytes()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_checkpoint_of_another_form_is_not_gone_on_from(tmp_path: Path) -> None:
+    """Versions before this one stored other keys."""
+    text = np.frombuffer(b'{"identity": {"a": "b"}, "frames": ["x"], "told": {}}', dtype=np.uint8)
+    with unfinished_table(tmp_path / "lut") as unfinished:
+        np.savez(unfinished.folder / CHECKPOINT, text=text)
+        assert unfinished.load() is None
+
+
+def test_the_frames_of_a_table_are_found_again(session: Session, session_under_way: Session, tmp_path: Path) -> None:
+    build(session, tmp_path / "lut")
+    lut = open_lut(tmp_path / "lut")
+    assert find_faults(lut) == []
+    assert lost_frames(lut, session_under_way) == []
+    first, second = (session_under_way.folder / frame.file for frame in lut.frames[1:3])
+    first.unlink()
+    data = bytearray(second.read_bytes())
+    data[-1] ^= 1
+    second.write_bytes(data)
+    gone, changed = lost_frames(lut, session_under_way)
+    assert f"{first} cannot be read" in gone
+    assert f"{second} has changed" in changed
+    os.truncate(tmp_path / "lut" / "samples.npy", 1000)
+    with pytest.raises(FormatError, match=r"cannot read .*samples\.npy"):
+        open_lut(tmp_path / "lut")

@@ -1,0 +1,70 @@
+"""Options of a build: windows of other sizes than the paper's 5×5."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquisition.session.folder import Session
+from calibration.cli import main
+from calibration.pipeline.build import build, check
+from calibration.pipeline.options import BuildOptions
+from calibration.report.report import write_report
+from calibration.report.summary import summary as report_summary
+from calibration.table.description import describe
+from calibration.table.lut import open_lut
+from calibration.table.verification import find_faults
+from calibration.verdict.values import judged_values
+from foundation.errors import InputError
+
+
+@pytest.mark.parametrize("window", [1, 2, 4, 11, -5])
+def test_a_window_that_has_no_middle_or_no_place_is_refused(window: int) -> None:
+    with pytest.raises(InputError, match="3, 5, 7 or 9 expected"):
+        BuildOptions(window)
+
+
+def test_three_by_three_are_the_inner_samples_of_five_by_five(session: Session, tmp_path: Path) -> None:
+    large = build(session, tmp_path / "5")
+    small = build(session, tmp_path / "3", report=write_report, options=BuildOptions(3))
+    five, three = open_lut(tmp_path / "5"), open_lut(tmp_path / "3")
+    assert three.samples.shape == (*five.samples.shape[:2], 9, 3)
+    assert "9 samples each" in dict(describe(three))["Colours"]
+    assert find_faults(three) == []
+    inner = five.samples.reshape(*five.samples.shape[:2], 5, 5, 3)[:, :, 1:4, 1:4].reshape(three.samples.shape)
+    # The same photosites; the field differs, since the references are sampled by the same window.
+    off = inner.astype(np.float64) - three.samples
+    assert np.abs(off).max() <= 1 + 0.02 * three.samples.max()
+    assert np.abs(off / np.maximum(inner, 100)).mean() < 0.004
+    assert three.ground_truth == pytest.approx(five.ground_truth, abs=0.003)
+    assert judged_values(small.figures)["bleed"] < judged_values(large.figures)["bleed"]
+    assert len(small.figures.cells.unfit) <= 2
+    assert small.figures.sensor.transfer.noisy.sum() <= 1
+
+
+def test_a_window_larger_than_the_cells_is_said(session: Session, tmp_path: Path) -> None:
+    result = check(session, BuildOptions(9))
+    assert "bleed" in {row.threshold.name for row in result.verdict.refused}
+    note = next(row.note for row in report_summary(result.figures) if row.name == "Window")
+    assert note.startswith("too large: ")
+    plain = next(row.note for row in report_summary(check(session).figures) if row.name == "Window")
+    assert plain.startswith("up to 5×5")
+
+
+def test_the_command_takes_a_window(session: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def run(*arguments: object) -> tuple[int, str]:
+        return main([*map(str, arguments)]), capsys.readouterr().err
+
+    code, said = run("--window", 4, session.folder, tmp_path / "lut")
+    assert code == 2
+    assert "a window of 4 pixels was asked for" in said
+    code, said = run("--window", 3, "--info", tmp_path / "lut")
+    assert code == 2
+    assert "--window is about how a table is made, and --info reads one" in said
+    code, said = run("--window", 9, session.folder, tmp_path / "lut")
+    assert code == 4
+    assert "a smaller window (build-lut --window)" in said
+    assert json.loads((tmp_path / "lut.refused" / "report.json").read_text())["channels"]["window"] == 9

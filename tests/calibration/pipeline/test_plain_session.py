@@ -1,0 +1,160 @@
+"""Sessions of a chart without tags: what moves between frames is followed, and reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquisition.chart.layout import A_SERIES_MM, design_chart, paper_chart
+from acquisition.framing.tagless_field import field_mm
+from acquisition.lights.illuminations import Illumination
+from acquisition.session.journal import ACCEPTED
+from acquisition.session.plan import SessionStep
+from calibration.cli import main
+from calibration.pipeline.build import build
+from calibration.report.report import write_report
+from calibration.table.lut import open_lut
+from drivers.presenter import Colour
+from sim.world.room import Room
+from tests.calibration.lab import LIGHTS, SETTINGS, Lab, hang_chart, renumbered, take
+
+SMALL = paper_chart("A6", 3)
+ROOM = Room(waviness_mm=0.5)
+RED = Illumination(0, "uniform", None, Colour(255, 0, 0))
+
+
+@pytest.fixture(scope="module")
+def plain() -> Lab:
+    return hang_chart(SMALL, "Test", ROOM)
+
+
+def moved_by(dx: float, dy: float, roll_deg: float = 0.0) -> Lab:
+    """Return the lab with the camera shifted so that the chart lies (dx, dy) half-size pixels further."""
+    lab = hang_chart(SMALL, "Test", replace(ROOM, roll_deg=ROOM.roll_deg + roll_deg))
+    x, y = lab.world.view.centre_px
+    lab.world.view = replace(lab.world.view, centre_px=(x + dx, y + dy))
+    return lab
+
+
+def worst_error(lab: Lab, folder: Path) -> float:
+    """Return how far the means of cells lie from the room's truth, as a share of white, the worst of all lights."""
+    table = open_lut(folder)
+    codes = lab.chart.rgb[lab.chart.cell_of_colour]
+    worst = 0.0
+    for light in table.illuminations:
+        white = lab.world.white(light.colour, SETTINGS)
+        true = lab.world.reflected(codes, light.colour, SETTINGS) / white
+        mean = table.samples[light.index].mean(axis=1) / table.white[light.index]
+        lit = int(np.argmax(white))
+        worst = max(worst, float(np.abs(mean - true)[:, lit].max()))
+    return worst
+
+
+@pytest.mark.parametrize(("by", "anew"), [((0.3, -0.2), []), ((4.0, -2.5), [2])])
+def test_a_bump_is_followed_and_reported(plain: Lab, tmp_path: Path, by: tuple[float, float], anew: list[int]) -> None:
+    bumped = moved_by(*by)
+    lights = renumbered([*LIGHTS[4:8], RED])
+
+    def frame(step: SessionStep) -> bytes:
+        return (bumped if step.number >= 4 else plain).dng(step.colour, step.number)
+
+    with take(plain, tmp_path / "session", lights, frame=frame) as session:
+        result = build(session, tmp_path / "lut", report=write_report)
+    assert [figures.record.illumination for figures in result.figures.frames if figures.reregistered] == anew
+    first = next(figures for figures in result.figures.frames if figures.record.illumination == 2)
+    assert (first.shift.dx, first.shift.dy) == pytest.approx(by, abs=0.05)
+    assert result.figures.largest_shift_px == pytest.approx(np.hypot(*by), abs=0.07)
+    # A grid left behind by 4 px reads the next cell: 0.15 of white here.
+    assert worst_error(plain, tmp_path / "lut") < 0.05
+    page = (tmp_path / "lut" / "report.html").read_text()
+    assert f"{len(anew)} frames registered again" in page
+    remarks = [row.threshold.name for row in result.verdict.remarks]
+    assert ("moved_anew" in remarks) == bool(anew)
+
+
+def test_a_turn_is_registered_anew(plain: Lab, tmp_path: Path) -> None:
+    turned = moved_by(0.0, 0.0, roll_deg=0.7)
+    lights = renumbered(LIGHTS[4:7])
+
+    def frame(step: SessionStep) -> bytes:
+        return (turned if step.number >= 3 else plain).dng(step.colour, step.number)
+
+    with take(plain, tmp_path / "session", lights, frame=frame) as session:
+        result = build(session, tmp_path / "lut")
+    assert [figures.record.illumination for figures in result.figures.frames if figures.reregistered] == [1]
+    assert worst_error(plain, tmp_path / "lut") < 0.05
+
+
+def test_nothing_is_registered_anew_where_nothing_moves(plain: Lab, tmp_path: Path) -> None:
+    lights = renumbered([*LIGHTS[::3], RED])
+    with take(plain, tmp_path / "session", lights) as session:
+        result = build(session, tmp_path / "lut")
+    assert not any(figures.reregistered for figures in result.figures.frames)
+    assert result.figures.largest_shift_px < 0.05
+    assert min(figures.shift.gauges for figures in result.figures.frames) >= 16
+    assert worst_error(plain, tmp_path / "lut") < 0.05
+
+
+Command = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    def run(*arguments: object) -> tuple[int, str]:
+        code = main([*map(str, arguments)])
+        said = capsys.readouterr()
+        return code, said.out + said.err
+
+    return run
+
+
+def test_corners_by_hand_stand_in_for_light_that_shows_nothing(plain: Lab, tmp_path: Path, command: Command) -> None:
+    """Of red light alone nobody can say which way up the chart hangs; white frames are all refused here."""
+    lights = renumbered([RED])
+    with take(
+        plain, tmp_path / "session", lights, verdict=lambda step: "refused" if step.kind == "white" else ACCEPTED
+    ):
+        pass
+    code, said = command("--check", tmp_path / "session")
+    assert code == 4
+    assert "which way up it hangs" in said
+    raw = 2 * plain.truth_px(field_mm(plain.chart), plain.mosaic(tmp_path)) + 0.5
+    corners = [f"{x:.0f},{y:.0f}" for x, y in raw + np.array([(9, -7), (-8, 6), (5, 8), (-9, -6)])]
+    code, said = command(tmp_path / "session", tmp_path / "lut", "--corners", *corners)
+    assert code == 0, said
+    assert worst_error(plain, tmp_path / "lut") < 0.05
+
+
+def test_corners_that_cannot_be_are_refused_on_the_command_line(plain: Lab, tmp_path: Path, command: Command) -> None:
+    with take(plain, tmp_path / "session", renumbered(LIGHTS[4:6])):
+        pass
+    for corners, expected in (
+        (["0,0", "9000,0", "9000,6000", "0,6000"], "do not lie in the picture"),
+        (["1,1", "2,2", "x", "3,3"], "'x' is no corner"),
+        (["716,496", "68,494", "72,50", "722,60"], "give them in this order"),
+    ):
+        code, said = command(tmp_path / "session", tmp_path / "lut", "--corners", *corners)
+        assert code == 2
+        assert expected in said
+    assert not (tmp_path / "lut").exists()
+
+
+def test_a_check_that_fails_shows_what_was_looked_for(plain: Lab, tmp_path: Path, command: Command) -> None:
+    with take(plain, tmp_path / "session", renumbered(LIGHTS[4:6])):
+        pass
+    found = tmp_path / "found.png"
+    assert command("--check", tmp_path / "session", "--picture", found)[0] == 0
+    assert found.read_bytes().startswith(b"\x89PNG")
+    design_chart(3, A_SERIES_MM["A5"]).save(tmp_path / "session" / "chart.json")
+    missed = tmp_path / "missed.png"
+    code, said = command("--check", tmp_path / "session", "--picture", missed)
+    assert code == 4
+    assert f"see {missed}" in said
+    assert missed.read_bytes().startswith(b"\x89PNG")
+    code, said = command(tmp_path / "session", tmp_path / "lut", "--picture", missed)
+    assert code == 2
+    assert "--picture goes with --check" in said

@@ -1,0 +1,67 @@
+"""A table carries its verdict; a refused one leaves its report, and nothing else."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Generator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from acquisition.session.folder import Session
+from calibration.cli import main
+from calibration.pipeline.build import build, check, refused_folder
+from calibration.report.report import write_report
+from calibration.verdict.thresholds import THRESHOLDS
+from calibration.verdict.values import judged_values
+from foundation.errors import QualityError
+from tests.calibration.lab import LIGHTS, Lab, take
+
+STRICT = (replace(next(limit for limit in THRESHOLDS if limit.name == "darkest_counts"), refuse=60_000.0),)
+
+
+@pytest.fixture(scope="module")
+def short(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Generator[Session]:
+    with take(lab, tmp_path_factory.mktemp("short") / "session", LIGHTS[:2]) as session:
+        yield session
+
+
+def test_a_table_carries_its_verdict(session: Session, tmp_path: Path) -> None:
+    result = build(session, tmp_path / "lut", report=write_report)
+    report = json.loads((tmp_path / "lut" / "report.json").read_text())
+    assert report["format"] == "crop.report"
+    assert report["verdict"] == result.verdict.outcome != "refuse"
+    assert report["figures"].keys() == judged_values(result.figures).keys()
+    assert {limit["name"] for limit in report["limits"]} == report["figures"].keys()
+    # No series of exposures was given, and the lights are few.
+    assert report["figures"].keys() == {limit.name for limit in THRESHOLDS} - {"linearity", "off_codes_deg"}
+    page = (tmp_path / "lut" / "report.html").read_text()
+    assert "class='verdict " in page
+    for limit in report["limits"]:
+        assert html.escape(limit["title"]) in page
+
+
+def test_a_refused_table_leaves_its_report_alone(short: Session, tmp_path: Path) -> None:
+    with pytest.raises(QualityError, match=r"no table is made\. Bare paper under the darkest .*expose longer"):
+        build(short, tmp_path / "lut", report=write_report, thresholds=STRICT)
+    assert list(tmp_path.iterdir()) == [tmp_path / "lut.refused"] == [refused_folder(tmp_path / "lut")]
+    kept = sorted(path.name for path in (tmp_path / "lut.refused").iterdir())
+    assert kept == ["report.html", "report.json"]
+    assert json.loads((tmp_path / "lut.refused" / "report.json").read_text())["verdict"] == "refuse"
+
+
+def test_a_check_is_judged_by_the_same_limits(short: Session) -> None:
+    assert check(short).verdict.outcome != "refuse"
+    assert [row.threshold for row in check(short, thresholds=STRICT).verdict.refused] == list(STRICT)
+
+
+def test_the_command_ends_with_the_exit_code_of_a_refusal(
+    short: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A window of nine pixels does not fit into these cells."""
+    assert main(["--check", "--window", "9", str(short.folder)]) == 4
+    assert "Light of neighbouring cells in the worst sample" in capsys.readouterr().err
+    assert main(["--window", "9", str(short.folder), str(tmp_path / "lut")]) == 4
+    assert not (tmp_path / "lut").exists()

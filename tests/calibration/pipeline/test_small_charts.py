@@ -1,0 +1,48 @@
+"""Charts of 8 and 64 colours, as `acquire chart` makes them: fewer cells than some figures of larger ones need."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquisition.chart.layout import design_chart
+from calibration.pipeline.build import build
+from calibration.registration.register import register
+from calibration.report.report import write_report
+from calibration.table.lut import open_lut
+from calibration.verdict.values import judged_values
+from sim.world.room import Room
+from tests.calibration.lab import LIGHTS, SETTINGS, hang_chart, renumbered, take
+
+LIGHT = renumbered(LIGHTS[5:6])
+
+
+@pytest.mark.parametrize(("bits", "seed"), [(1, 1), (2, 1), (2, 3)])
+def test_a_small_chart_becomes_a_table(bits: int, seed: int, tmp_path: Path) -> None:
+    lab = hang_chart(design_chart(bits, seed=seed), "Test", Room(projector_falloff=0.3))
+    with take(lab, tmp_path / "session", LIGHT) as session:
+        result = build(session, tmp_path / "lut")
+        write_report(result, session, tmp_path)
+    assert result.verdict.outcome == "accept"
+    assert not result.figures.cells.unfit
+    assert judged_values(result.figures).keys().isdisjoint({"unlike_scatter", "unlike_block", "doubtful_share"})
+    # What is not judged is not shown as clean.
+    report = (tmp_path / "report.html").read_text()
+    assert "The course of the session" in report
+    assert "<h2>The print</h2>" not in report
+    table = open_lut(tmp_path / "lut")
+    codes = lab.chart.rgb[lab.chart.cell_of_colour]
+    true = lab.world.reflected(codes, LIGHT[0].colour, SETTINGS) / lab.world.white(LIGHT[0].colour, SETTINGS)
+    assert table.samples[0].mean(axis=1) / table.white[0] == pytest.approx(true, abs=0.02)
+
+
+def test_cells_of_a_hundred_pixels_are_found_well_enough(tmp_path: Path) -> None:
+    lab = hang_chart(design_chart(2), "EOS 550D", Room())
+    mosaic = lab.mosaic(tmp_path)
+    found = register(mosaic, lab.chart)
+    error = found.to_pixels(lab.chart.centres_mm) - lab.truth_px(lab.chart.centres_mm, mosaic)
+    assert found.cell_px > 100
+    assert found.clearance > 20
+    assert np.linalg.norm(error, axis=1).max() < 0.05 * found.cell_px

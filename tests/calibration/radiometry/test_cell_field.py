@@ -1,0 +1,69 @@
+"""The light on a chart without tags, read from its cells, against the light of the room."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from acquisition.chart.layout import paper_chart
+from acquisition.chart.printing import drawing
+from calibration.radiometry.cell_field import field_of_cells
+from calibration.radiometry.paper import PaperReader
+from drivers.presenter import WHITE, Colour
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from sim.world.world import World
+from tests.calibration.lab import SETTINGS
+
+CHART = paper_chart("A1", 4)
+WHITES_MM = np.array([reference.centre_mm for reference in CHART.references])
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    picture = drawing(CHART)
+    return World(Print(picture.page_mm, picture.rectangles_mm, picture.rgb), BODIES["Test"], Room(waviness_mm=0))
+
+
+def seen(world: World, colour: Colour) -> tuple[npt.NDArray[np.float64], ...]:
+    """Return cells with the noise of 25 samples, references, and the true field at the cells, mean 1."""
+    cells = world.seen(CHART.rgb, CHART.centres_mm, colour, SETTINGS)
+    cells += np.random.default_rng(1).normal(size=cells.shape) * np.sqrt(np.maximum(cells, 0) / 50 + 2)
+    whites = world.seen(np.full((len(WHITES_MM), 3), 255), WHITES_MM, colour, SETTINGS)
+    bare = world.seen(np.full((len(cells), 3), 255), CHART.centres_mm, colour, SETTINGS)
+    return cells, whites, bare / bare.mean(axis=0)
+
+
+def test_the_light_in_the_middle_is_told_by_the_cells(world: World) -> None:
+    cells, whites, true = seen(world, WHITE)
+    there = np.ones(len(cells), dtype=np.bool_)
+    field = field_of_cells(CHART.rgb, CHART.centres_mm, cells, there, WHITES_MM, whites, CHART.page_mm)
+    error = field.at(CHART.centres_mm) / true - 1
+    assert np.sqrt((error**2).mean()) < 0.004
+    # References in the margin alone leave more than twice that.
+    alone = PaperReader(WHITES_MM, CHART.centres_mm, CHART.page_mm).read(whites)[0].field
+    assert np.sqrt(((alone.at(CHART.centres_mm) / true - 1) ** 2).mean()) > 0.009
+
+
+def test_covered_cells_and_a_stained_reference_are_left_out(world: World) -> None:
+    cells, whites, true = seen(world, WHITE)
+    there = np.ones(len(cells), dtype=np.bool_)
+    there[1000:1100] = False
+    cells[1000:1100] = 7000
+    # A few that nobody has noticed.
+    cells[2000:2020] *= 0.5
+    whites[3] *= 0.8
+    whites[5] = np.nan
+    field = field_of_cells(CHART.rgb, CHART.centres_mm, cells, there, WHITES_MM, whites, CHART.page_mm)
+    assert np.sqrt(((field.at(CHART.centres_mm) / true - 1) ** 2).mean()) < 0.005
+
+
+def test_a_colour_without_light_has_no_shape(world: World) -> None:
+    cells, whites, _ = seen(world, Colour(0, 0, 255))
+    there = np.ones(len(cells), dtype=np.bool_)
+    cells[:, 0] = np.random.default_rng(2).normal(0, 2, len(cells))
+    whites[:, 0] = 0.5
+    field = field_of_cells(CHART.rgb, CHART.centres_mm, cells, there, WHITES_MM, whites, CHART.page_mm)
+    assert (field.at(CHART.centres_mm)[:, 0] == 1).all()

@@ -1,0 +1,49 @@
+"""The levels of grey, and how grey they are."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+import numpy as np
+import pytest
+
+from acquisition.chart.model import Reference
+from calibration.radiometry.greys import GreyLevels, references_csv, tint_deg
+
+GREYS = [
+    Reference(f"grey {code}", (code, code, code), (float(n), 0.0), (5.0, 5.0)) for n, code in enumerate([71, 188] * 20)
+]
+
+
+def test_each_level_is_the_mean_of_its_patches_without_the_stained_one() -> None:
+    levels = GreyLevels.of(GREYS)
+    assert levels.names == ("grey 188", "grey 71")
+    random = np.random.default_rng(2)
+    field = random.uniform(0.8, 1.2, (40, 3))
+    true = np.where(levels.level[:, None] == 0, [4000.0, 5000, 3000], [500.0, 700, 400])
+    seen = field * (true + random.normal(0, 10, (40, 3)))
+    seen[1] *= 0.7
+    seen[4] = np.nan
+    value, error = levels.read(seen, field)
+    assert value == pytest.approx(np.array([[4000, 5000, 3000], [500, 700, 400]]), abs=10)
+    assert error == pytest.approx(np.full((2, 3), 10 / np.sqrt(20)), rel=0.5)
+
+
+def test_a_level_without_patches_is_empty_in_the_file() -> None:
+    levels = GreyLevels.of(GREYS)
+    seen = np.where(levels.level[:, None] == 1, np.nan, 100.0) * np.ones(3)
+    value, error = levels.read(seen, np.ones((40, 3)))
+    text = references_csv(levels.names, np.full((1, 3), 200.0), np.ones((1, 3)), value[None], error[None])
+    rows = list(csv.DictReader(io.StringIO(text)))
+    assert [row["name"] for row in rows] == ["white", "grey 188", "grey 71"]
+    assert float(rows[1]["g"]) == 100
+    assert rows[2]["g"] == ""
+
+
+def test_a_grey_in_white_s_direction_has_no_tint() -> None:
+    white = np.array([[3000.0, 5000, 4000]])
+    greys = np.stack([0.3 * white[0], white[0] * [0.3, 0.3, 0.33]])[None]
+    tint = tint_deg(white, greys)[0]
+    assert tint[0] == pytest.approx(0, abs=1e-6)
+    assert 1 < tint[1] < 4

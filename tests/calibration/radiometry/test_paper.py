@@ -1,0 +1,130 @@
+"""The flat field and the ground truth, read from bare paper."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration.radiometry.corrections import corrections
+from calibration.radiometry.flat_field import FlatField
+from calibration.radiometry.paper import MAX_ORDER_AROUND, Paper, PaperReader
+from foundation.errors import QualityError
+
+PAGE = (400.0, 300.0)
+RANDOM = np.random.default_rng(3)
+PLACES = RANDOM.random((400, 2)) * PAGE
+CENTRES = RANDOM.random((1000, 2)) * PAGE
+
+
+def read_paper(seen: npt.NDArray[np.float64], base: FlatField | None = None) -> Paper:
+    return PaperReader(PLACES, CENTRES, PAGE, base).read(seen)[0]
+
+
+def falloff(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    x, y = (2 * points / PAGE - 1).T
+    return np.stack([1 / (1 + 0.2 * (x * x + y * y)), 1 / (1 + 0.25 * ((x - 0.1) ** 2 + y * y)), 1 - 0.1 * x], axis=-1)
+
+
+def test_the_field_is_found_and_its_mean_over_the_cells_is_one() -> None:
+    level = np.array([3000.0, 8000.0, 5000.0])
+    paper = read_paper(falloff(PLACES) * level)
+    assert paper.field.at(CENTRES).mean(axis=0) == pytest.approx(1, abs=1e-6)
+    expected = falloff(CENTRES) / falloff(CENTRES).mean(axis=0)
+    # Corners that no reference reaches are extrapolated.
+    assert paper.field.at(CENTRES) == pytest.approx(expected, rel=0.01)
+    assert np.sqrt(((paper.field.at(CENTRES) / expected - 1) ** 2).mean()) < 3e-4
+    assert paper.white == pytest.approx(level * falloff(CENTRES).mean(axis=0), rel=1e-3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([20.0, 300.0, 9000.0]))
+def test_noise_is_not_taken_for_shape(seed: int, level: float) -> None:
+    random = np.random.default_rng(seed)
+    noise = np.sqrt(level / 1.8 + 36) / 5
+    seen = level * falloff(PLACES) + random.normal(0, noise, (len(PLACES), 3))
+    base = read_paper(9000 * falloff(PLACES)).field
+    paper = read_paper(seen, base)
+    true = level * falloff(CENTRES).mean(axis=0)
+    assert (np.abs(paper.white - true) < 6 * paper.error + 1e-3 * true).all()
+    assert paper.error == pytest.approx(np.full(3, noise / 20), rel=0.35)
+    expected = falloff(CENTRES) / falloff(CENTRES).mean(axis=0)
+    assert np.sqrt(((paper.field.at(CENTRES) / expected - 1) ** 2).mean()) < 0.002 + 0.25 * noise / level
+
+
+def test_references_that_are_covered_or_dirty_do_not_count() -> None:
+    seen = 5000 * falloff(PLACES)
+    seen[:30] *= 0.5
+    seen[30:40] = np.nan
+    paper = read_paper(seen)
+    assert paper.references == 390
+    assert paper.white == pytest.approx(5000 * falloff(CENTRES).mean(axis=0), rel=0.002)
+
+
+def test_a_channel_without_light_has_the_shape_of_a_brighter_frame() -> None:
+    base = read_paper(9000 * falloff(PLACES)).field
+    seen = np.random.default_rng(0).normal(0, 1, (len(PLACES), 3))
+    field = read_paper(seen, base).field
+    assert field.at(CENTRES) == pytest.approx(base.at(CENTRES), rel=0.02)
+    assert (field.at(CENTRES) > 0).all()
+
+
+def test_too_few_references_are_refused() -> None:
+    with pytest.raises(QualityError, match="5 white references can be used, at least 6 expected"):
+        PaperReader(PLACES[:5], CENTRES, PAGE).read(np.ones((5, 3)))
+
+
+def test_the_table_says_enough_to_undo_the_field() -> None:
+    """Evaluated by the words of `lut.json`, with NumPy's Legendre series and nothing of ours."""
+    base = read_paper(9000 * falloff(PLACES)).field
+    tilted = falloff(PLACES) * (1 + 0.05 * (2 * PLACES[:, :1] / PAGE[0] - 1))
+    field = read_paper(9000 * tilted, base).field
+    record = next(c for c in corrections(PAGE, np.zeros((1, 2, 2)), 13584, [field]) if c["name"] == "field")
+    u, v = (2 * CENTRES / PAGE - 1).T
+    for channel in range(3):
+        product = np.ones(len(CENTRES))
+        for factor in record["per_light"][0][channel]:
+            weights, order, rest = np.zeros((7, 7)), 0, list(factor)
+            while rest:
+                for j in range(order + 1):
+                    weights[order - j, j] = rest.pop(0)
+                order += 1
+            product *= np.asarray(np.polynomial.legendre.legval2d(u, v, weights), dtype=np.float64)
+        assert product == pytest.approx(field.at(CENTRES)[:, channel], rel=1e-5)
+
+
+def test_an_even_field_is_one() -> None:
+    assert FlatField.uniform(PAGE).at(CENTRES) == pytest.approx(1)
+    assert isinstance(FlatField.uniform(PAGE), FlatField)
+
+
+def test_a_stain_is_ignored_by_the_white_and_shown_by_the_spread() -> None:
+    random = np.random.default_rng(8)
+    seen = falloff(PLACES) * 6000 + random.normal(0, 12, (len(PLACES), 3))
+    clean = read_paper(seen)
+    stained = seen.copy()
+    stained[np.linalg.norm(PLACES - (200, 150), axis=1) < 40] *= 0.8
+    found = read_paper(stained)
+    assert found.white == pytest.approx(clean.white, rel=0.003)
+    assert (clean.spread < 0.004).all()
+    assert (found.spread > 0.02).all()
+
+
+def test_references_in_the_margin_give_no_shape_that_vanishes_there() -> None:
+    """The light bends by 4 % in the middle, which the base knows; noise in the margin must not undo it."""
+    side = RANDOM.random((300, 2)) * PAGE
+    side[:150, 1] = np.where(RANDOM.random(150) < 0.5, 0.02, 0.98) * PAGE[1]
+    side[150:, 0] = np.where(RANDOM.random(150) < 0.5, 0.02, 0.98) * PAGE[0]
+    base = PaperReader(PLACES, CENTRES, PAGE).read(falloff(PLACES) * 5000)[0].field
+    x, y = (2 * side / PAGE - 1).T
+    seen = falloff(side) * 3000 * (1 + 0.02 * x - 0.01 * y * y)[:, None] * RANDOM.normal(1, 0.002, (300, 3))
+    # A smear on some, as margins have them.
+    seen[:12] *= 0.97
+    u, v = (2 * CENTRES / PAGE - 1).T
+    true = falloff(CENTRES) * (1 + 0.02 * u - 0.01 * v * v)[:, None]
+    true /= true.mean(axis=0)
+    field = PaperReader(side, CENTRES, PAGE, base, MAX_ORDER_AROUND).read(seen)[0].field
+    assert max(field.orders()) <= MAX_ORDER_AROUND
+    assert np.abs(field.at(CENTRES) / true - 1).max() < 0.01

@@ -1,0 +1,111 @@
+"""Primaries of unlike field: synthetic cells whose light is known, then a session compared with its room."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from acquisition.lights.illuminations import plan_illuminations
+from calibration.pipeline.build import build
+from calibration.radiometry.flat_field import FlatField
+from calibration.radiometry.paper import Paper, PaperReader
+from calibration.radiometry.primaries import Primaries, pure_lights
+from calibration.table.lut import open_lut
+from sim.world.room import Room
+from tests.calibration.lab import SETTINGS, hang, renumbered, take
+
+PAGE = (400.0, 300.0)
+RANDOM = np.random.default_rng(5)
+PLACES, CENTRES = RANDOM.random((400, 2)) * PAGE, RANDOM.random((1000, 2)) * PAGE
+
+_Array = npt.NDArray[np.float64]
+
+
+def shapes(points: _Array) -> _Array:
+    """Return the fields (N, 3) of three primaries, polynomials of order 2."""
+    x, y = (2 * points / PAGE - 1).T
+    return np.stack([1 - 0.1 * x * x, 1 - 0.06 * y * y + 0.03 * x, 1 - 0.12 * x * y], axis=-1)
+
+
+def test_a_cells_field_is_what_it_reflects() -> None:
+    fields = shapes(CENTRES) / shapes(CENTRES).mean(axis=0)
+    at_paper = shapes(PLACES) / shapes(CENTRES).mean(axis=0)
+    # What paper, and each cell, reflects of each primary into each channel.
+    paper = np.array([[3000.0, 600, 100], [500, 5000, 700], [80, 900, 4000]])
+    cells: _Array = paper[:, None] * (0.02 + RANDOM.random((3, 1000, 1)) ** 2)
+    reader = PaperReader(PLACES, CENTRES, PAGE)
+    alone = [reader.read(at_paper[:, [p]] * paper[p])[0] for p in range(3)]
+    known = Primaries.of((0, 1, 2), alone, [*cells], CENTRES)
+    assert known is not None
+    assert known.difference == pytest.approx((fields.max(axis=1) / fields.min(axis=1)).max() - 1, abs=0.01)
+    amounts = np.array([0.7, 0.3, 0.9])
+    white = amounts @ paper
+    assert known.amounts(white) == pytest.approx(amounts, rel=1e-3)
+    true = np.einsum("p,ip,pic->ic", amounts, fields, cells) / np.einsum("p,pic->ic", amounts, cells)
+    of_paper = np.einsum("p,ip,pc->ic", amounts, fields, paper) / white
+    assert np.abs(true / of_paper - 1).max() > 0.01
+    assert known.field_ratio(white) == pytest.approx(true / of_paper, abs=3e-3)
+    # Undone by what `lut.json` records.
+    record = known.correction(white[None])
+    assert record["lights"] == [0, 1, 2]
+    assert record["per_light"][0] == pytest.approx(amounts, rel=1e-3)
+
+
+def test_one_primary_has_papers_field() -> None:
+    reader = PaperReader(PLACES, CENTRES, PAGE)
+    alone = [reader.read(shapes(PLACES)[:, [p]] * np.full(3, 1000.0))[0] for p in range(3)]
+    known = Primaries.of((0, 1, 2), alone, [RANDOM.random((1000, 3)) * 900 for _ in range(3)], CENTRES)
+    assert known is not None
+    pure = Primaries.of(
+        (0, 1, 2), [replace(p, white=np.eye(3)[n] * 1000) for n, p in enumerate(alone)], [*known.cells], CENTRES
+    )
+    assert pure is not None
+    assert pure.field_ratio(np.array([0, 800.0, 0])) == pytest.approx(1, abs=1e-12)
+
+
+def test_a_dim_primary_tells_nothing() -> None:
+    even = FlatField(PAGE, ((), (), ()))
+    dim = [Paper(even, np.array([1000.0, 10, 10]), np.ones(3), 9, np.zeros(3)) for _ in range(2)]
+    dim.append(Paper(even, np.array([1.0, 10, 200]), np.ones(3), 9, np.zeros(3)))
+    assert Primaries.of((0, 1, 2), dim, [np.ones((10, 3)) for _ in range(3)], RANDOM.random((10, 2))) is None
+
+
+def test_the_brightest_pure_lights_are_chosen() -> None:
+    lights = plan_illuminations(3, (3000,))
+    found = pure_lights(lights)
+    assert found is not None
+    assert [(lights[n].colour.red, lights[n].colour.green, lights[n].colour.blue) for n in found] == [
+        (255, 0, 0),
+        (0, 255, 0),
+        (0, 0, 255),
+    ]
+    assert pure_lights([light for light in lights if light.kind == "cct"]) is None
+
+
+def test_a_session_of_unlike_primaries_is_told_true(tmp_path: Path) -> None:
+    room = Room(waviness_mm=0.5, projector_falloff=0.3, primary_difference=0.4, response_spread=0.0)
+    lab = hang(room=room)
+    lights = renumbered(plan_illuminations(2, (4500, 6500)))
+    with take(lab, tmp_path / "session", lights) as session:
+        result = build(session, tmp_path / "lut")
+    lut = open_lut(tmp_path / "lut")
+    codes = lab.chart.rgb[lab.chart.cell_of_colour]
+    fit = np.ones(len(codes), dtype=bool)
+    fit[[cell.colour for cell in lut.provenance.unfit]] = False
+    assert result.figures.primaries is not None
+    corrected: list[_Array] = []
+    plain: list[_Array] = []
+    for light in lights:
+        white = lab.world.white(light.colour, SETTINGS)
+        true = lab.world.reflected(codes, light.colour, SETTINGS) / white * lut.white[light.index]
+        off = lut.samples[light.index].mean(axis=1) / true - 1
+        lit = fit[:, None] & (true > 1500)
+        undone = (1 + off) * result.figures.primaries.field_ratio(lut.white[light.index]) - 1
+        corrected.append(off[lit])
+        plain.append(undone[lit])
+    one, other = (float(np.sqrt((np.concatenate(values) ** 2).mean())) for values in (corrected, plain))
+    assert one < 0.9 * other

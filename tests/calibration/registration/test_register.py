@@ -1,0 +1,177 @@
+"""The chart's place in a frame, against the place from which the simulated frame was rendered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from acquisition.chart.layout import A_SERIES_MM, design_chart
+from benchmarks import rooms
+from calibration.registration.register import register
+from drivers.presenter import WHITE, Colour
+from drivers.raw.rawfile import Mosaic, read_raw
+from foundation.errors import RegistrationError
+from sim.world.room import Room
+from tests.calibration.lab import Lab, hang
+from tests.data_files import shipped
+
+
+def miss(lab: Lab, mosaic: Mosaic) -> npt.NDArray[np.float64]:
+    """Return how far the registered cells lie from the truth, px."""
+    registration = register(mosaic, lab.chart)
+    places = registration.to_pixels(lab.chart.centres_mm)
+    return np.linalg.norm(places - lab.truth_px(lab.chart.centres_mm, mosaic), axis=1)
+
+
+def test_whole_chart_in_the_default_room(tmp_path: Path) -> None:
+    lab = hang(5, "A0", "EOS 550D", room=Room())
+    mosaic = lab.mosaic(tmp_path)
+    error = miss(lab, mosaic)
+    assert np.sqrt(np.mean(error**2)) < 0.05
+    assert error.max() < 0.3
+
+
+@pytest.mark.parametrize("colour", [WHITE, Colour(255, 0, 0), Colour(0, 0, 255), Colour(90, 60, 20)])
+def test_every_light_registers(lab: Lab, tmp_path: Path, colour: Colour) -> None:
+    error = miss(lab, lab.mosaic(tmp_path, colour))
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert error.max() < 0.6
+
+
+@pytest.mark.parametrize(("bits", "page"), [(1, "A7"), (2, "A6"), (3, "A5")])
+@pytest.mark.parametrize("roll", [0.5, 180.0])
+def test_small_charts_upright_and_upside_down(tmp_path: Path, bits: int, page: str, roll: float) -> None:
+    lab = hang(bits, page, room=Room(waviness_mm=0.5, roll_deg=roll))
+    error = miss(lab, lab.mosaic(tmp_path))
+    assert np.sqrt(np.mean(error**2)) < 0.15
+    assert error.max() < 0.6
+
+
+def test_waves_that_tags_cannot_see(tmp_path: Path) -> None:
+    lab = hang(room=Room(waviness_mm=3.0, seed=5))
+    mosaic = lab.mosaic(tmp_path)
+    registration = register(mosaic, lab.chart)
+    truth = lab.truth_px(lab.chart.centres_mm, mosaic)
+    by_tags = np.linalg.norm(registration.lens.to_pixels(lab.chart.centres_mm) - truth, axis=1)
+    by_cells = np.linalg.norm(registration.to_pixels(lab.chart.centres_mm) - truth, axis=1)
+    assert (by_cells**2).mean() < 0.25 * (by_tags**2).mean()
+    assert by_cells.max() < 0.6
+
+
+def test_the_estimate_of_its_own_error_is_honest(lab: Lab, tmp_path: Path) -> None:
+    mosaic = lab.mosaic(tmp_path)
+    registration = register(mosaic, lab.chart)
+    assert registration.agreement > 0.99
+    assert registration.block_rms_px < 0.03
+    assert registration.blocks.good.all()
+    assert registration.cell_px == pytest.approx(9, abs=1)
+
+
+def test_shifted_moves_every_point(lab: Lab, tmp_path: Path) -> None:
+    registration = register(lab.mosaic(tmp_path), lab.chart)
+    moved = registration.shifted(0.25, -0.5).to_pixels(lab.chart.centres_mm)
+    assert moved - registration.to_pixels(lab.chart.centres_mm) == pytest.approx(np.tile([0.25, -0.5], (len(moved), 1)))
+
+
+def test_another_order_of_colours_is_refused(lab: Lab, tmp_path: Path) -> None:
+    other = design_chart(3, A_SERIES_MM["A5"], 2)
+    assert [tag.id for tag in other.tags] == [tag.id for tag in lab.chart.tags]
+    with pytest.raises(RegistrationError, match=r"colours are not those of the chart: .* name the chart\.json"):
+        register(lab.mosaic(tmp_path), other)
+
+
+def test_a_slip_by_one_cell_is_refused_or_mended(lab: Lab, tmp_path: Path) -> None:
+    """A chart file whose cells stand one cell beside the print must not give a table one cell off."""
+    slipped = replace(lab.chart, centres_mm=lab.chart.centres_mm + np.array([lab.chart.cell_mm[0], 0]))
+    mosaic = lab.mosaic(tmp_path)
+    try:
+        places = register(mosaic, slipped).to_pixels(slipped.centres_mm)
+    except RegistrationError:
+        return
+    assert np.abs(places - lab.truth_px(lab.chart.centres_mm, mosaic)).max() < 1
+
+
+def test_a_covered_half_is_refused(lab: Lab, tmp_path: Path) -> None:
+    top, left, height, width = lab.world.body.visible
+
+    def cover(counts: npt.NDArray[np.uint16]) -> None:
+        counts[top + height // 4 : top + 3 * height // 4, left + width // 6 : left + 5 * width // 6] = 2600
+
+    with pytest.raises(RegistrationError, match="uncover"):
+        register(lab.mosaic(tmp_path, paint=cover), lab.chart)
+
+
+def test_a_covered_corner_does_not_pull_its_neighbours(tmp_path: Path) -> None:
+    lab = hang(4, "A2", "EOS 550D", room=Room())
+    top, left, height, width = lab.world.body.visible
+    rows, columns = slice(top + height // 2, top + height // 2 + 400), slice(left + width // 2, left + width // 2 + 400)
+
+    def cover(counts: npt.NDArray[np.uint16]) -> None:
+        counts[rows, columns] = 3000
+
+    mosaic = lab.mosaic(tmp_path, paint=cover)
+    registration = register(mosaic, lab.chart)
+    truth = lab.truth_px(lab.chart.centres_mm, mosaic)
+    middle = np.array([width / 4 + 100, height / 4 + 100])
+    free = (np.abs(truth - middle) > 130).any(axis=1)
+    error = np.linalg.norm(registration.to_pixels(lab.chart.centres_mm) - truth, axis=1)
+    assert error[free].max() < 0.6
+    hidden = (np.abs(truth - middle) < 95).all(axis=1)
+    assert hidden.sum() > 30
+    assert registration.mismatched_cells[hidden].all()
+    assert not registration.mismatched_cells[free].any()
+
+
+def test_out_of_focus_is_refused(tmp_path: Path) -> None:
+    lab = hang(room=Room(waviness_mm=0.5, blur_px=1.6))
+    with pytest.raises(RegistrationError, match=r"out of focus|not fit|looked for"):
+        register(lab.mosaic(tmp_path), lab.chart)
+
+
+def test_too_far_away_is_refused(tmp_path: Path) -> None:
+    lab = hang(room=Room(waviness_mm=0.5, fill=0.78))
+    with pytest.raises(RegistrationError, match="nearer"):
+        register(lab.mosaic(tmp_path), lab.chart)
+
+
+def test_a_real_photograph_without_the_chart_is_refused(lab: Lab) -> None:
+    path = shipped("raw/canon_eos_550d_colorchart.dng")
+    with pytest.raises(RegistrationError, match="looked for, none found") as caught:
+        register(read_raw(path), lab.chart, path.name)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_mirrored_frame_is_called_mirrored(lab: Lab, tmp_path: Path) -> None:
+    top, left, height, width = lab.world.body.visible
+
+    def mirror(counts: npt.NDArray[np.uint16]) -> None:
+        seen = counts[top : top + height, left : left + width // 2 * 2]
+        # Whole blocks change places, so that every photosite keeps its colour.
+        seen[:] = seen.reshape(height, -1, 2)[:, ::-1].reshape(height, -1).copy()
+
+    with pytest.raises(RegistrationError, match="is mirrored"):
+        register(lab.mosaic(tmp_path, paint=mirror), lab.chart)
+
+
+@pytest.mark.parametrize("roll", [90.0, -90.0, 180.0, 37.0])
+def test_a_turned_camera_sees_the_same_chart(tmp_path: Path, roll: float) -> None:
+    lab = hang(2, "A6", "EOS 550D", room=Room(waviness_mm=0.5, roll_deg=roll, fill=0.55))
+    mosaic = lab.mosaic(tmp_path)
+    registration = register(mosaic, lab.chart)
+    error = registration.to_pixels(lab.chart.centres_mm) - lab.truth_px(lab.chart.centres_mm, mosaic)
+    assert np.linalg.norm(error, axis=1).max() < 0.6
+    turned = registration.framing.rotation_deg - roll
+    assert abs((turned + 180) % 360 - 180) < 5
+
+
+@pytest.mark.parametrize("seed", [101, 102, 103])
+def test_rooms_that_nothing_was_tuned_for(seed: int) -> None:
+    """More of them, on whole charts, are in `benchmarks.rooms`."""
+    case = rooms.random_case(seed)
+    error = rooms.miss(replace(case, body="EOS 550D", room=replace(case.room, blur_px=0.7)), 4, "A2")
+    assert error.max() < rooms.SILENT_PX / 2
+    assert np.sqrt((error**2).mean()) < 0.1

@@ -1,0 +1,133 @@
+"""A chart without tags registered by its outline and its cells, against the place it was rendered from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from acquisition.chart.layout import paper_chart
+from acquisition.chart.model import Chart
+from acquisition.framing.tagless_field import field_mm
+from calibration.registration.register import register
+from drivers.presenter import WHITE, Colour
+from drivers.raw.rawfile import Mosaic
+from foundation.errors import RegistrationError
+from sim.world.room import Room
+from tests.calibration.lab import Lab, hang_chart
+
+SMALL = paper_chart("A6", 3)
+
+
+@pytest.fixture(scope="module")
+def plain() -> Lab:
+    return hang_chart(SMALL, "Test", Room(waviness_mm=0.5))
+
+
+def miss(lab: Lab, mosaic: Mosaic, chart: Chart | None = None) -> npt.NDArray[np.float64]:
+    """Return how far the registered cells lie from the truth, px."""
+    places = register(mosaic, chart or lab.chart).to_pixels(lab.chart.centres_mm)
+    return np.linalg.norm(np.asarray(places - lab.truth_px(lab.chart.centres_mm, mosaic)), axis=1)
+
+
+@pytest.mark.parametrize("colour", [WHITE, Colour(110, 70, 20), Colour(0, 255, 0), Colour(0, 0, 255)])
+def test_every_light_that_shows_which_way_up_registers(plain: Lab, tmp_path: Path, colour: Colour) -> None:
+    error = miss(plain, plain.mosaic(tmp_path, colour))
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert error.max() < 0.4
+
+
+def test_upside_down_is_the_same_chart(tmp_path: Path) -> None:
+    lab = hang_chart(SMALL, "Test", Room(waviness_mm=0.5, roll_deg=180.0))
+    assert miss(lab, lab.mosaic(tmp_path)).max() < 0.4
+
+
+def test_the_paper_s_whole_grid_on_a_sheet_that_waves_by_six_millimetres(tmp_path: Path) -> None:
+    lab = hang_chart(paper_chart(), "EOS 550D", Room(waviness_mm=6.0, seed=3))
+    mosaic = lab.mosaic(tmp_path)
+    registration = register(mosaic, lab.chart)
+    truth = lab.truth_px(lab.chart.centres_mm, mosaic)
+    error = np.asarray(np.linalg.norm(registration.to_pixels(lab.chart.centres_mm) - truth, axis=1), dtype=np.float64)
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert error.max() < 0.7
+    assert registration.blocks.good.all()
+    assert not registration.mismatched_cells.any()
+    assert registration.agreement > 0.999
+
+
+def test_red_light_registers_where_the_session_knows_the_way_up(plain: Lab, tmp_path: Path) -> None:
+    white = register(plain.mosaic(tmp_path), plain.chart)
+    mosaic = plain.mosaic(tmp_path, Colour(255, 0, 0), key=2)
+    places = register(mosaic, plain.chart, near=white).to_pixels(plain.chart.centres_mm)
+    assert np.abs(places - plain.truth_px(plain.chart.centres_mm, mosaic)).max() < 0.5
+
+
+def test_stated_corners_find_the_same_places(plain: Lab, tmp_path: Path) -> None:
+    mosaic = plain.mosaic(tmp_path)
+    stated = plain.truth_px(field_mm(plain.chart), mosaic) + np.array([(6, -5), (-4, 6), (3, 4), (-6, -3)])
+    by_itself = register(mosaic, plain.chart).to_pixels(plain.chart.centres_mm)
+    by_corners = register(mosaic, plain.chart, corners=stated).to_pixels(plain.chart.centres_mm)
+    assert np.abs(by_itself - by_corners).max() < 0.1
+
+
+def test_another_order_of_colours_is_refused(plain: Lab, tmp_path: Path) -> None:
+    shuffled = replace(plain.chart, colours=np.random.default_rng(1).permutation(plain.chart.colours))
+    with pytest.raises(RegistrationError, match=r"name the chart\.json of this print"):
+        register(plain.mosaic(tmp_path), shuffled)
+
+
+def test_a_field_displaced_by_one_cell_is_refused(plain: Lab, tmp_path: Path) -> None:
+    """The outline fits, and every block of cells looks smooth as it should: only the colours' level shows it.
+
+    A slip along y is found on large charts alone: with two rows of blocks it looks like an ink that reacts to blue.
+    """
+    columns = len(np.unique(plain.chart.centres_mm[:, 0].round(3)))
+    grid = plain.chart.colours.reshape(-1, columns)
+    other = replace(plain.chart, colours=np.roll(grid, 1, axis=1).reshape(-1))
+    with pytest.raises(RegistrationError, match="have the colours of the cells beside them"):
+        register(plain.mosaic(tmp_path), other)
+
+
+def test_a_covered_half_is_refused(plain: Lab, tmp_path: Path) -> None:
+    top, left, height, width = plain.world.body.visible
+
+    def cover(counts: npt.NDArray[np.uint16]) -> None:
+        counts[top + height // 4 : top + 3 * height // 4, left + width // 6 : left + 5 * width // 6] = 3400
+
+    with pytest.raises(RegistrationError, match="uncover"):
+        register(plain.mosaic(tmp_path, paint=cover), plain.chart)
+
+
+def test_a_covered_part_is_named_and_does_not_pull_its_neighbours(plain: Lab, tmp_path: Path) -> None:
+    top, left, height, width = plain.world.body.visible
+    rows, columns = slice(top + height // 2, top + height // 2 + 80), slice(left + width // 3, left + width // 3 + 80)
+
+    def cover(counts: npt.NDArray[np.uint16]) -> None:
+        counts[rows, columns] = 7000
+
+    mosaic = plain.mosaic(tmp_path, paint=cover)
+    registration = register(mosaic, plain.chart)
+    truth = plain.truth_px(plain.chart.centres_mm, mosaic)
+    middle = np.array([width / 6 + 20, height / 4 + 20])
+    hidden = (np.abs(truth - middle) < 14).all(axis=1)
+    free = (np.abs(truth - middle) > 35).any(axis=1)
+    assert hidden.sum() >= 4
+    assert registration.mismatched_cells[hidden].all()
+    assert not registration.mismatched_cells[free].any()
+    error = np.linalg.norm(registration.to_pixels(plain.chart.centres_mm) - truth, axis=1)
+    assert error[free].max() < 0.6
+
+
+def test_out_of_focus_is_refused(tmp_path: Path) -> None:
+    lab = hang_chart(SMALL, "Test", Room(waviness_mm=0.5, blur_px=1.6))
+    with pytest.raises(RegistrationError, match="out of focus"):
+        register(lab.mosaic(tmp_path), lab.chart)
+
+
+def test_too_far_away_is_refused(tmp_path: Path) -> None:
+    lab = hang_chart(SMALL, "Test", Room(waviness_mm=0.5, fill=0.6))
+    with pytest.raises(RegistrationError, match="nearer"):
+        register(lab.mosaic(tmp_path), lab.chart)

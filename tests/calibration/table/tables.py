@@ -1,0 +1,53 @@
+"""Small tables for these tests, and a way to damage them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from acquisition.lights.illuminations import plan_illuminations
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.source_frames import SourceFrame, frames_sha256
+from calibration.table.writer import LutWriter
+
+LIGHTS = plan_illuminations(1, (2500, 6500))
+FRAMES = [SourceFrame("white", None, "frames/0000_white.dng", "00" * 32)] + [
+    SourceFrame("light", light.index, f"frames/{light.index + 2:04d}_light.dng", f"{light.index:02x}" * 32)
+    for light in LIGHTS
+]
+
+
+def write(folder: Path, seed: int = 0, chart: str = "cd" * 32, lights: int = len(LIGHTS)) -> Lut:
+    folder.mkdir()
+    writer = LutWriter(folder, lights, 8, 25)
+    values = np.random.default_rng(seed).integers(0, 14000, (lights, 8, 25, 3), dtype=np.uint16)
+    for light in reversed(range(lights)):
+        writer.put(light, values[light])
+    writer.finish(
+        LIGHTS[:lights],
+        np.full((lights, 3), 9000.0),
+        Provenance(
+            camera="Test",
+            bits=1,
+            white_level=11000,
+            session_sha256=frames_sha256(FRAMES),
+            chart_sha256=chart,
+            software="croplab test",
+        ),
+        FRAMES,
+    )
+    lut = open_lut(folder)
+    assert np.array_equal(lut.samples, values)
+    return lut
+
+
+def flip(name: str, place: int) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        data = bytearray((folder / name).read_bytes())
+        data[place] ^= 1
+        (folder / name).write_bytes(data)
+
+    return change

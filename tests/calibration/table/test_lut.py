@@ -1,0 +1,59 @@
+"""The table on disk: every version is read for ever, and samples that have changed are not used."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.table.lut import open_lut
+from calibration.table.verification import find_faults
+from calibration.table.writer import LutWriter
+from foundation.errors import FormatError, InputError
+from tests.calibration.table.tables import flip, write
+
+VERSION_1 = Path(__file__).parent / "table_v1"
+"""Written by the first release of the format; never to be written again."""
+
+
+def test_a_table_of_version_1_is_read_for_ever() -> None:
+    lut = open_lut(VERSION_1)
+    values = np.arange(2 * 8 * 3 * 3) * 331 % 14000
+    assert np.array_equal(lut.samples.ravel(), values)
+    assert lut.white.tolist() == [[9000.5, 12000.25, 7000.125], [1, 2, 8000]]
+    assert [light.colour.green for light in lut.illuminations] == [255, 0]
+    assert lut.provenance.camera == "Canon EOS 550D"
+    assert [cell.colour for cell in lut.provenance.unfit] == [5]
+    assert lut.frames == ()
+    with pytest.raises(InputError, match="records no hashes"):
+        find_faults(lut)
+
+
+def test_the_name_of_a_table_of_version_1_stays() -> None:
+    """Datasets made from such a table hold it."""
+    content = (VERSION_1 / "lut.json").read_bytes() + (VERSION_1 / "illuminations.csv").read_bytes()
+    assert open_lut(VERSION_1).sha256 == hashlib.sha256(content).hexdigest()
+
+
+def test_a_table_s_name_changes_with_its_samples(tmp_path: Path) -> None:
+    assert write(tmp_path / "one", 0).sha256 == write(tmp_path / "same", 0).sha256
+    assert write(tmp_path / "other", 1).sha256 != open_lut(tmp_path / "one").sha256
+
+
+def test_samples_that_have_changed_are_not_used(tmp_path: Path) -> None:
+    lut = write(tmp_path / "lut")
+    flip("samples.npy", 128 + 2 * 1200 + 7)(lut.folder)
+    changed = open_lut(lut.folder)
+    for light in (0, 1, 3):
+        changed.require_unchanged(light)
+    with pytest.raises(FormatError, match=r"samples\.npy: the samples of light 2 are not those .*build-lut --verify"):
+        changed.require_unchanged(2)
+
+
+def test_a_table_in_the_making_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / ".lut.partial").mkdir()
+    LutWriter(tmp_path / ".lut.partial", 1, 8, 25)
+    with pytest.raises(FormatError, match="is a table in the making; finish it with build-lut"):
+        open_lut(tmp_path / "lut")

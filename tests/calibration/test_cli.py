@@ -1,0 +1,149 @@
+"""`build-lut` on tables that are there: described, verified, compared; and what it says of an unfinished one."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from acquisition.session.folder import Session
+from calibration.cli import main
+from calibration.pipeline.build import build
+from tests.calibration.lab import LIGHTS
+
+VERSION_1 = Path(__file__).parent / "table" / "table_v1"
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    def run(*arguments: object) -> tuple[int, str, str]:
+        code = main([*map(str, arguments)])
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def lut(session: Session, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("table") / "lut"
+    build(session, folder)
+    return folder
+
+
+def test_info_tells_what_the_table_is(lut: Path, command: Command) -> None:
+    code, out, _ = command("--info", lut)
+    assert code == 0
+    assert "Canon CroP Test" in out
+    assert f"{len(LIGHTS)}: {len(LIGHTS) - 3} uniform, 3 black bodies 2500 to 6500 K" in out
+    assert "512 (3 bits a channel), 25 samples each" in out
+    assert "black, half size, saturation, field, rounding" in out
+
+
+def test_info_tells_of_a_table_of_version_1(command: Command) -> None:
+    code, out, _ = command("--info", VERSION_1)
+    assert code == 0
+    assert "1 of 8, 1 covered" in out
+    assert "no hash recorded" in out
+    assert "not listed" in out
+
+
+def test_a_check_tells_nothing_that_one_frame_cannot(session: Session, command: Command) -> None:
+    code, out, _ = command("--check", session.folder)
+    assert code == 0
+    assert "remark: Frames" not in out
+    assert "Movement of the chart" not in out
+    assert "Drift of white" not in out
+    assert "Tags found" in out
+
+
+def test_verify_accepts_what_is_whole(lut: Path, session: Session, command: Command) -> None:
+    assert command("--verify", lut)[0] == 0
+    code, out, _ = command("--verify", lut, session.folder)
+    assert code == 0
+    assert "every byte is as it was built, and so are its" in out
+
+
+def test_verify_names_the_light_that_has_changed(lut: Path, session: Session, command: Command, tmp_path: Path) -> None:
+    shutil.copytree(lut, tmp_path / "lut")
+    shutil.copytree(session.folder, tmp_path / "session")
+    path = tmp_path / "lut" / "samples.npy"
+    data = bytearray(path.read_bytes())
+    data[128 + 4 * 512 * 25 * 6] ^= 1
+    path.write_bytes(data)
+    next((tmp_path / "session" / "frames").glob("*light_003*")).unlink()
+    code, out, err = command("--verify", tmp_path / "lut", tmp_path / "session")
+    assert code == 2
+    assert f"the samples of 1 of {len(LIGHTS)} lights have changed: 4\n" in out
+    assert "light_003.dng cannot be read" in out
+    assert "2 faults" in err
+
+
+def test_a_table_without_hashes_cannot_be_verified(command: Command) -> None:
+    code, _, err = command("--verify", VERSION_1)
+    assert code == 2
+    assert "records no hashes" in err
+
+
+def test_match_compares_two_tables(lut: Path, command: Command) -> None:
+    code, out, _ = command("--match", lut, lut)
+    assert code == 0
+    assert "colours and lights correspond" in out
+    code, _, err = command("--match", lut, VERSION_1)
+    assert code == 2
+    assert "3 bits of each channel against 1" in err
+
+
+def test_a_published_table_comes_back_byte_by_byte(lut: Path, command: Command, tmp_path: Path) -> None:
+    code, out, _ = command("--publish", lut, tmp_path / "published")
+    assert code == 0
+    assert f"{len(LIGHTS)} lights" in out
+    code, out, _ = command("--fetch", tmp_path / "published", tmp_path / "fetched")
+    assert code == 0
+    assert "every byte is as it was published" in out
+    assert (tmp_path / "fetched" / "samples.npy").read_bytes() == (lut / "samples.npy").read_bytes()
+    code, _, err = command("--fetch", tmp_path / "nothing", tmp_path / "again")
+    assert code == 2
+    assert "holds no table" in err
+
+
+def test_append_says_how_far_the_table_is(session: Session, command: Command, tmp_path: Path) -> None:
+    shutil.copytree(session.folder, tmp_path / "session")
+    last = next((tmp_path / "session" / "frames").glob("*light_012*"))
+    with Session.open(tmp_path / "session") as copy:
+        victim = next(record for record in copy.frames() if record.file.endswith(last.name))
+    _refuse(tmp_path / "session", victim.file)
+    code, out, _ = command("--append", tmp_path / "session", tmp_path / "lut")
+    assert code == 0
+    assert f"{len(LIGHTS) - 1} of {len(LIGHTS)} lights" in out
+    assert command("--info", tmp_path / "lut")[2].count("in the making") == 1
+
+
+def _refuse(folder: Path, file: str) -> None:
+    import sqlite3
+    from contextlib import closing
+
+    with closing(sqlite3.connect(folder / "journal.sqlite")) as journal, journal:
+        journal.execute("UPDATE attempts SET verdict='refused' WHERE file=?", (file,))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--info", VERSION_1, "--check", "s"], "--check and --info are two commands"),
+        (["--info", VERSION_1, "session"], "--info does not expect session"),
+        (["--verify", VERSION_1, "session", "lut"], "--verify does not expect lut"),
+        (["--append", "session"], "a folder for the table is expected"),
+        (["--append"], "a session is expected"),
+        (["--info", "nowhere"], "nowhere is no table"),
+    ],
+)
+def test_what_cannot_be_meant_is_said(arguments: list[object], said: str, command: Command) -> None:
+    code, _, err = command(*arguments)
+    assert code == 2
+    assert said in err
+    assert len(err.strip().splitlines()) == 1

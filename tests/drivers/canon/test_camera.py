@@ -1,0 +1,728 @@
+"""The EOS driver against recorded conversations, and against scripted bodies that speak the recorded layouts."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Generator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.camera import CameraIdentity, ExposureSettings
+from drivers.canon.camera import CanonEos
+from drivers.canon.records import (
+    Notice,
+    OtherRecord,
+    PropertyChanged,
+    Record,
+    TransferRequest,
+    decode_events,
+    encode_events,
+)
+from drivers.canon.state import EosState, custom_functions, problems
+from drivers.canon.values import ImageFile, ImageFormat
+from drivers.links.pipes import Pipe, UsbPipes
+from drivers.links.usb import open_usb
+from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode
+from drivers.ptp.ip_transport import IpTransport
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
+from drivers.ptp.transport import Transaction, Transport
+from drivers.ptp.usb_transport import UsbTransport
+from foundation.errors import DeviceError, DeviceRefused, LinkClosed, StorageError
+from sim.buses import faults
+from sim.buses.faults import Occasion
+from sim.buses.ptpip_server import serve_ptpip
+from sim.buses.responder import Answer, Responder
+from sim.buses.usb import SimulatedBus
+from sim.buses.usb_device import PtpUsbDevice
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D
+from sim.camera.eos_model import EosModel
+from sim.clock import SimulatedClock
+from tests.contracts.camera import SETTINGS, Bench, CameraContract
+from tests.drivers.canon.eos_lab import Lab
+from tests.drivers.ptp.conversations import Recorded
+
+IDENTITY = CameraIdentity("Canon Inc.", "Canon EOS 550D", "0000000001", "3-1.0.9")
+IDENTITIES = {
+    "EOS 60D": CameraIdentity("Canon Inc.", "Canon EOS 60D", "1280627086", "3-1.1.0"),
+    "EOS 550D": IDENTITY,
+}
+
+
+class Replay:
+    """A cable on which a recorded body answers as it did; what it was not asked then, it does not know now."""
+
+    label = "the recorded body"
+
+    def __init__(self, transactions: list[Recorded]) -> None:
+        self.left = list(transactions)
+        self.transactions: list[int] = []
+        self.asked: list[tuple[int, tuple[int, ...], bytes | None]] = []
+        self.closed = False
+
+    def transact(
+        self,
+        request: PtpRequest,
+        *,
+        send: bytes | None = None,
+        receive: Callable[[bytes], object] | None = None,
+        timeout: float,
+    ) -> Transaction:
+        assert receive is None
+        assert timeout > 0
+        self.transactions.append(request.transaction)
+        self.asked.append((request.code, request.parameters, send))
+        sent = None if send is None else send.hex()
+        for number, known in enumerate(self.left):
+            data = known["data"] if known["dir"] == "out" else None
+            if int(known["code"], 16) == request.code and tuple(known["params"]) == request.parameters and data == sent:
+                self.left = self.left[number + 1 :]
+                answer = bytes.fromhex(known["data"] or "") if known["dir"] == "in" else b""
+                response = PtpResponse(int(known["rc"], 16), request.transaction, tuple(known["rparams"]))
+                return Transaction(response, answer)
+        pytest.fail(f"the recorded host did not ask {request} with {sent} here")
+
+    def events(self) -> tuple[PtpEvent, ...]:
+        return ()
+
+    def reset(self) -> None:
+        pytest.fail("a healthy cable is not reset")
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_speaks_as_the_recorded_host_did(body: str, recording: list[Recorded]) -> None:
+    cable = Replay(recording[:37])
+    camera = CanonEos(lambda: cable, SimulatedClock())
+    assert camera.identity() == IDENTITIES[body]
+    camera.close()
+    camera.close()
+    assert cable.closed
+    assert cable.transactions == list(range(len(cable.transactions)))
+    assert cable.left == [], "the last of the recorded transactions is the last of ours"
+    assert [code for code, _, _ in cable.asked if code != Operation.EOS_GET_EVENT] == [
+        0x1002, 0x1001, 0x9114, 0x9115, 0x9127, 0x9110, 0x911A, 0x9110, 0x9114, 0x9115, 0x1003,
+    ]  # fmt: skip
+
+
+def test_a_recorded_body_that_is_not_set_up_is_refused_with_all_reasons_at_once(
+    body: str, recording: list[Recorded]
+) -> None:
+    cable = Replay([*recording[:22], *[recording[6]] * 10])
+    camera = CanonEos(lambda: cable, SimulatedClock())
+    with pytest.raises(DeviceRefused) as caught:
+        camera.configure(ExposureSettings(iso=110, aperture=8, shutter_s=0.5))
+    drive, speeds = {
+        "EOS 60D": ("continuous high", "100, 125, 160, 200"),
+        "EOS 550D": ("continuous", "100, 200, 400, 800"),
+    }[body]
+    assert str(caught.value) == (
+        "the camera cannot take the series: the mode dial stands at aperture priority: turn it to M; "
+        f"the drive mode is {drive}: set single shooting; "
+        f"ISO speed 110 is not offered; near it: {speeds}; "
+        "shutter time 0.5 is not offered; near it: nothing, the list is empty"
+    )
+
+
+@pytest.fixture
+def lab() -> Lab:
+    return Lab()
+
+
+@pytest.fixture(params=[False, True], ids=["keeps frames", "forgets frames"])
+def moody_lab(request: pytest.FixtureRequest) -> Lab:
+    """Give a body that keeps what waits in its memory when a session ends, and one that does not."""
+    return Lab(forgetful=request.param)
+
+
+class TestOverMemory(CameraContract):
+    @pytest.fixture
+    def bench(self, lab: Lab) -> Bench:
+        return Bench(lab.camera, lab.film, IDENTITY, lab.clock.now)
+
+
+class TestNewerBodyOverMemory(CameraContract):
+    @pytest.fixture
+    def bench(self) -> Bench:
+        lab = Lab(EOS_6D_MARK_II)
+        identity = CameraIdentity("Canon.Inc", "Canon EOS 6D Mark II", "0000000001", "3-1.0.2")
+        return Bench(lab.camera, lab.film, identity, lab.clock.now)
+
+
+class TestOverUsb(CameraContract):
+    @pytest.fixture
+    def bench(self, lab: Lab) -> Bench:
+        bus = SimulatedBus()
+        bus.plug(PtpUsbDevice(lab.eos))
+        camera = CanonEos(lambda: UsbTransport(open_usb(backend=bus), lab.clock), lab.clock)
+        return Bench(camera, lab.film, IDENTITY, lab.clock.now)
+
+
+class TestOverNetwork(CameraContract):
+    @pytest.fixture
+    def bench(self, lab: Lab) -> Generator[Bench]:
+        with serve_ptpip(lab.eos, 0) as server:
+            host, port = server.address
+            camera = CanonEos(
+                lambda: IpTransport.connect(host, port, guid=bytes(16), name="CroP", clock=lab.clock), lab.clock
+            )
+            yield Bench(camera, lab.film, IDENTITY, lab.clock.now)
+            camera.close()
+
+
+# What the body's own settings spoil.
+
+
+SPOILS: list[tuple[Callable[[SimulatedEos], None], str]] = [
+    (
+        lambda eos: eos.turn_dial(AeMode.APERTURE_PRIORITY),
+        "the mode dial stands at aperture priority: turn it to M",
+    ),
+    (lambda eos: eos.turn_dial(AeMode.BULB), "the mode dial stands at bulb"),
+    (lambda eos: eos.switch_focus(automatic=True), "autofocus is on: set the lens to MF"),
+    (lambda eos: eos.set_menu(Property.EOS_DRIVE_MODE, 1), "the drive mode is continuous: set single shooting"),
+    (lambda eos: eos.set_menu(Property.EOS_DRIVE_MODE, 0x11), "the drive mode is timer 2 s"),
+    (lambda eos: eos.switch_mirror_lockup(on=True), "mirror lockup is on: switch it off"),
+    (lambda eos: eos.set_menu(Property.EOS_AEB, 8), "exposure bracketing is on: switch it off"),
+    (lambda eos: eos.set_menu(Property.EOS_AUTO_POWER_OFF, 30), "auto power off is set to 30 s: set it to off"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "reason"), SPOILS)
+@pytest.mark.parametrize("body", [EOS_550D, EOS_6D_MARK_II], ids=["550D", "6D Mark II"])
+def test_what_would_spoil_a_series_is_refused_with_its_remedy(
+    spoil: Callable[[SimulatedEos], None], reason: str, body: EosModel
+) -> None:
+    lab = Lab(body)
+    spoil(lab.eos)
+    with pytest.raises(DeviceRefused, match=reason):
+        lab.camera.configure(SETTINGS)
+    assert lab.film.frames == []
+
+
+def test_a_low_battery_is_refused() -> None:
+    with pytest.raises(DeviceRefused, match="the battery is low"):
+        Lab(battery=0.05).camera.configure(SETTINGS)
+
+
+def test_a_dial_turned_during_the_series_is_set_back_or_refused(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    lab.take()
+    lab.eos.set_menu(Property.EOS_SHUTTER_SPEED, 0x38)
+    lab.eos.set_menu(Property.EOS_IMAGE_FORMAT, ImageFormat((ImageFile(1, 0, 3),)))
+    lab.take()
+    assert lab.film.settings == [SETTINGS, SETTINGS]
+    lab.eos.turn_dial(AeMode.PROGRAM)
+    with pytest.raises(DeviceRefused, match="turn it to M"):
+        lab.take()
+
+
+def test_raw_beside_jpeg_is_not_offered_as_raw_alone() -> None:
+    both = ImageFormat((ImageFile(6, 0, 4), ImageFile(1, 0, 3)))
+    properties = tuple(
+        replace(spec, value=both.encode(), formats=(both,)) if spec.code == Property.EOS_IMAGE_FORMAT else spec
+        for spec in EOS_550D.properties
+    )
+    with pytest.raises(DeviceRefused, match=r"image format RAW alone is not offered; with raw are: RAW \+ JPEG L fine"):
+        Lab(replace(EOS_550D, properties=properties)).camera.configure(SETTINGS)
+
+
+def test_the_body_is_given_back_as_it_was(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    lab.take()
+    lab.camera.close()
+    assert lab.eos._number_of(Property.EOS_CAPTURE_DESTINATION) == CaptureDestination.CARD  # pyright: ignore[reportPrivateUsage]
+    assert lab.waiting() == 0
+
+
+def heard(lab: Lab) -> list[tuple[int, ...]]:
+    """Return the list of (offset, size) of the pieces that will be asked of the body, and answered."""
+    pieces: list[tuple[int, ...]] = []
+
+    class Listening(faults.TroubledResponder):
+        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+            if request.code == Operation.EOS_GET_PARTIAL_OBJECT:
+                pieces.append(request.parameters[1:])
+            return super().answer(request, data)
+
+    lab.device = Listening(lab.device)
+    return pieces
+
+
+def test_a_large_frame_comes_in_pieces_of_a_mebibyte() -> None:
+    lab = Lab(film_bytes=2_500_000)
+    pieces = heard(lab)
+    lab.camera.configure(SETTINGS)
+    size = lab.take().size
+    assert pieces == [(0, 1 << 20), (1 << 20, 1 << 20), (2 << 20, size - (2 << 20))]
+    assert lab.waiting() == 0
+
+
+@pytest.mark.parametrize("absent", [Operation.EOS_REMOTE_RELEASE_ON, Operation.EOS_GET_PARTIAL_OBJECT])
+def test_a_body_without_an_operation_is_used_by_another(absent: Operation) -> None:
+    lab = Lab(without=(absent,))
+    lab.camera.configure(SETTINGS)
+    lab.take()
+    lab.take()
+    assert lab.openings == 1
+
+
+def test_the_body_is_kept_awake_in_a_long_wait() -> None:
+    lab = Lab(auto_power_off_s=30)
+    lab.eos.set_menu(Property.EOS_AUTO_POWER_OFF, 0)
+    lab.camera.configure(replace(SETTINGS, shutter_s=30))
+    lab.take()
+    for _ in range(60):
+        lab.clock.sleep(10)
+        lab.camera.idle()
+    lab.take()
+    assert lab.openings == 1
+
+
+# Trouble.
+
+EVERY_OPERATION = (
+    Operation.GET_DEVICE_INFO,
+    Operation.OPEN_SESSION,
+    Operation.EOS_SET_REMOTE_MODE,
+    Operation.EOS_SET_EVENT_MODE,
+    Operation.EOS_GET_EVENT,
+    Operation.EOS_REQUEST_DEVICE_PROP_VALUE,
+    Operation.EOS_SET_DEVICE_PROP_VALUE_EX,
+    Operation.EOS_PC_HDD_CAPACITY,
+    Operation.EOS_REMOTE_RELEASE_ON,
+    Operation.EOS_REMOTE_RELEASE_OFF,
+    Operation.EOS_GET_PARTIAL_OBJECT,
+    Operation.EOS_TRANSFER_COMPLETE,
+)
+NAMES = [code.name for code in EVERY_OPERATION]
+
+
+def goes_on(lab: Lab, frames: int = 3) -> None:
+    """See that a series is taken whole, and that nothing is left in the body's memory."""
+    lab.camera.configure(SETTINGS)
+    for _ in range(frames):
+        lab.take()
+    assert lab.waiting() == 0
+    lab.camera.close()
+
+
+@pytest.mark.parametrize("code", EVERY_OPERATION, ids=NAMES)
+@pytest.mark.parametrize(
+    ("answer", "times"),
+    [
+        (ResponseCode.DEVICE_BUSY, 1),
+        (ResponseCode.DEVICE_BUSY, 7),
+        (ResponseCode.GENERAL_ERROR, 1),
+        (ResponseCode.GENERAL_ERROR, 3),
+        (ResponseCode.SESSION_NOT_OPEN, 1),
+        (ResponseCode.SESSION_NOT_OPEN, 2),
+    ],
+)
+def test_an_operation_that_is_declined_for_a_while(moody_lab: Lab, code: Operation, answer: int, times: int) -> None:
+    moody_lab.device = faults.Declining(moody_lab.eos, answer, Occasion({code}, times=times))
+    goes_on(moody_lab)
+
+
+@pytest.mark.parametrize("code", EVERY_OPERATION, ids=NAMES)
+@pytest.mark.parametrize("obeys", [False, True])
+@pytest.mark.parametrize("after", [0, 3])
+def test_an_operation_that_is_never_answered(moody_lab: Lab, code: Operation, obeys: bool, after: int) -> None:
+    moody_lab.device = faults.Hanging(moody_lab.eos, Occasion({code}, after=after), obeys=obeys)
+    goes_on(moody_lab)
+
+
+@pytest.mark.parametrize("code", EVERY_OPERATION, ids=NAMES)
+@pytest.mark.parametrize("after", [0, 3])
+def test_a_body_unplugged_at_an_operation_is_found_at_its_new_address(
+    moody_lab: Lab, code: Operation, after: int
+) -> None:
+    bus = SimulatedBus()
+    troubled = faults.Interrupting(moody_lab.eos, lambda: bus.replug(device), Occasion({code}, after=after))
+    device = PtpUsbDevice(troubled)
+    bus.plug(device)
+    moody_lab.camera = CanonEos(lambda: UsbTransport(open_usb(backend=bus), moody_lab.clock), moody_lab.clock)
+    goes_on(moody_lab)
+
+
+@pytest.mark.parametrize("code", EVERY_OPERATION, ids=NAMES)
+@pytest.mark.parametrize("after", [0, 3])
+def test_a_response_lost_on_the_way(moody_lab: Lab, code: Operation, after: int) -> None:
+    occasion = Occasion({code}, after=after)
+    moody_lab.cable = lambda transport: faults.LosingResponses(transport, occasion)
+    goes_on(moody_lab)
+
+
+@pytest.mark.parametrize("after", [*range(0, 14_000, 617), 4095, 4096, 4097, 8192])
+def test_a_cable_pulled_at_any_byte(after: int) -> None:
+    lab = Lab(film_bytes=3000)
+    lab.pipes = lambda pipes: faults.CutOff(pipes, after) if lab.openings == 1 else pipes
+    goes_on(lab)
+    assert lab.openings > 1
+
+
+WAYS: dict[str, Callable[[UsbPipes], UsbPipes]] = {
+    "short reads": faults.ShortReads,
+    "header alone": faults.HeaderAlone,
+    "data and response joined": faults.Joining,
+    "no empty packets": faults.WithoutEmptyPackets,
+    "stalls in": lambda pipes: faults.Stalling(pipes, Pipe.BULK_IN, range(3, 400, 7)),
+    "stalls out": lambda pipes: faults.Stalling(pipes, Pipe.BULK_OUT, range(3, 400, 7)),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_whatever_way_the_bytes_come(way: str) -> None:
+    lab = Lab(film_bytes=40_000)
+    lab.pipes = WAYS[way]
+    goes_on(lab)
+    assert lab.openings == 1
+
+
+CHANGES: dict[str, Callable[[bytes], bytes]] = {
+    "short": lambda data: data[:-3],
+    "surplus": lambda data: data + b"more",
+    "nothing": lambda data: b"",
+    "garbage": lambda data: b"\xff" * 64,
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("code", [Operation.GET_DEVICE_INFO, Operation.EOS_GET_EVENT])
+def test_wrong_data_once(moody_lab: Lab, code: Operation, change: str) -> None:
+    moody_lab.device = faults.Falsifying(moody_lab.eos, CHANGES[change], Occasion({code}))
+    goes_on(moody_lab)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_wrong_data_in_a_piece_whose_length_the_body_tells(change: str) -> None:
+    lab = Lab(without=[Operation.EOS_GET_PARTIAL_OBJECT])
+    lab.device = faults.Falsifying(lab.eos, CHANGES[change], Occasion({Operation.GET_PARTIAL_OBJECT}))
+    goes_on(lab)
+
+
+@pytest.mark.parametrize("change", ["short", "surplus", "nothing"])  # of Canon's operation a decoder must tell garbage
+def test_wrong_data_in_a_piece(moody_lab: Lab, change: str) -> None:
+    occasion = Occasion({Operation.EOS_GET_PARTIAL_OBJECT})
+    moody_lab.device = faults.Falsifying(moody_lab.eos, CHANGES[change], occasion)
+    goes_on(moody_lab)
+
+
+class Announcing(faults.TroubledResponder):
+    """Changes the records in GetEvent's answers."""
+
+    def __init__(self, good: Responder, change: Callable[[tuple[Record, ...]], tuple[Record, ...]]) -> None:
+        super().__init__(good)
+        self._change = change
+
+    def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+        answer = super().answer(request, data)
+        if request.code != Operation.EOS_GET_EVENT or answer.data is None:
+            return answer
+        return Answer(answer.response, encode_events(self._change(decode_events(answer.data))))
+
+
+def is_frame(record: Record) -> bool:
+    return isinstance(record, TransferRequest)
+
+
+def test_an_announcement_that_is_lost_costs_at_most_one_attempt(moody_lab: Lab, request: pytest.FixtureRequest) -> None:
+    seen: list[Record] = []
+
+    def lose_second(records: tuple[Record, ...]) -> tuple[Record, ...]:
+        fresh = [record for record in records if is_frame(record) and record not in seen]
+        seen.extend(fresh)
+        return tuple(record for record in records if not (record in fresh and len(seen) == 2))
+
+    moody_lab.device = Announcing(moody_lab.eos, lose_second)
+    goes_on(moody_lab)
+    assert len(moody_lab.film.frames) == (4 if "forgets" in request.node.name else 3)
+    assert moody_lab.openings == 2
+
+
+def test_announcements_that_are_late_or_doubled(lab: Lab) -> None:
+    former: list[Record] = []
+
+    def repeat(records: tuple[Record, ...]) -> tuple[Record, ...]:
+        again = tuple(former)
+        former[:] = [record for record in records if is_frame(record)] or former
+        return again + records + tuple(record for record in records if is_frame(record))
+
+    lab.device = Announcing(lab.eos, repeat)
+    goes_on(lab, 6)
+    assert len(lab.film.frames) == 6
+    assert lab.openings == 1
+
+
+def test_an_object_that_is_not_there_is_passed_over(lab: Lab) -> None:
+    def lie(records: tuple[Record, ...]) -> tuple[Record, ...]:
+        bogus = TransferRequest(0x77, 0xB103, 600, "IMG_9999.CR2")
+        return tuple(item for record in records for item in ((record, bogus) if is_frame(record) else (record,)))
+
+    lab.device = Announcing(lab.eos, lie)
+    goes_on(lab)
+    assert len(lab.film.frames) == 3
+    assert lab.openings == 1
+
+
+def test_an_object_that_is_announced_for_ever_and_never_there(lab: Lab) -> None:
+    bogus = TransferRequest(0x77, 0xB103, 600, "IMG_9999.CR2")
+    lab.device = Announcing(lab.eos, lambda records: (*records, bogus))
+    goes_on(lab)
+    assert len(lab.film.frames) == 3
+
+
+def test_an_announcement_that_comes_after_the_next_release_is_not_taken_for_its_frame(lab: Lab) -> None:
+    held: list[Record] = []
+    released: list[int] = []
+
+    def hold_first(records: tuple[Record, ...]) -> tuple[Record, ...]:
+        if released:
+            late, held[:] = tuple(held), []
+            return records + late
+        held.extend(filter(is_frame, records))
+        return tuple(record for record in records if not is_frame(record))
+
+    class Listening(faults.TroubledResponder):
+        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+            if request.code == Operation.EOS_REMOTE_RELEASE_ON:
+                released.append(1)
+            return super().answer(request, data)
+
+    lab.device = Listening(Announcing(lab.eos, hold_first))
+    lab.camera.configure(replace(SETTINGS, shutter_s=1.0))
+    lab.press()
+    lab.camera.idle()
+    assert held
+    lab.take(attempts=1)
+    assert len(lab.film.frames) == 2
+    assert lab.waiting() == 0
+
+
+def test_a_transfer_goes_on_where_it_broke_off() -> None:
+    lab = Lab(film_bytes=2_500_000)
+    pieces = heard(lab)
+    lab.device = faults.Hanging(lab.device, Occasion({Operation.EOS_GET_PARTIAL_OBJECT}, after=1))
+    lab.camera.configure(SETTINGS)
+    lab.take(attempts=1)
+    assert [offset for offset, _ in pieces] == [0, 1 << 20, 2 << 20]
+    assert lab.openings == 2
+
+
+def test_what_stood_behind_the_place_in_the_file_is_gone(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    into = io.BytesIO(b"former" * 1000)
+    lab.camera.capture(into)
+    assert into.getvalue() == lab.film.frames[-1]
+
+
+def test_records_that_nobody_knows_and_a_queue_that_never_ends(lab: Lab) -> None:
+    strange = OtherRecord(0xC1FE, b"whatever")
+    shutter = Notice(EosEvent.SHUTDOWN_TIMER_UPDATED, 30)
+    lab.device = Announcing(lab.eos, lambda records: (strange, *records, *(shutter,) * 20))
+    goes_on(lab)
+    assert len(lab.film.frames) == 3
+
+
+HINTS: dict[str, Callable[[Responder], Responder]] = {
+    "lost": faults.LosingEvents,
+    "late": lambda good: faults.DelayingEvents(good, 5),
+    "flooding": lambda good: faults.RepeatingEvents(good, 2_000),
+    "unknown": lambda good: faults.UnknownEvents(good, PtpEvent(0xC1FE, 7, (1, 2, 3))),
+}
+
+
+@pytest.mark.parametrize("trouble", HINTS)
+def test_hints_on_the_event_pipe_are_hints(lab: Lab, trouble: str) -> None:
+    lab.device = HINTS[trouble](lab.eos)
+    goes_on(lab)
+    assert lab.openings == 1
+
+
+def announced(size: Callable[[int], int]) -> Callable[[tuple[Record, ...]], tuple[Record, ...]]:
+    return lambda records: tuple(
+        replace(record, size=size(record.size)) if isinstance(record, TransferRequest) else record for record in records
+    )
+
+
+SIZES: dict[str, Callable[[int], int]] = {
+    "too large": lambda size: size + 1,
+    "nothing": lambda size: 0,
+    "absurd": lambda size: 0xFFFFFFFF,
+}
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_size_that_is_not_true_is_told_and_leaves_nothing_behind(lab: Lab, size: str) -> None:
+    lab.device = Announcing(lab.eos, announced(SIZES[size]))
+    lab.camera.configure(SETTINGS)
+    with pytest.raises(DeviceError, match="bytes"):
+        lab.take(attempts=1)
+    assert lab.waiting() == 0
+    assert lab.openings == 1
+
+
+def test_a_full_disk_leaves_nothing_in_the_camera(lab: Lab) -> None:
+    class Full(io.BytesIO):
+        def write(self, data: Any) -> int:
+            raise StorageError("the disk is full")
+
+    lab.camera.configure(SETTINGS)
+    with pytest.raises(StorageError):
+        lab.camera.capture(Full())
+    assert lab.waiting() == 0
+    lab.take()
+
+
+def test_a_jpeg_beside_the_raw_is_freed(lab: Lab) -> None:
+    def add_jpeg(records: tuple[Record, ...]) -> tuple[Record, ...]:
+        jpeg = TransferRequest(0x78, 0x3801, 10, "IMG_0001.JPG")
+        return tuple(item for record in records for item in ((record, jpeg) if is_frame(record) else (record,)))
+
+    freed: list[int] = []
+
+    class Listening(faults.TroubledResponder):
+        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+            if request.code == Operation.EOS_TRANSFER_COMPLETE:
+                freed.append(request.parameters[0])
+            return super().answer(request, data)
+
+    lab.device = Listening(Announcing(lab.eos, add_jpeg))
+    goes_on(lab, 2)
+    assert freed.count(0x78) == 2
+
+
+def test_what_a_killed_run_left_is_thrown_away(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    lab.take()
+    # The host dies with the release pressed and the frame under way.
+    lab.device.answer(PtpRequest(Operation.EOS_REMOTE_RELEASE_ON, 1000, (3, 1)), None)
+    assert len(lab.film.frames) == 2
+    lab.camera = CanonEos(lab.open, lab.clock)
+    goes_on(lab)
+    assert len(lab.film.frames) == 5
+
+
+def test_a_frame_left_in_the_memory_is_not_taken_for_the_next(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    lab.press()
+    lab.take()
+    assert len(lab.film.frames) == 2
+    assert lab.waiting() == 0
+
+
+def test_a_full_memory_is_emptied(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    for _ in range(EOS_550D.burst):
+        lab.press()
+    assert lab.waiting() == EOS_550D.burst
+    lab.take()
+    assert lab.waiting() == 0
+
+
+def test_a_body_that_went_to_sleep_is_waited_for(lab: Lab) -> None:
+    asleep: list[bool] = []
+
+    class Sleepy(faults.TroubledResponder):
+        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+            if asleep:
+                asleep.pop()
+                raise LinkClosed("it sleeps")
+            return super().answer(request, data)
+
+    lab.device = Sleepy(lab.eos)
+    lab.camera.configure(SETTINGS)
+    asleep.extend([True] * 4)
+    lab.take()
+
+
+def test_a_camera_that_is_gone_for_good_says_what_to_do(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    lab.take()
+
+    def gone(transport: Transport) -> Transport:
+        raise LinkClosed("no camera on USB")
+
+    lab.cable = gone
+    lab.device = lab.eos
+    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    with pytest.raises(DeviceError, match="no camera to work with: no camera on USB; check the cable and the battery"):
+        lab.take(attempts=1)
+    lab.cable = lambda transport: transport
+    lab.take()
+
+
+def test_a_camera_that_never_was_is_told_at_once() -> None:
+    clock = SimulatedClock()
+
+    def absent() -> Transport:
+        raise LinkClosed("no camera on USB")
+
+    with pytest.raises(LinkClosed, match="no camera on USB"):
+        CanonEos(absent, clock).identity()
+    assert clock.monotonic() == 0
+
+
+def test_another_body_in_its_place_is_refused(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    lab.device = SimulatedEos(EOS_550D, lab.film, lab.clock, serial="0000000002", auto_power_off_s=0)
+    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    with pytest.raises(DeviceRefused, match="serial number 0000000001 there is now a Canon EOS 550D with 0000000002"):
+        lab.take()
+
+
+def test_another_makers_camera_is_refused(lab: Lab) -> None:
+    body = replace(EOS_550D, info=replace(EOS_550D.info, manufacturer="Nikon Corporation", model="D90"))
+    with pytest.raises(DeviceRefused, match="is a Nikon Corporation D90, which does not speak as a Canon EOS does"):
+        Lab(body).camera.identity()
+
+
+def test_a_release_that_stays_refused_says_where_to_look(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    lab.device = faults.Declining(
+        lab.eos, ResponseCode.DEVICE_BUSY, Occasion({Operation.EOS_REMOTE_RELEASE_ON}, times=None)
+    )
+    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    with pytest.raises(DeviceRefused, match="look for mirror lockup"):
+        lab.take()
+    lab.device = lab.eos
+    lab.take()
+
+
+# What a body tells, as values.
+
+
+def test_mirror_lockup_among_recorded_custom_functions(body: str, recording: list[Recorded]) -> None:
+    state = EosState()
+    records = decode_events(bytes.fromhex(recording[5]["data"] or ""))
+    state.take(records)
+    assert state.functions[0x060F] == 0
+    assert len(state.functions) == {"EOS 60D": 20, "EOS 550D": 2}[body]
+    groups = [
+        record.value
+        for record in records
+        if isinstance(record, PropertyChanged) and record.code == Property.EOS_CUSTOM_FUNCTIONS
+    ]
+    number, count = (0x060F).to_bytes(4, "little"), (1).to_bytes(4, "little")
+    (group,) = (value for value in groups if number in value)
+    switched_on = group.replace(number + count + bytes(4), number + count + count)
+    state.take([PropertyChanged(Property.EOS_CUSTOM_FUNCTIONS, switched_on)])
+    assert "mirror lockup is on: switch it off" in problems(state)
+
+
+@given(st.binary(max_size=200))
+def test_custom_functions_of_any_bytes_are_none_or_some(value: bytes) -> None:
+    assert all(isinstance(number, int) for number in custom_functions(value))
+
+
+@given(st.lists(st.integers(0, 200), max_size=300))
+def test_only_so_many_announcements_are_remembered(handles: list[int]) -> None:
+    state = EosState()
+    state.take(TransferRequest(handle, 0xB103, 1, "IMG_0001.CR2") for handle in handles)
+    assert len(state.waiting) == min(len(set(handles)), 64)
+    assert not handles or handles[-1] in state.waiting

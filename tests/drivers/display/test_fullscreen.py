@@ -1,0 +1,428 @@
+"""The full-screen presenter on X servers without a monitor; the screenshots are not its own."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import ctypes.util
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from acquisition.lights.illuminations import plan_illuminations
+from drivers.display.displays import Display, choose_display, list_displays
+from drivers.display.fullscreen import FullScreen, identify_displays
+from drivers.display.x11 import XScreen
+from drivers.presenter import BLACK, WHITE, Colour
+from foundation.errors import ConfigurationError, DeviceError
+from sim.clock import SimulatedClock
+from tests.contracts.presenter import Bench, PresenterContract
+from tests.drivers.display.x_servers import Picture, VirtualScreen, screenshot, two_outputs, virtual_screen
+
+PATIENCE_S = 20.0
+"""For what must come; nothing waits this long unless it fails."""
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualScreen]:
+    with virtual_screen(tmp_path_factory.mktemp("xvfb"), "640x360") as screen:
+        yield screen
+
+
+@pytest.fixture
+def virtual(server: VirtualScreen, monkeypatch: pytest.MonkeyPatch) -> VirtualScreen:
+    monkeypatch.setenv("DISPLAY", server.display)
+    return server
+
+
+@pytest.fixture(scope="module")
+def xorg(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with two_outputs(tmp_path_factory.mktemp("xorg")) as display:
+        yield display
+
+
+@pytest.fixture
+def outputs(xorg: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setenv("DISPLAY", xorg)
+    return xorg
+
+
+@pytest.fixture
+def screen(virtual: VirtualScreen) -> Iterator[FullScreen]:
+    presenter = FullScreen()
+    yield presenter
+    presenter.close()
+
+
+def plain(picture: Picture) -> Colour:
+    """Return the one colour of a picture."""
+    code = int(picture[0, 0])
+    assert np.all(picture == code)
+    return Colour(code >> 16, code >> 8 & 255, code & 255)
+
+
+class TestFullScreen(PresenterContract):
+    @pytest.fixture
+    def bench(self, screen: FullScreen, virtual: VirtualScreen) -> Bench:
+        return Bench(screen, lambda: plain(virtual.picture()))
+
+
+def test_all_707_lights_arrive_in_every_pixel(screen: FullScreen, virtual: VirtualScreen) -> None:
+    lights = plan_illuminations()
+    assert len(lights) == 707
+    for light in lights:
+        screen.show(light.colour)
+        assert plain(virtual.picture()) == light.colour
+
+
+def test_a_window_in_front_is_noticed(screen: FullScreen) -> None:
+    import glfw
+
+    screen.show(WHITE)
+    glfw.default_window_hints()
+    notification = glfw.create_window(100, 50, "You have mail", None, None)
+    try:
+        glfw.show_window(notification)
+        glfw.poll_events()
+        with pytest.raises(DeviceError, match=r"the screen shows .* in place of \(9, 9, 9\) in \d+ of 230400 pixels"):
+            screen.show(Colour(9, 9, 9))
+    finally:
+        glfw.destroy_window(notification)
+    screen.show(Colour(9, 9, 9))
+
+
+def test_what_opengl_does_not_draw_is_noticed(screen: FullScreen, virtual: VirtualScreen) -> None:
+    import glfw
+
+    prototype: Any = ctypes.CFUNCTYPE
+    mask = prototype(None, *[ctypes.c_ubyte] * 4)(glfw.get_proc_address("glColorMask"))
+    screen.show(Colour(1, 2, 3))
+    mask(1, 0, 1, 1)
+    with pytest.raises(
+        DeviceError, match=r"OpenGL drew \(9, \d+, 9\) in place of \(9, 9, 9\) in 230400 of 230400 pixels"
+    ):
+        screen.show(Colour(9, 9, 9))
+    mask(1, 1, 1, 1)
+    screen.show(Colour(9, 9, 9))
+    assert plain(virtual.picture()) == Colour(9, 9, 9)
+
+
+def test_a_display_that_goes_away_is_noticed(outputs: str) -> None:
+    xrandr = shutil.which("xrandr")
+    if xrandr is None:
+        pytest.skip("xrandr is not installed (Debian: x11-xserver-utils)")
+    presenter = FullScreen("right")
+    try:
+        presenter.show(WHITE)
+        subprocess.run([xrandr, "--output", "DUMMY1", "--off"], check=True)
+        with pytest.raises(DeviceError, match=r"no longer fills display 2: DUMMY1|no 480×270 pixels at"):
+            presenter.show(Colour(9, 9, 9))
+    finally:
+        presenter.close()
+        subprocess.run([xrandr, "--output", "DUMMY1", "--mode", "480x270", "--right-of", "DUMMY0"], check=True)
+    with contextlib.closing(FullScreen("right")) as presenter:
+        presenter.show(WHITE)
+
+
+def test_a_window_moved_away_is_noticed(screen: FullScreen) -> None:
+    import glfw
+
+    glfw.set_window_monitor(glfw.get_current_context(), cast("Any", None), 10, 10, 300, 200, 0)
+    with pytest.raises(DeviceError, match="no longer fills display 1: screen 640×360"):
+        screen.show(WHITE)
+
+
+def test_a_window_that_is_asked_to_close_stays(screen: FullScreen, virtual: VirtualScreen) -> None:
+    import glfw
+
+    glfw.set_window_should_close(glfw.get_current_context(), True)
+    screen.show(WHITE)
+    assert plain(virtual.picture()) == WHITE
+
+
+def test_only_its_own_thread_may_show(screen: FullScreen, virtual: VirtualScreen) -> None:
+    caught: list[str] = []
+
+    def stray() -> None:
+        try:
+            screen.show(WHITE)
+        except DeviceError as error:
+            caught.append(str(error))
+
+    thread = threading.Thread(target=stray)
+    thread.start()
+    thread.join()
+    assert len(caught) == 1
+    assert "thread" in caught[0]
+    assert plain(virtual.picture()) == BLACK
+
+
+def test_the_light_goes_out_with_a_process_that_is_killed(virtual: VirtualScreen) -> None:
+    program = (
+        "from drivers.display.fullscreen import FullScreen; from drivers.presenter import Colour\n"
+        "screen = FullScreen(); screen.show(Colour(250, 240, 230)); print('lit', flush=True); input()"
+    )
+    process = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    with process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"lit\n"
+        assert plain(virtual.picture()) == Colour(250, 240, 230)
+        process.kill()
+    deadline = time.monotonic() + PATIENCE_S
+    # The server may be seen while it paints, when the picture is of two colours.
+    while np.any(virtual.picture()):
+        assert time.monotonic() < deadline, "the window is still there"
+    assert plain(virtual.picture()) == BLACK
+
+
+def test_a_server_that_ends_does_not_end_us(tmp_path: Path) -> None:
+    program = (
+        "from foundation.errors import DeviceError; from drivers.display.fullscreen import FullScreen\n"
+        "from drivers.presenter import WHITE\n"
+        "screen = FullScreen(); screen.show(WHITE); print('lit', flush=True); input()\n"
+        "for _ in range(2):\n"
+        "    try: screen.show(WHITE)\n"
+        "    except DeviceError as error: print(error, flush=True)\n"
+        "screen.close()"
+    )
+    with contextlib.ExitStack() as served:
+        server = served.enter_context(virtual_screen(tmp_path, "320x200"))
+        process = served.enter_context(
+            subprocess.Popen(
+                [sys.executable, "-c", program],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                env={**os.environ, "DISPLAY": server.display},
+            )
+        )
+        assert process.stdout is not None
+        assert process.stdout.readline() == "lit\n"
+        server.end()
+        said, _ = process.communicate("\n", timeout=PATIENCE_S)
+    assert process.returncode == 0
+    assert said.count("the X server of display 1: screen 320×200 at +0+0, 0 Hz is gone: somebody logged out") == 2
+
+
+def test_every_code_of_every_channel_arrives_without_a_cursor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with virtual_screen(tmp_path, "320x200", cursor=True) as server:
+        monkeypatch.setenv("DISPLAY", server.display)
+        with contextlib.closing(FullScreen()) as presenter:
+            for code in range(256):
+                colour = Colour(code, 255 - code, (code * 7) % 256)
+                presenter.show(colour)
+                assert plain(server.picture()) == colour
+
+
+def test_opens_again_and_again(virtual: VirtualScreen) -> None:
+    for colour in (WHITE, Colour(1, 2, 3)):
+        with contextlib.closing(FullScreen()) as presenter:
+            presenter.show(colour)
+            assert plain(virtual.picture()) == colour
+
+
+def test_lists_displays_from_left_to_right(outputs: str) -> None:
+    desk, projector = list_displays()
+    assert (desk.number, desk.name, desk.place, desk.width, desk.height) == (1, "DUMMY0", "+0+0", 640, 360)
+    assert (projector.number, projector.name, projector.place) == (2, "DUMMY1", "+640+0")
+    assert (projector.width, projector.height) == (480, 270)
+    # The pixel clock over the totals of the mode line: 12 MHz / (520 · 290).
+    assert projector.refresh_hz == 80
+
+
+@pytest.mark.parametrize("wanted", ["right", "DUMMY1", "+640+0", 2, "2"])
+def test_the_display_that_was_named_lights_up_and_the_other_does_not(outputs: str, wanted: str | int) -> None:
+    before = screenshot(outputs, 640, 360)
+    presenter = FullScreen(wanted)
+    try:
+        presenter.show(Colour(12, 200, 77))
+        after = screenshot(outputs, 1120, 360)
+        assert plain(after[:270, 640:]) == Colour(12, 200, 77)
+        assert not np.any(after[270:, 640:] == 0x0CC84D)
+        assert np.array_equal(after[:, :640], before)
+    finally:
+        presenter.close()
+
+
+def test_two_displays_at_once(outputs: str) -> None:
+    left, right = FullScreen("left"), FullScreen("right")
+    try:
+        left.show(Colour(255, 0, 0))
+        right.show(Colour(0, 0, 255))
+        left.show(Colour(0, 255, 0))
+        picture = screenshot(outputs, 1120, 360)
+        assert plain(picture[:, :640]) == Colour(0, 255, 0)
+        assert plain(picture[:270, 640:]) == Colour(0, 0, 255)
+    finally:
+        left.close()
+        right.close()
+
+
+def test_tells_the_displays_apart(outputs: str) -> None:
+    class Onlooker(SimulatedClock):
+        picture: Picture | None = None
+
+        def sleep(self, seconds: float) -> None:
+            super().sleep(seconds)
+            self.picture = screenshot(outputs, 1120, 360)
+
+    clock = Onlooker()
+    assert [display.number for display in identify_displays(5.0, clock)] == [1, 2]
+    assert clock.picture is not None
+    # A two in 3×5 blocks; 38 px is a seventh of the projector's 270 px, rounded down.
+    block, left, top = 38, 640 + (480 - 5 * 38) // 2 + 38, (270 - 7 * 38) // 2 + 38
+    middles = clock.picture[top + block // 2 : top + 5 * block : block, left + block // 2 : left + 3 * block : block]
+    rows = ["".join("#" if pixel == 0xFFFFFF else "." for pixel in row) for row in middles]
+    assert rows == ["###", "..#", "###", "#..", "###"]
+    assert set(np.unique(clock.picture[:, :640])) == {0, 0xFFFFFF}
+
+
+def test_a_bent_gamma_ramp_is_reported(outputs: str) -> None:
+    import glfw
+
+    presenter = FullScreen("right")
+    try:
+        desk, projector = sorted(glfw.get_monitors(), key=glfw.get_monitor_pos)
+        glfw.set_gamma(projector, 1.0)
+        assert ramps(presenter) == []
+        glfw.set_gamma(desk, 1.2)
+        assert ramps(presenter) == []
+        glfw.set_gamma(projector, 1.2)
+        (warning,) = ramps(presenter)
+        # x^(1/1.2) − x is largest where its slope is 0, at x = 1.2^−6 = 0.33, and 0.07 there.
+        assert "gamma ramp of DUMMY1 is not straight (red 0.33 becomes 0.40): switch off night light" in warning
+    finally:
+        presenter.close()
+
+
+def test_a_gamma_ramp_that_was_never_written_is_none(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
+    import glfw
+
+    # Some X servers give out whatever their memory held before.
+    noise = np.random.default_rng(1).random((3, 256))
+    monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor: noise)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    assert ramps(screen) == []
+    monkeypatch.setattr(glfw, "get_gamma_ramp", lambda monitor: [np.linspace(1, 0, 256)] * 3)  # pyright: ignore[reportUnknownLambdaType, reportUnknownArgumentType]
+    assert len(ramps(screen)) == 1, "inverted colours are somebody's wish"
+
+
+def test_a_colour_profile_of_the_display_is_reported(outputs: str) -> None:
+    if shutil.which("xprop") is None:
+        pytest.skip("xprop is not installed: apt-get install x11-utils")
+    presenter = FullScreen("right")
+    try:
+
+        def told() -> list[str]:
+            return [warning for warning in presenter.warnings() if "profile" in warning]
+
+        def set_profile(name: str) -> None:
+            subprocess.run(["xprop", "-root", "-f", name, "8s", "-set", name, "profile"], check=True)
+
+        assert told() == []
+        set_profile("_ICC_PROFILE")
+        assert told() == [], "that is the other display's"
+        set_profile("_ICC_PROFILE_1")
+        (warning,) = told()
+        assert "colour profile is set for DUMMY1" in warning
+    finally:
+        presenter.close()
+
+
+def ramps(presenter: FullScreen) -> list[str]:
+    return [warning for warning in presenter.warnings() if "gamma" in warning]
+
+
+def test_the_screen_saver_is_held_off_where_that_can_be_asked_for(virtual: VirtualScreen) -> None:
+    screen = XScreen()
+    assert screen.stays_awake == (ctypes.util.find_library("xcb-screensaver") is not None)
+    assert screen.has_extension("MIT-SCREEN-SAVER")
+    assert not screen.has_extension("NO-SUCH-THING")
+    screen.close()
+    screen.close()
+    with pytest.raises(DeviceError, match="closed"):
+        screen.read(0, 0, 1, 1)
+
+
+def test_what_is_not_on_the_screen_cannot_be_read(virtual: VirtualScreen) -> None:
+    screen = XScreen()
+    with pytest.raises(DeviceError, match=r"no 100×100 pixels at \+600\+0 any more"):
+        screen.read(600, 0, 100, 100)
+    assert screen.read(0, 0, 100, 100).shape == (100, 100)
+    screen.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only there a missing DISPLAY is a missing desktop")
+@pytest.mark.parametrize("display", [":4711", ""])
+def test_no_desktop_says_so(monkeypatch: pytest.MonkeyPatch, display: str) -> None:
+    monkeypatch.setenv("DISPLAY", display)
+    with pytest.raises(DeviceError, match=r"no desktop to show a picture on .* with DISPLAY set"):
+        FullScreen()
+    with pytest.raises(DeviceError, match="no desktop"):
+        list_displays()
+
+
+DESK = Display(1, "DP-1", 0, 0, 2560, 1440, 60)
+BEAMER = Display(2, "HDMI-1", 2560, 0, 1920, 1080, 60)
+ABOVE = Display(2, "DP-1", 0, -1080, 1920, 1080, 60)
+
+
+def test_the_only_display_needs_no_name() -> None:
+    assert choose_display((DESK,)) == DESK
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        ("left", DESK),
+        ("right", BEAMER),
+        ("HDMI-1", BEAMER),
+        ("+2560+0", BEAMER),
+        ("+0+0", DESK),
+        (1, DESK),
+        ("2", BEAMER),
+    ],
+)
+def test_a_display_is_chosen_by_any_of_its_marks(wanted: str | int, expected: Display) -> None:
+    assert choose_display((DESK, BEAMER), wanted) == expected
+
+
+def test_a_place_may_be_negative() -> None:
+    assert choose_display((DESK, ABOVE), "+0-1080") == ABOVE
+
+
+@pytest.mark.parametrize(
+    ("displays", "wanted", "reason"),
+    [
+        ((DESK, BEAMER), None, "no display is named: 2 fit"),
+        ((DESK, BEAMER), "HDMI-2", "display 'HDMI-2' is not there"),
+        ((DESK, BEAMER), "+1920+0", "not there"),
+        ((DESK, BEAMER), 3, "display 3 is not there"),
+        ((DESK, ABOVE), "DP-1", "display 'DP-1': 2 fit; name one by its place"),
+        ((DESK,), "right", "not two displays side by side"),
+        ((DESK, ABOVE), "left", "not two displays side by side"),
+        ((), None, "no display is named is not there|found: none"),
+    ],
+)
+def test_a_choice_that_cannot_be_made_lists_what_there_is(
+    displays: tuple[Display, ...], wanted: str | int | None, reason: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=reason) as caught:
+        choose_display(displays, wanted)
+    for display in displays:
+        assert str(display) in str(caught.value)
+
+
+def test_numbers_follow_the_order(outputs: str) -> None:
+    displays = list_displays()
+    assert [display.number for display in displays] == list(range(1, len(displays) + 1))
+    assert all(first.x <= second.x for first, second in pairwise(displays))

@@ -1,0 +1,197 @@
+"""USB through pyusb: the PTP contract on the simulated bus, and what finding and opening say when they cannot."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import pytest
+import usb.core
+
+from drivers.links.pipes import Pipe, PipeStalled
+from drivers.links.usb import UDEV_RULE, UsbDevice, list_devices, open_usb
+from drivers.ptp.messages import PtpRequest
+from drivers.ptp.usb_transport import UsbTransport
+from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
+from sim.buses.usb import SimulatedBus
+from sim.buses.usb_device import BULK_IN, Identity, PtpUsbDevice, Setup
+from sim.clock import SimulatedClock
+from tests.contracts.transport import ECHO, PATIENCE_S, Bench, Echo, TransportContract
+
+
+class TestSimulatedBus(TransportContract):
+    @pytest.fixture
+    def bench(self) -> Bench:
+        responder = Echo()
+        device = PtpUsbDevice(responder)
+        bus = SimulatedBus()
+        bus.plug(device)
+        transport = UsbTransport(open_usb(backend=bus), SimulatedClock())
+        return Bench(transport, responder, lambda: bus.unplug(device))
+
+
+def camera(serial: str | None = "1234", product: int = 0x31EA) -> PtpUsbDevice:
+    return PtpUsbDevice(Echo(), Identity(product=product, serial=serial))
+
+
+def bus_with(*devices: PtpUsbDevice) -> SimulatedBus:
+    bus = SimulatedBus()
+    for port, device in enumerate(devices, 1):
+        bus.plug(device, port)
+    return bus
+
+
+class Keyboard(PtpUsbDevice):
+    def configuration_descriptor(self) -> bytes:
+        descriptor = bytearray(super().configuration_descriptor())
+        descriptor[14:17] = (3, 1, 1)
+        return bytes(descriptor)
+
+
+def test_lists_cameras_and_nothing_else() -> None:
+    bus = bus_with(camera(), Keyboard(Echo()), camera(serial=None, product=0x32CA))
+    assert list_devices(backend=bus) == (
+        UsbDevice(0x04A9, 0x31EA, "1234", "Canon Digital Camera", "1-1", 2),
+        UsbDevice(0x04A9, 0x32CA, None, "Canon Digital Camera", "1-3", 4),
+    )
+
+
+def test_opens_by_any_mark() -> None:
+    bus = bus_with(camera("1"), camera("2"), camera("3", product=0x32CA))
+    pipes = open_usb(serial="2", backend=bus)
+    assert "serial number 2" in pipes.label
+    assert "1-2" in pipes.label
+    pipes.close()
+    assert "1-1" in open_usb(port="1-1", backend=bus).label
+    assert "32ca" in open_usb(vendor=0x04A9, product=0x32CA, backend=bus).label
+
+
+def test_says_what_is_there_when_the_camera_is_not() -> None:
+    with pytest.raises(LinkClosed, match="none at all"):
+        open_usb(backend=SimulatedBus())
+    with pytest.raises(LinkClosed, match=r"serial number 9 .* serial number 1\b.*switch the camera on"):
+        open_usb(serial="9", backend=bus_with(camera("1")))
+
+
+def test_asks_which_when_several_fit() -> None:
+    with pytest.raises(InputError, match=r"serial number 1\b.*serial number 2\b"):
+        open_usb(vendor=0x04A9, backend=bus_with(camera("1"), camera("2")))
+
+
+def test_a_camera_held_by_the_desktop_says_how_to_free_it() -> None:
+    device = camera()
+    bus = bus_with(device)
+    bus.hold(device)
+    with pytest.raises(DeviceRefused, match="gvfs-gphoto2-volume-monitor"):
+        open_usb(backend=bus)
+    bus.hold(device, held=False)
+    open_usb(backend=bus)
+
+
+def test_a_camera_without_permission_names_the_rule() -> None:
+    device = camera()
+    bus = bus_with(device)
+    bus.lock(device)
+    for serial in (None, "1234"):
+        with pytest.raises(DeviceRefused, match=r"70-crop-cameras\.rules"):
+            open_usb(serial=serial, backend=bus)
+    assert list_devices(backend=bus)[0].serial is None
+
+
+def test_a_second_opening_is_refused_until_the_first_is_closed() -> None:
+    bus = bus_with(camera())
+    first = open_usb(backend=bus)
+    with pytest.raises(DeviceRefused, match="another program"):
+        open_usb(backend=bus)
+    first.close()
+    first.close()
+    open_usb(backend=bus)
+
+
+def test_the_kernels_driver_steps_aside_and_comes_back() -> None:
+    device = camera()
+    bus = bus_with(device)
+    bus.bind_kernel_driver(device)
+    pipes = open_usb(backend=bus)
+    assert not bus.kernel_driver_sits_on(device)
+    pipes.close()
+    assert bus.kernel_driver_sits_on(device)
+    assert not bus.is_claimed(device)
+
+
+def test_an_unconfigured_device_is_configured() -> None:
+    device = camera()
+    bus = bus_with(device)
+    device.control(Setup(0x00, 9, 0, 0, 0))
+    transport = UsbTransport(open_usb(backend=bus), SimulatedClock())
+    assert transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
+
+
+def test_the_pipes_know_their_sizes() -> None:
+    pipes = open_usb(backend=bus_with(camera()))
+    assert pipes.packet_size == 512
+    # bInterval 6 at high speed: 2^5 microframes of 125 µs.
+    assert 0.004 <= pipes.polling_s <= 0.01
+
+
+def test_errors_of_the_bus_become_ours() -> None:
+    device = camera()
+    bus = bus_with(device)
+    pipes = open_usb(backend=bus)
+    with pytest.raises(LinkTimeout, match="1234"):
+        pipes.bulk_read(512, 0.001)
+    device.halt(BULK_IN)
+    with pytest.raises(PipeStalled):
+        pipes.bulk_read(512, 0.001)
+    pipes.clear_halt(Pipe.BULK_IN)
+    with pytest.raises(LinkTimeout):
+        pipes.bulk_read(512, 0.001)
+    with pytest.raises(PipeStalled):
+        pipes.control_in(0x7F, 4, 0.001)
+    bus.unplug(device)
+    with pytest.raises(LinkClosed, match="check cable"):
+        pipes.bulk_write(b"x", 0.001)
+    pipes.close()
+    with pytest.raises(LinkClosed, match="closed"):
+        pipes.bulk_write(b"x", 0.001)
+
+
+def test_a_restarted_camera_is_found_again_by_its_number() -> None:
+    device = camera("7")
+    bus = bus_with(camera("6"), device)
+    transport = UsbTransport(open_usb(serial="7", backend=bus), SimulatedClock())
+    before = list_devices(backend=bus)
+    bus.replug(device)
+    with pytest.raises(LinkClosed):
+        transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S)
+    transport.close()
+    again = UsbTransport(open_usb(serial="7", backend=bus), SimulatedClock())
+    assert again.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
+    assert {found.address for found in before} != {found.address for found in list_devices(backend=bus)}
+    assert {found.port for found in before} == {found.port for found in list_devices(backend=bus)}
+
+
+def test_a_port_reset_keeps_the_pipes() -> None:
+    device = camera()
+    pipes = open_usb(backend=bus_with(device))
+    transport = UsbTransport(pipes, SimulatedClock())
+    pipes.reset_port()
+    assert transport.transact(PtpRequest(ECHO, 1), timeout=PATIENCE_S).response.ok
+
+
+def test_no_library_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def find(**_: object) -> object:
+        raise usb.core.NoBackendError("No backend available")
+
+    monkeypatch.setattr(usb.core, "find", find)
+    with pytest.raises(LinkClosed, match="libusb is not installed"):
+        list_devices()
+
+
+def test_the_rule_that_messages_name_is_shipped() -> None:
+    rule = resources.files("drivers") / "data" / UDEV_RULE
+    lines = [line for line in rule.read_text().splitlines() if line and not line.startswith("#")]
+    assert len(lines) == 1
+    # udev.rules(7): the vendor as in sysfs, the interfaces as udev lists them, :class subclass protocol:.
+    assert 'ATTR{idVendor}=="04a9"' in lines[0]
+    assert 'ENV{ID_USB_INTERFACES}=="*:060101:*"' in lines[0]
+    assert 'TAG+="uaccess"' in lines[0]

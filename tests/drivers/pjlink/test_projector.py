@@ -1,0 +1,626 @@
+"""The PJLink driver: conversations in the standard's bytes, the projector contract, and troubled cables.
+
+The conversations are written after PJLink 1.04, 2.00 and 2.10 (sections 4 and 5), not after the codec under test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from drivers.links.link import Link
+from drivers.links.tcp import TcpLink
+from drivers.pjlink.projector import PjLinkProjector
+from drivers.pjlink.wire import Input, NoResolution, Resolution
+from drivers.projector import Fault, Lamp, Power, ProjectorIdentity, Severity
+from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkTimeout, ProtocolError
+from sim.clock import SimulatedClock
+from sim.projectors.pjlink import PjLinkPeer, memory_link, serve_pjlink
+from sim.projectors.projector import ProjectorTraits, SimulatedProjector
+from tests.contracts.projector import Bench, ProjectorContract
+from tests.drivers.links.troubled_links import Deaf, Dribbling, DroppedAfter, Garbling, Slow
+
+PASSWORD = "JBMIAProjectorLink"
+DIGEST = b"5d8409bc1c3fa39749434aa3a5c38682"
+# PJLink 2.10, 5.1: the controller's random number, and the digest for the projector's CHALLENGE.
+NONCE = b"c14b279e603d8a5f17e849ba360f2dc5"
+CHALLENGE = b"PJLINK 2 3db25e10f69c47a85adb24cf361897e0\r"
+SHA256 = b"70ab129eac6924d4c129c9c4fcf45be42e1e776325a66db67e5b6eee50f2a692"
+
+
+class Script:
+    """A cable that has one conversation by heart and objects to a byte too many or too few.
+
+    `lines` alternates what the projector says and what it must hear; None hangs up. Unheard answers are an error, too:
+    see `ended`.
+    """
+
+    def __init__(self, *lines: bytes | None) -> None:
+        self._lines = list(lines)
+        self.closed = False
+
+    def write(self, data: bytes, timeout: float) -> None:
+        if self._lines and self._lines[0] is None:
+            raise LinkClosed("the script hangs up")
+        assert self._lines, f"nothing more was to be said, but {data!r} was"
+        assert data == self._lines.pop(0)
+
+    def read(self, limit: int, timeout: float) -> bytes:
+        if not self._lines:
+            raise LinkTimeout("the script has ended")
+        line = self._lines.pop(0)
+        if line is None:
+            raise LinkClosed("the script hangs up")
+        return line
+
+    def close(self) -> None:
+        self.closed = True
+
+    def ended(self) -> bool:
+        return not self._lines
+
+
+def driver(*scripts: Script, password: str | None = None, sha256: bool = False) -> PjLinkProjector:
+    """Return the driver on one script after another; a connection too many is an error."""
+    waiting = list(scripts)
+    return PjLinkProjector(
+        lambda: waiting.pop(0), password, sha256=sha256, nonce=lambda: bytes.fromhex(NONCE.decode("ascii"))
+    )
+
+
+def test_power_without_password() -> None:
+    script = Script(
+        b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=0\r", b"%1POWR 1\r", b"%1POWR=OK\r", b"%1POWR ?\r", b"%1POWR=3\r"
+    )
+    projector = driver(script)
+    assert projector.power() is Power.STANDBY
+    projector.switch_on()
+    assert projector.power() is Power.WARMING
+    assert script.ended()
+    projector.close()
+    assert script.closed
+
+
+def test_only_the_first_command_proves_the_password() -> None:
+    script = Script(
+        b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", b"%1AVMT 31\r", b"%1AVMT=OK\r"
+    )  # fmt: skip
+    projector = driver(script, password=PASSWORD)
+    assert projector.power() is Power.ON
+    projector.set_muted(True)
+    assert script.ended()
+
+
+def test_a_password_that_nobody_asks_for_is_not_sent() -> None:
+    script = Script(b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=1\r")
+    assert driver(script, password=PASSWORD).power() is Power.ON
+
+
+def test_a_wrong_password_is_refused_in_words() -> None:
+    script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"PJLINK ERRA\r")
+    with pytest.raises(DeviceRefused, match="refuses the password"):
+        driver(script, password=PASSWORD).power()
+    assert script.ended()
+    assert script.closed
+
+
+def test_a_missing_password_is_asked_for_before_anything_is_sent() -> None:
+    script = Script(b"PJLINK 1 498e4a67\r")
+    with pytest.raises(DeviceRefused, match="asks for a password"):
+        driver(script).power()
+    assert script.ended()
+    assert script.closed
+
+
+def test_a_server_that_wants_the_digest_each_time_gets_a_new_connection() -> None:
+    first = Script(
+        b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", b"%1ERST ?\r", b"PJLINK ERRA\r"
+    )  # fmt: skip
+    second = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1ERST ?\r", b"%1ERST=000000\r")
+    projector = driver(first, second, password=PASSWORD)
+    assert projector.power() is Power.ON
+    assert projector.faults() == ()
+    assert first.closed
+    assert second.ended()
+
+
+def test_health_and_name() -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1ERST ?\r", b"%1ERST=010020\r",
+        b"%1LAMP ?\r", b"%1LAMP=120 1 3000 0\r",
+        b"%1INF1 ?\r", b"%1INF1=Seiko\r",
+        b"%1INF2 ?\r", b"%1INF2=ERR1\r",
+        b"%1NAME ?\r", b"%1NAME=room 3\r",
+    )  # fmt: skip
+    projector = driver(script)
+    assert projector.faults() == (Fault("lamp", Severity.WARNING), Fault("filter", Severity.ERROR))
+    assert projector.lamps() == (Lamp(120, True), Lamp(3000, False))
+    assert projector.identity() == ProjectorIdentity("Seiko", "", "room 3")
+    assert script.ended()
+
+
+def test_a_lampless_projector_has_no_lamps() -> None:
+    assert driver(Script(b"PJLINK 0\r", b"%1LAMP ?\r", b"%1LAMP=ERR1\r")).lamps() == ()
+
+
+@pytest.mark.parametrize(
+    ("code", "error", "words"),
+    [
+        (b"ERR1", DeviceRefused, "does not know this command"),
+        (b"ERR2", DeviceRefused, "does not offer this value"),
+        (b"ERR3", DeviceRefused, "warming up, cooling down or in standby"),
+        (b"ERR4", DeviceFault, "failure of its own"),
+    ],
+)
+def test_each_error_has_its_sentence(code: bytes, error: type[Exception], words: str) -> None:
+    script = Script(b"PJLINK 0\r", b"%1AVMT 31\r", b"%1AVMT=" + code + b"\r", b"%1POWR ?\r", b"%1POWR=3\r")
+    projector = driver(script)
+    with pytest.raises(error, match=rf"{code.decode()} to AVMT 31: .*{words}"):
+        projector.set_muted(True)
+    # A refusal is no fault of the cable: the same connection goes on.
+    assert projector.power() is Power.WARMING
+
+
+def test_tolerates_case_line_feeds_and_pieces() -> None:
+    script = Script(b"pjlink ", b"0\r\n", b"%1POWR ?\r", b"%1po", b"wr=", b"1\r\n", b"%1POWR 0\r", b"%1POWR=ok\r\n")
+    projector = driver(script)
+    assert projector.power() is Power.ON
+    projector.switch_off()
+    assert script.ended()
+
+
+def test_an_idle_connection_that_was_dropped_is_replaced_silently() -> None:
+    first = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", None)
+    second = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r")
+    projector = driver(first, second, password=PASSWORD)
+    assert projector.power() is Power.ON
+    assert projector.power() is Power.ON
+    assert first.closed
+    assert second.ended()
+
+
+def test_a_new_connection_that_is_dropped_is_not_tried_again() -> None:
+    for script in (Script(None), Script(b"PJLINK 0\r", b"%1POWR ?\r", None)):
+        with pytest.raises(LinkClosed):
+            driver(script).power()
+        assert script.closed
+
+
+def test_a_second_drop_in_a_row_is_told() -> None:
+    first = Script(b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=1\r", None)
+    second = Script(b"PJLINK 0\r", b"%1POWR ?\r", None)
+    projector = driver(first, second)
+    projector.power()
+    with pytest.raises(LinkClosed):
+        projector.power()
+
+
+def test_a_late_answer_never_meets_a_later_question() -> None:
+    late = Script(b"PJLINK 0\r", b"%1POWR ?\r")
+    fresh = Script(b"PJLINK 0\r", b"%1ERST ?\r", b"%1ERST=000000\r")
+    projector = driver(late, fresh)
+    with pytest.raises(LinkTimeout):
+        projector.power()
+    assert late.closed
+    assert projector.faults() == ()
+
+
+@pytest.mark.parametrize(
+    "answer", [b"%1LAMP=1 1\r", b"what?\r", b"%1POWR=7\r", b"%1POWR=\r", b"x" * 500, b"\xff\r", b"%1POWR=OK\r"]
+)
+def test_an_answer_that_does_not_fit_is_a_protocol_error(answer: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        driver(Script(b"PJLINK 0\r", b"%1POWR ?\r", answer)).power()
+
+
+def test_a_set_command_must_be_answered_by_ok() -> None:
+    with pytest.raises(ProtocolError, match="expected OK"):
+        driver(Script(b"PJLINK 0\r", b"%1POWR 1\r", b"%1POWR=1\r")).switch_on()
+
+
+def test_inputs_of_class_1_have_no_names() -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1CLSS ?\r", b"%1CLSS=1\r",
+        b"%1INST ?\r", b"%1INST=11 12 21 31\r",
+        b"%1INPT ?\r", b"%1INPT=31\r",
+        b"%1INPT 11\r", b"%1INPT=OK\r",
+    )  # fmt: skip
+    projector = driver(script)
+    assert projector.inputs() == (Input("11"), Input("12"), Input("21"), Input("31"))
+    assert projector.input() == Input("31")
+    projector.select_input("11")
+    assert script.ended()
+
+
+def test_inputs_of_class_2_have_names_where_the_projector_gives_them() -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1CLSS ?\r", b"%1CLSS=2\r",
+        b"%2INST ?\r", b"%2INST=11 31 3A 61\r",
+        b"%2INNM ?11\r", b"%2INNM=Computer\r",
+        b"%2INNM ?31\r", "%2INNM=Anschlu\u00df 1\r".encode(),
+        b"%2INNM ?3A\r", b"%2INNM=ERR3\r",
+        b"%2INNM ?61\r", b"%2INNM=\r",
+        b"%2INPT ?\r", b"%2INPT=3a\r",
+        b"%2INNM ?3A\r", b"%2INNM=HDBaseT\r",
+        b"%2INPT 61\r", b"%2INPT=OK\r",
+        b"%1INPT 31\r", b"%1INPT=OK\r",
+    )  # fmt: skip
+    projector = driver(script)
+    assert projector.inputs() == (Input("11", "Computer"), Input("31", "Anschlu\u00df 1"), Input("3A"), Input("61"))
+    assert projector.input() == Input("3A", "HDBaseT")
+    projector.select_input("61")
+    projector.select_input("31")
+    assert script.ended()
+
+
+def test_an_input_that_cannot_be_is_our_mistake() -> None:
+    with pytest.raises(ValueError, match="is no PJLink input"):
+        driver().select_input("HDMI")
+
+
+def test_what_class_2_tells() -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1CLSS ?\r", b"%1CLSS=2\r",
+        b"%2IRES ?\r", b"%2IRES=1920x1080\r",
+        b"%2IRES ?\r", b"%2IRES=-\r",
+        b"%2IRES ?\r", b"%2IRES=*\r",
+        b"%2RRES ?\r", b"%2RRES=1920x1200\r",
+        b"%2FREZ ?\r", b"%2FREZ=1\r",
+        b"%2FREZ 0\r", b"%2FREZ=OK\r",
+        b"%2SNUM ?\r", b"%2SNUM=X5A 0012\r",
+        b"%2SVER ?\r", b"%2SVER=1.03\r",
+        b"%2FILT ?\r", b"%2FILT=300\r",
+        b"%2FILT ?\r", b"%2FILT=ERR1\r",
+        b"%2RLMP ?\r", b"%2RLMP=ELPLP96 ELPLP97\r",
+        b"%2RFIL ?\r", b"%2RFIL=ERR1\r",
+        b"%1INFO ?\r", b"%1INFO=\r",
+    )  # fmt: skip
+    projector = driver(script)
+    assert projector.input_resolution() == Resolution(1920, 1080)
+    assert projector.input_resolution() is NoResolution.NO_SIGNAL
+    assert projector.input_resolution() is NoResolution.UNKNOWN_SIGNAL
+    assert projector.recommended_resolution() == Resolution(1920, 1200)
+    assert projector.frozen()
+    projector.set_frozen(False)
+    assert projector.serial_number() == "X5A 0012"
+    assert projector.software_version() == "1.03"
+    assert projector.filter_hours() == 300
+    assert projector.filter_hours() is None
+    assert projector.lamp_models() == ("ELPLP96", "ELPLP97")
+    assert projector.filter_models() == ()
+    assert projector.other_information() == ""
+    assert script.ended()
+
+
+@pytest.mark.parametrize("answer", [b"%1CLSS=1\r", b"%1CLSS=ERR1\r"])
+def test_class_1_is_never_asked_what_class_2_knows(answer: bytes) -> None:
+    script = Script(b"PJLINK 0\r", b"%1CLSS ?\r", answer)
+    projector = driver(script)
+    for ask in (
+        projector.input_resolution,
+        projector.recommended_resolution,
+        projector.frozen,
+        projector.serial_number,
+        projector.software_version,
+        projector.filter_hours,
+        projector.lamp_models,
+    ):
+        with pytest.raises(DeviceRefused, match="speaks PJLink class 1"):
+            ask()
+    with pytest.raises(DeviceRefused, match="speaks PJLink class 1"):
+        projector.select_input("3A")
+    assert projector.pjlink_class() == 1
+    assert script.ended()
+
+
+def test_a_notice_of_start_inside_the_connection_answers_nothing() -> None:
+    # Some class 2 projectors send it there, and fill their packets up with NUL (seen by users of other controllers).
+    script = Script(
+        b"PJLINK 0\r" + bytes(200),
+        b"%1POWR ?\r", b"%2LKUP=D0:D9:4F:00:00:01\r\0\0\0", b"\0\0%1POWR=1\r" + bytes(120),
+        b"%1POWR ?\r", b"%2LKUP=D0:D9:4F:00:00:01\r%1POWR=2\r",
+    )  # fmt: skip
+    projector = driver(script)
+    assert projector.power() is Power.ON
+    assert projector.power() is Power.COOLING
+    assert script.ended()
+
+
+def test_sha256_proves_the_password_once() -> None:
+    script = Script(
+        b"PJLINK 1 498e4a67\r", b"PJLINK 2\r", CHALLENGE,
+        NONCE + SHA256 + b"%1POWR ?\r", b"%1POWR=1\r",
+        b"%1ERST ?\r", b"%1ERST=000000\r",
+    )  # fmt: skip
+    projector = driver(script, password=PASSWORD, sha256=True)
+    assert projector.power() is Power.ON
+    assert projector.faults() == ()
+    assert script.ended()
+
+
+@pytest.mark.parametrize("answer", [b"PJLINK ERRA\r", b"%1POWR=ERR1\r", None, "silence"])
+def test_who_knows_no_sha256_is_met_again_with_md5_and_for_good(answer: bytes | str | None) -> None:
+    first = Script(b"PJLINK 1 498e4a67\r", b"PJLINK 2\r", *([] if isinstance(answer, str) else [answer]))
+    second = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r", None)
+    third = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r")
+    projector = driver(first, second, third, password=PASSWORD, sha256=True)
+    assert projector.power() is Power.ON
+    assert projector.power() is Power.ON
+    assert first.closed
+    assert third.ended()
+
+
+def test_sha256_is_not_offered_where_no_password_is_wanted() -> None:
+    script = Script(b"PJLINK 0\r", b"%1POWR ?\r", b"%1POWR=1\r")
+    assert driver(script, password=PASSWORD, sha256=True).power() is Power.ON
+    assert script.ended()
+
+
+def test_a_wrong_password_by_sha256_is_refused_in_words() -> None:
+    script = Script(
+        b"PJLINK 1 498e4a67\r", b"PJLINK 2\r", CHALLENGE, NONCE + SHA256 + b"%1POWR ?\r", b"PJLINK ERRA\r"
+    )  # fmt: skip
+    with pytest.raises(DeviceRefused, match="refuses the password"):
+        driver(script, password=PASSWORD, sha256=True).power()
+    assert script.closed
+
+
+def test_another_service_at_that_port_is_named() -> None:
+    with pytest.raises(ProtocolError, match=r"SSH-2\.0"):
+        driver(Script(b"SSH-2.0-OpenSSH_9.2\r\n")).power()
+
+
+def test_an_answer_that_never_ends_is_a_timeout() -> None:
+    clock = SimulatedClock()
+
+    class Endless(Script):
+        def read(self, limit: int, timeout: float) -> bytes:
+            clock.sleep(1.0)
+            return b"P"
+
+    with pytest.raises(LinkTimeout, match="not finished its answer"):
+        PjLinkProjector(lambda: Endless(b""), timeout=5.0, clock=clock).power()
+
+
+def simulated_bench(
+    connect: Callable[[SimulatedProjector], Callable[[], Link]],
+    password: str | None = None,
+    traits: ProjectorTraits | None = None,
+    sha256: bool = False,
+) -> Bench:
+    """Return the driver on a simulated projector behind `connect`."""
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock, traits=traits)
+    return Bench(
+        PjLinkProjector(connect(device), password, sha256=sha256),
+        clock.sleep,
+        device.break_part,
+        device.repair,
+        device.traits.identity,
+        device.traits.warm_up_s,
+        device.traits.cool_down_s,
+    )
+
+
+class TestOverMemory(ProjectorContract):
+    @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
+    def bench(self, request: pytest.FixtureRequest) -> Bench:
+        return simulated_bench(lambda device: lambda: memory_link(PjLinkPeer(device, request.param)), request.param)
+
+
+class TestSha256(ProjectorContract):
+    @pytest.fixture(params=[True, False], ids=["known", "unknown"])
+    def bench(self, request: pytest.FixtureRequest) -> Bench:
+        return simulated_bench(
+            lambda device: lambda: memory_link(PjLinkPeer(device, PASSWORD)),
+            PASSWORD,
+            ProjectorTraits(sha256=request.param),
+            sha256=True,
+        )
+
+
+class TestClass1(ProjectorContract):
+    @pytest.fixture
+    def bench(self) -> Bench:
+        return simulated_bench(
+            lambda device: lambda: memory_link(PjLinkPeer(device)), traits=ProjectorTraits(pjlink_class=1)
+        )
+
+
+class TestOverLoopback(ProjectorContract):
+    @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
+    def bench(self, request: pytest.FixtureRequest) -> Iterator[Bench]:
+        clock = SimulatedClock()
+        device = SimulatedProjector(clock)
+        with serve_pjlink(device, password=request.param) as server:
+            projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), request.param, 10.0)
+            yield Bench(
+                projector,
+                clock.sleep,
+                device.break_part,
+                device.repair,
+                device.traits.identity,
+                device.traits.warm_up_s,
+                device.traits.cool_down_s,
+            )
+            projector.close()
+
+
+class TestByteByByte(ProjectorContract):
+    @pytest.fixture
+    def bench(self) -> Bench:
+        return simulated_bench(lambda device: lambda: Dribbling(memory_link(PjLinkPeer(device))))
+
+
+class TestDroppedAtEverySecondCommand(ProjectorContract):
+    @pytest.fixture(params=[None, PASSWORD], ids=["open", "password"])
+    def bench(self, request: pytest.FixtureRequest) -> Bench:
+        return simulated_bench(
+            lambda device: lambda: DroppedAfter(memory_link(PjLinkPeer(device, request.param)), 1), request.param
+        )
+
+
+class TestNoisyLineEnds(ProjectorContract):
+    """A projector that answers in small letters, with LF and filling, and announces its start in between."""
+
+    @pytest.fixture
+    def bench(self) -> Bench:
+        def garble(data: bytes) -> bytes:
+            data = data.replace(b"%1POWR=", b"%1powr=").replace(b"=OK", b"=Ok").replace(b"=ERR", b"=err")
+            return b"\n%2LKUP=00:11:22:33:44:55\r\0" + data.replace(b"\r", b"\r\n\0\0")
+
+        return simulated_bench(lambda device: lambda: Garbling(memory_link(PjLinkPeer(device)), garble))
+
+
+class TestAnswersThatTakeTheirTime(ProjectorContract):
+    """Four of the five seconds that an answer may take, by a clock of the cable's own."""
+
+    @pytest.fixture
+    def bench(self) -> Bench:
+        clock, cable_clock = SimulatedClock(), SimulatedClock()
+        device = SimulatedProjector(clock)
+        return Bench(
+            PjLinkProjector(lambda: Slow(memory_link(PjLinkPeer(device)), cable_clock, 4.0), clock=cable_clock),
+            clock.sleep,
+            device.break_part,
+            device.repair,
+            device.traits.identity,
+            device.traits.warm_up_s,
+            device.traits.cool_down_s,
+        )
+
+
+def test_an_answer_that_comes_too_late_is_a_timeout() -> None:
+    clock = SimulatedClock()
+    peer = PjLinkPeer(SimulatedProjector(SimulatedClock()))
+    projector = PjLinkProjector(lambda: Slow(memory_link(peer), clock, 6.0), clock=clock)
+    with pytest.raises(LinkTimeout, match="6 s"):
+        projector.power()
+
+
+class TestClass2:
+    """What class 2 adds, on the simulated projector, over memory and over loopback."""
+
+    @pytest.fixture(params=["memory", "loopback", "byte by byte", "dropped"])
+    def lit(self, request: pytest.FixtureRequest) -> Iterator[tuple[PjLinkProjector, SimulatedProjector]]:
+        device = SimulatedProjector(SimulatedClock(), Power.ON)
+        wrapped: dict[str, Callable[[Link], Link]] = {
+            "memory": lambda good: good,
+            "byte by byte": Dribbling,
+            "dropped": lambda good: DroppedAfter(good, 1),
+        }
+        if request.param in wrapped:
+            wrap = wrapped[request.param]
+            yield PjLinkProjector(lambda: wrap(memory_link(PjLinkPeer(device, PASSWORD))), PASSWORD), device
+            return
+        with serve_pjlink(device, password=PASSWORD) as server:
+            projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), PASSWORD, 10.0)
+            yield projector, device
+            projector.close()
+
+    def test_inputs(self, lit: tuple[PjLinkProjector, SimulatedProjector]) -> None:
+        projector, device = lit
+        assert projector.inputs() == device.traits.inputs
+        for source in device.traits.inputs:
+            projector.select_input(source.code)
+            assert projector.input() == source
+        with pytest.raises(DeviceRefused, match="does not offer this value"):
+            projector.select_input("59")
+
+    def test_resolution_and_freeze(self, lit: tuple[PjLinkProjector, SimulatedProjector]) -> None:
+        projector, device = lit
+        assert projector.input_resolution() == projector.recommended_resolution() == device.traits.panel
+        device.signal = NoResolution.NO_SIGNAL
+        assert projector.input_resolution() is NoResolution.NO_SIGNAL
+        device.set_frozen(True)
+        assert projector.frozen()
+        projector.set_frozen(False)
+        assert not device.frozen()
+
+    def test_names_and_hours(self, lit: tuple[PjLinkProjector, SimulatedProjector]) -> None:
+        projector, _ = lit
+        assert projector.pjlink_class() == 2
+        assert projector.serial_number() == "SIM0000001"
+        assert projector.software_version() == "1.00"
+        assert projector.filter_hours() == 45
+        assert projector.lamp_models() == ("LAMP-1",)
+        assert projector.filter_models() == ("FILTER-1",)
+        assert projector.other_information() == "simulated"
+
+
+def test_a_garbled_answer_is_told_and_the_next_connection_is_clean() -> None:
+    peer = PjLinkPeer(SimulatedProjector(SimulatedClock(), Power.ON))
+    garbles: list[Callable[[bytes], bytes]] = [lambda data: data.replace(b"POWR=", b"PO\xffR="), lambda data: data]
+    projector = PjLinkProjector(lambda: Garbling(memory_link(peer), garbles.pop(0)))
+    with pytest.raises(ProtocolError):
+        projector.power()
+    assert projector.power() is Power.ON
+
+
+def test_a_swallowed_answer_is_told_and_the_next_connection_is_clean() -> None:
+    device = SimulatedProjector(SimulatedClock())
+    made: list[Link] = []
+
+    def connect() -> Link:
+        good = memory_link(PjLinkPeer(device))
+        made.append(Deaf(good, after=1) if not made else good)
+        return made[-1]
+
+    projector = PjLinkProjector(connect)
+    with pytest.raises(LinkTimeout, match="on purpose"):
+        projector.switch_on()
+    # The command itself went through; the driver does not hide that it cannot know.
+    assert projector.power() is Power.WARMING
+
+
+def test_a_restarted_server_goes_unnoticed() -> None:
+    device = SimulatedProjector(SimulatedClock())
+    with serve_pjlink(device, password=PASSWORD) as server:
+        projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), PASSWORD, 10.0)
+        assert projector.power() is Power.STANDBY
+        server.hang_up()
+        assert projector.power() is Power.STANDBY
+        projector.close()
+
+
+@pytest.mark.parametrize("knows_sha256", [True, False])
+@pytest.mark.parametrize("offered", [True, False])
+def test_a_wrong_password_over_memory(knows_sha256: bool, offered: bool) -> None:
+    peer = PjLinkPeer(
+        SimulatedProjector(SimulatedClock(), traits=ProjectorTraits(sha256=knows_sha256)), PASSWORD
+    )  # fmt: skip
+    projector = PjLinkProjector(lambda: memory_link(peer), "guess", sha256=offered)
+    with pytest.raises(DeviceRefused, match="refuses the password"):
+        projector.power()
+
+
+def test_a_connection_left_idle_over_loopback_is_replaced_silently() -> None:
+    clock = SimulatedClock()
+    with serve_pjlink(SimulatedProjector(clock, Power.ON), password=PASSWORD) as server:
+        made: list[TcpLink] = []
+
+        def connect() -> TcpLink:
+            made.append(TcpLink.connect(*server.address, 10.0))
+            return made[-1]
+
+        projector = PjLinkProjector(connect, PASSWORD, 10.0)
+        assert projector.power() is Power.ON
+        clock.sleep(29)
+        assert projector.power() is Power.ON
+        assert len(made) == 1
+        clock.sleep(30)
+        assert projector.power() is Power.ON
+        assert len(made) == 2
+        projector.close()
+
+
+def test_a_wrong_password_over_loopback() -> None:
+    with serve_pjlink(SimulatedProjector(SimulatedClock()), password=PASSWORD) as server:
+        projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), "guess", 10.0)
+        with pytest.raises(DeviceRefused, match="refuses the password"):
+            projector.power()

@@ -1,0 +1,332 @@
+"""PTP over USB: the class's bytes on scripted pipes, the contract through devices with bad habits, and true faults."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.links.pipes import Pipe, PipeStalled, UsbPipes
+from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
+from drivers.ptp.usb_transport import UsbTransport
+from foundation.errors import DeviceError, LinkClosed, LinkTimeout, ProtocolError
+from sim.buses.faults import CutOff, Deaf, Garbling, HeaderAlone, Joining, ShortReads, Stalling, WithoutEmptyPackets
+from sim.buses.ptp_memory import MemoryPipes
+from sim.buses.usb_device import PtpUsbDevice
+from sim.clock import SimulatedClock
+from tests.contracts.transport import (
+    ECHO,
+    GIVE,
+    PATIENCE_S,
+    RAISE,
+    TAKE,
+    Bench,
+    Echo,
+    TransportContract,
+    payload,
+)
+
+
+class _OverMemory(TransportContract):
+    def trouble(self, good: UsbPipes) -> UsbPipes:
+        raise NotImplementedError
+
+    @pytest.fixture
+    def bench(self) -> Bench:
+        responder = Echo()
+        pipes = MemoryPipes(PtpUsbDevice(responder))
+        return Bench(UsbTransport(self.trouble(pipes), SimulatedClock()), responder, pipes.pull)
+
+
+class TestShortReads(_OverMemory):
+    def trouble(self, good: UsbPipes) -> UsbPipes:
+        return ShortReads(good)
+
+
+class TestHeaderAlone(_OverMemory):
+    def trouble(self, good: UsbPipes) -> UsbPipes:
+        return HeaderAlone(good)
+
+
+class TestDataAndResponseTogether(_OverMemory):
+    def trouble(self, good: UsbPipes) -> UsbPipes:
+        return Joining(good)
+
+
+class TestWithoutEmptyPackets(_OverMemory):
+    def trouble(self, good: UsbPipes) -> UsbPipes:
+        return WithoutEmptyPackets(good)
+
+
+class TestAfterAStall(_OverMemory):
+    def trouble(self, good: UsbPipes) -> UsbPipes:
+        return Stalling(Stalling(good, Pipe.BULK_IN, range(0, 10000, 40)), Pipe.BULK_OUT, ())
+
+
+class Script:
+    """Pipes that note what is written and read out what was put down; b"" is an empty packet, an error is raised."""
+
+    label = "the camera"
+    packet_size = 512
+    polling_s = 0.01
+
+    def __init__(self, *reads: bytes | DeviceError, events: tuple[bytes, ...] = (), status: bytes = b"") -> None:
+        self.reads = list(reads)
+        self.events = list(events)
+        self.status = status
+        self.written: list[bytes | tuple[int, bytes] | Pipe] = []
+        self.limits: list[int] = []
+
+    def bulk_write(self, data: bytes, timeout: float) -> None:
+        self.written.append(data)
+
+    def bulk_read(self, limit: int, timeout: float) -> bytes:
+        assert limit % 512 == 0
+        assert limit <= 512 * 1024
+        if not self.reads:
+            raise LinkTimeout("silence")
+        self.limits.append(limit)
+        read = self.reads.pop(0)
+        if isinstance(read, DeviceError):
+            raise read
+        assert len(read) <= limit
+        return read
+
+    def interrupt_read(self, timeout: float) -> bytes:
+        if not self.events:
+            raise LinkTimeout("silence")
+        return self.events.pop(0)
+
+    def control_out(self, request: int, data: bytes, timeout: float) -> None:
+        self.written.append((request, data))
+
+    def control_in(self, request: int, limit: int, timeout: float) -> bytes:
+        self.written.append((request, b""))
+        return self.status
+
+    def clear_halt(self, pipe: Pipe) -> None:
+        self.written.append(pipe)
+
+    def reset_port(self) -> None:
+        self.written.append(b"port reset")
+
+    def close(self) -> None:
+        self.written.append(b"closed")
+
+
+OK = bytes.fromhex("0c000000 0300 0120 05000000")
+STALL = PipeStalled("on purpose")
+
+
+def over(script: Script) -> UsbTransport:
+    return UsbTransport(script, SimulatedClock())
+
+
+def data(length: int, body: bytes) -> bytes:
+    return length.to_bytes(4, "little") + bytes.fromhex("0200 1691 05000000") + body
+
+
+def get(script: Script) -> bytes:
+    return over(script).transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).data
+
+
+def test_a_command_is_one_container() -> None:
+    # USB Still Image Capture Device Definition 1.0, 7.1.
+    script = Script(bytes.fromhex("10000000 0300 0120 05000000 2a000000"))
+    done = over(script).transact(PtpRequest(0x9128, 5, (3, 1)), timeout=PATIENCE_S)
+    assert script.written == [bytes.fromhex("14000000 0100 2891 05000000 03000000 01000000")]
+    assert done.response == PtpResponse(0x2001, 5, (42,))
+
+
+def test_data_are_one_container_closed_by_an_empty_packet_when_full() -> None:
+    script = Script(OK)
+    over(script).transact(PtpRequest(0x9110, 5), send=bytes(500), timeout=PATIENCE_S)
+    header = bytes.fromhex("00020000 0200 1091 05000000")
+    assert script.written[1:] == [header + bytes(500), b""]
+    script = Script(OK)
+    over(script).transact(PtpRequest(0x9110, 5), send=bytes(501), timeout=PATIENCE_S)
+    assert script.written[1:] == [b"\x01" + header[1:] + bytes(501)]
+
+
+def test_the_tail_is_read_in_whole_packets() -> None:
+    size = 12 + 1_000_000
+    script = Script(
+        data(size, bytes(500)),
+        bytes(512 * 1024),
+        bytes((size - 512 - 524288) // 512 * 512),
+        bytes((size - 512 - 524288) % 512),
+        OK,
+    )
+    pieces: list[bytes] = []
+    over(script).transact(PtpRequest(0x9116, 5), receive=pieces.append, timeout=PATIENCE_S)
+    assert sum(map(len, pieces)) == 1_000_000
+    assert script.limits == [512, 524288, 475_136, 512, 512]
+
+
+def test_an_empty_packet_before_the_response_is_skipped() -> None:
+    assert get(Script(data(512, bytes(500)), b"", OK)) == bytes(500)
+    assert get(Script(data(512, bytes(500)), OK)) == bytes(500)
+
+
+def test_data_of_unknown_length_end_with_a_short_packet() -> None:
+    unknown = 0xFFFFFFFF
+    assert get(Script(data(unknown, bytes(500)), bytes(512 * 1024), b"end", OK)) == bytes(500 + 524288) + b"end"
+    assert get(Script(data(unknown, b"short"), OK)) == b"short"
+    assert get(Script(data(unknown, bytes(500)), b"", OK)) == bytes(500)
+    # The empty packet ends a larger read, and leaves no other trace.
+    assert get(Script(data(unknown, bytes(500)), bytes(1024), OK)) == bytes(500 + 1024)
+
+
+def test_one_stall_is_cleared_and_the_read_repeated() -> None:
+    script = Script(STALL, OK)
+    assert get(script) == b""
+    assert script.written[1:] == [Pipe.BULK_IN]
+
+
+def test_a_second_stall_is_an_error() -> None:
+    script = Script(STALL, STALL, OK)
+    with pytest.raises(ProtocolError, match="stalls again"):
+        get(script)
+
+
+@pytest.mark.parametrize("transfer", [0, 1, 2])
+def test_a_stall_on_the_way_out_is_tried_again(transfer: int) -> None:
+    bench = Echo()
+    pipes = Stalling(MemoryPipes(PtpUsbDevice(bench)), Pipe.BULK_OUT, {transfer})
+    transport = UsbTransport(pipes, SimulatedClock())
+    for _ in range(2):
+        done = transport.transact(PtpRequest(TAKE, 1), send=payload(500), timeout=PATIENCE_S)
+        assert done.response.parameters[0] == 500
+
+
+def test_endless_empty_packets_are_an_error() -> None:
+    with pytest.raises(ProtocolError, match="empty packet"):
+        get(Script(*[b""] * 100))
+
+
+@pytest.mark.parametrize(
+    ("reads", "wrong"),
+    [
+        ((data(100, bytes(88))[:4] + bytes.fromhex("0200 1691 06000000") + bytes(88), OK), "transaction 6"),
+        ((data(13, b"a"), data(13, b"a"), OK), "second data phase"),
+        ((bytes.fromhex("0c000000 0400 0120 05000000"),), "where a response was due"),
+        ((b"garbage that is no container at all",), "container"),
+    ],
+)
+def test_what_ptp_does_not_allow_is_refused(reads: tuple[bytes, ...], wrong: str) -> None:
+    with pytest.raises(ProtocolError, match=wrong):
+        get(Script(*reads))
+
+
+def test_a_device_that_succeeds_with_half_the_data_is_not_believed() -> None:
+    # A short packet cannot end a container whose length is known: what follows is taken for its payload.
+    with pytest.raises((ProtocolError, LinkTimeout)):
+        get(Script(data(2000, bytes(100)), OK))
+
+
+def test_events_are_joined_from_packets_of_eight() -> None:
+    # As an EOS sends them: 16 bytes in two packets, 12 in two.
+    script = Script(
+        events=(
+            bytes.fromhex("10000000 0400 01c1"),
+            bytes.fromhex("ffffffff 2a000000"),
+            bytes.fromhex("0c000000 0400 02c1"),
+            bytes.fromhex("05000000"),
+        )
+    )
+    assert over(script).events() == (PtpEvent(0xC101, 0xFFFFFFFF, (42,)), PtpEvent(0xC102, 5))
+
+
+def test_half_an_event_waits_for_the_rest() -> None:
+    script = Script(events=(bytes.fromhex("0c000000 0400 01c1"),))
+    transport = over(script)
+    assert transport.events() == ()
+    script.events.append(bytes.fromhex("05000000"))
+    assert transport.events() == (PtpEvent(0xC101, 5),)
+
+
+def test_garbage_on_the_interrupt_pipe_is_told_once() -> None:
+    script = Script(events=(b"\xff" * 8, b"\xff" * 8))
+    transport = over(script)
+    with pytest.raises(ProtocolError):
+        transport.events()
+    script.events[:] = [bytes.fromhex("0c000000 0400 01c1"), bytes.fromhex("05000000")]
+    assert transport.events() == (PtpEvent(0xC101, 5),)
+
+
+def test_reset_asks_the_class_and_waits_until_the_device_is_ready() -> None:
+    # 5.2.3 and 5.2.4: reset, then status until it is no longer busy.
+    script = Script(status=bytes.fromhex("0400 0120"))
+    transport = over(script)
+    transport.reset()
+    assert script.written == [(0x66, b""), (0x67, b""), Pipe.BULK_OUT, Pipe.BULK_IN]
+
+
+def test_a_device_that_stays_busy_has_its_port_reset() -> None:
+    script = Script(status=bytes.fromhex("0400 1920"))
+    clock = SimulatedClock()
+    UsbTransport(script, clock).reset()
+    assert clock.monotonic() == pytest.approx(2.0)
+    assert b"port reset" in script.written
+
+
+def test_a_caller_who_cannot_take_data_cancels() -> None:
+    def full(piece: bytes) -> None:
+        raise KeyboardInterrupt
+
+    script = Script(data(2000, bytes(500)), status=bytes.fromhex("0400 0120"))
+    transport = over(script)
+    with pytest.raises(KeyboardInterrupt):
+        transport.transact(PtpRequest(0x9116, 5), receive=full, timeout=PATIENCE_S)
+    # 5.2.1: the cancellation code, then the transaction.
+    assert script.written[1:3] == [(0x64, bytes.fromhex("0140 05000000")), (0x67, b"")]
+    script.reads.append(OK)
+    assert transport.transact(PtpRequest(0x9116, 5), timeout=PATIENCE_S).response.ok
+
+
+def camera() -> MemoryPipes:
+    return MemoryPipes(PtpUsbDevice(Echo()))
+
+
+def _give_twice(transport: UsbTransport, pieces: list[bytes]) -> None:
+    for number in range(2):
+        transport.transact(PtpRequest(GIVE, number, (2000,)), receive=pieces.append, timeout=PATIENCE_S)
+
+
+@given(after=st.integers(0, 3100))
+def test_pulled_out_at_any_byte_is_closed(after: int) -> None:
+    pieces: list[bytes] = []
+    transport = UsbTransport(CutOff(camera(), after), SimulatedClock())
+    with pytest.raises(LinkClosed):
+        _give_twice(transport, pieces)
+    assert (payload(2000) * 2).startswith(b"".join(pieces))
+
+
+@given(reads=st.integers(0, 3))
+def test_silence_at_any_read_is_a_timeout(reads: int) -> None:
+    transport = UsbTransport(Deaf(camera(), reads), SimulatedClock())
+    with pytest.raises(LinkTimeout):
+        transport.transact(PtpRequest(GIVE, 1, (3000,)), timeout=PATIENCE_S)
+
+
+@given(at=st.integers(0, 11), value=st.integers(0, 255))
+def test_a_garbled_byte_in_a_response_is_never_taken_for_another_message(at: int, value: int) -> None:
+    def change(read: bytes) -> bytes:
+        return read[:at] + bytes([value]) + read[at + 1 :]
+
+    transport = UsbTransport(Garbling(camera(), change), SimulatedClock())
+    try:
+        done = transport.transact(PtpRequest(ECHO, 0x01020304), timeout=PATIENCE_S)
+    except (ProtocolError, LinkTimeout):
+        return
+    # Only the code may differ, for any is allowed.
+    assert done.response.transaction == 0x01020304
+    assert done.response.parameters == ()
+    assert at in (6, 7) or done.response.ok
+
+
+def test_a_flood_of_events_does_not_keep_us() -> None:
+    transport = UsbTransport(camera(), SimulatedClock())
+    transport.transact(PtpRequest(RAISE, 1, (5000,)), timeout=PATIENCE_S)
+    assert len(transport.events()) == 4096
+    assert len(transport.events()) == 904

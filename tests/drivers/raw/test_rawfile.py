@@ -1,0 +1,444 @@
+"""Raw files: real ones against dcraw's own output, made ones with odd margins, damaged ones."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import subprocess
+import sys
+import threading
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from drivers.camera import ExposureSettings
+from drivers.raw import plain_dng as dng_reading
+from drivers.raw import rawfile
+from drivers.raw.rawfile import Area, Mosaic, read_raw
+from drivers.tiff import reading as tiff
+from foundation.errors import FormatError
+from sim.camera.dng import write_dng as write_simulated_dng
+from sim.world.sensors import BODIES, Rectangle
+from tests.data_files import available, shipped
+from tests.drivers.raw.raw_files import Tags, longs, lossless_jpeg, ratios, shorts, text, write_cr2, write_dng
+
+EOS_550D = shipped("raw/canon_eos_550d_colorchart.dng")
+G2 = shipped("raw/canon_powershot_g2.crw")
+REAL = (EOS_550D, G2, *available("raw/blackmagic.dng"))
+
+
+def noise(shape: tuple[int, int], top: int = 4096) -> NDArray[np.uint16]:
+    return np.random.default_rng(7).integers(0, top, shape).astype(np.uint16)
+
+
+def outcome(path: Path) -> Mosaic | FormatError:
+    """Return what reading gives; anything but these two fails the test."""
+    try:
+        return read_raw(path)
+    except FormatError as error:
+        return error
+
+
+# Real files
+
+
+def test_counts_are_dcraws() -> None:
+    # Measured with dcraw 9.28, -D -4 -T.
+    for line in shipped("raw/dcraw_D4T.sha256").read_text().splitlines():
+        digest, name, shape = line.split()
+        mosaic = read_raw(shipped(f"raw/{name}"))
+        assert f"{mosaic.counts.shape[0]}x{mosaic.counts.shape[1]}" == shape
+        assert hashlib.sha256(mosaic.counts.astype("<u2").tobytes()).hexdigest() == digest
+
+
+def test_a_real_550d_file() -> None:
+    # Tags as exiftool and tifffile show them; the sensor's left border is black on a real sensor, near the 2048 counts
+    # that Canon's bodies of this generation are set to.
+    mosaic = read_raw(EOS_550D)
+    assert mosaic.camera == "Canon EOS Kiss X4"
+    assert mosaic.pattern == "RGGB"
+    assert mosaic.visible == Area(26, 152, 1156, 1734)
+    assert mosaic.sensor.shape == (1182, 1888)
+    np.testing.assert_array_equal(mosaic.black, np.full((2, 2), 2056.0))
+    assert mosaic.white_level == 15000
+    assert (mosaic.iso, mosaic.aperture, mosaic.shutter_s) == (None, None, None)
+    black = mosaic.masked_black()
+    assert black is not None
+    np.testing.assert_allclose(black, 2048, atol=4)
+
+
+def test_a_real_g2_file() -> None:
+    mosaic = read_raw(G2)
+    assert mosaic.camera == "Canon PowerShot G2"
+    assert mosaic.pattern == "RGGB"
+    assert (mosaic.iso, mosaic.aperture) == (50, 4.0)
+    assert mosaic.shutter_s == pytest.approx(1 / 50, rel=0.02)
+    np.testing.assert_array_equal(mosaic.black, np.full((2, 2), 32.0))
+    assert mosaic.white_level == 1023
+    black = mosaic.masked_black()
+    assert black is not None
+    np.testing.assert_allclose(black, 32, atol=0.2)
+
+
+@pytest.mark.parametrize("real", [None, *available("raw/blackmagic.dng")], ids=lambda real: real and real.name)
+def test_a_compressed_file_of_another_maker(tmp_path: Path, real: Path | None) -> None:
+    # The made one has the same structure: lossless JPEG of 12-bit codes, a table that decodes them, no masked area.
+    path, codes, tones = real or tmp_path / "made.dng", noise((64, 96)), np.arange(4096, dtype=np.uint16) * 16
+    if real is None:
+        tags = {50708: text("Blackmagic Pocket Cinema Camera 4K"), 50712: shorts(*tones.tolist()), 50714: shorts(512)}
+        write_dng(path, codes, {**tags, 50717: longs(65535), 259: shorts(7)}, lossless_jpeg(codes))
+    mosaic = read_raw(path)
+    assert mosaic.camera == "Blackmagic Pocket Cinema Camera 4K"
+    if real is None:
+        np.testing.assert_array_equal(mosaic.counts, tones[codes])
+    else:
+        assert mosaic.counts.shape == (2176, 4128)
+    np.testing.assert_array_equal(mosaic.black, np.full((2, 2), 512.0))
+    assert mosaic.masked == ()
+    assert mosaic.masked_black() is None
+
+
+# Frames
+
+
+def test_a_550d_cr2_is_framed_as_dcraw_does(tmp_path: Path) -> None:
+    # dcraw 9.28 shows raw[51:3516, 142:5344] as RGGB; LibRaw's own frame begins one row lower.
+    columns = np.random.default_rng(2).integers(0, 64, 5344)
+    columns[:2] = 1
+    counts = np.add.outer(8192 + np.arange(3516), columns).astype(np.uint16)
+    write_cr2(tmp_path / "IMG_0001.CR2", counts, "Canon EOS 550D", iso=200)
+    mosaic = read_raw(tmp_path / "IMG_0001.CR2")
+    np.testing.assert_array_equal(mosaic.counts, counts[51:3516, 142:5344])
+    assert mosaic.pattern == "RGGB"
+    assert mosaic.camera == "Canon EOS 550D"
+    assert (mosaic.iso, mosaic.aperture, mosaic.shutter_s) == (200, 8.0, 0.5)
+    assert mosaic.masked == (Area(0, 0, 3516, 140), Area(4, 140, 44, 5204))
+    assert mosaic.block_planes().shape == (2, 2, 1732, 2601)
+
+
+def test_a_canon_cr2_whose_frame_both_share_is_left_alone(tmp_path: Path) -> None:
+    counts = (noise((64, 96), 4) + 2048).astype(np.uint16)
+    write_cr2(tmp_path / "small.CR2", counts, "Canon EOS 550D")
+    mosaic = read_raw(tmp_path / "small.CR2")
+    visible = mosaic.visible
+    np.testing.assert_array_equal(mosaic.sensor, counts)
+    np.testing.assert_array_equal(
+        mosaic.counts,
+        counts[visible.top : visible.top + visible.height, visible.left : visible.left + visible.width],
+    )
+
+
+@pytest.mark.parametrize("maker", ["Canon", "Nikon"])
+@pytest.mark.parametrize(("top", "left"), [(0, 0), (1, 0), (0, 1), (13, 17), (12, 40)])
+def test_a_dng_is_framed_by_its_active_area(tmp_path: Path, maker: str, top: int, left: int) -> None:
+    # DNG 1.4: CFAPattern counts from the active area's corner, however odd that is.
+    counts = noise((61, 90))
+    more = {271: text(maker), 272: text("Test"), 50829: longs(top, left, 60, 88), 33422: (1, 4, b"\2\1\1\0")}
+    write_dng(tmp_path / "odd.dng", counts, more)
+    mosaic = read_raw(tmp_path / "odd.dng")
+    assert mosaic.visible == Area(top, left, 60 - top, 88 - left)
+    assert mosaic.pattern == "BGGR"
+    assert mosaic.camera == f"{maker} Test"
+    np.testing.assert_array_equal(mosaic.counts, counts[top:60, left:88])
+    np.testing.assert_array_equal(mosaic.sensor, counts)
+
+
+@pytest.mark.parametrize(
+    ("code", "pattern"), [(b"\0\1\1\2", "RGGB"), (b"\1\0\2\1", "GRBG"), (b"\1\2\0\1", "GBRG"), (b"\2\1\1\0", "BGGR")]
+)
+def test_patterns(tmp_path: Path, code: bytes, pattern: str) -> None:
+    write_dng(tmp_path / "a.dng", noise((40, 60)), {33422: (1, 4, code)})
+    assert read_raw(tmp_path / "a.dng").pattern == pattern
+
+
+def test_a_simulated_camera_file_reads_back(tmp_path: Path) -> None:
+    body = dataclasses.replace(
+        BODIES["EOS 550D"],
+        sensor=(129, 206),
+        visible=Rectangle(51, 47, 77, 157),
+        masked=(Rectangle(0, 0, 129, 40),),
+    )
+    counts = noise(body.sensor)
+    exposure = ExposureSettings(400, 5.6, 0.25)
+    with (tmp_path / "s.dng").open("wb") as stream:
+        write_simulated_dng(stream, counts, body, settings=exposure, taken_at=datetime(2026, 1, 1, tzinfo=UTC))
+    mosaic = read_raw(tmp_path / "s.dng")
+    np.testing.assert_array_equal(mosaic.counts, counts[51:128, 47:204])
+    assert mosaic.pattern == "RGGB"
+    assert mosaic.masked == (Area(0, 0, 129, 40),)
+    assert mosaic.white_level == 13584
+    assert (mosaic.iso, mosaic.aperture, mosaic.shutter_s) == (400, pytest.approx(5.6), 0.25)
+
+
+def none(data: bytes, directories: list[tiff.Directory]) -> None:
+    """Stand in for a reader that is never sure."""
+
+
+_CODES = [b"\0\1\1\2", b"\1\0\2\1", b"\1\2\0\1", b"\2\1\1\0"]
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    size=st.tuples(st.integers(40, 70), st.integers(40, 70)),
+    code=st.sampled_from(_CODES),
+    corner=st.none() | st.tuples(st.integers(0, 9), st.integers(0, 9)),
+    black=st.sampled_from([{}, {50714: shorts(2048)}, {50713: shorts(2, 2), 50714: shorts(1, 2, 3, 4)}]),
+    table=st.booleans(),
+    maker=st.sampled_from(["Canon", "Nikon"]),
+)
+def test_a_plain_dng_is_what_libraw_reads(
+    tmp_path: Path,
+    size: tuple[int, int],
+    code: bytes,
+    corner: tuple[int, int] | None,
+    black: Tags,
+    table: bool,
+    maker: str,
+) -> None:
+    more: Tags = {271: text(maker), 272: text("Test"), 33422: (1, 4, code), **black}
+    if corner is not None:
+        more[50829] = longs(*corner, *size)
+    if table:
+        more[50712] = shorts(*range(0, 8192, 2))
+    write_dng(tmp_path / "a.dng", noise(size), more)
+    data = (tmp_path / "a.dng").read_bytes()
+    plain = dng_reading.read_plainly(data, tiff.read_directories(data))
+    # A table of tones is LibRaw's to apply, a visible area that is not stated its to know.
+    assert (plain is None) == (table or corner is None)
+    read = read_raw(tmp_path / "a.dng")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rawfile, "read_plainly", none)
+        unpacked = read_raw(tmp_path / "a.dng")
+    np.testing.assert_array_equal(read.sensor, unpacked.sensor)
+    np.testing.assert_array_equal(read.black, unpacked.black)
+    alike = ("pattern", "white_level", "camera", "visible", "masked", "iso", "aperture", "shutter_s")
+    assert [getattr(read, name) for name in alike] == [getattr(unpacked, name) for name in alike]
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {258: shorts(8)},
+        {277: shorts(2)},
+        {33421: shorts(2, 3)},
+        {33422: (1, 4, b"\0\0\1\2")},
+        {33422: (1, 4, b"\3\1\1\2")},
+        {50711: shorts(2)},
+        {50717: longs(4095, 4095)},
+        {279: longs(10)},
+        {259: shorts(7)},
+    ],
+)
+def test_what_is_not_plain_is_left_to_libraw(tmp_path: Path, more: Tags) -> None:
+    write_dng(tmp_path / "a.dng", noise((40, 60)), {50829: longs(0, 0, 40, 60), **more})
+    data = (tmp_path / "a.dng").read_bytes()
+    assert dng_reading.read_plainly(data, tiff.read_directories(data)) is None
+
+
+# Black
+
+
+def test_black_keeps_its_fraction_and_its_place(tmp_path: Path) -> None:
+    # DNG 1.4: BlackLevel counts from the active area's corner; the deltas of columns and rows add to it.
+    levels = ratios((20483, 10), (20495, 10), (2050, 1), (2051, 1))
+    more = {50713: shorts(2, 2), 50714: levels, 50829: longs(3, 5, 40, 60)}
+    write_dng(tmp_path / "a.dng", noise((40, 60)), more)
+    np.testing.assert_allclose(read_raw(tmp_path / "a.dng").black, [[2048.3, 2049.5], [2050, 2051]])
+    write_dng(tmp_path / "b.dng", noise((40, 60)), {50713: shorts(1, 2), 50714: shorts(100, 200)})
+    np.testing.assert_array_equal(read_raw(tmp_path / "b.dng").black, [[100, 200], [100, 200]])
+
+
+def test_masked_black_is_the_mean_of_each_phase(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    counts = np.full((201, 300), 4000, np.uint16)
+    truth = np.array([[2047.25, 2048.0], [2049.5, 2046.75]])
+    for row in range(2):
+        for column in range(2):
+            # The visible corner (13, 41) has phase (0, 0): sensor rows and columns of even number have the other.
+            border = counts[(row + 1) % 2 :: 2, (column + 1) % 2 : 41 : 2]
+            border[...] = np.round(rng.normal(truth[row, column], 6.0, border.shape))
+    counts[:, :4] = 2066  # the disturbed first columns, too near to be told by their value
+    counts[50, 20:24] = 16000  # hot photosites
+    write_dng(tmp_path / "a.dng", counts, {50829: longs(13, 41, 201, 300), 50830: longs(0, 0, 201, 40)})
+    mosaic = read_raw(tmp_path / "a.dng")
+    black = mosaic.masked_black()
+    assert black is not None
+    # 1800 photosites a phase: a standard error of 0.14.
+    np.testing.assert_allclose(black, truth, atol=0.6)
+
+
+def test_a_masked_area_that_is_too_small_or_off_the_sensor_tells_nothing(tmp_path: Path) -> None:
+    write_dng(tmp_path / "a.dng", noise((40, 60)), {50830: longs(0, 0, 20, 20)})
+    assert read_raw(tmp_path / "a.dng").masked == (Area(0, 0, 20, 20),)
+    assert read_raw(tmp_path / "a.dng").masked_black() is None
+    write_dng(tmp_path / "b.dng", noise((40, 60)), {50830: longs(0, 0, 400, 20, 9, 9, 9, 9)})
+    assert read_raw(tmp_path / "b.dng").masked == ()
+
+
+def test_block_planes_are_the_four_phases(tmp_path: Path) -> None:
+    write_dng(tmp_path / "a.dng", noise((41, 63)), {50829: longs(2, 3, 41, 62)})
+    mosaic = read_raw(tmp_path / "a.dng")
+    planes = mosaic.block_planes()
+    assert planes.shape == (2, 2, 19, 29)
+    for row in range(2):
+        for column in range(2):
+            np.testing.assert_array_equal(planes[row, column], mosaic.counts[row:38:2, column:58:2])
+    assert np.shares_memory(planes, mosaic.sensor)
+
+
+def test_arrays_are_read_only(tmp_path: Path) -> None:
+    write_dng(tmp_path / "a.dng", noise((40, 60)))
+    mosaic = read_raw(tmp_path / "a.dng")
+    for array in (mosaic.counts, mosaic.sensor, mosaic.black, mosaic.block_planes()):
+        assert not array.flags.writeable
+
+
+# What is no raw file
+
+
+def test_what_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"no raw file .*gone\.CR2; check the name"):
+        read_raw(tmp_path / "gone.CR2")
+    with pytest.raises(FormatError, match="is a folder"):
+        read_raw(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"x",
+        b"II*\0",
+        b"MM\0*\0\0\0\x08\0\0\0\0\0\0",
+        b"kind,illumination,file\n" * 100,
+        b"\x89PNG\r\n\x1a\n" + bytes(1000),
+        b"\xff\xd8\xff\xe0" + bytes(1000),
+        bytes(100_000),
+    ],
+    ids=["empty", "one byte", "four bytes", "empty TIFF", "text", "PNG", "JPEG", "zeros"],
+)
+def test_what_is_no_raw_file(tmp_path: Path, content: bytes, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "frame.CR2").write_bytes(content)
+    with pytest.raises(FormatError, match=r"frame\.CR2 cannot be read as a raw file: .*; expected .*: copy"):
+        read_raw(tmp_path / "frame.CR2")
+    assert capfd.readouterr() == ("", "")
+
+
+LATE_WRITER = """
+import ctypes
+from pathlib import Path
+from drivers.raw import rawfile
+
+libc = ctypes.CDLL(None)
+with rawfile._libraw_silenced():
+    kept = ctypes.c_void_p.in_dll(libc, "stderr").value
+print(libc.fputs(b"late", ctypes.c_void_p(kept)) >= 0 and libc.fflush(ctypes.c_void_p(kept)) == 0)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="C's stderr is a variable of that name on Linux only")
+def test_a_library_that_came_while_a_raw_file_was_read_may_write_later() -> None:
+    """The C++ library keeps the stream that it finds as stderr when it is loaded, and flushes it at the end."""
+    done = subprocess.run([sys.executable, "-c", LATE_WRITER], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")
+
+
+def test_a_sensor_that_is_no_bayer_is_named_so(tmp_path: Path) -> None:
+    counts = noise((60, 90))
+    xtrans = bytes([1, 1, 0, 1, 1, 2] * 6)
+    write_dng(tmp_path / "x.dng", counts, {33421: shorts(6, 6), 33422: (1, 36, xtrans)})
+    cyan = {33422: (1, 4, b"\3\4\1\5"), 50710: (1, 4, b"\3\4\1\5")}
+    write_dng(tmp_path / "c.dng", counts, cyan)
+    write_dng(tmp_path / "linear.dng", counts, {262: shorts(34892)})
+    for name in ("x.dng", "c.dng", "linear.dng"):
+        with pytest.raises(FormatError, match=f"{name} .*(Bayer|raw file)"):
+            read_raw(tmp_path / name)
+
+
+# Damage
+
+
+@pytest.mark.parametrize("real", REAL, ids=lambda real: real.name)
+def test_a_cut_file_is_an_error(tmp_path: Path, real: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    data = real.read_bytes()
+    # The last 58 bytes of blackmagic.dng pad the file; no tag points at them.
+    whole = len(data) - (58 if real.name == "blackmagic.dng" else 0)
+    lengths = [0, 7, 8, 100, 999, 1500, 5000, 20_000, *np.linspace(30_000, whole - 1, 9).astype(int).tolist()]
+    cut = tmp_path / real.name
+    for length in lengths:
+        cut.write_bytes(data[:length])
+        assert isinstance(outcome(cut), FormatError), length
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_cut_cr2_is_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    write_cr2(tmp_path / "a.CR2", noise((64, 96), 64), "Canon EOS 550D")
+    data = (tmp_path / "a.CR2").read_bytes()
+    assert isinstance(outcome(tmp_path / "a.CR2"), Mosaic)
+    for length in range(0, len(data), 97):
+        (tmp_path / "a.CR2").write_bytes(data[:length])
+        assert isinstance(outcome(tmp_path / "a.CR2"), FormatError), length
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("make", ["dng", "cr2"])
+def test_flipped_bytes_are_a_mosaic_or_an_error(tmp_path: Path, make: str, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / f"a.{make}"
+    if make == "dng":
+        more = {271: text("Canon"), 50829: longs(3, 5, 40, 60), 50830: longs(0, 0, 40, 4)}
+        write_dng(path, noise((40, 60)), more)
+    else:
+        write_cr2(path, noise((64, 96), 64), "Canon EOS 550D")
+    data = path.read_bytes()
+    rng = np.random.default_rng(11)
+    kinds: set[type] = set()
+    for _ in range(400):
+        flipped = bytearray(data)
+        # Mostly in the directories, where a byte decides how the others are read.
+        for place in rng.integers(0, 700 if rng.random() < 0.7 else len(data), rng.integers(1, 4)):
+            flipped[place] = rng.integers(256)
+        path.write_bytes(flipped)
+        kinds.add(type(outcome(path)))
+    assert kinds == {Mosaic, FormatError}
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("real", REAL[1:], ids=lambda real: real.name)
+def test_flipped_bytes_of_real_files(tmp_path: Path, real: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    data = real.read_bytes()
+    rng = np.random.default_rng(5)
+    path = tmp_path / real.name
+    for _ in range(12):
+        flipped = bytearray(data)
+        for place in rng.integers(0, len(data), 20):
+            flipped[place] = rng.integers(256)
+        path.write_bytes(flipped)
+        outcome(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_threads_decode_side_by_side(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    counts = noise((64, 96), 64)
+    write_cr2(tmp_path / "good.CR2", counts, "Canon EOS 550D")
+    data = (tmp_path / "good.CR2").read_bytes()
+    (tmp_path / "bad.CR2").write_bytes(data[:-4000] + bytes(4000))
+    failures: list[object] = []
+
+    def decode(name: str) -> None:
+        for _ in range(20):
+            found = outcome(tmp_path / name)
+            if name == "good.CR2" and not (isinstance(found, Mosaic) and np.array_equal(found.sensor, counts)):
+                failures.append(found)
+
+    threads = [threading.Thread(target=decode, args=(name,)) for name in ("good.CR2", "bad.CR2") * 2]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failures == []
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,126 @@
+"""The command `evaluate` as a user meets it: what it prints, writes and returns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from fsspec.core import url_to_fs
+
+from evaluation import experiments
+from evaluation.cli import main
+from evaluation.methods import standard_methods
+
+
+def test_a_dataset_on_a_store(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(dataset), "--methods", "white-patch"]) == 0
+    table = capsys.readouterr().out.splitlines()[1:]
+    store, top = url_to_fs("memory://evaluated/set")
+    for path in dataset.rglob("*"):
+        if path.is_file():
+            store.pipe_file(f"{top}/{path.relative_to(dataset).as_posix()}", path.read_bytes())
+    assert main(["memory://evaluated/set/", "--methods", "white-patch"]) == 0
+    title, *same = capsys.readouterr().out.splitlines()
+    assert title == "set: reproduction angular error of 16 images, degrees"
+    assert same == table
+    assert main(["memory://evaluated/nothing"]) == 2
+    assert "memory://evaluated/nothing is no dataset" in capsys.readouterr().err
+
+
+def test_the_command(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table, images = dataset.parent / "table.csv", dataset.parent / "images.csv"
+    wish = ("--methods", "white-patch,gray-world", "--csv", str(table), "--images", str(images))
+    assert main([str(dataset), *wish]) == 0
+    printed = capsys.readouterr().out
+    assert "reproduction angular error of 16 images" in printed
+    heads = [printed.index(head) for head in ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")]
+    assert heads == sorted(heads)
+    assert printed.index("White-Patch") < printed.index("Gray-world")
+    assert [row.split(",")[0] for row in table.read_text().splitlines()] == ["method", "White-Patch", "Gray-world"]
+    assert len(images.read_text().splitlines()) == 33
+
+
+def test_the_command_counts_images_without_a_usable_pixel(
+    make_dataset: Callable[[int, int], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(make_dataset(12, 12))]) == 0
+    after = capsys.readouterr().out.rpartition("┘")[2]
+    reason = "no usable pixel in 16 of 16 images (too small for it, clipped, black or even)"
+    assert after.split("\n") == [
+        "",
+        f"General Gray-world: {reason}; their light was taken to be grey",
+        f"1st-order Gray-Edge: {reason}; their light was taken to be grey",
+        "",
+    ]
+
+
+@pytest.mark.parametrize("place", [".", "../set[a-1]", "splits/.."])
+def test_the_table_names_the_dataset(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], place: str
+) -> None:
+    folder = dataset.rename(dataset.with_name("set[a-1]"))
+    (folder / "splits").mkdir()
+    monkeypatch.chdir(folder)
+    assert main([place, "--methods", "gray-world"]) == 0
+    assert capsys.readouterr().out.startswith("set[a-1]: reproduction angular error of 16 images, degrees\n")
+
+
+def test_a_file_gets_the_whole_table_however_narrow_the_terminal(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
+    assert main([str(dataset)]) == 0
+    first, *table = capsys.readouterr().out.splitlines()
+    assert first == "made: reproduction angular error of 16 images, degrees"
+    assert {len(line) for line in table} == {len(table[0])}
+    for method in standard_methods().values():
+        assert [line for line in table if method.name in line and len(re.findall(r"\d\.\d\d ", line)) == 6]
+
+
+def test_a_narrow_terminal_cuts_no_number(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # By which rich takes any output for a terminal.
+    printed: dict[int, str] = {}
+    for columns in (30, 75, 120):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        assert main([str(dataset)]) == 0
+        printed[columns] = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out)
+    numbers = {columns: re.findall(r"\d\.\d\d ", text) for columns, text in printed.items()}
+    assert len(numbers[120]) == 6 * len(standard_methods())
+    assert numbers[30] == numbers[75] == numbers[120]
+    assert max(map(len, printed[75].splitlines())) <= 75
+    for word in ("Gray-world", "2nd-order", "Worst 25%"):
+        assert all(word in text for text in printed.values())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("made", "--methods", "magic"), "'magic' is no method; the methods are white-patch"),
+        (("lut",), "is no dataset"),
+        (("made", "--csv", "made"), "made already exists; name another place for the table"),
+        (("made", "--csv", "made/gt.txt"), "made/gt.txt already exists; name another place for the table"),
+        (("made", "--images", "empty"), "empty already exists; name another place for the images' errors"),
+        (("made", "--csv", "new.csv", "--images", "lut/../new.csv"), "are both lut/../new.csv; give each a file"),
+    ],
+)
+def test_what_cannot_be_done_is_one_sentence(
+    dataset: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    message: str,
+) -> None:
+    def never(*given: object) -> None:
+        pytest.fail("the work must not begin")
+
+    monkeypatch.chdir(dataset.parent)
+    monkeypatch.setattr(experiments, "evaluate", never)
+    Path("empty").mkdir()
+    before = {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")}
+    assert main([*arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")} == before

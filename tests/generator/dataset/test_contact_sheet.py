@@ -1,0 +1,44 @@
+"""The contact sheet of a dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from generator.dataset.contact_sheet import contact_sheet
+from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.reader import Dataset, Entry
+from generator.pictures.sources import random_scenes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from calibration.table.lut import Lut
+
+
+def test_a_contact_sheet_shows_rows_of_sources(
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[str] = []
+    load = Dataset.read_image
+
+    def read(self: Dataset, entry: Entry) -> npt.NDArray[np.uint16]:
+        shown.append(entry.image)
+        return load(self, entry)
+
+    monkeypatch.setattr(Dataset, "read_image", read)
+    made = generate_dataset(
+        make_lut(), tmp_path / "out", random_scenes(5, 24, 16), [0, 1, 2, 3], options=DatasetOptions(previews=False)
+    )
+    whole = contact_sheet(made)
+    assert len(shown) == 20
+    assert whole.dtype == np.uint8
+    shown.clear()
+    part = contact_sheet(made, max_rows=3, max_columns=2)
+    assert shown == ["000000.png", "000003.png", "000008.png", "000011.png", "000016.png", "000019.png"]
+    assert part.shape[0] < whole.shape[0]
+    assert part.shape[1] < whole.shape[1]

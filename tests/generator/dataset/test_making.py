@@ -1,0 +1,215 @@
+"""A dataset's folder: what is in it, that it can be made again, and what happens when something is wrong."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import cv2
+import numpy as np
+import pytest
+
+from foundation.errors import FormatError, InputError
+from generator.dataset.making import Callbacks, DatasetOptions, generate_dataset
+from generator.dataset.reader import open_dataset
+from generator.kernels.rendering import render
+from generator.lights.choices import ListedLights, RandomLights
+from generator.lights.lighting import mixture_of
+from generator.pictures.picture import read_picture
+from generator.pictures.sources import find_pictures, random_scenes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from calibration.table.lut import Lut
+
+
+NUMBERS = (0, 1, 2, 3, 6, 7, 8, 9)
+"""Of the images of `pictures` under two lights: the third picture leaves its two numbers free."""
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """Return a folder of five pictures, the third of them broken."""
+    folder = tmp_path / "pictures"
+    (folder / "more").mkdir(parents=True)
+    rng = np.random.default_rng(2)
+    for name, shape in (("a.png", (20, 30)), ("b, c.png", (31, 17)), ("more/d.png", (8, 600)), ("more/e.png", (9, 9))):
+        coarse = rng.integers(0, 256, (shape[0], shape[1], 3)).astype(np.uint8)
+        (folder / name).write_bytes(cv2.imencode(".png", coarse)[1].tobytes())
+    (folder / "broken.jpg").write_bytes(b"no picture")
+    return folder
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Return the hash of every file below `folder`."""
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_what_is_in_the_folder(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
+    lut = make_lut()
+    skipped: list[tuple[str, str]] = []
+    images: list[int] = []
+    made = generate_dataset(
+        lut,
+        tmp_path / "out",
+        find_pictures([pictures]),
+        [2, 1],
+        seed=77,
+        workers=2,
+        callbacks=Callbacks(
+            on_image=lambda: images.append(1),
+            on_skip=lambda name, reason, missed: skipped.append((name, f"{reason} ({missed} images)")),
+        ),
+    )
+    assert len(images) == 8
+    assert [name for name, _ in skipped] == ["broken.jpg"]
+    assert "JPEG" in skipped[0][1]
+    assert skipped[0][1].endswith("(2 images)")
+    with (tmp_path / "out" / "ground_truth.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert list(rows[0]) == ["image", "source", "illumination", "r", "g", "b"]
+    assert [row["image"] for row in rows] == [f"{number:06d}.png" for number in NUMBERS]
+    assert [row["source"] for row in rows] == [
+        name for name in ("a.png", "b, c.png", "more/d.png", "more/e.png") for _ in range(2)
+    ]
+    assert [int(row["illumination"]) for row in rows] == [2, 1] * 4
+    truths = [[float(row[channel]) for channel in "rgb"] for row in rows]
+    np.testing.assert_allclose(truths, lut.ground_truth[[2, 1] * 4], atol=1e-9)
+    np.testing.assert_allclose(np.sum(truths, axis=1), 1, atol=2e-9)
+    np.testing.assert_array_equal(np.loadtxt(tmp_path / "out" / "gt.txt"), truths)
+    described = json.loads((tmp_path / "out" / "dataset.json").read_text())
+    assert (described["format"], described["version"], described["seed"]) == ("crop.dataset", 2, 77)
+    assert described["table"]["sha256"] == lut.sha256
+    assert described["table"]["white_level"] == 8000
+    assert (described["planned"], described["images"], described["sources"]) == (10, 8, 4)
+    assert described["skipped"] == [{"position": 2, "name": "broken.jpg"}]
+    with (tmp_path / "out" / "sources.csv").open(newline="") as stream:
+        sources = list(csv.DictReader(stream))
+    assert [(row["position"], row["name"]) for row in sources] == [
+        ("0", "a.png"),
+        ("1", "b, c.png"),
+        ("3", "more/d.png"),
+        ("4", "more/e.png"),
+    ]
+    file = pictures / "b, c.png"
+    assert sources[1]["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert (sources[1]["width"], sources[1]["height"]) == ("17", "31")
+    assert str(tmp_path) not in (tmp_path / "out" / "dataset.json").read_text()
+    lines = (tmp_path / "out" / "SHA256SUMS").read_text().splitlines()
+    listed = {name: digest for digest, name in (line.split("  ") for line in lines)}
+    assert listed == {name: digest for name, digest in contents(tmp_path / "out").items() if name != "SHA256SUMS"}
+    # Every image is the one that its number, source and light say, by the reader and by OpenCV alone.
+    again = open_dataset(tmp_path / "out")
+    assert again == made
+    for number, entry in zip(NUMBERS, again.entries, strict=True):
+        expected = render(lut, read_picture(pictures / entry.source), int(entry.illumination), seed=77, image=number)
+        np.testing.assert_array_equal(again.read_image(entry), expected)
+        path = tmp_path / "out" / "images" / entry.image
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert stored is not None
+        np.testing.assert_array_equal(stored[..., ::-1], expected)
+        data = again.read_preview(entry)
+        assert data is not None
+        preview = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert preview is not None
+        assert max(preview.shape[:2]) == min(512, max(expected.shape[:2]))
+
+
+def test_workers_change_no_byte(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
+    lut = make_lut(unfit=(3,))
+    sources = (*find_pictures([pictures]), *random_scenes(3, 40, 30, 5))
+    for workers in (1, 2, 7):
+        choice = RandomLights(3, 4, 5)
+        generate_dataset(lut, tmp_path / f"out{workers}", sources, choice, seed=5, workers=workers)
+    assert contents(tmp_path / "out1") == contents(tmp_path / "out2") == contents(tmp_path / "out7")
+    generate_dataset(lut, tmp_path / "other", sources, RandomLights(3, 4, 5), seed=6)
+    one, other = contents(tmp_path / "out1"), contents(tmp_path / "other")
+    assert all(one[name] != other[name] for name in one if name.startswith("images/"))
+
+
+def test_replaced_pixels_are_counted(make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path) -> None:
+    lut = make_lut(unfit=(0, 21))
+    (source,) = find_pictures([pictures / "a.png"])
+    made = generate_dataset(lut, tmp_path / "out", [source], [0], options=DatasetOptions(previews=False))
+    top = source.read().picture >> 6
+    count = int(((top == 0).all(axis=2) | (top == 1).all(axis=2)).sum())  # colour 21 is (1, 1, 1)
+    assert count > 0
+    assert made.description.replaced_pixels == count
+    assert [source.replaced_pixels for source in made.sources] == [count]
+    assert made.read_preview(made.entries[0]) is None
+    assert not (tmp_path / "out" / "previews").exists()
+
+
+def test_images_come_of_samples_as_they_were_measured(
+    make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path
+) -> None:
+    lut = make_lut()
+    with (lut.folder / "samples.npy").open("r+b") as stream:
+        stream.seek(-1, os.SEEK_END)
+        stream.write(b"\xff")
+    sources = find_pictures([pictures])
+    generate_dataset(lut, tmp_path / "sound", sources, [0, 1])
+    with pytest.raises(FormatError, match="samples of light 3 are not those that were measured"):
+        generate_dataset(lut, tmp_path / "out", sources, [0, 3])
+    with pytest.raises(FormatError, match="samples of light 3 are not those that were measured"):
+        generate_dataset(lut, tmp_path / "mixed", sources, ListedLights((mixture_of({0: 1, 3: 1}),)))
+
+
+def test_pictures_too_small_for_the_format_are_passed_over(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+    sources = (*random_scenes(1, 21, 40), *random_scenes(1, 22, 22, 5))
+    skipped: list[str] = []
+    made = generate_dataset(
+        make_lut(),
+        tmp_path / "out",
+        sources,
+        [0],
+        options=DatasetOptions(form="dng"),
+        callbacks=Callbacks(on_skip=lambda name, reason, missed: skipped.append(reason)),
+    )
+    assert [entry.image for entry in made.entries] == ["000001.dng"]
+    (reason,) = skipped
+    assert reason.startswith("random-000000 is 21x40 px, too small for dng, which takes 22x22 and more; choose another")
+
+
+def test_nothing_is_left_of_a_dataset_that_cannot_be(
+    make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path
+) -> None:
+    lut = make_lut()
+    sources = find_pictures([pictures])
+    before, threads = contents(tmp_path), threading.active_count()
+    with pytest.raises(InputError, match="there is no light 9"):
+        generate_dataset(lut, tmp_path / "out", sources, [0, 9], workers=2)
+    with pytest.raises(FormatError, match="none of the 1 pictures can be read"):
+        generate_dataset(lut, tmp_path / "out", find_pictures([pictures / "broken.jpg"]), [0])
+    unlike: Any = (1, 2)
+    with pytest.raises(InputError, match="the split 1,2 is to be three shares from 0 that sum to 1"):
+        generate_dataset(lut, tmp_path / "out", sources, [0], options=DatasetOptions(split=unlike))
+    with pytest.raises(InputError, match="'bmp' is no format of a dataset; use one of png, tiff, exr, jxl, dng"):
+        DatasetOptions(form=cast("Any", "bmp"))
+    assert contents(tmp_path) == before
+    assert not list(tmp_path.glob(".out*"))
+    assert threading.active_count() == threads
+
+
+def test_a_taken_folder_and_empty_lists_are_refused(
+    make_lut: Callable[..., Lut], pictures: Path, tmp_path: Path
+) -> None:
+    lut = make_lut()
+    with pytest.raises(InputError, match="already exists"):
+        generate_dataset(lut, pictures, find_pictures([pictures]), [0])
+    with pytest.raises(InputError, match="0 pictures under 1 lights make no image"):
+        generate_dataset(lut, tmp_path / "out", [], [0])
+    with pytest.raises(InputError, match="under 0 lights make no image"):
+        generate_dataset(lut, tmp_path / "out", find_pictures([pictures]), [])
+    with pytest.raises(InputError, match="0 workers were asked for"):
+        generate_dataset(lut, tmp_path / "out", find_pictures([pictures]), [0], workers=0)

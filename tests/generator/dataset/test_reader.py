@@ -1,0 +1,118 @@
+"""Reading a dataset: what is damaged or disagrees is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from foundation.errors import FormatError
+from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.dataset.reader import open_dataset
+from generator.lights.choices import ListedLights, TogetherLights
+from generator.masks.request import parse_masks
+from generator.pictures.sources import random_scenes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from calibration.table.lut import Lut
+
+BARE = DatasetOptions(previews=False)
+
+
+@pytest.fixture
+def small(make_lut: Callable[..., Lut], tmp_path: Path) -> Path:
+    """Return a dataset of two random scenes under one light, without previews."""
+    generate_dataset(
+        make_lut(),
+        tmp_path / "small",
+        random_scenes(2, 24, 16),
+        [1],
+        options=DatasetOptions(form="tiff", previews=False),
+    )
+    return tmp_path / "small"
+
+
+def test_a_damaged_dataset_is_named(small: Path, tmp_path: Path) -> None:
+    opened = open_dataset(small)
+    (small / "images" / opened.entries[0].image).write_bytes(b"II*")
+    with pytest.raises(FormatError, match=r"000000\.tiff cannot be read as tiff"):
+        opened.read_image(opened.entries[0])
+    (small / "images" / opened.entries[1].image).unlink()
+    with pytest.raises(FormatError, match=r"cannot read .*000001\.tiff: No such file"):
+        opened.read_image(opened.entries[1])
+    table = small / "ground_truth.csv"
+    text = table.read_text()
+    table.write_text("\n".join(text.splitlines()[:-1]))
+    with pytest.raises(FormatError, match="has rows of 1 images, expected the 2 of"):
+        open_dataset(small)
+    table.write_text(text.replace(",1,", ",one,"))
+    with pytest.raises(FormatError, match=r"ground_truth\.csv, line 2: expected image,source"):
+        open_dataset(small)
+    path = small / "dataset.json"
+    path.write_text(path.read_text().replace('"version": 2', '"version": 3'))
+    with pytest.raises(FormatError, match=r"version: .*reads crop\.dataset of versions 1 to 2"):
+        open_dataset(small)
+    with pytest.raises(FormatError, match=r"is no dataset: it has no dataset\.json; make one with generate"):
+        open_dataset(tmp_path / "nowhere")
+
+
+def lines_of(path: Path) -> list[str]:
+    return path.read_text().splitlines()
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ((3, 2, 1, 0), r"gt\.txt, line 1: .* is not the light of 000000\.png, which is .* in ground_truth\.csv; see"),
+        ((0, 1, 3, 2), r"gt\.txt, line 3: .* is not the light of 000002\.png"),
+        ((0, 1, 2, "0.3 0.4 0.3"), r"gt\.txt, line 4: 0\.3 0\.4 0\.3 is not the light of 000003\.png"),
+        ((0, 1, 2, 3, 0), r"gt\.txt has 5 lines, expected one for each of the 4 images of ground_truth\.csv; make"),
+        ((0, 1, 2), r"gt\.txt, line 4: expected the light of 000003\.png, .* found nothing; make"),
+        ((0, "nan 0.5 0.5", 2, 3), r"gt\.txt, line 2: expected .* found 'nan 0\.5 0\.5'"),
+        ((0, "0 0 0", 2, 3), r"gt\.txt, line 2: expected .* = 1 and none below 0, found '0 0 0'"),
+        ((0, "1.5 0 -0.5", 2, 3), r"gt\.txt, line 2: expected .* found '1\.5 0 -0\.5'"),
+        ((0, "x" * 999, 2, 3), r"gt\.txt, line 2: expected .* found 'x{80}…'; make"),
+    ],
+)
+def test_ground_truths_that_disagree_are_named(
+    make_lut: Callable[..., Lut], tmp_path: Path, written: tuple[int | str, ...], message: str
+) -> None:
+    out = tmp_path / "out"
+    made = generate_dataset(make_lut(), out, random_scenes(1, 24, 16), [0, 1, 2, 3], options=BARE)
+    truths = lines_of(out / "gt.txt")
+    (out / "gt.txt").write_text("\n".join([*truths, "", ""]))
+    assert open_dataset(out) == made
+    (out / "gt.txt").write_text("\n".join(line if isinstance(line, str) else truths[line] for line in written))
+    with pytest.raises(FormatError, match=message):
+        open_dataset(out)
+
+
+@pytest.mark.parametrize("light", ["nan,0.5,0.5", "0,0,0", "inf,0,0", "0.3,0.3"])
+def test_a_ground_truth_that_is_no_light_is_named(small: Path, light: str) -> None:
+    table = small / "ground_truth.csv"
+    head, first, second = lines_of(table)
+    row = ",".join([*second.split(",")[:3], light])
+    table.write_text("\n".join([head, first, row]))
+    with pytest.raises(FormatError, match=rf"ground_truth\.csv, line 3: expected image,.* found '{row[:10]}.*; make"):
+        open_dataset(small)
+
+
+def test_a_table_that_is_no_csv_is_named(small: Path) -> None:
+    table = small / "ground_truth.csv"
+    table.write_text(table.read_text() + '"' + "x" * 200_000)
+    with pytest.raises(FormatError, match=r"ground_truth\.csv, line 4 is no CSV: field larger than"):
+        open_dataset(small)
+
+
+def test_the_mean_of_several_lights_lies_between_them(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+    choice = TogetherLights(ListedLights((0, 3)), 2, parse_masks("half-plane", 2, 5))
+    out = tmp_path / "out"
+    generate_dataset(make_lut(), out, random_scenes(2, 24, 16), choice, options=BARE)
+    assert all(entry.truth not in entry.truths for entry in open_dataset(out).entries)
+    first, _ = lines_of(out / "gt.txt")
+    (out / "gt.txt").write_text(f"{first}\n0.1 0.1 0.8\n")
+    with pytest.raises(FormatError, match=r"gt\.txt, line 2: 0\.1 0\.1 0\.8 is not the light of 000001\.png, .* and "):
+        open_dataset(out)

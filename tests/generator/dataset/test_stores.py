@@ -1,0 +1,237 @@
+"""Stores past this machine: the same dataset, a shard at a time, whatever breaks on the way."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import fsspec
+import numpy as np
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+
+from foundation.errors import FormatError, InputError, StorageError
+from generator.dataset.making import (
+    DatasetOptions,
+    Plan,
+    finish_dataset,
+    generate_dataset,
+    make_dataset,
+    make_share,
+)
+from generator.dataset.production.shards import make_elsewhere
+from generator.dataset.production.workplace import workplace
+from generator.dataset.reader import open_dataset
+from generator.dataset.verification import file_faults
+from generator.lights.choices import ListedLights
+from generator.pictures.sources import find_pictures, random_scenes
+from generator.stores.store import LocalStore, RemoteStore, open_store
+from tests.generator.groups import grouped
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+
+SCENES = random_scenes(4, 24, 16, 8)
+
+
+class FailingFileSystem(MemoryFileSystem):
+    """A store of memory that fails at its writes from number `fails_at` on, or never."""
+
+    protocol = "failing"
+    store: dict[str, Any] = {}  # noqa: RUF012  as the class above has it
+    fails_at: int | None = None
+    writes = 0
+
+    def _count(self) -> None:
+        FailingFileSystem.writes += 1
+        if FailingFileSystem.fails_at is not None and FailingFileSystem.writes >= FailingFileSystem.fails_at:
+            raise ConnectionResetError("the store hung up")
+
+    def pipe_file(self, path: str, value: bytes, mode: str = "overwrite", **kwargs: Any) -> None:
+        self._count()
+        super().pipe_file(path, value, mode, **kwargs)
+
+    def put_file(self, lpath: str, rpath: str, **kwargs: Any) -> None:
+        self._count()
+        super().put_file(lpath, rpath, **kwargs)
+
+
+@pytest.fixture(autouse=True)
+def empty_stores() -> Iterator[None]:
+    """Empty the stores of memory, which last as long as the program."""
+    fsspec.register_implementation("failing", FailingFileSystem, clobber=True)
+    FailingFileSystem.fails_at = None
+    MemoryFileSystem.store.clear()
+    FailingFileSystem.store.clear()
+    yield
+    MemoryFileSystem.store.clear()
+    FailingFileSystem.store.clear()
+
+
+def contents(place: str | Path) -> dict[str, str]:
+    """Return the hash of every file of a store."""
+    store = open_store(place)
+    return {name: hashlib.sha256(store.get(name)).hexdigest() for name in store.names()}
+
+
+def make(lut: Lut, out: str | Path, **options: Any) -> None:
+    wishes: dict[str, Any] = {"seed": 3, "shard_images": 3, "split": (0.5, 0.0, 0.5), **options}
+    generate_dataset(lut, out, SCENES, [2, 0], **grouped(**wishes))
+
+
+@pytest.mark.parametrize("layout", ["folder", "webdataset", "parquet"])
+def test_a_dataset_in_a_store_is_the_one_on_the_disk(make_lut: Callable[..., Lut], tmp_path: Path, layout: str) -> None:
+    lut = make_lut()
+    make(lut, tmp_path / "out", layout=layout)
+    make(lut, "memory://bucket/out", layout=layout, workers=3)
+    assert contents("memory://bucket/out") == contents(tmp_path / "out")
+    there, here = open_dataset("memory://bucket/out"), open_dataset(tmp_path / "out")
+    assert there.entries == here.entries
+    assert there.sources == here.sources
+    for entry in here.entries[::3]:
+        np.testing.assert_array_equal(there.read_image(entry), here.read_image(entry))
+    assert list(file_faults("memory://bucket/out")) == []
+    with pytest.raises(InputError, match="memory://bucket/out already holds a dataset; name another place"):
+        make(lut, "memory://bucket/out", layout=layout)
+
+
+@pytest.mark.parametrize("layout", ["folder", "webdataset"])
+def test_a_store_that_fails_at_any_write_is_gone_on_with(
+    make_lut: Callable[..., Lut], tmp_path: Path, layout: str
+) -> None:
+    lut = make_lut()
+    make(lut, tmp_path / "out", layout=layout, previews=False)
+    expected = contents(tmp_path / "out")
+    write = 0
+    failed = True
+    while failed:
+        write += 1
+        FailingFileSystem.store.clear()
+        FailingFileSystem.writes, FailingFileSystem.fails_at = 0, write
+        try:
+            make(lut, "failing://bucket/out", layout=layout, previews=False)
+        except StorageError as error:
+            assert "ConnectionResetError: the store hung up; check the address" in str(error)  # noqa: PT017
+            with pytest.raises(FormatError, match="is no dataset"):
+                open_dataset("failing://bucket/out")
+        else:
+            failed = False
+        FailingFileSystem.fails_at = None
+        if failed:
+            make(lut, "failing://bucket/out", layout=layout, previews=False)
+        assert contents("failing://bucket/out") == expected, f"failed at write {write}"
+    assert write > 8
+
+
+def test_shares_in_a_store(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+    lut = make_lut()
+    plan = Plan(lut, SCENES, ListedLights((2, 0)), 3, DatasetOptions(shard_images=3, split=(0.5, 0.0, 0.5)))
+    make(lut, tmp_path / "out")
+    assert make_share(plan, "memory://out", (1, 2)) == (1, 3)
+    with pytest.raises(InputError, match=r"memory://out was begun with another plan \(seed 3, now 4\)"):
+        make(lut, "memory://out", seed=4)
+    assert make_share(plan, "memory://out", (0, 2)) == (3, 3)
+    finish_dataset("memory://out")
+    assert contents("memory://out") == contents(tmp_path / "out")
+
+
+def test_sources_in_a_store(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+    lut = make_lut()
+    rng = np.random.default_rng(4)
+    (tmp_path / "pictures").mkdir()
+    for name in ("a.png", "b.png"):
+        data = cv2.imencode(".png", rng.integers(0, 256, (9, 8, 3)).astype(np.uint8))[1].tobytes()
+        (tmp_path / "pictures" / name).write_bytes(data)
+        RemoteStore("memory://bucket/pictures").put(name, data)
+    RemoteStore("memory://bucket/pictures").put("c.png", b"no picture")
+    (tmp_path / "pictures" / "c.png").write_bytes(b"no picture")
+    for place, out in (("memory://bucket/pictures", "there"), (str(tmp_path / "pictures"), "here")):
+        generate_dataset(lut, tmp_path / out, find_pictures([place]), [0, 1])
+    assert contents(tmp_path / "there") == contents(tmp_path / "here")
+    assert len(open_dataset(tmp_path / "here").description.skipped) == 1
+
+
+@pytest.mark.parametrize("remote", [True, False])
+def test_a_late_worker_of_a_plan_that_was_removed_is_not_believed(
+    make_lut: Callable[..., Lut], tmp_path: Path, remote: bool
+) -> None:
+    lut = make_lut()
+    out = "memory://bucket/out" if remote else str(tmp_path / "out")
+    old, new = (Plan(lut, SCENES, ListedLights((0, 2)), seed, DatasetOptions(shard_images=3)) for seed in (3, 4))
+    with workplace(out, old.identity()) as late:
+        pass
+    RemoteStore(out).remove("") if remote else shutil.rmtree(tmp_path / ".out.partial")
+    make_share(new, out, (1, 2))
+    with nullcontext() if remote else pytest.raises(StorageError, match="is gone"):
+        make_elsewhere(old.job(0), late)
+    make_dataset(new, out)
+    make_dataset(new, tmp_path / "undisturbed")
+    assert contents(out) == contents(tmp_path / "undisturbed")
+
+
+def test_a_source_out_of_reach_ends_the_work_and_leaves_no_picture_out(
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lut = make_lut()
+    data = cv2.imencode(".png", np.zeros((9, 8, 3), np.uint8))[1].tobytes()
+    for name in ("a.png", "b.png"):
+        RemoteStore("failing://bucket/pictures").put(name, data)
+    pictures = find_pictures(["failing://bucket/pictures"])
+
+    def hang_up(*_: object, **__: object) -> None:
+        raise ConnectionResetError("the store hung up")
+
+    with monkeypatch.context() as outage:
+        outage.setattr(FailingFileSystem, "get_file", hang_up)
+        with pytest.raises(StorageError, match=r"cannot read failing://bucket/pictures/a.png: the store hung up; see"):
+            generate_dataset(lut, tmp_path / "out", pictures, [0])
+    assert generate_dataset(lut, tmp_path / "out", pictures, [0]).description.sources == 2
+
+
+@pytest.mark.parametrize("unmounted", ["gone", "empty"])
+def test_a_disk_that_is_not_mounted_is_told_from_a_picture_that_is_gone(
+    make_lut: Callable[..., Lut], tmp_path: Path, unmounted: str
+) -> None:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for name in ("a.png", "b.png"):
+        (folder / name).write_bytes(cv2.imencode(".png", np.zeros((9, 8, 3), np.uint8))[1].tobytes())
+    pictures = find_pictures([folder])
+    (folder / "a.png").unlink()
+    made = generate_dataset(make_lut(), tmp_path / "one", pictures, [0])
+    assert (made.description.sources, [left.name for left in made.description.skipped]) == (1, ["a.png"])
+    shutil.rmtree(folder)
+    if unmounted == "empty":
+        folder.mkdir()
+    with pytest.raises(StorageError, match=r"a\.png: No such file or directory; see that every machine"):
+        generate_dataset(make_lut(name="again"), tmp_path / "none", pictures, [0])
+
+
+def test_a_place_that_holds_something_else_is_left_alone(make_lut: Callable[..., Lut]) -> None:
+    RemoteStore("memory://bucket").put("out/mine.txt", b"mine")
+    with pytest.raises(InputError, match="memory://bucket/out already holds something else"):
+        make(make_lut(), "memory://bucket/out")
+    assert RemoteStore("memory://bucket").get("out/mine.txt") == b"mine"
+
+
+def test_a_file_url_is_a_folder(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
+    make(make_lut(), f"file://{tmp_path}/out")
+    assert open_dataset(f"file://{tmp_path}/out").store == LocalStore(tmp_path / "out")
+
+
+def test_a_file_of_a_block_that_fails_does_not_appear(tmp_path: Path) -> None:
+    def fail(store: LocalStore | RemoteStore) -> None:
+        with store.create("a/b") as stream:
+            stream.write(b"half")
+            raise KeyError
+
+    for store in (LocalStore(tmp_path), RemoteStore("memory://bucket")):
+        with pytest.raises(KeyError):
+            fail(store)
+        assert not store.has("a/b")
+        assert list(store.names()) == []

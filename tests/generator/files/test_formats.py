@@ -1,0 +1,217 @@
+"""Files read back by other readers than the one that wrote them, and looked into by parsers of their standards."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import imagecodecs
+import numpy as np
+import numpy.typing as npt
+import OpenImageIO as oiio  # noqa: N813
+import pytest
+import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from PIL import Image
+
+from foundation.errors import FormatError, InputError
+from generator.files.formats import (
+    FORMATS,
+    Format,
+    ImageMetadata,
+    decode_image,
+    encode_image,
+    encode_preview,
+    libraries_of,
+    suffix_of,
+)
+
+METADATA = ImageMetadata(white_level=11536, white=(2046.0, 1579.5, 4520.0), camera="Canon EOS 550D")
+WHOLE: tuple[Format, ...] = ("png", "tiff", "exr", "jxl")
+"""The formats that keep all three channels."""
+
+Image16 = npt.NDArray[np.uint16]
+images = hnp.arrays(
+    np.uint16,
+    st.tuples(st.integers(1, 9), st.integers(1, 40), st.just(3)),
+    elements=st.integers(0, 65535) | st.integers(0, 3),
+    fill=st.integers(0, 65535),
+)
+
+
+def noisy(height: int, width: int) -> Image16:
+    """Return an image with shot noise on a gradient, and the extreme numbers."""
+    rng = np.random.default_rng(0)
+    means = np.linspace(20, 12000, height * width * 3).reshape(height, width, 3)
+    image = rng.poisson(means).astype(np.uint16)
+    image[0, 0] = (65535, 1, 256)
+    return image
+
+
+def by_openimageio(path: Path) -> Image16:
+    stream = oiio.ImageInput.open(str(path))
+    assert stream is not None, oiio.geterror()
+    values = np.asarray(stream.read_image("float" if path.suffix == ".exr" else "uint16"))
+    return values.astype(np.uint16)
+
+
+@pytest.mark.parametrize("form", WHOLE)
+def test_every_bit_comes_back_in_place(tmp_path: Path, form: Format) -> None:
+    image = noisy(31, 45)
+    path = tmp_path / f"image{suffix_of(form)}"
+    path.write_bytes(encode_image(image, form, METADATA))
+    stream = oiio.ImageInput.open(str(path))
+    assert stream is not None
+    assert str(stream.spec().format) == ("float" if form == "exr" else "uint16")
+    np.testing.assert_array_equal(by_openimageio(path), image)
+    np.testing.assert_array_equal(decode_image(path.read_bytes(), form, "image"), image)
+
+
+@pytest.mark.parametrize("form", ["png", "tiff"])
+def test_opencv_reads_the_same(form: Format) -> None:
+    image = noisy(31, 45)
+    data = np.frombuffer(encode_image(image, form, METADATA), np.uint8)
+    read = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    assert read is not None
+    np.testing.assert_array_equal(read[..., ::-1], image)
+
+
+@pytest.mark.parametrize("form", WHOLE)
+@settings(max_examples=60, deadline=None)
+@given(image=images)
+def test_any_image_comes_back(form: Format, image: Image16) -> None:
+    np.testing.assert_array_equal(decode_image(encode_image(image, form, METADATA), form, "image"), image)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_an_image_need_not_be_contiguous(form: Format) -> None:
+    image = noisy(48, 60)
+    turned = image[::-1, ::-1]
+    assert encode_image(turned, form, METADATA) == encode_image(turned.copy(), form, METADATA)
+
+
+def chunks_of(data: bytes) -> list[tuple[bytes, bytes]]:
+    """Return name and content of a PNG's chunks (ISO/IEC 15948, 5.3), each with its sum checked by zlib."""
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    chunks: list[tuple[bytes, bytes]] = []
+    at = 8
+    while at < len(data):
+        (size,) = struct.unpack_from(">I", data, at)
+        body = data[at + 4 : at + 8 + size]
+        assert struct.unpack_from(">I", data, at + 8 + size) == (zlib.crc32(body),)
+        chunks.append((body[:4], body[4:]))
+        at += 12 + size
+    return chunks
+
+
+def test_png_is_sixteen_bit_rgb_and_tells_its_shot() -> None:
+    chunks = chunks_of(encode_image(noisy(20, 30), "png", METADATA))
+    assert [name for name, _ in chunks] == [b"IHDR", b"tEXt", b"IDAT", b"IEND"]
+    # 11.2.2: width, height, bit depth, colour type, compression, filter and interlace methods.
+    assert struct.unpack(">IIBBBBB", chunks[0][1]) == (30, 20, 16, 2, 0, 0, 0)
+    keyword, _, note = chunks[1][1].partition(b"\0")
+    assert keyword == b"Description"
+    values = json.loads(note)
+    assert (values["white_level"], values["white"], values["camera"]) == (
+        11536,
+        [2046.0, 1579.5, 4520.0],
+        "Canon EOS 550D",
+    )
+    assert len(zlib.decompress(chunks[2][1])) == 20 * (1 + 6 * 30)
+
+
+def test_pillow_shows_the_upper_bytes() -> None:
+    """Pillow has no 16-bit RGB; what it shows is the image all the same, not one changed by a profile or gamma."""
+    image = noisy(20, 30)
+    with Image.open(io.BytesIO(encode_image(image, "png", METADATA))) as read:
+        assert read.size == (30, 20)
+        assert "gamma" not in read.info
+        np.testing.assert_array_equal(np.asarray(read.convert("RGB")), image >> 8)
+
+
+def test_tiff_is_uncompressed_and_plain() -> None:
+    image = noisy(4, 5)
+    with tifffile.TiffFile(io.BytesIO(encode_image(image, "tiff", METADATA))) as file:
+        page = file.pages.first
+        assert (page.compression, page.photometric, page.bitspersample, page.samplesperpixel) == (1, 2, 16, 3)
+        assert page.dataoffsets[0] % 16 == 0
+        assert json.loads(page.description)["white_level"] == 11536
+        np.testing.assert_array_equal(file.asarray(), image)
+
+
+def test_exr_is_float_under_zip_and_tells_its_shot(tmp_path: Path) -> None:
+    image = noisy(40, 30)
+    path = tmp_path / "image.exr"
+    path.write_bytes(encode_image(image, "exr", METADATA))
+    stream = oiio.ImageInput.open(str(path))
+    assert stream is not None
+    spec = stream.spec()
+    assert (str(spec.format), spec.nchannels) == ("float", 3)
+    assert spec.getattribute("compression") == "zip"
+    assert spec.getattribute("crop:camera") == "Canon EOS 550D"
+    assert spec.getattribute("crop:white_level") == 11536
+    assert spec.getattribute("crop:white") == (2046.0, 1579.5, 4520.0)
+    np.testing.assert_array_equal(by_openimageio(path), image)
+
+
+def test_jpeg_xl_is_one_lossless_codestream() -> None:
+    image = noisy(20, 30)
+    data = encode_image(image, "jxl", METADATA)
+    # ISO/IEC 18181-2, 5: the signature box; 16-bit lossless wants level 10, which only a container can tell.
+    assert data[:12] == bytes.fromhex("0000000c 4a584c20 0d0a870a")
+    np.testing.assert_array_equal(imagecodecs.jpegxl_decode(data), image)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_other_arrays_are_refused(form: Format) -> None:
+    with pytest.raises(InputError, match=r"the image is uint16 \(4, 4\)"):
+        encode_image(np.zeros((4, 4), np.uint16), form, METADATA)
+    with pytest.raises(InputError, match=r"the image is uint16 \(0, 4, 3\)"):
+        encode_image(np.zeros((0, 4, 3), np.uint16), form, METADATA)
+
+
+@pytest.mark.parametrize(("form", "width", "height"), [("tiff", 30000, 24000), ("dng", 60000, 36000)])
+def test_what_a_format_of_32_bit_offsets_cannot_hold_is_refused_unwritten(
+    form: Format, width: int, height: int
+) -> None:
+    # One count seen everywhere: an image of 4 GiB that takes no memory.
+    image = np.broadcast_to(np.uint16(7), (height, width, 3))
+    with pytest.raises(InputError, match=rf"an image of {width}x{height} px is too large for {form.upper()}: .* 4 GiB"):
+        encode_image(image, form, METADATA)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("keep", [0, 10, 1000])
+def test_damaged_files_are_refused_by_name(form: Format, keep: int) -> None:
+    data = encode_image(noisy(40, 40), form, METADATA)
+    with pytest.raises(FormatError, match=r"images/000007"):
+        decode_image(data[:keep], form, "images/000007")
+
+
+def test_a_file_of_eight_bits_is_refused() -> None:
+    data = cv2.imencode(".png", np.zeros((4, 5, 3), np.uint8))[1].tobytes()
+    with pytest.raises(FormatError, match=r"a\.png holds uint8 \(4, 5, 3\), expected uint16"):
+        decode_image(data, "png", "a.png")
+
+
+def test_the_libraries_named_are_installed() -> None:
+    from importlib.metadata import version
+
+    for form in FORMATS:
+        for library in libraries_of(form):
+            assert version(library)
+
+
+def test_a_preview_is_a_jpeg_of_the_right_colour(tmp_path: Path) -> None:
+    path = tmp_path / "preview.jpg"
+    path.write_bytes(encode_preview(np.full((16, 16, 3), (200, 100, 50), np.uint8)))
+    stream = oiio.ImageInput.open(str(path))
+    assert stream is not None
+    assert stream.format_name() == "jpeg"
+    assert np.abs(np.asarray(stream.read_image("uint8")).reshape(-1, 3) - [200.0, 100, 50]).max() <= 3

@@ -1,0 +1,44 @@
+"""Every colour that is unfit for use is replaced by the nearest fit one, and no other colour is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration.table.provenance import Provenance, Unfit
+from generator.kernels.palette import channels_of, colours_in, nearest_fit_colours, replace_unfit_colours
+
+if TYPE_CHECKING:
+    pass
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 5), st.integers(1, 30), st.integers(1, 30), st.integers(0, 2**32 - 1), st.booleans())
+def test_every_unfit_colour_and_no_other_is_replaced(bits: int, height: int, width: int, seed: int, few: bool) -> None:
+    rng = np.random.default_rng(seed)
+    picture = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
+    unfit = rng.choice(8**bits, 1 if few else min(8**bits - 1, 40), replace=False)
+    known = Provenance(
+        camera="Test",
+        bits=bits,
+        white_level=9,
+        session_sha256="1" * 64,
+        chart_sha256="2" * 64,
+        software="test",
+        unfit=[Unfit(colour=int(colour), cause="stain") for colour in unfit],
+    )
+    before = picture.copy()
+    fit, count = replace_unfit_colours(picture, known)
+    np.testing.assert_array_equal(picture, before)
+    upper = (picture >> (8 - bits)).astype(np.int64)
+    colour = (upper[..., 0] << 2 * bits) | (upper[..., 1] << bits) | upper[..., 2]
+    np.testing.assert_array_equal(np.flatnonzero(colours_in(picture, bits)), np.unique(colour))
+    hit = np.isin(colour, unfit)
+    assert count == np.count_nonzero(hit)
+    np.testing.assert_array_equal(fit[~hit], picture[~hit])
+    instead = dict(zip(unfit.tolist(), nearest_fit_colours(unfit, bits).tolist(), strict=True))
+    codes = channels_of([instead[index] for index in colour[hit].tolist()], bits) << (8 - bits)
+    np.testing.assert_array_equal(fit[hit], codes.reshape(-1, 3))

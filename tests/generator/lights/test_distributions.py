@@ -1,0 +1,140 @@
+"""Distributions of lights, and the choices that draw from them."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.stats import chisquare, kstest
+
+from foundation.errors import FormatError, InputError
+from generator.lights.choices import DrawnLights
+from generator.lights.distributions import Distribution, Fitted, Gaussian, Uniform, parse_distribution
+from generator.lights.gamut import Gamut, rb_of
+from generator.lights.lighting import LightChoice
+from generator.philox import CHROMATICITIES, words
+
+CORNERS = np.array([[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]])
+GAMUT = Gamut(np.array([*CORNERS, [0.3, 0.4, 0.3]]))
+
+
+def draws(distribution: Distribution, count: int) -> npt.NDArray[np.float64]:
+    return distribution.draw(words(3, np.arange(count), 0, 0, CHROMATICITIES))
+
+
+def whites(choice: DrawnLights, pictures: int) -> npt.NDArray[np.float64]:
+    mixtures = [lighting.mixtures[0] for at in range(pictures) for lighting in choice.lightings_of(at)]
+    return rb_of(np.array([np.asarray(mixture.weights) @ GAMUT.white[list(mixture.lights)] for mixture in mixtures]))
+
+
+def test_uniform_fills_the_triangle_evenly() -> None:
+    rb = draws(Uniform(), 40_000)
+    assert (rb > 0).all()
+    assert (rb.sum(axis=1) < 1).all()
+    # Sixteen congruent triangles; a true sampler fails one time in 10⁵.
+    i, j = (np.floor(4 * rb)).astype(int).T
+    upper = (4 * rb - np.stack([i, j], axis=1)).sum(axis=1) > 1
+    counts = np.bincount((i * 4 + j) * 2 + upper, minlength=32)
+    assert chisquare(counts[counts > 0]).pvalue > 1e-5
+    assert (counts > 0).sum() == 16
+
+
+def test_gaussian_has_its_moments() -> None:
+    rb = draws(Gaussian(0.3, 0.25, 0.02, 0.05, -0.8), 20_000)
+    # Standard errors: sd / √20000 of means, about 0.7 % of deviations, 0.003 of the correlation; six of them.
+    assert abs(rb[:, 0].mean() - 0.3) < 6 * 0.02 / 141
+    assert abs(rb[:, 1].mean() - 0.25) < 6 * 0.05 / 141
+    np.testing.assert_allclose(rb.std(axis=0), [0.02, 0.05], rtol=0.03)
+    standard = (rb - rb.mean(axis=0)) / rb.std(axis=0)
+    assert (standard[:, 0] * standard[:, 1]).mean() == pytest.approx(-0.8, abs=0.02)
+    assert kstest((rb[:, 1] - 0.25) / 0.05, "norm").pvalue > 1e-5
+
+
+def test_a_fit_follows_the_data() -> None:
+    rng = np.random.default_rng(1)
+    clusters = np.concatenate([rng.normal([0.2, 0.4], 0.005, (300, 2)), rng.normal([0.5, 0.1], 0.005, (100, 2))])
+    truths = 900 * np.stack([clusters[:, 0], 1 - clusters.sum(axis=1), clusters[:, 1]], axis=1)
+    rb = draws(Fitted.of(truths), 20_000)
+    first = rb[:, 0] < 0.35
+    # Binomial, three quarters expected: standard error 0.0031; the kernels mix hardly any over the gap.
+    assert first.mean() == pytest.approx(0.75, abs=0.02)
+    np.testing.assert_allclose(rb.mean(axis=0), clusters.mean(axis=0), atol=0.006)
+    covariance = np.cov(clusters.T, ddof=1)
+    np.testing.assert_allclose(np.cov(rb.T), covariance * (1 + 400 ** (-1 / 3)), rtol=0.08)
+
+
+@pytest.mark.parametrize("truths", [[[1, 2, 3]], [[1, 2, 1], [2, 2, 2]], [[1, 1, 1], [1, 2, 1], [1, 3, 1], [1, 4, 1]]])
+def test_what_has_no_density_is_refused(truths: list[list[float]]) -> None:
+    with pytest.raises(FormatError, match=r"no distribution fits the \d ground truths of gt\.csv"):
+        Fitted.of(np.array(truths, dtype=np.float64), "gt.csv")
+
+
+def test_drawn_lights_stay_in_the_gamut_and_keep_the_shape_there() -> None:
+    choice = DrawnLights(GAMUT, Uniform(), 2, seed=4)
+    assert isinstance(choice, LightChoice)
+    assert choice.lights_each == 2
+    rb = whites(choice, 1500)
+    assert len(rb) == 3000
+    barycentric = np.linalg.solve(CORNERS.T, np.stack([rb[:, 0], 1 - rb.sum(axis=1), rb[:, 1]])).T
+    assert barycentric.min() > -1e-6
+    # Uniform over the triangle: the least of three shares has the distribution 1 − (1 − 3x)²; one failure in 10⁵.
+    assert kstest(barycentric.min(axis=1), lambda x: 1 - (1 - 3 * np.clip(x, 0, 1 / 3)) ** 2).pvalue > 1e-5
+
+
+def test_drawn_lights_are_a_function_of_seed_and_position() -> None:
+    choice = DrawnLights(GAMUT, Uniform(), 2, seed=4)
+    again = pickle.loads(pickle.dumps(DrawnLights(GAMUT, Uniform(), 2, seed=4)))
+    forwards = [choice.lightings_of(at) for at in range(20)]
+    assert [again.lightings_of(at) for at in reversed(range(20))] == forwards[::-1]
+    labels = {lighting.mixtures[0].label for lightings in forwards for lighting in lightings}
+    assert len(labels) == 40
+    assert DrawnLights(GAMUT, Uniform(), 2, seed=5).lightings_of(0) != forwards[0]
+    # More lights a picture leave the first as they were.
+    assert DrawnLights(GAMUT, Uniform(), 5, seed=4).lightings_of(7)[:2] == forwards[7]
+
+
+def test_a_distribution_beside_the_gamut_is_refused() -> None:
+    with pytest.raises(
+        InputError, match=r"0\.0% of the distribution lies within what .* whose mean is r=0\.325, b=0\.325"
+    ):
+        DrawnLights(GAMUT, Gaussian(0.95, 0.02, 0.001, 0.001), 1, 0)
+    with pytest.raises(InputError, match="0 lights a picture"):
+        DrawnLights(GAMUT, Uniform(), 0, 0)
+
+
+def test_texts_of_distributions(tmp_path: Path) -> None:
+    assert parse_distribution("uniform") == Uniform()
+    assert parse_distribution("gaussian:r=.3,b=.25,sd=.02") == Gaussian(0.3, 0.25, 0.02, 0.02)
+    assert parse_distribution("gaussian: b=.25, r=.3, sd_r=.02, sd_b=.03, corr=-.5") == Gaussian(
+        0.3, 0.25, 0.02, 0.03, -0.5
+    )
+    file = tmp_path / "gt.csv"
+    file.write_text("1 2 1\n1 3 1\n2 3 1\n1 3 2\n")
+    fitted = parse_distribution(f"fit:{file}")
+    assert fitted.describe()["ground_truths"] == 4
+    assert fitted.describe()["file"] == "gt.csv"
+    assert parse_distribution(str(file)).describe() == fitted.describe()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is no distribution"),
+        ("normal:r=1", "is no distribution of lights; write uniform, gaussian"),
+        ("uniform:r=1", "is no distribution"),
+        ("fit:", "is no distribution"),
+        ("gaussian:r=.3,sd=.1", "lacks a number"),
+        ("gaussian:r=.3,b=.2,sd_r=.1", "lacks a number"),
+        ("gaussian:r=.3,b=.2,sd=0", "'sd=0' of the distribution gaussian: expected a number from 1e-06 to 1"),
+        ("gaussian:r=.3,b=x,sd=.1", "'b=x' of the distribution gaussian"),
+        ("gaussian:r=.3,g=.2,sd=.1", "'g=.2' is no option of the distribution gaussian; known are r, b, sd"),
+        ("gaussian:r=.3,r=.2,sd=.1", "r is given twice"),
+        ("fit:none.csv", r"cannot read ground truths none\.csv"),
+    ],
+)
+def test_a_bad_distribution_is_named(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        parse_distribution(text)

@@ -1,0 +1,210 @@
+"""Where each of several lights falls."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from foundation.errors import InputError
+from generator.masks.making import MadeMaskPlan
+from generator.masks.request import parse_masks
+from generator.masks.shapes import HalfPlanes, SmoothFields, Spots, Windows
+from generator.masks.weights import FULL, MaskMaker, quantise_shares
+
+KINDS = ("half-plane", "soft-edge", "spots", "smooth", "window")
+Map = npt.NDArray[np.float32]
+
+
+def weights(text: str, height: int, width: int, lights: int = 2, seed: int = 0, number: int = 0) -> Map:
+    return parse_masks(text, lights, seed).maker(number).weights(height, width, lights)
+
+
+def shrunk(fine: Map, height: int, width: int) -> Map:
+    return np.asarray(cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+@given(
+    st.sampled_from(KINDS),
+    st.integers(1, 90),
+    st.integers(1, 90),
+    st.integers(2, 5),
+    st.integers(0, 2**64 - 1),
+    st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=60, deadline=None)
+def test_weights_are_whole_parts_that_sum_to_one(
+    kind: str, height: int, width: int, lights: int, seed: int, number: int
+) -> None:
+    maps = weights(kind, height, width, lights, seed, number)
+    assert (maps.shape, maps.dtype) == ((height, width, lights), np.float32)
+    parts = np.rint(maps.astype(np.float64) * FULL)
+    np.testing.assert_array_equal((parts / FULL).astype(np.float32), maps)
+    np.testing.assert_array_equal(parts.sum(axis=2), FULL)
+    assert parts.min() >= 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("lights", [2, 3])
+def test_the_same_look_at_every_size(kind: str, lights: int) -> None:
+    for number in range(4):
+        fine = weights(kind, 480, 640, lights, number=number)
+        coarse = weights(kind, 96, 128, lights, number=number)
+        off = np.abs(shrunk(fine, 96, 128) - coarse)
+        # Only pixels that an edge crosses may differ, by less than the edge; edges are few.
+        assert off.mean() < 0.004
+        assert np.quantile(off, 0.97) < 0.05
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_image_and_seed_has_masks_of_its_own(kind: str) -> None:
+    first = weights(kind, 60, 80)
+    np.testing.assert_array_equal(first, weights(kind, 60, 80))
+    for other in (weights(kind, 60, 80, number=1), weights(kind, 60, 80, seed=1)):
+        assert np.abs(first - other).mean() > 0.01
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_light_falls_somewhere(kind: str) -> None:
+    """Over forty images each of three lights gets its share; over one, none is left out but by chance."""
+    shares = np.array([weights(kind, 30, 40, 3, number=number).mean(axis=(0, 1)) for number in range(40)])
+    assert shares.mean(axis=0).min() > 0.08
+    assert (shares > 0.01).mean() > 0.8
+
+
+def test_masks_travel_to_other_programs() -> None:
+    plan = parse_masks("window:columns=3", 2, 5)
+    again = pickle.loads(pickle.dumps(plan))
+    assert isinstance(plan.maker(3), MaskMaker)
+    np.testing.assert_array_equal(again.maker(3).weights(40, 50, 2), plan.maker(3).weights(40, 50, 2))
+
+
+def test_a_half_plane_has_its_angle() -> None:
+    # The first light on the left, the second on the right; then the first above, the second below.
+    across = weights("half-plane:angle=0", 40, 80)
+    assert across[:, 0, 0].min() == 1
+    assert across[:, -1, 1].min() == 1
+    np.testing.assert_array_equal(across, np.broadcast_to(across[:1], across.shape))
+    down = weights("half-plane:angle=90", 40, 80)
+    assert down[0, :, 0].min() == 1
+    assert down[-1, :, 1].min() == 1
+    # A sharp edge is one pixel wide.
+    assert ((across[0, :, 0] > 0) & (across[0, :, 0] < 1)).sum() <= 1
+
+
+def test_strips_follow_one_another() -> None:
+    strips = weights("half-plane:angle=0", 4, 300, 4)
+    assert strips[0].argmax(axis=1).tolist() == sorted(strips[0].argmax(axis=1))
+    assert set(strips[0].argmax(axis=1)) == {0, 1, 2, 3}
+
+
+def test_a_soft_edge_has_its_width() -> None:
+    edge = weights("soft-edge:angle=0,width=.5", 3, 1000)[0, :, 1]
+    between = np.flatnonzero((edge > 0) & (edge < 1))
+    assert len(between) == pytest.approx(500, abs=6)
+    middle = between.mean()
+    x = ((np.arange(1000) - middle) / 500 + 0.5).clip(0, 1)
+    np.testing.assert_allclose(edge, 3 * x**2 - 2 * x**3, atol=2e-3)
+
+
+def test_spots_have_their_size() -> None:
+    for number in range(6):
+        spot = weights("spots:count=1,radius=.1,softness=.5", 400, 400, number=number)[..., 1]
+        if (spot > 0)[[0, -1]].any() or (spot > 0)[:, [0, -1]].any():
+            continue
+        # Half its light within 40 px; nothing beyond 40 + 10; by areas of discs.
+        assert (spot >= 0.5).sum() == pytest.approx(np.pi * 40**2, rel=0.03)
+        assert (spot > 0).sum() == pytest.approx(np.pi * 50**2, rel=0.03)
+        assert (spot == 1).sum() == pytest.approx(np.pi * 30**2, rel=0.03)
+        break
+    else:
+        pytest.fail("no spot lies within the picture")
+
+
+def test_smooth_fields_change_over_their_scale() -> None:
+    def steepness(scale: float) -> float:
+        return float(
+            np.mean(
+                [
+                    np.abs(np.diff(weights(f"smooth:scale={scale}", 200, 200, number=number)[..., 0], axis=1)).mean()
+                    for number in range(8)
+                ]
+            )
+        )
+
+    assert steepness(0.1) / steepness(0.4) == pytest.approx(4, rel=0.35)
+    flat = weights("smooth:contrast=0", 50, 50, 4)
+    np.testing.assert_allclose(flat, 0.25, atol=2 / FULL)
+    # Nothing is steeper than an edge of the scale; there is no seam where pieces of the spline meet.
+    field = weights("smooth:scale=.5", 400, 400)[..., 0].astype(np.float64)
+    assert np.abs(np.diff(field, axis=1)).max() < 0.06
+    assert np.abs(np.diff(field, n=2, axis=0)).max() < 0.006
+
+
+def test_windows_have_their_panes() -> None:
+    for number in range(20):
+        lit = weights("window:columns=3,rows=2,softness=0.002", 400, 400, number=number)[..., 1] > 0.5
+        if lit[[0, -1]].any() or lit[:, [0, -1]].any():
+            continue
+        count, _, stats, _ = cv2.connectedComponentsWithStats(lit.astype(np.uint8))
+        areas = stats[1:, cv2.CC_STAT_AREA]
+        assert count - 1 == 6
+        assert areas.min() > 0.1 * areas.max()
+        break
+    else:
+        pytest.fail("no window lies within the picture")
+
+
+def test_whole_parts_give_what_is_left_to_the_largest() -> None:
+    out = np.empty((1, 1, 3), np.float32)
+    quantise_shares(np.array([1, 1, 1.0001], np.float32).reshape(3, 1, 1), out)
+    assert np.rint(out * FULL).ravel().tolist() == [21844, 21844, 21847]
+
+
+@given(hnp.arrays(np.float32, (2, 3, 37), elements=st.floats(0, 1, width=32)))
+def test_whole_parts_of_two_are_those_of_three_one_of_which_is_dark(shares: npt.NDArray[np.float32]) -> None:
+    shares[0] += np.float32(2**-20) * (shares.sum(axis=0) == 0)
+    two, three = np.empty((3, 37, 2), np.float32), np.empty((3, 37, 3), np.float32)
+    quantise_shares(shares, two)
+    quantise_shares(np.concatenate([shares, np.zeros_like(shares[:1])]), three)
+    np.testing.assert_array_equal(three, np.dstack([two, np.zeros((3, 37))]))
+
+
+def test_texts_of_masks() -> None:
+    assert parse_masks("half-plane", 2, 1) == MadeMaskPlan(HalfPlanes(None, 0.0), 1)
+    assert parse_masks("half-plane:angle=-30,width=.1", 2, 1) == MadeMaskPlan(HalfPlanes(-30.0, 0.1), 1)
+    assert parse_masks("soft-edge", 2, 1) == MadeMaskPlan(HalfPlanes(None, None), 1)
+    assert parse_masks("spots:count=3", 2, 1) == MadeMaskPlan(Spots(3), 1)
+    assert parse_masks("smooth:contrast=8", 2, 1) == MadeMaskPlan(SmoothFields(contrast=8), 1)
+    assert parse_masks("window:rows=1,columns=2", 2, 1) == MadeMaskPlan(Windows(2, 1), 1)
+    assert parse_masks("spots:count=3", 2, 1).describe() == {
+        "masks": "spots",
+        "count": 3,
+        "radius": None,
+        "softness": 0.8,
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "'' is neither a folder of masks nor a kind of them: half-plane, soft-edge, spots, smooth, window"),
+        ("stripes", "'stripes' is neither a folder"),
+        ("spots:count=0", "'count=0' of the masks spots: expected a number from 1 to 20"),
+        ("spots:count=1.5", "count=1.5 of the masks spots: expected a whole number"),
+        ("spots:size=1", "'size=1' is no option of the masks spots; known are count, radius, softness"),
+        ("smooth:scale", "'scale' is no option of the masks smooth"),
+        ("window:rows=2,rows=3", "rows is given twice for the masks window"),
+    ],
+)
+def test_bad_masks_are_named(text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=message):
+        parse_masks(text, 2, 0)

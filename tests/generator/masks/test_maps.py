@@ -1,0 +1,78 @@
+"""Maps written beside images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import imagecodecs
+import numpy as np
+import numpy.typing as npt
+import PIL.Image
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from foundation.angles import angles_deg
+from foundation.errors import FormatError
+from generator.files.formats import encode_map
+from generator.lights.lighting import Lighting, plain
+from generator.masks.given import find_masks
+from generator.masks.maps import decode_ground_truth, decode_weights, encode_maps
+from generator.masks.request import parse_masks
+from generator.masks.weights import FULL
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+
+
+@pytest.mark.parametrize("lights", [2, 3])
+def test_maps_are_read_back_as_the_image_was_made(tmp_path: Path, make_lut: Callable[..., Lut], lights: int) -> None:
+    lut = make_lut()
+    shining = [0, 2, 3][:lights]
+    lighting = Lighting(tuple(plain(light) for light in shining), parse_masks("smooth", lights, 1).maker(0))
+    weights = lighting.weights_of(40, 60)
+    names: list[str] = []
+    for folder, suffix, data in encode_maps(weights, lighting.whites(lut)):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / f"000004{suffix}").write_bytes(data)
+        names.append(f"{folder}/000004{suffix}")
+    assert names == [*(f"masks/000004_{light}.png" for light in range(lights)), "ground_truth/000004.png"]
+    *masks, truths = [(tmp_path / name).read_bytes() for name in names]
+    np.testing.assert_array_equal(decode_weights(masks, "it"), weights)
+    truth = decode_ground_truth(truths, "it")
+    exact = weights.astype(np.float64) @ lut.white[shining]
+    assert angles_deg(truth.astype(np.float64), exact).max() < 0.002
+    np.testing.assert_allclose(truth.sum(axis=2), 1, atol=1e-6)
+    # The same by an independent reader; and the masks can be given again.
+    with PIL.Image.open(tmp_path / "masks/000004_1.png") as mask:
+        assert mask.mode == "I;16"
+        np.testing.assert_array_equal(np.asarray(mask), np.rint(weights[..., 1] * FULL))
+    again = find_masks(tmp_path / "masks", lights).maker(0)
+    np.testing.assert_array_equal(again.weights(40, 60, lights), weights)
+
+
+@given(
+    st.sampled_from([(), (3,)]).flatmap(
+        lambda channels: hnp.arrays(np.uint16, st.tuples(st.integers(1, 9), st.integers(1, 9), *map(st.just, channels)))
+    )
+)
+def test_any_map_is_read_by_others(values: npt.NDArray[np.uint16]) -> None:
+    data = encode_map(values)
+    np.testing.assert_array_equal(imagecodecs.png_decode(data), values)
+    seen = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert seen is not None
+    np.testing.assert_array_equal(seen if values.ndim == 2 else seen[..., ::-1], values)
+
+
+def test_maps_that_are_damaged_are_named() -> None:
+    masks = [encode_map(np.ones(shape, np.uint16)) for shape in ((2, 2), (2, 3))]
+    with pytest.raises(FormatError, match="the masks of it differ in size"):
+        decode_weights(masks, "it")
+    with pytest.raises(FormatError, match="it is no picture that can be read"):
+        decode_weights([masks[0], masks[1][:50]], "it")
+    with pytest.raises(FormatError, match="it is no map of 16 bits"):
+        decode_ground_truth(masks[0], "it")

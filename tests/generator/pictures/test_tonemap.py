@@ -1,0 +1,88 @@
+"""The Flash operator by hand, and back again."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from foundation.errors import InputError
+from generator.pictures.preview import preview_of
+from generator.pictures.tonemap import fit_flash, flash
+
+
+def test_two_pixels_by_hand() -> None:
+    # V = 0.1 and 0.4, geometric mean 0.2, k = 5 * 0.2 = 1; y = x / (V + 1); brightest 0.4 / 1.4 becomes 255.
+    image = np.array([[[0.1, 0.05, 0.0], [0.2, 0.4, 0.1]]])
+    operator = fit_flash(image, gamma=1)
+    assert operator.k == pytest.approx(1)
+    expected = np.array([[[0.1 / 1.1, 0.05 / 1.1, 0], [0.2 / 1.4, 0.4 / 1.4, 0.1 / 1.4]]]) / (0.4 / 1.4) * 255
+    np.testing.assert_allclose(operator.apply(image), expected)
+    display = fit_flash(image).apply(image)
+    np.testing.assert_allclose(display, 255 * (expected / 255) ** (1 / 2.2))
+    np.testing.assert_array_equal(flash(image), np.rint(display))
+
+
+@given(
+    hnp.arrays(np.float64, (3, 4, 3), elements=st.floats(1e-4, 1)),
+    st.floats(0.5, 20),
+    st.sampled_from([1.0, 2.2]),
+)
+def test_the_inverse_gives_back_the_image(image: np.ndarray, a: float, gamma: float) -> None:
+    operator = fit_flash(image, a, gamma)
+    np.testing.assert_allclose(operator.invert(operator.apply(image)), image, rtol=1e-6)
+
+
+def test_the_scale_of_the_values_does_not_matter() -> None:
+    image = np.random.default_rng(0).uniform(0.01, 1, (9, 9, 3))
+    np.testing.assert_allclose(fit_flash(image).apply(image), fit_flash(image / 50).apply(image / 50))
+
+
+def test_codes_of_eight_bits_lose_little() -> None:
+    image = np.random.default_rng(0).uniform(0.02, 1, (50, 50, 3))
+    operator = fit_flash(image)
+    back = operator.invert(np.rint(operator.apply(image)))
+    assert np.median(np.abs(back / image - 1)) < 0.02
+
+
+def test_black_stays_black() -> None:
+    image = np.zeros((2, 2, 3))
+    assert not flash(image).any()
+    image[0, 0] = 0.5
+    assert flash(image)[1, 1].tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_single_precision_moves_no_code_by_more_than_one(gamma: float) -> None:
+    image = np.random.default_rng(4).exponential(0.05, (200, 200, 3))
+    image[:3] = 0
+    exact = np.clip(fit_flash(image, gamma=gamma).apply(image), 0, 255)
+    codes = flash(image, gamma=gamma)
+    assert np.abs(codes - exact).max() < 0.501
+    assert (codes != np.rint(exact)).mean() < 1e-3
+
+
+@pytest.mark.parametrize(("a", "gamma"), [(0, 2.2), (5, 0)])
+def test_impossible_parameters_are_refused(a: float, gamma: float) -> None:
+    with pytest.raises(InputError, match="expected pixels and numbers above 0"):
+        fit_flash(np.ones((1, 1, 3)), a, gamma)
+
+
+@settings(deadline=None)
+@given(
+    hnp.arrays(np.uint16, (3, 4, 3), elements=st.integers(0, 65535) | st.integers(0, 3)),
+    st.sampled_from([255, 12000, 65535]),
+)
+def test_previews_are_the_operator_by_tables(image: npt.NDArray[np.uint16], white_level: int) -> None:
+    linear = image / white_level
+    exact = np.clip(fit_flash(linear).apply(linear), 0, 255)
+    assert np.abs(preview_of(image, white_level) - exact).max() <= 0.5 + 1e-4
+
+
+def test_previews_are_small() -> None:
+    image = np.full((300, 200, 3), 1000, np.uint16)
+    assert preview_of(image, 12000, side=100).shape == (100, 67, 3)
+    assert preview_of(image, 12000, side=400).shape == (300, 200, 3)

@@ -1,0 +1,207 @@
+"""Training items: what they show is in the table, and who asks for them, in which order, changes nothing."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from foundation.errors import FormatError, InputError
+from generator.lights.lighting import Mixture
+from generator.pictures.picture import Picture
+from generator.pictures.sources import random_scenes
+from generator.training.crops import Crops
+from generator.training.gallery import Gallery, gallery_of, open_gallery, save_gallery
+from tests.generator.conftest import MakeLut
+
+BITS = 2
+
+
+def ramp(height: int, width: int) -> Picture:
+    """Return a picture that has every colour of a table of 2 bits a channel, many times."""
+    rows, columns = np.mgrid[:height, :width]
+    return (np.stack([columns, rows, rows + columns], axis=-1) % 4 * 64).astype(np.uint8)
+
+
+@pytest.fixture
+def gallery() -> Gallery:
+    return gallery_of([ramp(40, 50), np.full((9, 8, 3), 200, np.uint8)], ["ramp", "plain"])
+
+
+def test_every_value_is_a_sample_of_its_colour_under_its_light(make_lut: MakeLut, gallery: Gallery) -> None:
+    lut = make_lut(bits=BITS)
+    batch = Crops(lut, gallery, (7, 8), flip=False, length=300).batch(np.arange(300))
+    assert batch.images.shape == (300, 3, 7, 8)
+    assert batch.images.dtype == np.float32
+    assert set(batch.lights.tolist()) == set(range(4))
+    assert set(batch.pictures.tolist()) == {0, 1}
+    for image, light, picture in zip(batch.images, batch.lights, batch.pictures, strict=True):
+        if picture == 1:
+            code = 200 >> 6
+            colour = code << 4 | code << 2 | code
+            wanted = lut.samples[light, colour].astype(np.float32) * np.float32(1 / lut.provenance.white_level)
+            assert (image.reshape(3, -1).T[:, None] == wanted[None]).all(axis=2).any(axis=1).all()
+    np.testing.assert_allclose(batch.illuminants, lut.ground_truth[batch.lights], rtol=1e-6)
+
+
+@settings(deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(order=st.permutations(list(range(24))), cut=st.integers(1, 23))
+def test_items_do_not_depend_on_who_asks_when(
+    made: tuple[Crops, np.ndarray[tuple[int, ...], np.dtype[np.float32]]], order: list[int], cut: int
+) -> None:
+    crops, images = made
+    for part in (order[:cut], order[cut:]):
+        np.testing.assert_array_equal(crops.batch(part).images, images[part])
+
+
+@pytest.fixture
+def made(make_lut: MakeLut, gallery: Gallery) -> tuple[Crops, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
+    crops = Crops(make_lut(bits=BITS), gallery, (5, 6), length=24, exposure=(0.5, 2.0), seed=11)
+    return crops, crops.batch(np.arange(24)).images
+
+
+def test_a_pickled_copy_gives_the_same_and_carries_no_table(make_lut: MakeLut, gallery: Gallery) -> None:
+    crops = Crops(make_lut(bits=3), gallery, (5, 6), lights=[1, Mixture((0, 2), (0.5, 0.5))], length=50, seed=3)
+    stored = pickle.dumps(crops)
+    assert len(stored) < gallery.codes.size + 4000
+    again = pickle.loads(stored)
+    np.testing.assert_array_equal(again.batch(np.arange(50)).images, crops.batch(np.arange(50)).images)
+
+
+def test_seeds_and_epochs_differ_and_threads_do_not(make_lut: MakeLut, gallery: Gallery) -> None:
+    lut = make_lut(bits=BITS)
+    first = Crops(lut, gallery, (6, 6), length=40).batch(np.arange(40))
+    same = Crops(lut, gallery, (6, 6), length=40, threads=3).batch(np.arange(40))
+    np.testing.assert_array_equal(first.images, same.images)
+    for other in (Crops(lut, gallery, (6, 6), length=40, seed=1), Crops(lut, gallery, (6, 6), length=40, epoch=1)):
+        assert (other.batch(np.arange(40)).images != first.images).any(axis=(1, 2, 3)).sum() >= 39
+    moved = Crops(lut, gallery, (6, 6), length=40)
+    moved.set_epoch(1)
+    np.testing.assert_array_equal(
+        moved.batch([3]).images, Crops(lut, gallery, (6, 6), length=40, epoch=1).batch([3]).images
+    )
+
+
+def test_a_batch_fills_the_memory_it_is_given(make_lut: MakeLut, gallery: Gallery) -> None:
+    crops = Crops(make_lut(bits=BITS), gallery, (5, 6), length=40, threads=2)
+    memory = np.full((12, 3, 5, 6), np.nan, np.float32)
+    batch = crops.batch(np.arange(9, 20), out=memory[1:])
+    assert np.shares_memory(batch.images, memory)
+    np.testing.assert_array_equal(memory[1:], crops.batch(np.arange(9, 20)).images)
+    assert np.isnan(memory[0]).all()
+    with pytest.raises(InputError, match="the target is float32"):
+        crops.batch(np.arange(9, 20), out=memory)
+
+
+def test_choices_are_even(make_lut: MakeLut) -> None:
+    gallery = gallery_of([ramp(12, 13)] * 5)
+    count = 6000
+    crops = Crops(make_lut(bits=BITS), gallery, (4, 4), length=count, exposure=(0.25, 1.0), seed=7)
+    batch = crops.batch(np.arange(count))
+    for drawn, kinds in ((batch.lights, 4), (batch.pictures, 5)):
+        expected = count / kinds
+        # Chi-square with 4 degrees of freedom at most: above 28 by chance once in 80 000.
+        assert ((np.bincount(drawn, minlength=kinds) - expected) ** 2 / expected).sum() < 28
+    # The gain is even in stops over two stops, mean 1 stop: its error is 2 / sqrt(12 · 6000) = .0075 stops.
+    means = np.log2(batch.images.mean(axis=(1, 2, 3)))
+    bright = np.log2(Crops(make_lut(bits=BITS, name="again"), gallery, (4, 4), length=count, seed=7)
+                     .batch(np.arange(count)).images.mean(axis=(1, 2, 3)))  # fmt: skip
+    assert abs((means - bright).mean() + 1.0) < 6 * 0.0075
+    assert np.ptp(means - bright) == pytest.approx(2.0, abs=0.02)
+
+
+def test_mirrored_items_are_the_others_mirrored(make_lut: MakeLut) -> None:
+    lut = make_lut(bits=BITS)
+    gallery = gallery_of([ramp(6, 6)])
+    plain = Crops(lut, gallery, (6, 6), length=200, flip=False).batch(np.arange(200)).images
+    mixed = Crops(lut, gallery, (6, 6), length=200).batch(np.arange(200)).images
+    mirrored = (mixed == plain[..., ::-1]).all(axis=(1, 2, 3))
+    same = (mixed == plain).all(axis=(1, 2, 3))
+    assert (mirrored ^ same).all()
+    # Of 200 fair coins fewer than 50 or more than 150 heads: below 1e-12.
+    assert 50 < mirrored.sum() < 150
+
+
+def test_unfit_colours_take_their_stand_ins(make_lut: MakeLut) -> None:
+    lut = make_lut(bits=BITS, unfit=(63,))
+    white = np.full((8, 8, 3), 255, np.uint8)
+    images = Crops(lut, gallery_of([white]), (4, 4), lights=[1], flip=False, length=9).batch(np.arange(9)).images
+    from generator.kernels.palette import nearest_fit_colours
+
+    wanted = lut.samples[1, int(nearest_fit_colours([63], BITS)[0])].astype(np.float32) / lut.provenance.white_level
+    values = images.transpose(0, 2, 3, 1).reshape(-1, 1, 3)
+    found = np.isclose(values, wanted[None], rtol=1e-6).all(axis=-1)
+    assert np.count_nonzero(found, axis=1).min() >= 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        ({"size": (10, 9)}, "1 of 2 pictures are smaller"),
+        ({"size": (0, 4)}, "0x4"),
+        ({"length": 0}, "0 items"),
+        ({"exposure": (2.0, 1.0)}, "exposure"),
+        ({"exposure": (0.0, 1.0)}, "exposure"),
+        ({"lights": []}, "no light"),
+        ({"lights": [4]}, "no light 4"),
+        ({"seed": -1}, "seed"),
+        ({"epoch": -1}, "epoch"),
+    ],
+)
+def test_what_cannot_be_is_refused(make_lut: MakeLut, gallery: Gallery, wrong: dict[str, object], word: str) -> None:
+    arguments: dict[str, object] = {"size": (4, 4)} | wrong
+    with pytest.raises(InputError, match=word):
+        Crops(make_lut(bits=BITS), gallery, **arguments)  # pyright: ignore[reportArgumentType]
+
+
+def test_items_that_are_not_there(make_lut: MakeLut, gallery: Gallery) -> None:
+    crops = Crops(make_lut(bits=BITS), gallery, (4, 4), length=3)
+    assert crops[2][0].shape == (3, 4, 4)
+    with pytest.raises(IndexError):
+        crops[3]
+    outside: list[list[int]] = [[3], [-1], []]
+    for wrong in outside:
+        with pytest.raises(InputError):
+            crops.batch(wrong)
+
+
+def test_a_gallery_on_disk_is_the_pictures(tmp_path: Path) -> None:
+    sources = random_scenes(3, 9, 7)
+    gallery = save_gallery(sources, tmp_path / "gallery")
+    assert gallery.names == ("random-000000", "random-000001", "random-000002")
+    for number, source in enumerate(sources):
+        np.testing.assert_array_equal(gallery.picture(number), source.read().picture)
+    again = pickle.loads(pickle.dumps(gallery))
+    np.testing.assert_array_equal(again.codes, gallery.codes)
+    with pytest.raises(InputError, match="gallery"):
+        save_gallery(sources, tmp_path / "gallery")
+    np.testing.assert_array_equal(open_gallery(str(tmp_path / "gallery")).codes, gallery.codes)
+    with pytest.raises(InputError, match="1 pictures of a gallery have 2 names"):
+        gallery_of([sources[0].read().picture], ["one", "two"])
+    (tmp_path / "gallery" / "codes.u8").write_bytes(b"short")
+    with pytest.raises(FormatError, match="5 bytes, expected 567"):
+        open_gallery(tmp_path / "gallery")
+    with pytest.raises(FormatError, match="no gallery"):
+        open_gallery(tmp_path)
+
+
+WITHOUT_TORCH = """
+import sys
+sys.modules["torch"] = None
+from generator.training import Crops
+try:
+    from generator.training.torch_crops import CropDataset
+except ImportError as error:
+    print(error)
+"""
+
+
+def test_pytorch_that_is_missing_is_an_import_error_and_named() -> None:
+    done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("training batches for PyTorch need it: pip install 'croplab[torch]'\n", "")

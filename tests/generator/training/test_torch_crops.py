@@ -1,0 +1,81 @@
+"""PyTorch's own loader gets the same items whatever its workers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from foundation.errors import InputError
+from generator.training.crops import Crops
+from generator.training.gallery import gallery_of
+from tests.generator.conftest import MakeLut
+
+torch: Any = pytest.importorskip("torch", reason="PyTorch is not installed: pip install 'croplab[torch]'")
+batches: Any = pytest.importorskip("generator.training.torch_crops")
+CropDataset, CropStream, collated = batches.CropDataset, batches.CropStream, batches.collated
+
+
+@pytest.fixture
+def crops(make_lut: MakeLut) -> Crops:
+    rows, columns = np.mgrid[:20, :30]
+    picture = (np.stack([columns, rows, rows + columns], axis=-1) % 4 * 64).astype(np.uint8)
+    return Crops(make_lut(bits=2), gallery_of([picture]), (6, 5), length=22, exposure=(0.5, 1.5), seed=5)
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_loader_by_number_gives_every_item_once(crops: Crops, workers: int) -> None:
+    loader = torch.utils.data.DataLoader(
+        CropDataset(crops),
+        batch_size=4,
+        num_workers=workers,
+        collate_fn=collated,
+        multiprocessing_context=_spawn(workers),
+    )
+    loaded = list(loader)
+    wanted = crops.batch(np.arange(22))
+    np.testing.assert_array_equal(torch.cat([batch["image"] for batch in loaded]).numpy(), wanted.images)
+    np.testing.assert_array_equal(torch.cat([batch["illuminant"] for batch in loaded]).numpy(), wanted.illuminants)
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+@pytest.mark.parametrize("workers", [0, 3])
+def test_a_stream_keeps_the_order_of_one_worker(crops: Crops, workers: int) -> None:
+    loader = torch.utils.data.DataLoader(
+        CropStream(crops, 4), batch_size=None, num_workers=workers, multiprocessing_context=_spawn(workers)
+    )
+    images = [batch["image"] for batch in loader]
+    assert [len(image) for image in images] == [4, 4, 4, 4, 4, 2]
+    np.testing.assert_array_equal(torch.cat(images).numpy(), crops.batch(np.arange(22)).images)
+
+
+def _spawn(workers: int) -> str | None:
+    # A fork of a process that has threads may hang.
+    return "spawn" if workers else None
+
+
+def test_the_plain_collate_gives_the_same(crops: Crops) -> None:
+    one = next(iter(torch.utils.data.DataLoader(CropDataset(crops), batch_size=4)))
+    other = next(iter(torch.utils.data.DataLoader(CropDataset(crops), batch_size=4, collate_fn=collated)))
+    for name in ("image", "illuminant"):
+        assert one[name].dtype == torch.float32
+        assert torch.equal(one[name], other[name])
+
+
+def test_single_items_and_their_bounds(crops: Crops) -> None:
+    dataset = CropDataset(crops)
+    np.testing.assert_array_equal(dataset[21]["image"].numpy(), crops.batch([21]).images[0])
+    with pytest.raises(IndexError):
+        dataset[22]
+    with pytest.raises(InputError, match="batches of 0"):
+        CropStream(crops, 0)
+
+
+def test_nothing_else_imports_pytorch() -> None:
+    modules = "generator, generator.training, generator.dataset.making, generator.kernels.rendering"
+    code = f"import sys, {modules}; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

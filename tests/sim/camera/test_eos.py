@@ -1,0 +1,880 @@
+"""The simulated EOS against the conversation of a real one, and against the rules that PTP and Canon's bodies keep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from datetime import datetime, timedelta
+from io import BytesIO
+from threading import Event as ThreadEvent
+from typing import BinaryIO
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from drivers.camera import ExposureSettings
+from drivers.canon import apex
+from drivers.canon.camera import CanonEos
+from drivers.canon.datasets import DeviceInfoEx, decode_object_entries
+from drivers.canon.records import (
+    AvailableFormats,
+    AvailableValues,
+    Notice,
+    ObjectEvent,
+    PropertyChanged,
+    Record,
+    TransferRequest,
+    decode_events,
+)
+from drivers.canon.values import RAW_ONLY, ImageFile, ImageFormat, PropertySetting, number_of, number_value, text_value
+from drivers.ptp.codes import (
+    AeMode,
+    CaptureDestination,
+    DriveMode,
+    EosEvent,
+    ObjectFormat,
+    Operation,
+    Property,
+    ReleaseButton,
+    ResponseCode,
+)
+from drivers.ptp.datasets import (
+    DeviceInfo,
+    DevicePropDesc,
+    ObjectInfo,
+    StorageInfo,
+    decode_u32_array,
+    decode_value,
+    encode_string,
+)
+from drivers.ptp.messages import PtpRequest
+from foundation.errors import DeviceRefused, LinkClosed
+from sim.buses.ptp_memory import MemoryTransport
+from sim.buses.responder import Answer
+from sim.camera.eos import SimulatedEos
+from sim.camera.eos_bodies import EOS_6D_MARK_II, EOS_550D, EOS_550D_AS_LISTED, EOS_BODIES, TEST_BODY
+from sim.camera.eos_model import OPERATIONS, EosModel
+from sim.camera.eos_state import CARD, DCIM, EMPTY_SLOT, FOLDER
+from sim.clock import OPENING, SimulatedClock
+from tests.drivers.ptp.conversations import EOS_60D_PROPERTIES, Recorded, conversations, transcript
+
+REAL = {"the transcript": transcript} | {name: make for name, make in conversations().items() if name == "EOS 60D"}
+"""Conversations of the real EOS 60D: without the bytes that it sent, and whole where the recording is found."""
+
+
+class NumberedFilm:
+    """Film whose frames tell their number, and that notes how each was exposed."""
+
+    suffix = ".dng"
+
+    def __init__(self, size: int = 3000) -> None:
+        self.size = size
+        self.exposures: list[tuple[ExposureSettings, datetime]] = []
+        self.frames: list[bytes] = []
+        self.broken = False
+
+    def accept(self, settings: ExposureSettings) -> None:
+        if settings.shutter_s > 30:
+            raise DeviceRefused("the film takes 30 s at most")
+
+    def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
+        if self.broken:
+            raise DeviceRefused("the film is torn")
+        frame = f"frame {len(self.frames)} ".encode().ljust(self.size, b"\xa5")
+        self.exposures.append((settings, released_at))
+        self.frames.append(frame)
+        return into.write(frame)
+
+
+class Host:
+    """An initiator that holds a body by its wire."""
+
+    def __init__(self, eos: SimulatedEos, clock: SimulatedClock, film: NumberedFilm) -> None:
+        self.eos = eos
+        self.clock = clock
+        self.film = film
+        self.transaction = 0
+
+    def ask(self, code: int, *parameters: int, data: bytes | None = None) -> Answer:
+        request = PtpRequest(code, 0 if code == Operation.OPEN_SESSION else self.next(), parameters)
+        if code == Operation.OPEN_SESSION:
+            self.transaction = 0
+        answer = self.eos.answer(request, data)
+        assert answer.response.transaction == request.transaction
+        return answer
+
+    def next(self) -> int:
+        self.transaction += 1
+        return self.transaction
+
+    def code(self, code: int, *parameters: int, data: bytes | None = None) -> int:
+        return self.ask(code, *parameters, data=data).response.code
+
+    def ok(self, code: int, *parameters: int, data: bytes | None = None) -> bytes:
+        answer = self.ask(code, *parameters, data=data)
+        assert answer.response.ok, str(answer.response)
+        return answer.data or b""
+
+    def events(self) -> tuple[Record, ...]:
+        return decode_events(self.ok(Operation.EOS_GET_EVENT))
+
+    def set(self, code: int, value: int | ImageFormat | str) -> int:
+        octets = (
+            value.encode()
+            if isinstance(value, ImageFormat)
+            else text_value(value)
+            if isinstance(value, str)
+            else number_value(value)
+        )
+        return self.code(Operation.EOS_SET_DEVICE_PROP_VALUE_EX, data=PropertySetting(code, octets).encode())
+
+    def take_control(self, destination: int = CaptureDestination.HOST) -> Host:
+        self.ok(Operation.OPEN_SESSION, 1)
+        self.ok(Operation.EOS_SET_REMOTE_MODE, 1)
+        self.ok(Operation.EOS_SET_EVENT_MODE, 1)
+        assert self.set(Property.EOS_CAPTURE_DESTINATION, destination) == ResponseCode.OK
+        self.ok(Operation.EOS_PC_HDD_CAPACITY, 0x0FFFFFFF, 0x1000, 1)
+        self.events()
+        return self
+
+    def press(self, autofocus: bool = False) -> int:
+        code = self.code(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, int(not autofocus))
+        self.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
+        return code
+
+    def shoot(self) -> tuple[Record, ...]:
+        """Take a picture and wait until it is announced."""
+        assert self.press() == ResponseCode.OK
+        self.clock.sleep(60)
+        return self.events()
+
+    def number(self, code: int) -> int:
+        self.ok(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, code)
+        return number_of([e for e in self.events() if isinstance(e, PropertyChanged) and e.code == code][-1].value)
+
+
+def transfers(records: tuple[Record, ...]) -> list[TransferRequest]:
+    return [record for record in records if isinstance(record, TransferRequest)]
+
+
+def changes(records: tuple[Record, ...]) -> dict[int, bytes]:
+    return {record.code: record.value for record in records if isinstance(record, PropertyChanged)}
+
+
+def lists(records: tuple[Record, ...]) -> dict[int, tuple[int, ...]]:
+    return {record.code: record.values for record in records if isinstance(record, AvailableValues)}
+
+
+def statuses(records: tuple[Record, ...]) -> list[int]:
+    return [r.number for r in records if isinstance(r, Notice) and r.type == EosEvent.CAMERA_STATUS_CHANGED]
+
+
+def host_of(body: EosModel = TEST_BODY, *, card_bytes: int | None = 8 << 30, battery: float = 1.0) -> Host:
+    clock, film = SimulatedClock(), NumberedFilm()
+    return Host(
+        SimulatedEos(body, film, clock, card_bytes=card_bytes, battery=battery, auto_power_off_s=0), clock, film
+    )
+
+
+@pytest.fixture
+def host() -> Host:
+    return host_of().take_control()
+
+
+# The real one.
+
+
+def kind_of(code: int, parameters: list[int], data: bytes) -> object:
+    """Return what a data phase is, without the values that differ from body to body."""
+    match code:
+        case Operation.GET_DEVICE_INFO:
+            info = DeviceInfo.decode(data)
+            return info.vendor_extension_id, info.manufacturer, info.properties, len(info.serial_number), info.events
+        case Operation.EOS_GET_EVENT:
+            records = decode_events(data)
+            return {type(record) for record in records}, changes(records).keys() & {Property.EOS_AVAILABLE_SHOTS}
+        case Operation.EOS_GET_DEVICE_INFO_EX:
+            info_ex = DeviceInfoEx.decode(data)
+            return info_ex.events, info_ex.others
+        case Operation.EOS_GET_STORAGE_IDS:
+            return decode_u32_array(data)
+        case Operation.EOS_GET_STORAGE_INFO:
+            info = StorageInfo.decode(data)
+            return info.storage_type, info.filesystem_type, info.capacity > 0, info.free_images, info.description
+        case Operation.GET_DEVICE_PROP_DESC:
+            described = DevicePropDesc.decode(data)
+            return parameters, described.data_type, described.writable, described.form
+        case _:
+            raise AssertionError(f"the recording holds data of 0x{code:04x}")
+
+
+@pytest.mark.parametrize("real", REAL.values(), ids=REAL)
+def test_holds_the_conversation_of_a_real_60d(real: Callable[[], list[Recorded]]) -> None:
+    host = host_of(EOS_550D)
+    host.eos.turn_dial(AeMode.APERTURE_PRIORITY)
+    sessions = 0
+    for number, recorded in enumerate(real()):
+        code = int(recorded["code"], 16)
+        request = PtpRequest(code, recorded["tid"], tuple(recorded["params"]))
+        if code == Operation.OPEN_SESSION:
+            sessions += 1
+            if sessions == 2:
+                # Its card was taken out between the two sessions.
+                host.eos.remove_card()
+        data = bytes.fromhex(recorded["data"]) if recorded["data"] else None
+        sent = data if recorded["dir"] == "out" else None
+        assert host.eos.takes_data(request) == (recorded["dir"] == "out")
+        answer = host.eos.answer(request, sent)
+        place = f"transaction {number}, 0x{code:04x}"
+        assert f"{answer.response.code:04x}" == recorded["rc"], place
+        assert len(answer.response.parameters) == len(recorded["rparams"]), place
+        assert (answer.data is None) == (recorded["dir"] != "in"), place
+        if recorded["dir"] == "in" and data is not None:
+            assert answer.data is not None
+            ours, theirs = (kind_of(code, recorded["params"], octets) for octets in (answer.data, data))
+            assert ours == theirs, place
+    assert sessions == 2
+
+
+def test_tells_of_itself_in_the_order_of_the_60d() -> None:
+    theirs = EOS_60D_PROPERTIES
+    ours = [spec.code for spec in EOS_550D.properties]
+    assert [code for code in theirs if code in ours] == [code for code in ours if code in theirs]
+    assert set(ours) <= set(theirs)
+
+
+# The lists that owners have published: libgphoto2, cameras/canon-eos550d.txt and canon-eos6d-mark2.txt.
+
+LISTED_SHUTTER_550D = (
+    "bulb 30 20 15 10 8 6 4 3 2 1.5 1 0.7 0.5 0.3 1/4 1/6 1/8 1/10 1/15 1/20 1/30 1/45 1/60 1/90 1/125 1/180 1/250 "
+    "1/350 1/500 1/750 1/1000 1/1500 1/2000 1/3000 1/4000"
+)
+LISTED_APERTURE_550D = "4 4.5 5.6 6.7 8 9.5 11 13 16 19 22 27"
+LISTED_ISO_6D2 = (
+    "auto 100 125 160 200 250 320 400 500 640 800 1000 1250 1600 2000 2500 3200 4000 5000 6400 8000 10000 12800 16000 "
+    "20000 25600 32000 40000"
+)
+
+
+def test_a_550d_can_be_the_one_that_was_listed() -> None:
+    host = host_of(EOS_550D_AS_LISTED)
+    host.ok(Operation.OPEN_SESSION, 1)
+    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
+    offered = lists(host.events())
+    assert [apex.SHUTTER.label(code) for code in offered[Property.EOS_SHUTTER_SPEED]] == LISTED_SHUTTER_550D.split()
+    assert [apex.APERTURE.label(code) for code in offered[Property.EOS_APERTURE]] == LISTED_APERTURE_550D.split()
+    assert [apex.ISO.label(code) for code in offered[Property.EOS_ISO_SPEED]] == (
+        ["auto", "200", "400", "800", "1600", "3200", "6400"]
+    )
+
+
+def test_a_6d_mark_ii_is_the_one_that_was_listed() -> None:
+    host = host_of(EOS_6D_MARK_II)
+    info = DeviceInfo.decode(host.ok(Operation.GET_DEVICE_INFO))
+    assert (info.manufacturer, info.model, info.device_version) == ("Canon.Inc", "Canon EOS 6D Mark II", "3-1.0.2")
+    host.ok(Operation.OPEN_SESSION, 1)
+    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
+    records = host.events()
+    assert [apex.ISO.label(code) for code in lists(records)[Property.EOS_ISO_SPEED]] == LISTED_ISO_6D2.split()
+    formats = next(
+        r.formats for r in records if isinstance(r, AvailableFormats) and r.code == Property.EOS_IMAGE_FORMAT
+    )
+    assert len(formats) == 31
+    assert [str(formats[at]) for at in (0, 6, 7, 28, 29, 30)] == [
+        "JPEG L fine", "JPEG S2 fine", "RAW + JPEG L fine", "RAW", "mRAW", "sRAW",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "product"), [("EOS 550D", 0x31EA), ("EOS 6D Mark II", 0x32CA)])
+def test_bodies_have_their_usb_ids(name: str, product: int) -> None:
+    assert EOS_BODIES[name].usb == (0x04A9, product)
+
+
+# Sessions.
+
+
+def test_tells_what_it_is_without_a_session() -> None:
+    host = host_of()
+    assert host.eos.answer(PtpRequest(Operation.GET_DEVICE_INFO), None).response.ok
+    assert host.code(Operation.GET_STORAGE_IDS) == ResponseCode.SESSION_NOT_OPEN
+    assert host.code(Operation.OPEN_SESSION, 0) == ResponseCode.INVALID_PARAMETER
+
+
+def test_one_session_at_a_time() -> None:
+    host = host_of()
+    host.ok(Operation.OPEN_SESSION, 7)
+    answer = host.ask(Operation.OPEN_SESSION, 8)
+    assert (answer.response.code, answer.response.parameters) == (ResponseCode.SESSION_ALREADY_OPEN, (7,))
+    host.ok(Operation.CLOSE_SESSION)
+    assert host.code(Operation.CLOSE_SESSION) == ResponseCode.SESSION_NOT_OPEN
+    host.ok(Operation.OPEN_SESSION, 8)
+
+
+def test_a_transaction_number_is_used_once() -> None:
+    host = host_of()
+    host.ok(Operation.OPEN_SESSION, 1)
+
+    def code(transaction: int) -> int:
+        return host.eos.answer(PtpRequest(Operation.GET_STORAGE_IDS, transaction), None).response.code
+
+    assert [code(n) for n in (1, 1, 3, 2, 0, 0xFFFFFFFF, 4)] == [
+        ResponseCode.OK,
+        ResponseCode.INVALID_TRANSACTION_ID,
+        ResponseCode.OK,  # 2 was lost on its way
+        ResponseCode.INVALID_TRANSACTION_ID,
+        ResponseCode.INVALID_TRANSACTION_ID,
+        ResponseCode.INVALID_TRANSACTION_ID,
+        ResponseCode.OK,
+    ]
+
+
+@pytest.mark.parametrize("body", EOS_BODIES.values(), ids=lambda body: body.model)
+def test_carries_out_all_that_it_lists_and_nothing_else(body: EosModel) -> None:
+    host = host_of(body)
+    listed = DeviceInfo.decode(host.ok(Operation.GET_DEVICE_INFO)).operations
+    assert listed == tuple(OPERATIONS)
+    for code in range(0x1000, 0x10000):
+        if code in (Operation.OPEN_SESSION, Operation.CLOSE_SESSION):
+            continue
+        known = host.code(code, 1) != ResponseCode.OPERATION_NOT_SUPPORTED
+        assert known == (code in listed), f"0x{code:04x}"
+
+
+def test_a_specimen_may_lack_operations() -> None:
+    clock = SimulatedClock()
+    film = NumberedFilm()
+    eos = SimulatedEos(EOS_550D, film, clock, without=(Operation.EOS_REMOTE_RELEASE_ON,))
+    host = Host(eos, clock, film).take_control()
+    assert Operation.EOS_REMOTE_RELEASE_ON not in DeviceInfo.decode(host.ok(Operation.GET_DEVICE_INFO)).operations
+    assert host.code(Operation.EOS_REMOTE_RELEASE_ON, 3, 1) == ResponseCode.OPERATION_NOT_SUPPORTED
+    assert host.ask(Operation.EOS_REMOTE_RELEASE).response.parameters == (0,)
+    clock.sleep(5)
+    assert len(transfers(host.events())) == 1
+
+
+@example(Operation.EOS_PC_HDD_CAPACITY, [0xFFFFFFFF, 0xFFFFFFFF], None)
+@example(Operation.EOS_SET_DEVICE_PROP_VALUE_EX, [], PropertySetting(Property.EOS_CAMERA_TIME, b"\xff" * 4).encode())
+@given(
+    code=st.sampled_from(OPERATIONS),
+    parameters=st.lists(st.integers(0, 0xFFFFFFFF) | st.sampled_from([0, 1, 2, 3, CARD, FOLDER, DCIM]), max_size=5),
+    data=st.none() | st.binary(max_size=40),
+)
+def test_answers_whatever_is_asked(code: int, parameters: list[int], data: bytes | None) -> None:
+    host = host_of().take_control()
+    assert host.shoot()
+    answer = host.ask(code, *parameters, data=data)
+    assert answer.response.ok or answer.data is None
+    host.clock.sleep(60)
+    assert host.eos.answer(PtpRequest(Operation.OPEN_SESSION, 0, (1,)), None)
+    host.transaction = 1000
+    host.events()
+
+
+def test_a_body_without_a_master_takes_no_orders() -> None:
+    host = host_of()
+    host.ok(Operation.OPEN_SESSION, 1)
+    assert host.set(Property.EOS_ISO_SPEED, 0x50) == ResponseCode.EOS_OPERATION_REFUSED
+    assert host.code(Operation.EOS_REMOTE_RELEASE_ON, 3, 1) == ResponseCode.EOS_OPERATION_REFUSED
+    assert host.film.exposures == []
+
+
+def test_says_nothing_before_event_mode() -> None:
+    host = host_of()
+    host.ok(Operation.OPEN_SESSION, 1)
+    assert host.ok(Operation.EOS_GET_EVENT) == bytes([8, 0, 0, 0, 0, 0, 0, 0])
+    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
+    assert len(host.ok(Operation.EOS_GET_EVENT)) > 1000
+    assert host.ok(Operation.EOS_GET_EVENT) == bytes([8, 0, 0, 0, 0, 0, 0, 0])
+
+
+def test_hints_once_that_there_is_something_to_ask_for(host: Host) -> None:
+    host.eos.events()
+    host.set(Property.EOS_ISO_SPEED, 0x50)
+    host.set(Property.EOS_ISO_SPEED, 0x58)
+    assert [event.code for event in host.eos.events()] == [0xC101]
+    assert host.eos.events() == ()
+
+
+# Properties.
+
+
+def test_a_value_on_its_list_is_set_and_told(host: Host) -> None:
+    assert host.set(Property.EOS_SHUTTER_SPEED, 0x65) == ResponseCode.OK
+    assert changes(host.events()) == {Property.EOS_SHUTTER_SPEED: number_value(0x65)}
+
+
+@pytest.mark.parametrize(
+    ("code", "value"),
+    [
+        (Property.EOS_SHUTTER_SPEED, 0x64),
+        (Property.EOS_APERTURE, 0x24),
+        (Property.EOS_CAPTURE_DESTINATION, 1),
+        (Property.EOS_AE_MODE, AeMode.MANUAL),
+        (Property.EOS_MODEL_ID, 0x80000287),
+        (Property.EOS_EXPOSURE_COMPENSATION, 0),
+    ],
+)
+def test_what_is_on_no_list_is_declined_as_busy(host: Host, code: int, value: int) -> None:
+    # As the recorded 60D does for aperture 0x24 and destination 1.
+    assert host.set(code, value) == ResponseCode.DEVICE_BUSY
+    assert changes(host.events()) == {}
+
+
+def test_a_setting_that_makes_no_sense(host: Host) -> None:
+    set_ex = Operation.EOS_SET_DEVICE_PROP_VALUE_EX
+    assert host.set(0xDFFF, 1) == ResponseCode.DEVICE_PROP_NOT_SUPPORTED
+    for data in (b"", b"\x0c\0\0\0", PropertySetting(Property.EOS_IMAGE_FORMAT, number_value(7)).encode()):
+        assert host.code(set_ex, data=data) == ResponseCode.INVALID_DEVICE_PROP_FORMAT
+    short = PropertySetting(Property.EOS_ISO_SPEED, b"\x48").encode()
+    assert host.code(set_ex, data=short) == ResponseCode.INVALID_DEVICE_PROP_FORMAT
+
+
+def test_both_image_formats_follow_each_other(host: Host) -> None:
+    jpeg = ImageFormat((ImageFile(1, 0, 3),))
+    assert host.set(Property.EOS_IMAGE_FORMAT, jpeg) == ResponseCode.OK
+    told = changes(host.events())
+    assert told == {Property.EOS_IMAGE_FORMAT: jpeg.encode(), Property.EOS_IMAGE_FORMAT_SD: jpeg.encode()}
+
+
+def test_text_is_kept(host: Host) -> None:
+    assert host.set(Property.EOS_ARTIST, "A. Painter") == ResponseCode.OK
+    host.events()
+    host.ok(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, Property.EOS_ARTIST)
+    assert changes(host.events()) == {Property.EOS_ARTIST: b"A. Painter\0"}
+    assert host.code(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, 0xDFFF) == ResponseCode.GENERAL_ERROR
+
+
+def test_the_cameras_time_can_be_set(host: Host) -> None:
+    then = int(OPENING.timestamp()) - 86400
+    assert host.set(Property.EOS_CAMERA_TIME, then) == ResponseCode.OK
+    host.clock.sleep(5)
+    assert host.number(Property.EOS_CAMERA_TIME) == then + 5
+    (request,) = transfers(host.shoot())
+    info = ObjectInfo.decode(host.ok(Operation.GET_OBJECT_INFO, request.handle))
+    assert info.captured_at == "20251231T080005"
+    # The film lives in the lab's time, whatever the camera shows.
+    assert host.film.exposures[0][1] == OPENING + timedelta(seconds=5)
+
+
+def test_the_dial_decides_what_can_be_set(host: Host) -> None:
+    offered: dict[AeMode, tuple[bool, bool]] = {}
+    for mode in (AeMode.APERTURE_PRIORITY, AeMode.SHUTTER_PRIORITY, AeMode.PROGRAM, AeMode.BULB, AeMode.MANUAL):
+        host.eos.turn_dial(mode)
+        host.events()
+        shutter = host.set(Property.EOS_SHUTTER_SPEED, 0x65) == ResponseCode.OK
+        aperture = host.set(Property.EOS_APERTURE, 0x40) == ResponseCode.OK
+        offered[mode] = shutter, aperture
+    assert offered == {
+        AeMode.APERTURE_PRIORITY: (False, True),
+        AeMode.SHUTTER_PRIORITY: (True, False),
+        AeMode.PROGRAM: (False, False),
+        AeMode.BULB: (False, True),
+        AeMode.MANUAL: (True, True),
+    }
+
+
+def test_a_turn_of_the_dial_is_told_with_the_new_lists(host: Host) -> None:
+    host.eos.turn_dial(AeMode.APERTURE_PRIORITY)
+    records = host.events()
+    assert changes(records) == {Property.EOS_AE_MODE: number_value(AeMode.APERTURE_PRIORITY)}
+    assert lists(records) == {Property.EOS_SHUTTER_SPEED: ()}
+
+
+def test_standard_properties(host: Host) -> None:
+    friendly = DevicePropDesc.decode(host.ok(Operation.GET_DEVICE_PROP_DESC, Property.DEVICE_FRIENDLY_NAME))
+    assert friendly.current == "CroP Test"
+    name = encode_string("a test")
+    assert host.code(Operation.SET_DEVICE_PROP_VALUE, Property.SESSION_INITIATOR, data=name) == ResponseCode.OK
+    value = host.ok(Operation.GET_DEVICE_PROP_VALUE, Property.SESSION_INITIATOR)
+    assert decode_value(0xFFFF, value) == "a test"
+    refused = host.code(Operation.SET_DEVICE_PROP_VALUE, Property.BATTERY_LEVEL, data=b"\x64")
+    assert refused == ResponseCode.ACCESS_DENIED
+    assert host.code(Operation.GET_DEVICE_PROP_DESC, 0x5007) == ResponseCode.DEVICE_PROP_NOT_SUPPORTED
+
+
+# Taking pictures.
+
+
+def test_a_frame_arrives_as_the_film_made_it(host: Host) -> None:
+    for code, value in ((0xD103, 0x50), (0xD101, 0x40), (0xD102, 0x65)):
+        assert host.set(code, value) == ResponseCode.OK
+    host.events()
+    (request,) = transfers(host.shoot())
+    assert host.film.exposures == [(ExposureSettings(200, 11.0, 1 / 50), OPENING)]
+    assert (request.name, request.format, request.size) == ("IMG_0001.DNG", ObjectFormat.CR2, 3000)
+    assert host.ok(Operation.GET_OBJECT, request.handle) == host.film.frames[0]
+    info = ObjectInfo.decode(host.ok(Operation.GET_OBJECT_INFO, request.handle))
+    assert (info.filename, info.size, info.storage) == ("IMG_0001.DNG", 3000, 0)
+    assert host.code(Operation.GET_THUMB, request.handle) == ResponseCode.NO_THUMBNAIL_PRESENT
+
+
+@example(offset=3000, length=10)
+@given(offset=st.integers(0, 3100), length=st.integers(0, 4000))
+def test_any_part_of_a_frame_can_be_fetched(offset: int, length: int) -> None:
+    host = host_of().take_control()
+    (request,) = transfers(host.shoot())
+    for operation in (Operation.GET_PARTIAL_OBJECT, Operation.EOS_GET_PARTIAL_OBJECT):
+        answer = host.ask(operation, request.handle, offset, length)
+        if offset > 3000:
+            assert answer.response.code == ResponseCode.INVALID_PARAMETER
+        else:
+            part = host.film.frames[0][offset : offset + length]
+            assert answer.data == part
+            assert answer.response.parameters == (len(part),)
+
+
+def test_is_busy_until_the_frame_is_written(host: Host) -> None:
+    host.set(Property.EOS_SHUTTER_SPEED, 0x40)
+    host.events()
+    assert host.press() == ResponseCode.OK
+    assert statuses(host.events()) == [1]
+    for _ in range(5):
+        host.clock.sleep(0.1)
+        assert host.set(Property.EOS_ISO_SPEED, 0x58) == ResponseCode.DEVICE_BUSY
+        assert host.press() == ResponseCode.DEVICE_BUSY
+        assert host.events() == ()
+    host.clock.sleep(TEST_BODY.write_s + 0.001)
+    records = host.events()
+    assert len(transfers(records)) == 1
+    assert statuses(records) == [0]
+    assert host.set(Property.EOS_ISO_SPEED, 0x58) == ResponseCode.OK
+    assert len(host.film.frames) == 1
+
+
+def test_memory_is_full_until_frames_are_fetched(host: Host) -> None:
+    waiting = [transfers(host.shoot())[0] for _ in range(TEST_BODY.burst)]
+    assert host.press() == ResponseCode.DEVICE_BUSY
+    assert host.ask(Operation.EOS_REMOTE_RELEASE).response.parameters == (7,)
+    host.ok(Operation.EOS_TRANSFER_COMPLETE, waiting[2].handle)
+    assert host.code(Operation.EOS_TRANSFER_COMPLETE, waiting[2].handle) == ResponseCode.INVALID_OBJECT_HANDLE
+    assert host.code(Operation.GET_OBJECT, waiting[2].handle) == ResponseCode.INVALID_OBJECT_HANDLE
+    assert len(transfers(host.shoot())) == 1
+    assert host.press() == ResponseCode.DEVICE_BUSY
+    host.ok(Operation.EOS_RESET_TRANSFER)
+    assert len(transfers(host.shoot())) == 1
+
+
+def test_takes_nothing_for_a_host_that_has_not_told_its_room() -> None:
+    host = host_of()
+    host.ok(Operation.OPEN_SESSION, 1)
+    host.ok(Operation.EOS_SET_REMOTE_MODE, 1)
+    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
+    host.set(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.HOST)
+    assert host.number(Property.EOS_AVAILABLE_SHOTS) == 0
+    assert host.press() == ResponseCode.STORE_FULL
+    host.ok(Operation.EOS_PC_HDD_CAPACITY, TEST_BODY.frame_bytes // 0x1000 * 3, 0x1000, 1)
+    assert host.number(Property.EOS_AVAILABLE_SHOTS) == 3
+    assert len(transfers(host.shoot())) == 1
+    assert host.number(Property.EOS_AVAILABLE_SHOTS) == 2
+
+
+def test_raw_and_jpeg_are_two_files_of_one_name(host: Host) -> None:
+    assert host.set(Property.EOS_IMAGE_FORMAT, ImageFormat((*RAW_ONLY.files, ImageFile(1, 0, 3)))) == ResponseCode.OK
+    raw, jpeg = transfers(host.shoot())
+    assert (raw.name, jpeg.name) == ("IMG_0001.DNG", "IMG_0001.JPG")
+    assert jpeg.format == ObjectFormat.EXIF_JPEG
+    assert host.ok(Operation.GET_OBJECT, raw.handle) == host.film.frames[0]
+    picture = host.ok(Operation.GET_OBJECT, jpeg.handle)
+    assert picture[:2] == b"\xff\xd8"
+    assert picture[-2:] == b"\xff\xd9"
+    assert host.set(Property.EOS_IMAGE_FORMAT, ImageFormat((ImageFile(1, 0, 3),))) == ResponseCode.OK
+    assert [request.name for request in transfers(host.shoot())] == ["IMG_0002.JPG"]
+
+
+def test_bodies_with_wide_records() -> None:
+    host = host_of(replace(EOS_6D_MARK_II, wide_objects=True)).take_control(CaptureDestination.CARD_AND_HOST)
+    records = host.shoot()
+    (request,) = transfers(records)
+    (added,) = (record for record in records if isinstance(record, ObjectEvent))
+    assert (request.type, added.type) == (EosEvent.REQUEST_OBJECT_TRANSFER_64, EosEvent.OBJECT_ADDED_64)
+    assert added.entry.name == request.name == "IMG_0001.DNG"
+
+
+def test_film_that_fails_is_a_frame_that_never_comes(host: Host) -> None:
+    host.film.broken = True
+    records = host.shoot()
+    assert transfers(records) == []
+    assert statuses(records) == [1, 0]
+
+
+def test_film_that_cannot_be_exposed_so_is_a_release_that_fails(host: Host) -> None:
+    host.eos.set_menu(Property.EOS_SHUTTER_SPEED, 0x10)
+    assert host.press() == ResponseCode.OK
+    host.clock.sleep(60)
+    host.eos.set_menu(Property.EOS_ISO_SPEED, 0x40)
+
+    def refuse(settings: ExposureSettings) -> None:
+        raise DeviceRefused(f"not at ISO {settings.iso}")
+
+    host.film.accept = refuse
+    assert host.press() == ResponseCode.GENERAL_ERROR
+    assert len(host.film.frames) == 1
+
+
+def test_film_is_developed_beside_the_answers() -> None:
+    gate = ThreadEvent()
+
+    class SlowFilm(NumberedFilm):
+        def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
+            assert gate.wait(30)
+            return super().expose(settings, released_at, into)
+
+    clock, film = SimulatedClock(), SlowFilm()
+    with ThreadPoolExecutor(1) as executor:
+        eos = SimulatedEos(TEST_BODY, film, clock, auto_power_off_s=0, executor=executor)
+        host = Host(eos, clock, film).take_control()
+        assert host.press() == ResponseCode.OK
+        clock.sleep(60)
+        assert transfers(host.events()) == []
+        assert eos.busy
+        gate.set()
+        executor.submit(lambda: None).result(30)
+        clock.sleep(0.02)
+        assert len(transfers(host.events())) == 1
+
+
+# Card.
+
+
+def test_frames_on_the_card_can_be_listed_fetched_and_deleted() -> None:
+    host = host_of(card_bytes=10 << 20).take_control(CaptureDestination.CARD)
+    records = host.shoot()
+    (added,) = (record for record in records if isinstance(record, ObjectEvent))
+    entry = added.entry
+    assert transfers(records) == []
+    assert (added.type, entry.storage, entry.parent, entry.name) == (
+        EosEvent.OBJECT_ADDED,
+        CARD,
+        FOLDER,
+        "IMG_0001.DNG",
+    )
+    assert decode_u32_array(host.ok(Operation.EOS_GET_STORAGE_IDS)) == (CARD,)
+    root = decode_object_entries(host.ok(Operation.EOS_GET_OBJECT_INFO_EX, CARD, 0xFFFFFFFF, 0x100000))
+    assert [(item.handle, item.name) for item in root] == [(DCIM, "DCIM")]
+    files = decode_object_entries(host.ok(Operation.EOS_GET_OBJECT_INFO_EX, CARD, FOLDER, 0x100000))
+    assert [(item.handle, item.name, item.size) for item in files] == [(entry.handle, "IMG_0001.DNG", 3000)]
+    assert decode_u32_array(host.ok(Operation.GET_OBJECT_HANDLES, 0xFFFFFFFF, 0, 0)) == (DCIM, FOLDER, entry.handle)
+    assert decode_u32_array(host.ok(Operation.GET_OBJECT_HANDLES, CARD, ObjectFormat.CR2, FOLDER)) == (entry.handle,)
+    assert host.ask(Operation.GET_NUM_OBJECTS, CARD, 0, 0xFFFFFFFF).response.parameters == (1,)
+    assert host.code(Operation.GET_OBJECT_HANDLES, 0x00030001) == ResponseCode.INVALID_STORAGE_ID
+    assert host.ok(Operation.EOS_GET_OBJECT, entry.handle) == host.film.frames[0]
+    assert StorageInfo.decode(host.ok(Operation.EOS_GET_STORAGE_INFO, CARD)).free == (10 << 20) - 3000
+    assert host.code(Operation.EOS_DELETE_OBJECT, FOLDER) == ResponseCode.OBJECT_WRITE_PROTECTED
+    host.ok(Operation.EOS_DELETE_OBJECT, entry.handle)
+    assert Notice(EosEvent.OBJECT_REMOVED, entry.handle) in host.events()
+    assert host.code(Operation.EOS_GET_OBJECT, entry.handle) == ResponseCode.INVALID_OBJECT_HANDLE
+
+
+def test_a_full_card_takes_no_more() -> None:
+    host = host_of(card_bytes=TEST_BODY.frame_bytes + 3000).take_control(CaptureDestination.CARD)
+    host.shoot()
+    host.shoot()
+    assert host.number(Property.EOS_AVAILABLE_SHOTS) == 0
+    assert host.press() == ResponseCode.STORE_FULL
+    assert host.ask(Operation.EOS_REMOTE_RELEASE).response.parameters == (7,)
+
+
+def test_without_a_card_there_is_only_the_host() -> None:
+    host = host_of(card_bytes=None).take_control()
+    assert decode_u32_array(host.ok(Operation.GET_STORAGE_IDS)) == (EMPTY_SLOT,)
+    assert decode_u32_array(host.ok(Operation.GET_OBJECT_HANDLES, 0xFFFFFFFF, 0, 0)) == ()
+    assert host.set(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.CARD) == ResponseCode.DEVICE_BUSY
+    host.eos.insert_card(1 << 30)
+    records = host.events()
+    assert Notice(EosEvent.STORE_ADDED, CARD) in records
+    assert lists(records)[Property.EOS_CAPTURE_DESTINATION] == (2, 4, 6)
+    assert host.set(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.CARD) == ResponseCode.OK
+
+
+# What spoils a series.
+
+
+def test_autofocus_that_finds_nothing_releases_nothing(host: Host) -> None:
+    host.eos.switch_focus(automatic=True, finds=False)
+    assert host.press(autofocus=True) == ResponseCode.DEVICE_BUSY
+    assert host.ask(Operation.EOS_REMOTE_RELEASE).response.parameters == (1,)
+    assert host.press(autofocus=False) == ResponseCode.OK
+    host.clock.sleep(5)
+    host.eos.switch_focus(automatic=True, finds=True)
+    assert host.press(autofocus=True) == ResponseCode.OK
+    host.clock.sleep(5)
+    host.eos.switch_focus(automatic=False)
+    assert host.press(autofocus=True) == ResponseCode.OK
+    assert len(host.film.frames) == 3
+
+
+def test_a_half_press_alone_focuses_and_takes_nothing(host: Host) -> None:
+    host.eos.switch_focus(automatic=True)
+    host.events()
+    host.ok(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF, 0)
+    assert Property.EOS_FOCUS_INFO in changes(host.events())
+    host.ok(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.FULL, 0)
+    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.FULL)
+    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF)
+    host.clock.sleep(5)
+    assert len(transfers(host.events())) == 1
+    host.ok(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF, 0)
+    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF)
+    # Whoever lets go has lost the focus.
+    assert host.code(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.FULL, 0) == ResponseCode.DEVICE_BUSY
+    assert len(host.film.frames) == 1
+
+
+@pytest.mark.parametrize("body", [EOS_550D, EOS_6D_MARK_II], ids=lambda body: body.model)
+def test_mirror_lockup_blocks_the_release(body: EosModel) -> None:
+    host = host_of(body).take_control()
+    host.eos.switch_mirror_lockup(True)
+    assert changes(host.events()), "the host can know"
+    assert host.press() == ResponseCode.DEVICE_BUSY
+    assert host.ask(Operation.EOS_REMOTE_RELEASE).response.parameters == (3,)
+    host.eos.switch_mirror_lockup(False)
+    assert host.press() == ResponseCode.OK
+
+
+def test_bracketing_varies_the_exposure(host: Host) -> None:
+    assert host.set(Property.EOS_AEB, 0x08) == ResponseCode.OK
+    host.set(Property.EOS_SHUTTER_SPEED, 0x68)
+    for _ in range(4):
+        host.shoot()
+    times = [settings.shutter_s * 60 for settings, _ in host.film.exposures]
+    assert times == pytest.approx([1, 0.5, 2, 1])
+
+
+def test_timers_and_series_follow_the_drive_mode(host: Host) -> None:
+    assert host.set(Property.EOS_DRIVE_MODE, DriveMode.TIMER_2_S) == ResponseCode.OK
+    host.shoot()
+    assert host.film.exposures[0][1] == OPENING + timedelta(seconds=2)
+    assert host.set(Property.EOS_DRIVE_MODE, DriveMode.CONTINUOUS) == ResponseCode.OK
+    host.ok(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, 1)
+    host.clock.sleep(1.0)
+    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
+    host.clock.sleep(60)
+    # 3.7 frames a second: at 0, 0.27, 0.54 and 0.81 s.
+    assert len(transfers(host.events())) == 4
+    host.ok(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, 1)
+    host.clock.sleep(60.0)
+    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
+    # The memory holds six, and five were in it.
+    host.clock.sleep(60)
+    assert len(transfers(host.events())) == 1
+
+
+def test_bulb_lasts_as_long_as_the_press(host: Host) -> None:
+    assert host.set(Property.EOS_SHUTTER_SPEED, 0x0C) == ResponseCode.OK
+    assert host.code(Operation.EOS_REMOTE_RELEASE_ON, ReleaseButton.HALF_AND_FULL, 1) == ResponseCode.OK
+    host.clock.sleep(7.5)
+    assert Notice(EosEvent.BULB_EXPOSURE_TIME, 7) in host.events()
+    host.ok(Operation.EOS_REMOTE_RELEASE_OFF, ReleaseButton.HALF_AND_FULL)
+    host.clock.sleep(1)
+    assert len(transfers(host.events())) == 1
+    assert host.film.exposures[0][0].shutter_s == pytest.approx(7.5)
+
+
+def test_counts_releases_and_drains_its_battery() -> None:
+    host = host_of(battery=0.5 + 1.5 / TEST_BODY.shots_per_charge).take_control()
+    count = host.number(Property.EOS_SHUTTER_COUNTER)
+    assert host.number(Property.EOS_BATTERY_POWER) == 1
+    host.shoot()
+    assert host.number(Property.EOS_SHUTTER_COUNTER) == count + 1
+    level = DevicePropDesc.decode(host.ok(Operation.GET_DEVICE_PROP_DESC, Property.BATTERY_LEVEL))
+    assert level.current == 50
+    empty = host_of(battery=0.5 / TEST_BODY.shots_per_charge).take_control()
+    empty.shoot()
+    assert empty.press() == ResponseCode.EOS_LOW_BATTERY
+
+
+def test_goes_to_sleep_unless_kept_awake(host: Host) -> None:
+    host.eos.set_menu(Property.EOS_AUTO_POWER_OFF, 30)
+    host.ok(Operation.EOS_KEEP_DEVICE_ON)
+    host.events()
+    for _ in range(5):
+        host.clock.sleep(19)
+        assert host.events() == ()
+        host.ok(Operation.EOS_KEEP_DEVICE_ON)
+    host.clock.sleep(22)
+    assert [r.type for r in host.events() if isinstance(r, Notice)] == [EosEvent.WILL_SOON_SHUT_DOWN]
+    host.ok(Operation.EOS_KEEP_DEVICE_ON)
+    assert host.events() == (Notice(EosEvent.SHUTDOWN_TIMER_UPDATED, 30),)
+    for _ in range(29):
+        # Asking for events keeps no body awake.
+        host.clock.sleep(1)
+        host.events()
+    host.clock.sleep(1)
+    assert host.eos.asleep
+    with pytest.raises(LinkClosed, match="switched itself off"):
+        host.events()
+    host.eos.wake()
+    assert host.code(Operation.EOS_GET_EVENT) == ResponseCode.SESSION_NOT_OPEN
+    host.take_control()
+    assert len(transfers(host.shoot())) == 1
+
+
+def test_a_long_exposure_is_no_idleness(host: Host) -> None:
+    host.eos.set_menu(Property.EOS_AUTO_POWER_OFF, 20)
+    host.set(Property.EOS_SHUTTER_SPEED, 0x10)
+    assert host.press() == ResponseCode.OK
+    host.clock.sleep(25)
+    assert not host.eos.asleep
+    host.clock.sleep(5.2)
+    assert len(transfers(host.events())) == 1
+
+
+# The end of a session.
+
+
+def test_a_frame_that_nobody_fetched_is_offered_to_the_next(host: Host) -> None:
+    (request,) = transfers(host.shoot())
+    host.eos.unplugged()
+    assert host.code(Operation.EOS_GET_EVENT) == ResponseCode.SESSION_NOT_OPEN
+    host.ok(Operation.OPEN_SESSION, 2)
+    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
+    records = host.events()
+    assert transfers(records) == [request]
+    assert changes(records)[Property.EOS_CAPTURE_DESTINATION] == number_value(CaptureDestination.CARD)
+    assert host.ok(Operation.GET_OBJECT, request.handle) == host.film.frames[0]
+    # The next has not told yet what room it has.
+    host.ok(Operation.EOS_SET_REMOTE_MODE, 1)
+    assert host.set(Property.EOS_CAPTURE_DESTINATION, CaptureDestination.HOST) == ResponseCode.OK
+    assert host.number(Property.EOS_AVAILABLE_SHOTS) == 0
+
+
+def test_a_forgetful_body_loses_it() -> None:
+    clock, film = SimulatedClock(), NumberedFilm()
+    host = Host(SimulatedEos(TEST_BODY, film, clock, forgetful=True), clock, film).take_control()
+    (request,) = transfers(host.shoot())
+    host.ok(Operation.CLOSE_SESSION)
+    host.take_control()
+    assert host.code(Operation.GET_OBJECT, request.handle) == ResponseCode.INVALID_OBJECT_HANDLE
+
+
+def test_a_frame_under_way_outlives_its_session(host: Host) -> None:
+    host.set(Property.EOS_SHUTTER_SPEED, 0x30)
+    assert host.press() == ResponseCode.OK
+    host.eos.unplugged()
+    host.clock.sleep(5)
+    host.ok(Operation.OPEN_SESSION, 2)
+    host.ok(Operation.EOS_SET_EVENT_MODE, 1)
+    assert len(transfers(host.events())) == 1
+
+
+# With our own driver.
+
+
+@pytest.mark.parametrize(
+    "body", [EOS_550D, EOS_6D_MARK_II, replace(EOS_6D_MARK_II, wide_objects=True)], ids=["550D", "6D2", "wide"]
+)
+@pytest.mark.parametrize("without", [(), (Operation.EOS_REMOTE_RELEASE_ON,)], ids=["press", "release"])
+def test_our_driver_takes_a_series(body: EosModel, without: tuple[int, ...]) -> None:
+    clock, film = SimulatedClock(), NumberedFilm()
+    eos = SimulatedEos(body, film, clock, auto_power_off_s=0, without=without)
+    camera = CanonEos(lambda: MemoryTransport(eos), clock)
+    camera.configure(ExposureSettings(100, 8.0, 0.5))
+    for number in range(2 * body.burst):
+        into = BytesIO()
+        frame = camera.capture(into)
+        assert into.getvalue() == film.frames[number]
+        assert (frame.name, frame.released_at) == (f"IMG_{number + 1:04d}.DNG", film.exposures[number][1])
+    camera.close()
+    assert {settings for settings, _ in film.exposures} == {ExposureSettings(100, 8.0, 0.5)}

@@ -1,0 +1,263 @@
+"""Other people's PJLink clients on the simulated projector: what they understand, we cannot have misread alone.
+
+pypjlink2 knows class 1, aiopjlink both classes; neither knows SHA-256 or searches. The projector's time is handed in,
+so nobody waits for a lamp.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import warnings
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass
+
+import aiopjlink
+import pypjlink
+import pytest
+from aiopjlink import PJClass
+from pypjlink.projector import ProjectorError
+
+from drivers.links.tcp import TcpServer
+from drivers.pjlink.wire import NoResolution
+from drivers.projector import Power, Severity
+from sim.clock import SimulatedClock
+from sim.projectors.pjlink import serve_pjlink
+from sim.projectors.projector import ProjectorTraits, SimulatedProjector
+
+PATIENCE_S = 30.0
+"""How long a client may wait for an answer on a computer that has much else to do."""
+
+
+@dataclass
+class Served:
+    """A simulated projector behind a TCP server, and the password it asks for."""
+
+    device: SimulatedProjector
+    clock: SimulatedClock
+    server: TcpServer
+    password: str | None
+
+    def old_client(self) -> pypjlink.Projector:
+        host, port = self.server.address
+        client = pypjlink.Projector.from_address(host, port, timeout=PATIENCE_S)
+        assert client.authenticate(self.password) is (None if self.password is None else True)
+        return client
+
+    def talk(self, conversation: Callable[[aiopjlink.PJLink], Awaitable[None]], password: str | None = None) -> None:
+        """Let aiopjlink connect and have a conversation."""
+
+        async def connected() -> None:
+            host, port = self.server.address
+            async with aiopjlink.PJLink(host, port, password or self.password, timeout=PATIENCE_S) as link:
+                await conversation(link)
+
+        asyncio.run(connected())
+
+
+@pytest.fixture(params=[None, "JBMIAProjectorLink"], ids=["open", "password"])
+def served(request: pytest.FixtureRequest) -> Iterator[Served]:
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock)
+    with serve_pjlink(device, password=request.param) as server:
+        yield Served(device, clock, server, request.param)
+
+
+def test_pypjlink_goes_round_the_four_states(served: Served) -> None:
+    with served.old_client() as client:
+        assert client.get_power() == "off"
+        client.set_power("on")
+        assert client.get_power() == "warm-up"
+        with pytest.raises(ProjectorError, match="unavailable time"):
+            client.set_power("off")
+        served.clock.sleep(29)
+        assert client.get_power() == "warm-up"
+        served.clock.sleep(1)
+        assert client.get_power() == "on"
+        client.set_power("off")
+        assert client.get_power() == "cooling"
+
+
+def test_pypjlink_shows_and_mutes(served: Served) -> None:
+    served.device.switch_on()
+    served.clock.sleep(30)
+    with served.old_client() as client:
+        assert client.get_inputs() == [("RGB", 1), ("DIGITAL", 1), ("DIGITAL", 2)]
+        assert client.get_input() == ("DIGITAL", 1)
+        client.set_input("RGB", 1)
+        assert client.get_input() == ("RGB", 1)
+        with pytest.raises(ProjectorError, match="out of parameter"):
+            client.set_input("STORAGE", 1)
+        assert client.get_mute() == (False, False)
+        client.set_mute(pypjlink.MUTE_VIDEO | pypjlink.MUTE_AUDIO, True)
+        assert client.get_mute() == (True, True)
+        assert served.device.muted()
+        client.set_mute(pypjlink.MUTE_VIDEO, False)
+        assert not served.device.muted()
+
+
+def test_pypjlink_reads_health_and_name(served: Served) -> None:
+    with served.old_client() as client:
+        assert set(client.get_errors().values()) == {"ok"}
+        served.device.break_part("cover", Severity.WARNING)
+        served.device.break_part("other", Severity.ERROR)
+        assert {part for part, state in client.get_errors().items() if state == "warning"} == {"cover"}
+        assert {part for part, state in client.get_errors().items() if state == "error"} == {"other"}
+        assert client.get_lamps() == [(120, False)]
+        assert client.get_manufacturer() == "CroP"
+        assert client.get_product_name() == "Simulated Projector"
+        assert client.get_name() == "dark room"
+        assert client.get_other_info() == "simulated"
+
+
+def test_pypjlink_is_refused_with_a_wrong_password() -> None:
+    with (
+        serve_pjlink(SimulatedProjector(SimulatedClock()), password="right") as server,
+        pypjlink.Projector.from_address(*server.address, timeout=PATIENCE_S) as client,
+    ):
+        assert client.authenticate("wrong") is False
+
+
+def test_aiopjlink_goes_round_the_four_states(served: Served) -> None:
+    async def conversation(link: aiopjlink.PJLink) -> None:
+        states = aiopjlink.Power.State
+        assert await link.power.get() is states.OFF
+        await link.power.turn_on()
+        assert await link.power.get() is states.WARMING
+        with pytest.raises(aiopjlink.PJLinkERR3):
+            await link.power.turn_off()
+        served.clock.sleep(29)
+        assert await link.power.get() is states.WARMING
+        served.clock.sleep(1)
+        assert await link.power.get() is states.ON
+        await link.power.turn_off()
+        assert await link.power.get() is states.COOLING
+
+    served.talk(conversation)
+
+
+def test_aiopjlink_selects_inputs_of_both_classes(served: Served) -> None:
+    served.device.switch_on()
+    served.clock.sleep(30)
+    modes = aiopjlink.Sources.Mode
+
+    async def conversation(link: aiopjlink.PJLink) -> None:
+        assert await link.info.pjlink_class() is PJClass.TWO
+        assert await link.sources.available() == [(modes.RGB, "1"), (modes.DIGITAL, "1"), (modes.DIGITAL, "2")]
+        assert await link.sources.available_with_names() == [
+            (modes.RGB, "1", "Computer"),
+            (modes.DIGITAL, "1", "HDMI 1"),
+            (modes.DIGITAL, "2", "HDMI 2"),
+            (modes.DIGITAL, "A", "HDBaseT"),
+            (modes.INTERNAL, "1", "Test pattern"),
+        ]
+        assert await link.sources.get() == (modes.DIGITAL, "1")
+        await link.sources.set(modes.DIGITAL, "A", PJClass.TWO)
+        assert await link.sources.get(PJClass.TWO) == (modes.DIGITAL, "A")
+        with pytest.raises(aiopjlink.PJLinkERR2):
+            await link.sources.set(modes.DIGITAL, "A")
+        with pytest.raises(aiopjlink.PJLinkERR2):
+            await link.sources.get_source_name(modes.VIDEO, 9)
+
+    served.talk(conversation)
+
+
+def test_aiopjlink_reads_resolutions(served: Served) -> None:
+    served.device.switch_on()
+    served.clock.sleep(30)
+
+    async def conversation(link: aiopjlink.PJLink) -> None:
+        assert await link.sources.recommended_resolution() == (1920, 1080)
+        assert await link.sources.resolution() == (1920, 1080)
+        served.device.signal = NoResolution.NO_SIGNAL
+        with pytest.raises(aiopjlink.PJLinkProjectorError, match="no signal"):
+            await link.sources.resolution()
+        served.device.signal = NoResolution.UNKNOWN_SIGNAL
+        with pytest.raises(aiopjlink.PJLinkProjectorError, match="unknown signal"):
+            await link.sources.resolution()
+
+    served.talk(conversation)
+
+
+def test_aiopjlink_mutes_freezes_and_turns_the_volume(served: Served) -> None:
+    served.device.switch_on()
+    served.clock.sleep(30)
+
+    async def conversation(link: aiopjlink.PJLink) -> None:
+        assert await link.mute.status() == (False, False)
+        await link.mute.both(True)
+        assert await link.mute.status() == (True, True)
+        await link.mute.video(False)
+        assert not served.device.muted()
+        assert await link.freeze.get() is False
+        await link.freeze.set(True)
+        assert await link.freeze.get() is True
+        assert served.device.frozen()
+        await link.freeze.set(False)
+        assert not served.device.frozen()
+        await link.speaker.turn_up()
+        await link.microphone.turn_down()
+        assert (served.device.speaker, served.device.microphone) == (11, 9)
+
+    served.talk(conversation)
+
+
+def test_aiopjlink_reads_health_and_names(served: Served) -> None:
+    async def conversation(link: aiopjlink.PJLink) -> None:
+        category, level = aiopjlink.Errors.Category, aiopjlink.Errors.Level
+        assert set((await link.errors.query()).values()) == {level.OK}
+        served.device.break_part("temperature", Severity.WARNING)
+        served.device.break_part("filter", Severity.ERROR)
+        errors = await link.errors.query()
+        assert errors[category.TEMP] is level.WARN
+        assert errors[category.FILTER] is level.ERROR
+        assert await link.lamps.status() == [(120, aiopjlink.Lamp.State.OFF)]
+        assert await link.lamps.replacement_models() == ["LAMP-1"]
+        assert await link.filter.hours() == 45
+        assert await link.filter.replacement_models() == ["FILTER-1"]
+        assert await link.info.manufacturer_name() == "CroP"
+        assert await link.info.product_name() == "Simulated Projector"
+        assert await link.info.projector_name() == "dark room"
+        assert await link.info.serial_number() == "SIM0000001"
+        assert await link.info.software_version() == "1.00"
+        assert await link.info.other() == "simulated"
+
+    served.talk(conversation)
+
+
+def test_aiopjlink_is_refused_with_a_wrong_password() -> None:
+    clock = SimulatedClock()
+    with serve_pjlink(SimulatedProjector(clock), password="right") as server:
+
+        async def nothing(link: aiopjlink.PJLink) -> None:
+            raise AssertionError("it was let in")
+
+        # A refused aiopjlink leaves its socket to the garbage collector, which is to find it here.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ResourceWarning)
+            with pytest.raises(aiopjlink.PJLinkPassword, match="authentication failed"):
+                Served(SimulatedProjector(clock), clock, server, None).talk(nothing, "wrong")
+            gc.collect()
+
+
+def test_aiopjlink_is_told_by_class_1_that_it_knows_no_class_2() -> None:
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock, Power.ON, ProjectorTraits(pjlink_class=1))
+
+    async def conversation(link: aiopjlink.PJLink) -> None:
+        assert await link.info.pjlink_class() is PJClass.ONE
+        with pytest.raises(aiopjlink.PJLinkERR1):
+            await link.info.serial_number()
+
+    with serve_pjlink(device) as server:
+        Served(device, clock, server, None).talk(conversation)
+
+
+def test_aiopjlink_is_hung_up_on_after_thirty_idle_seconds(served: Served) -> None:
+    async def conversation(link: aiopjlink.PJLink) -> None:
+        await link.power.get()
+        served.clock.sleep(30)
+        with pytest.raises(aiopjlink.PJLinkConnectionClosed):
+            await link.power.get()
+
+    served.talk(conversation)

@@ -1,0 +1,342 @@
+"""The simulated projector: the contract, its light, and its port in the standard's bytes."""
+
+from __future__ import annotations
+
+import hashlib
+
+import pytest
+
+from drivers.links.udp import UdpSocket
+from drivers.pjlink.notices import FaultsChanged, InputChanged, LinkUp, PowerChanged
+from drivers.pjlink.search import NoticePort, search
+from drivers.pjlink.wire import NoResolution
+from drivers.projector import Fault, Power, Severity
+from foundation.errors import DeviceFault, LinkTimeout
+from sim.clock import SimulatedClock
+from sim.projectors.pjlink import PjLinkPeer
+from sim.projectors.pjlink_notices import Announcer, ProjectorDatagrams
+from sim.projectors.projector import ProjectorTraits, SimulatedProjector
+from tests.contracts.projector import Bench, ProjectorContract
+
+
+class TestSimulatedProjector(ProjectorContract):
+    @pytest.fixture
+    def bench(self) -> Bench:
+        clock = SimulatedClock()
+        device = SimulatedProjector(clock)
+        traits = device.traits
+        return Bench(
+            device, clock.sleep, device.break_part, device.repair, traits.identity, traits.warm_up_s, traits.cool_down_s
+        )
+
+
+def test_light_follows_the_lamp_and_the_mute() -> None:
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock)
+    assert device.light() == 0.0
+    device.switch_on()
+    clock.sleep(15)
+    assert device.light() == pytest.approx(0.5)
+    clock.sleep(15)
+    assert device.light() == 1.0
+    device.set_muted(True)
+    assert device.light() == 0.0
+    device.set_muted(False)
+    assert device.light() == 1.0
+    device.switch_off()
+    assert device.light() == 0.0
+
+
+def test_found_switched_on_it_lights_at_once() -> None:
+    assert SimulatedProjector(SimulatedClock(), Power.ON).light() == 1.0
+
+
+def test_mute_does_not_outlast_standby() -> None:
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock, Power.ON)
+    device.set_muted(True)
+    device.switch_off()
+    clock.sleep(60)
+    device.switch_on()
+    clock.sleep(30)
+    assert device.light() == 1.0
+
+
+def test_a_dead_lamp_goes_out_and_is_not_struck_again() -> None:
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock, Power.ON)
+    device.break_part("lamp", Severity.ERROR)
+    assert device.light() == 0.0
+    assert device.power() is Power.COOLING
+    clock.sleep(60)
+    with pytest.raises(DeviceFault):
+        device.switch_on()
+    device.repair()
+    device.switch_on()
+    assert device.power() is Power.WARMING
+
+
+def test_a_part_that_cannot_be_reported_is_our_mistake() -> None:
+    with pytest.raises(ValueError, match="fan, lamp"):
+        SimulatedProjector(SimulatedClock()).break_part("wheel", Severity.ERROR)
+
+
+def conversation(peer: PjLinkPeer, *commands: bytes) -> list[bytes]:
+    return [peer.receive(command) for command in commands]
+
+
+def test_the_port_speaks_the_standards_bytes() -> None:
+    # Written after PJLink 1.04, section 4.
+    clock = SimulatedClock()
+    peer = PjLinkPeer(SimulatedProjector(clock, traits=ProjectorTraits(pjlink_class=1)))
+    assert peer.connect() == b"PJLINK 0\r"
+    assert conversation(
+        peer, b"%1POWR ?\r", b"%1AVMT ?\r", b"%1POWR 1\r", b"%1POWR ?\r", b"%1POWR 0\r", b"%1INPT 31\r"
+    ) == [b"%1POWR=0\r", b"%1AVMT=ERR3\r", b"%1POWR=OK\r", b"%1POWR=3\r", b"%1POWR=ERR3\r", b"%1INPT=ERR3\r"]
+    clock.sleep(29)
+    assert peer.receive(b"%1CLSS ?\r") == b"%1CLSS=1\r"
+    clock.sleep(1)
+    assert conversation(
+        peer,
+        b"%1POWR ?\r",
+        b"%1AVMT 31\r",
+        b"%1AVMT ?\r",
+        b"%1AVMT 30\r",
+        b"%1AVMT ?\r",
+        b"%1INST ?\r",
+        b"%1INPT 32\r",
+        b"%1INPT ?\r",
+        b"%1INPT 59\r",
+        b"%1INPT 3A\r",
+        b"%1ERST ?\r",
+        b"%1LAMP ?\r",
+        b"%1POWR 5\r",
+        b"%1ABCD ?\r",
+        b"%2SNUM ?\r",
+        b"%1powr ?\r",
+    ) == [
+        b"%1POWR=1\r",
+        b"%1AVMT=OK\r",
+        b"%1AVMT=31\r",
+        b"%1AVMT=OK\r",
+        b"%1AVMT=30\r",
+        b"%1INST=11 31 32\r",
+        b"%1INPT=OK\r",
+        b"%1INPT=32\r",
+        b"%1INPT=ERR2\r",
+        b"%1INPT=ERR2\r",
+        b"%1ERST=000000\r",
+        b"%1LAMP=120 1\r",
+        b"%1POWR=ERR2\r",
+        b"%1ABCD=ERR1\r",
+        b"%2SNUM=ERR1\r",
+        b"%1POWR=1\r",
+    ]
+
+
+def test_class_2_speaks_the_standards_bytes() -> None:
+    # Written after PJLink 2.00, 4.3, 4.4, 4.9 and 4.15 to 4.26.
+    device = SimulatedProjector(SimulatedClock(), Power.ON)
+    peer = PjLinkPeer(device)
+    asked = [
+        (b"%1CLSS ?", b"%1CLSS=2"),
+        (b"%1INST ?", b"%1INST=11 31 32"),
+        (b"%2INST ?", b"%2INST=11 31 32 3A 61"),
+        (b"%2INNM ?31", b"%2INNM=HDMI 1"),
+        (b"%2INNM ?3a", b"%2INNM=HDBaseT"),
+        (b"%2INNM ?39", b"%2INNM=ERR2"),
+        (b"%2INNM ?", b"%2INNM=ERR2"),
+        (b"%2INPT 3A", b"%2INPT=OK"),
+        (b"%2INPT ?", b"%2INPT=3A"),
+        (b"%2INPT 6Z", b"%2INPT=ERR2"),
+        (b"%1INPT 61", b"%1INPT=ERR2"),
+        (b"%2IRES ?", b"%2IRES=1920x1080"),
+        (b"%2RRES ?", b"%2RRES=1920x1080"),
+        (b"%2SNUM ?", b"%2SNUM=SIM0000001"),
+        (b"%2SVER ?", b"%2SVER=1.00"),
+        (b"%2FILT ?", b"%2FILT=45"),
+        (b"%2RFIL ?", b"%2RFIL=FILTER-1"),
+        (b"%2RLMP ?", b"%2RLMP=LAMP-1"),
+        (b"%2FREZ ?", b"%2FREZ=0"),
+        (b"%2FREZ 1", b"%2FREZ=OK"),
+        (b"%2FREZ ?", b"%2FREZ=1"),
+        (b"%2FREZ 2", b"%2FREZ=ERR2"),
+        (b"%2SVOL 1", b"%2SVOL=OK"),
+        (b"%2MVOL 0", b"%2MVOL=OK"),
+        (b"%2SVOL ?", b"%2SVOL=ERR2"),
+        (b"%2POWR ?", b"%2POWR=ERR1"),
+        (b"%3POWR ?", b"%3POWR=ERR1"),
+    ]
+    assert conversation(peer, *(question + b"\r" for question, _ in asked)) == [answer + b"\r" for _, answer in asked]
+    assert (device.speaker, device.microphone) == (11, 9)
+    device.signal = NoResolution.NO_SIGNAL
+    assert peer.receive(b"%2IRES ?\r") == b"%2IRES=-\r"
+    device.signal = NoResolution.UNKNOWN_SIGNAL
+    assert peer.receive(b"%2IRES ?\r") == b"%2IRES=*\r"
+
+
+def test_class_2_in_standby() -> None:
+    peer = PjLinkPeer(SimulatedProjector(SimulatedClock(), traits=ProjectorTraits(filter_hours=None)))
+    assert conversation(
+        peer, b"%2IRES ?\r", b"%2FREZ 1\r", b"%2SVOL 1\r", b"%2INPT ?\r", b"%2SNUM ?\r", b"%2FILT ?\r", b"%2RFIL ?\r"
+    ) == [
+        b"%2IRES=ERR3\r",
+        b"%2FREZ=ERR3\r",
+        b"%2SVOL=ERR3\r",
+        b"%2INPT=ERR3\r",
+        b"%2SNUM=SIM0000001\r",
+        b"%2FILT=ERR1\r",
+        b"%2RFIL=ERR1\r",
+    ]
+
+
+def test_the_volume_ends_where_it_ends() -> None:
+    # PJLink 2.00, 4.23: a step beyond the end is answered as any other.
+    device = SimulatedProjector(SimulatedClock(), Power.ON)
+    peer = PjLinkPeer(device)
+    assert (
+        conversation(peer, *[b"%2SVOL 1\r"] * 15, *[b"%2MVOL 0\r"] * 15)
+        == [b"%2SVOL=OK\r"] * 15 + [b"%2MVOL=OK\r"] * 15
+    )
+    assert (device.speaker, device.microphone) == (20, 0)
+
+
+def test_freeze_does_not_outlast_standby() -> None:
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock, Power.ON)
+    device.set_frozen(True)
+    device.switch_off()
+    clock.sleep(60)
+    device.switch_on()
+    clock.sleep(30)
+    assert not device.frozen()
+
+
+def test_announces_its_start_and_then_each_change() -> None:
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock)
+    announcer = Announcer(device)
+    assert announcer.news() == (LinkUp("02:00:00:00:00:01"),)
+    assert announcer.news() == ()
+    device.switch_on()
+    assert announcer.news() == (PowerChanged(Power.WARMING),)
+    clock.sleep(30)
+    assert announcer.news() == (PowerChanged(Power.ON), InputChanged("31"))
+    device.set_input("32")
+    device.break_part("fan", Severity.WARNING)
+    assert announcer.news() == (FaultsChanged((Fault("fan", Severity.WARNING),)), InputChanged("32"))
+    device.repair()
+    assert announcer.news() == (FaultsChanged(()),)
+    assert announcer.news() == ()
+
+
+def test_class_1_announces_nothing_and_is_not_found() -> None:
+    device = SimulatedProjector(SimulatedClock(), traits=ProjectorTraits(pjlink_class=1))
+    assert Announcer(device).news() == ()
+    with UdpSocket(host="127.0.0.1") as asker, ProjectorDatagrams(device) as datagrams:
+        asker.send(b"%2SRCH\r", datagrams.address)
+        # It has heard the question once it has heard what came after it: its own end.
+        datagrams.close()
+        with pytest.raises(LinkTimeout):
+            asker.receive(0.0)
+
+
+def test_answers_a_search_in_the_standards_bytes() -> None:
+    # PJLink 2.00, 3.2.
+    with (
+        UdpSocket(host="127.0.0.1") as asker,
+        ProjectorDatagrams(SimulatedProjector(SimulatedClock())) as datagrams,
+    ):
+        asker.send(b"who is there?\r", datagrams.address)
+        asker.send(b"%2SRCH\r", datagrams.address)
+        assert asker.receive(10.0) == (b"%2ACKN=02:00:00:00:00:01\r", datagrams.address)
+
+
+def test_is_found_over_loopback() -> None:
+    with ProjectorDatagrams(SimulatedProjector(SimulatedClock())) as datagrams:
+        host, port = datagrams.address
+        (found,) = search(30.0, enough=1, address=host, port=port, listen_port=0)
+    assert (found.host, found.mac) == ("127.0.0.1", "02:00:00:00:00:01")
+
+
+def test_sends_notices_to_the_controller_in_its_menu() -> None:
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock)
+    with (
+        NoticePort(0, "127.0.0.1") as controller,
+        ProjectorDatagrams(device, controller=controller.address) as datagrams,
+    ):
+        datagrams.announce()
+        assert controller.receive(10.0) == ("127.0.0.1", LinkUp("02:00:00:00:00:01"))
+        device.switch_on()
+        datagrams.announce()
+        assert controller.receive(10.0) == ("127.0.0.1", PowerChanged(Power.WARMING))
+
+
+def test_the_port_asks_for_the_password_once_a_connection() -> None:
+    # PJLink 1.04, 5.1.
+    peer = PjLinkPeer(SimulatedProjector(SimulatedClock()), "JBMIAProjectorLink", seed="498e4a67")
+    for _ in range(2):
+        assert peer.connect() == b"PJLINK 1 498e4a67\r"
+        assert conversation(peer, b"5d8409bc1c3fa39749434aa3a5c38682%1POWR ?\r", b"%1POWR ?\r") == [b"%1POWR=0\r"] * 2
+    peer.connect()
+    assert peer.receive(b"%1POWR 1\r") == b"PJLINK ERRA\r"
+    assert peer.closed
+    peer.connect()
+    assert peer.receive(b"%1ERST ?\r%1POWR 1\r") == b"PJLINK ERRA\r"
+
+
+def test_sha256_is_asked_for_and_proved() -> None:
+    # PJLink 2.10, 5.1, with a random number of the projector's own.
+    device = SimulatedProjector(SimulatedClock(), traits=ProjectorTraits(sha256=True))
+    peer = PjLinkPeer(device, "secret", seed="498e4a67")
+    nonce = bytes(range(16))
+    answer = peer.receive(b"PJLINK 2\r")
+    assert answer.startswith(b"PJLINK 2 ")
+    challenge = bytes.fromhex(answer[9:-1].decode("ascii"))
+    mixed = bytes(ours ^ theirs for ours, theirs in zip(nonce, challenge, strict=True)).hex()
+    digest = nonce.hex() + hashlib.sha256((mixed + "secret").encode()).hexdigest()
+    assert conversation(peer, digest.encode() + b"%1POWR ?\r", b"%1POWR ?\r") == [b"%1POWR=0\r"] * 2
+    # Without, or with the digest of another connection, it is refused.
+    for wrong in (b"", digest.encode(), b"5d8409bc1c3fa39749434aa3a5c38682"):
+        peer.connect()
+        peer.receive(b"PJLINK 2\r")
+        assert peer.receive(wrong + b"%1POWR ?\r") == b"PJLINK ERRA\r"
+        assert peer.closed
+
+
+def test_a_port_without_sha256_takes_the_question_for_a_wrong_digest() -> None:
+    peer = PjLinkPeer(SimulatedProjector(SimulatedClock()), "secret")
+    assert peer.receive(b"PJLINK 2\r") == b"PJLINK ERRA\r"
+    assert peer.closed
+
+
+def test_each_connection_is_greeted_with_its_own_seed() -> None:
+    peer = PjLinkPeer(SimulatedProjector(SimulatedClock()), "secret")
+    assert len({peer.connect() for _ in range(8)}) == 8
+
+
+def test_the_port_hangs_up_after_thirty_idle_seconds() -> None:
+    clock = SimulatedClock()
+    peer = PjLinkPeer(SimulatedProjector(clock))
+    clock.sleep(29)
+    assert peer.receive(b"%1POWR ?\r") == b"%1POWR=0\r"
+    clock.sleep(29)
+    assert not peer.closed
+    clock.sleep(1)
+    assert peer.closed
+    assert peer.receive(b"%1POWR ?\r") == b""
+
+
+@pytest.mark.parametrize("noise", [b"GET / HTTP/1.0\r\n\r\n", b"\x01" * 500])
+def test_the_port_hangs_up_on_what_is_no_pjlink(noise: bytes) -> None:
+    peer = PjLinkPeer(SimulatedProjector(SimulatedClock()))
+    assert peer.receive(noise) == b""
+    assert peer.closed
+
+
+def test_a_dead_lamp_answers_err4() -> None:
+    device = SimulatedProjector(SimulatedClock())
+    device.break_part("lamp", Severity.ERROR)
+    peer = PjLinkPeer(device)
+    assert conversation(peer, b"%1POWR 1\r", b"%1ERST ?\r") == [b"%1POWR=ERR4\r", b"%1ERST=020000\r"]

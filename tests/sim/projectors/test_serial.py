@@ -1,0 +1,208 @@
+"""The simulated serial projectors, judged by software that others wrote for the real ones, and their own ends."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+if sys.platform == "win32":
+    pytest.skip("Windows has no pseudo-terminals", allow_module_level=True)
+
+from benqprojector import BenQProjectorSerial
+from epson_projector import Projector
+
+from drivers.links.serial import SerialLink
+from drivers.links.tcp import TcpLink
+from drivers.projector import Power, Severity
+from drivers.serial_projectors import LANGUAGES
+from drivers.serial_projectors.benq import BenqProjector
+from drivers.serial_projectors.epson import EpsonProjector
+from sim.buses.pty import PseudoTerminal
+from sim.buses.serial_cable import serve_network
+from sim.cli import main
+from sim.clock import SimulatedClock
+from sim.projectors.projector import ProjectorTraits, SimulatedProjector
+from sim.projectors.serial import PEERS, SERIAL_NUMBER, BenqPeer, EpsonPeer, OptomaPeer
+
+AT_ONCE = ProjectorTraits(warm_up_s=0.0, cool_down_s=0.0)
+"""Other software waits by its own clock; a projector that is on at once keeps it short."""
+
+
+@pytest.fixture
+def device() -> SimulatedProjector:
+    return SimulatedProjector(SimulatedClock(), traits=AT_ONCE)
+
+
+@pytest.mark.filterwarnings("ignore:open_text is deprecated:DeprecationWarning")
+def test_benqprojector_drives_the_simulated_benq(device: SimulatedProjector) -> None:
+    async def talk(path: str) -> None:
+        client = BenQProjectorSerial(path, 115200)
+        assert await client.connect()
+        assert (client.model, client.power_status) == ("Simulated Projector", client.POWERSTATUS_OFF)
+        assert await client.turn_on()
+        assert await client.send_command("pow", check_supported=False) == "on"
+        assert await client.send_command("blank", "on", check_supported=False) == "on"
+        assert await client.send_command("blank", check_supported=False) == "on"
+        assert await client.send_command("ltim", check_supported=False) == "120"
+        assert await client.send_command("3d", check_supported=False) is None, "refused, and the client knows it"
+        await client.disconnect()
+
+    with PseudoTerminal(BenqPeer(device)) as terminal:
+        asyncio.run(talk(terminal.path))
+    assert device.power() is Power.ON
+    assert device.muted()
+
+
+def test_epson_projector_drives_the_simulated_epson(device: SimulatedProjector) -> None:
+    async def talk(path: str) -> None:
+        client = Projector(path, type="serial")
+        assert await client.get_power() == "04"
+        assert await client.get_serial_number() == SERIAL_NUMBER
+        assert await client.send_command("PWR ON") == ""
+        client.close()
+        # A command locks this client for the time that it takes on a real projector.
+        client = Projector(path, type="serial")
+        assert await client.get_power() == "01"
+        assert await client.get_property("LAMP") == "120"
+        assert await client.get_property("ERR") == "00"
+        assert await client.send_command("MUTE ON") == ""
+        client.close()
+        client = Projector(path, type="serial")
+        assert await client.get_property("MUTE") == "ON"
+        assert await client.get_property("CMODE") is False, "refused, and the client knows it"
+        client.close()
+
+    with PseudoTerminal(EpsonPeer(device)) as terminal:
+        asyncio.run(talk(terminal.path))
+    assert device.power() is Power.ON
+    assert device.muted()
+
+
+def test_epson_accepts_nothing_until_it_has_switched_on() -> None:
+    clock = SimulatedClock()
+    peer = EpsonPeer(SimulatedProjector(clock))
+    assert peer.receive(b"PWR ON\r") == b""
+    assert peer.receive(b"PWR?\r") == b""
+    clock.sleep(29)
+    assert peer.receive(b"") == b""
+    clock.sleep(1)
+    assert peer.receive(b"") == b":"
+    assert peer.receive(b"PWR?\r\r") == b"PWR=01\r::"
+
+
+def test_epson_warming_up_by_remote_control_tells_its_power_only() -> None:
+    device = SimulatedProjector(SimulatedClock())
+    peer = EpsonPeer(device)
+    device.switch_on()
+    assert peer.receive(b"PWR?\rLAMP?\r") == b"PWR=02\r:ERR\r:"
+
+
+def test_epson_whose_lamp_dies_on_the_way_answers_err() -> None:
+    device = SimulatedProjector(SimulatedClock())
+    peer = EpsonPeer(device)
+    peer.receive(b"PWR ON\r")
+    device.break_part("lamp", Severity.ERROR)
+    device.clock.sleep(60)
+    assert peer.receive(b"") == b"ERR\r:"
+
+
+def test_optoma_tells_its_way_unasked() -> None:
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock)
+    peer = OptomaPeer(device)
+    assert peer.receive(b"~0000 1\r") == b"P\rINFO1\r"
+    clock.sleep(30)
+    assert peer.receive(b"") == b""
+    device.break_part("lamp", Severity.ERROR)
+    assert peer.receive(b"") == b"INFO4\rINFO2\r"
+    clock.sleep(60)
+    assert peer.receive(b"~00124 1\r") == b"INFO0\rOK0\r"
+    assert peer.receive(b"~0100 1\r") == b"", "another projector's number"
+
+
+@pytest.fixture(params=["benq", "epson"])
+def served(request: pytest.FixtureRequest, device: SimulatedProjector) -> Iterator[BenqProjector | EpsonProjector]:
+    def peer() -> BenqPeer | EpsonPeer:
+        return (BenqPeer if request.param == "benq" else EpsonPeer)(device, network=True)
+
+    with serve_network(peer) as server:
+
+        def connect() -> TcpLink:
+            return TcpLink.connect(*server.address, 10.0)
+
+        yield BenqProjector(connect) if request.param == "benq" else EpsonProjector(connect, network=True)
+
+
+def test_serves_the_network_as_well(served: BenqProjector | EpsonProjector) -> None:
+    served.switch_on()
+    assert served.power() is Power.ON
+    served.set_muted(True)
+    assert served.muted()
+    served.close()
+    assert served.muted()
+    served.close()
+
+
+def test_a_pseudo_terminal_leaves_no_thread_and_no_port(device: SimulatedProjector) -> None:
+    before = threading.active_count()
+    with PseudoTerminal(EpsonPeer(device)) as terminal:
+        assert threading.active_count() == before + 1
+    terminal.close()
+    assert threading.active_count() == before
+
+
+def test_a_pseudo_terminal_that_nobody_reads_can_be_closed(device: SimulatedProjector) -> None:
+    with PseudoTerminal(BenqPeer(device)) as terminal:
+        link = SerialLink.open(terminal.path, 115200)
+        for _ in range(5):
+            link.write(b"*modelname=?#\r" * 100, 10.0)
+            terminal.catch_up()
+        link.close()
+
+
+SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
+
+
+@pytest.mark.parametrize("name", sorted(PEERS))
+def test_serves_a_serial_projector_until_interrupted(name: str) -> None:
+    spoken = LANGUAGES[name]
+    with subprocess.Popen(
+        [*SIM, "projector", "--serial", name], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line.startswith(f"{spoken.maker} projector at /dev/")
+            path = line.split()[-1]
+            projector = spoken.projector(lambda: SerialLink.open(path, spoken.baud, spoken.parity))
+            assert projector.power() is Power.STANDBY
+            projector.switch_on()
+            assert projector.power() is Power.WARMING
+            projector.close()
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    assert (process.returncode, out, err) == (0, "stopped\n", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--serial", "klingon"], "benq, epson, nec, optoma"),
+        (["--serial", "epson", "--pjlink", "0"], "either --pjlink PORT or --serial LANGUAGE"),
+        ([], "either --pjlink PORT or --serial LANGUAGE"),
+        (["--serial", "epson", "--password", "x"], "a serial cable has none"),
+    ],
+)
+def test_not_exactly_one_cable_or_no_language_ends_with_2(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+) -> None:
+    assert main(["projector", *arguments]) == 2
+    assert said in capsys.readouterr().err

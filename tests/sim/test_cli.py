@@ -1,0 +1,151 @@
+"""`sim` as its user meets it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+import pytest
+import usbip
+import usbip.host
+
+from drivers.links.tcp import TcpLink, TcpServer
+from drivers.links.udp import UdpSocket
+from drivers.pjlink.notices import LinkUp
+from drivers.pjlink.projector import PjLinkProjector
+from drivers.pjlink.search import NoticePort, search
+from drivers.projector import Power
+from sim.cli import main
+
+SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
+
+
+def test_serves_a_projector_until_interrupted() -> None:
+    with subprocess.Popen(
+        [*SIM, "projector", "--pjlink", "0", "--password", "secret"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            host, port = line.split()[-1].split(":")
+            projector = PjLinkProjector(lambda: TcpLink.connect(host, int(port), 10.0), "secret", 10.0)
+            projector.switch_on()
+            assert projector.power() is Power.WARMING
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=30)
+            projector.close()
+        finally:
+            process.kill()
+    assert process.returncode == 0
+    assert out == "stopped\n"
+    assert err == ""
+
+
+def test_is_found_and_announces_itself() -> None:
+    with (
+        NoticePort(0, "127.0.0.1") as controller,
+        subprocess.Popen(
+            [*SIM, "projector", "--pjlink", "0", "--udp", "0", "--notify", f"127.0.0.1:{controller.address[1]}"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process,
+    ):
+        try:
+            assert process.stdout is not None
+            host, port = process.stdout.readline().split()[-1].split(":")
+            process.stdout.readline()
+            found = search(30.0, enough=1, address=host, port=int(port), listen_port=0)
+            _, notice = controller.receive(30.0)
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    assert [projector.mac for projector in found] == ["02:00:00:00:00:01"]
+    assert notice == LinkUp("02:00:00:00:00:01")
+    assert (process.returncode, out, err) == (0, "stopped\n", "")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["projector", "--pjlink"], ["camera", "--model", "Test", "--port"], ["camera", "--model", "Test", "--usbip"]],
+)
+def test_a_taken_port_is_one_line(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:
+    with TcpServer(lambda link: None) as server:
+        assert main([*arguments, str(server.address[1])]) == 3
+    error = capsys.readouterr().err
+    assert error.startswith("error: cannot listen at 127.0.0.1:")
+    assert error.count("\n") == 1
+
+
+def test_a_taken_udp_port_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with UdpSocket(host="127.0.0.1") as taken:
+        assert main(["projector", "--pjlink", "0", "--udp", str(taken.address[1])]) == 3
+    error = capsys.readouterr().err
+    assert error.startswith("error: cannot receive datagrams at 127.0.0.1:")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["projector"],
+        ["projector", "--pjlink", "x"],
+        ["projector", "--pjlink", "70000"],
+        ["projector", "--pjlink", "0", "--udp", "70000"],
+        ["projector", "--pjlink", "0", "--notify", "here"],
+        ["projector", "--pjlink", "0", "--notify", "127.0.0.1:0"],
+        ["camera"],
+        ["toaster"],
+        ["camera", "--port", "0", "--usbip", "0"],
+    ],
+)
+def test_wrong_arguments_end_with_2(arguments: list[str]) -> None:
+    assert main([*arguments]) == 2
+
+
+def test_a_password_longer_than_the_standards_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["projector", "--pjlink", "0", "--password", "x" * 33]) == 2
+    assert "at most 32" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("cables", [(), ("--port", "0", "--usbip", "0")])
+def test_a_camera_has_one_cable(capsys: pytest.CaptureFixture[str], cables: tuple[str, ...]) -> None:
+    assert main(["camera", *cables]) == 2
+    expected = "one camera has one cable: either --port N for PTP/IP or --usbip N for USB/IP"
+    assert capsys.readouterr().err == f"error: {expected}\n"
+
+
+def test_an_unknown_model_is_answered_by_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["camera", "--port", "0", "--model", "EOS R5"]) == 2
+    assert "EOS 550D, EOS 6D Mark II, Test" in capsys.readouterr().err
+
+
+def test_help_names_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    assert "130" in capsys.readouterr().out
+
+
+def test_lends_a_camera_over_usb_ip_until_interrupted() -> None:
+    with subprocess.Popen(
+        [*SIM, "camera", "--usbip", "0", "--model", "EOS 6D Mark II"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line.endswith("bus id 1-1\n")
+            host, port = line.split(" at ")[1].split(",")[0].split(":")
+            found = usbip.host.list_devices(usbip.USBIP(host, int(port)))
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    assert [(entry["idVendor"], entry["idProduct"]) for entry in found] == [(0x04A9, 0x32CA)]
+    assert (process.returncode, out, err) == (0, "stopped\n", "")

@@ -1,0 +1,404 @@
+"""The dark room keeps its laws: light adds, noise follows photon transfer, places are where `project` says.
+
+Probabilities of a false alarm are about one in a million for each statistical test; the seeds are fixed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import product
+from typing import cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.camera import ExposureSettings
+from drivers.presenter import BLACK, WHITE, Colour
+from sim.world.drawing import Print
+from sim.world.room import REFERENCE_EXPOSURE, Room
+from sim.world.sensors import BODIES, Body, Rectangle
+from sim.world.world import World
+
+SIX_SIGMA = 5.0
+PRIMARIES = (Colour(255, 0, 0), Colour(0, 255, 0), Colour(0, 0, 255))
+
+
+def visible(frame: NDArray[np.uint16], body: Body) -> NDArray[np.float64]:
+    area = body.visible
+    return frame[area.top : area.top + area.height, area.left : area.left + area.width].astype(np.float64)
+
+
+def channel_planes(signal: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return (rows, columns, 3): R, mean G and B of each RGGB block."""
+    rows, columns = (size // 2 * 2 for size in signal.shape)
+    mosaic = signal[:rows, :columns].astype(np.float64)
+    green = (mosaic[::2, 1::2] + mosaic[1::2, ::2]) / 2
+    return np.stack([mosaic[::2, ::2], green, mosaic[1::2, 1::2]], axis=-1)
+
+
+def test_light_adds(plain_world: World) -> None:
+    together = plain_world.signal(WHITE, REFERENCE_EXPOSURE)
+    apart = sum((plain_world.signal(one, REFERENCE_EXPOSURE) for one in PRIMARIES), np.zeros_like(together))
+    np.testing.assert_allclose(apart, together, rtol=1e-5)
+
+
+@pytest.mark.parametrize("code", [1, 10, 11, 128, 254])
+def test_a_code_gives_the_light_of_srgb(plain_world: World, code: int) -> None:
+    # IEC 61966-2-1: linear = c / 12.92 up to c = 0.04045, ((c + 0.055) / 1.055)^2.4 above.
+    c = code / 255
+    linear = c / 12.92 if c <= 0.04045 else math.pow((c + 0.055) / 1.055, 2.4)
+    full = plain_world.white(WHITE, REFERENCE_EXPOSURE)
+    np.testing.assert_allclose(plain_world.white(Colour(code, code, code), REFERENCE_EXPOSURE), full * linear)
+
+
+def test_a_power_law_projector_and_its_leak_and_the_rooms_own_light() -> None:
+    room = Room(transfer=2.0, black_leak=0.01, ambient=0.003)
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    world = World(sheet, BODIES["Test"], room)
+    full = World(sheet, BODIES["Test"], replace(room, black_leak=0, ambient=0)).white(WHITE, REFERENCE_EXPOSURE)
+    np.testing.assert_allclose(world.white(BLACK, REFERENCE_EXPOSURE), full * (0.01 + 0.003))
+    np.testing.assert_allclose(world.white(WHITE, REFERENCE_EXPOSURE), full * 1.003)
+    grey = world.white(Colour(51, 51, 51), REFERENCE_EXPOSURE, lamp=0.5)
+    np.testing.assert_allclose(grey, full * (0.5 * (0.01 + 0.99 * 0.04) + 0.003))
+
+
+@pytest.mark.parametrize(
+    ("settings", "factor"),
+    [
+        (ExposureSettings(iso=100, aperture=8, shutter_s=1.0), 2),
+        (ExposureSettings(iso=100, aperture=4, shutter_s=0.5), 4),
+        (ExposureSettings(iso=400, aperture=8, shutter_s=0.25), 2),
+    ],
+)
+def test_exposure_scales_light(plain_world: World, settings: ExposureSettings, factor: float) -> None:
+    once = plain_world.signal(WHITE, REFERENCE_EXPOSURE)
+    np.testing.assert_allclose(plain_world.signal(WHITE, settings), once * factor, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_paper_white_stands_where_the_room_says(name: str) -> None:
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    body = BODIES[name]
+    white = World(sheet, body, Room()).white(WHITE, REFERENCE_EXPOSURE)
+    assert white.max() / (body.saturation - body.black) == pytest.approx(0.70)
+    assert white.argmax() == 1
+
+
+@pytest.mark.parametrize("colour", PRIMARIES, ids=["red", "green", "blue"])
+def test_a_patch_has_the_signal_that_truth_gives(plain_world: World, colour: Colour) -> None:
+    sheet = plain_world.sheet
+    centres = (sheet.rectangles_mm[:, :2] + sheet.rectangles_mm[:, 2:]) / 2
+    primary = PRIMARIES.index(colour)
+    pixels = np.round(plain_world.project(centres))
+    x, y = pixels.astype(int).T
+    planes = channel_planes(plain_world.signal(colour, REFERENCE_EXPOSURE))
+    truth = plain_world.reflected(sheet.rgb, colour, REFERENCE_EXPOSURE)
+    # R lies a quarter of a pixel up and left of the block's centre, B down and right.
+    for channel, offset in enumerate((-0.25, 0, 0.25)):
+        field = plain_world.field(plain_world.view.locate(pixels + offset))[:, primary]
+        np.testing.assert_allclose(planes[y, x, channel], truth[:, channel] * field, rtol=3e-5)
+
+
+def test_the_field_falls_as_asked_and_is_balanced_over_the_sheet() -> None:
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    lens_only = World(sheet, BODIES["Test"], Room(projector_falloff=0, vignetting=0.3))
+    rows, columns = BODIES["Test"].half_size
+    corner = lens_only.view.locate(np.array([[-0.75, -0.75], [(columns - 1) / 2, (rows - 1) / 2]]))
+    np.testing.assert_allclose(lens_only.field(corner), [[0.7] * 3, [1] * 3], rtol=2e-3)
+    both = World(sheet, BODIES["Test"], Room())
+    x, y = np.meshgrid(np.linspace(0, 180, 37), np.linspace(0, 125, 26))
+    field = both.field(np.stack([x, y], axis=-1))
+    assert 0.95 < field[..., 1].max() <= 1
+    np.testing.assert_allclose(field.mean(axis=(0, 1)) / field[..., 1].mean(), 1, atol=2e-3)
+    assert np.ptp(field / field[..., 1:2]) > 0.01, "the primaries fall off differently"
+    assert field.max() > 0.95
+    # The primaries differ, but by little.
+    assert 0.001 < np.ptp(field / field.mean(axis=-1, keepdims=True)) < 0.2
+
+
+def test_each_photosite_integrates_the_print_over_aperture_and_blur() -> None:
+    """Against a sum over ten thousand points of the print for each of some photosites, found by `locate`."""
+    rng = np.random.default_rng(11)
+    x, y = (grid.ravel() for grid in np.meshgrid(2.1 * np.arange(70) + 15, 1.9 * np.arange(50) + 10))
+    sheet = Print(
+        (180, 125),
+        np.stack([x, y, x + 2.1, y + 1.9], axis=-1).astype(np.float64),
+        rng.choice([0, 90, 255], (3500, 3)).astype(np.uint8),
+    )
+    room = Room(vignetting=0, projector_falloff=0, response_spread=0, roll_deg=2, black_leak=0)
+    world = World(sheet, BODIES["Test"], room)
+    signal = world.signal(WHITE, REFERENCE_EXPOSURE)
+    palette = world.reflected(sheet.rgb, WHITE, REFERENCE_EXPOSURE)
+    white = world.white(WHITE, REFERENCE_EXPOSURE)
+    photosites = np.stack([rng.integers(120, 680, 40), rng.integers(100, 450, 40)], axis=-1)
+    blur = 2 * room.blur_px
+    steps = np.linspace(-4.95, 4.95, 100)
+    erf = np.vectorize(math.erf)
+    errors: list[float] = []
+    for column, row in cast("list[list[int]]", photosites.tolist()):
+        places = np.stack(np.meshgrid(steps, steps), axis=-1) + rng.uniform(-0.05, 0.05, (100, 100, 2))
+        edge = 0.5 / (blur * math.sqrt(2))
+        spread = erf(places / (blur * math.sqrt(2)) + edge) - erf(places / (blur * math.sqrt(2)) - edge)
+        weights = spread.prod(axis=-1)
+        points = world.view.locate((np.array([column, row]) + places - 0.5) / 2)
+        cell = np.floor((points - [15, 10]) / [2.1, 1.9]).astype(int)
+        channel = (0, 1, 1, 2)[2 * (row % 2) + column % 2]
+        inside = ((cell >= 0) & (cell < [70, 50])).all(axis=-1)
+        number = np.where(inside, cell[..., 1] * 70 + cell[..., 0], 0)
+        value = palette[number, channel]
+        value[~inside] = white[channel]
+        errors.append(float((weights * value).sum() / weights.sum() - signal[row, column]) / white[channel])
+    # The sum's own error is about 0.1 %; a photosite displaced by a tenth would be wrong by some 2 %.
+    assert np.sqrt(np.mean(np.square(errors))) < 0.003
+    assert np.abs(errors).max() < 0.01
+
+
+def test_squares_are_where_project_says(square_world: World) -> None:
+    """The centroid of each square's darkness, in each colour plane by itself, against its projected area's."""
+    signal = square_world.signal(WHITE, REFERENCE_EXPOSURE).astype(np.float64)
+    white = square_world.white(WHITE, REFERENCE_EXPOSURE)
+    places: NDArray[np.float64] = np.indices(signal.shape).astype(np.float64)
+    rows, columns = places[0], places[1]
+    for box in square_world.sheet.rectangles_mm:
+        steps = (np.arange(40) + 0.5) / 40
+        points = np.stack(np.meshgrid(*(a + steps * (b - a) for a, b in zip(box[:2], box[2:], strict=True))), axis=-1)
+        seen = square_world.project(points)
+        by_x = square_world.project(points + np.array([0.01, 0])) - seen
+        by_y = square_world.project(points + np.array([0, 0.01])) - seen
+        area = np.abs(by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0])
+        expected = (seen * area[..., None]).sum(axis=(0, 1)) / area.sum()
+        x, y = (round(2 * float(place) + 0.5) for place in expected)
+        window = (slice(y - 42, y + 43), slice(x - 42, x + 43))
+        for phase, channel in zip(product((0, 1), (0, 1)), (0, 1, 1, 2), strict=True):
+            mine: NDArray[np.bool_] = (rows[window] % 2 == phase[0]) & (columns[window] % 2 == phase[1])
+            darkness = (white[channel] - signal[window])[mine]
+            found = [
+                float((darkness * place[window][mine]).sum() / darkness.sum() - 0.5) / 2 for place in (columns, rows)
+            ]
+            np.testing.assert_allclose(found, expected, atol=0.003)
+
+
+def test_a_frame_is_its_key(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = world.expose(WHITE, REFERENCE_EXPOSURE, key=(3, 1))
+    np.testing.assert_array_equal(frame, world.expose(WHITE, REFERENCE_EXPOSURE, key=(3, 1)))
+    monkeypatch.setattr("sim.world.world.processor_count", lambda: 1)
+    alone = World(world.sheet, world.body, world.room)
+    np.testing.assert_array_equal(frame, alone.expose(WHITE, REFERENCE_EXPOSURE, key=(3, 1)))
+    monkeypatch.setattr("sim.world.world.processor_count", lambda: 7)
+    crowd = World(world.sheet, world.body, world.room)
+    np.testing.assert_array_equal(frame, crowd.expose(WHITE, REFERENCE_EXPOSURE, key=(3, 1)))
+
+
+@pytest.mark.parametrize("key", [(3,), (3, 2), (1, 3), (3, 1, 0)])
+def test_another_key_has_other_noise(world: World, key: tuple[int, ...]) -> None:
+    one, other = (
+        world.expose(BLACK, REFERENCE_EXPOSURE, key=k, lamp=0).astype(np.float64) - 2048 for k in ((3, 1), key)
+    )
+    correlation = float((one * other).mean() / np.sqrt((one**2).mean() * (other**2).mean()))
+    assert abs(correlation) < SIX_SIGMA / math.sqrt(one.size)
+
+
+def test_another_seed_has_other_noise_and_paper(world: World) -> None:
+    other = World(world.sheet, world.body, replace(world.room, seed=1))
+    middle = np.array([[60.0, 60.0]])
+    assert np.abs(other.project(middle) - world.project(middle)).max() > 0.001
+    dark = [w.expose(BLACK, REFERENCE_EXPOSURE, key=(0,), lamp=0) for w in (world, other)]
+    assert (dark[0] != dark[1]).mean() > 0.5
+
+
+@pytest.mark.parametrize("iso", [100, 800])
+def test_masked_borders_and_darkness_are_black_with_read_noise(world: World, iso: int) -> None:
+    settings = ExposureSettings(iso=iso, aperture=8, shutter_s=0.5)
+    body = world.body
+    lit = world.expose(WHITE, settings, key=(4,))
+    dark = world.expose(WHITE, settings, key=(5,), lamp=0)
+    # 6 DN at ISO 100 of which 2.8 electrons are the sensor's own; rounding adds 1/12.
+    own = 2.8 / 1.8
+    deviation = math.sqrt(6.0**2 - own**2 + (own * iso / 100) ** 2 + 1 / 12)
+    for area in body.masked:
+        masked = lit[area.top : area.top + area.height, area.left : area.left + area.width]
+        check_normal(masked, body.black, deviation)
+    check_normal(visible(dark, body), body.black, deviation)
+
+
+def check_normal(counts: NDArray[np.number], mean: float, deviation: float) -> None:
+    assert abs(counts.mean() - mean) < SIX_SIGMA * deviation / math.sqrt(counts.size)
+    assert abs(counts.std() / deviation - 1) < SIX_SIGMA / math.sqrt(2 * counts.size)
+
+
+@pytest.mark.parametrize("iso", [100, 400])
+def test_noise_follows_photon_transfer(world: World, iso: int) -> None:
+    """EMVA 1288: the variance of a count is signal / gain + read noise², + 1/12 DN² for rounding."""
+    settings = ExposureSettings(iso=iso, aperture=8, shutter_s=0.5 * 100 / iso)
+    body = world.body
+    signal = world.signal(WHITE, settings).astype(np.float64)
+    one, other = (visible(world.expose(WHITE, settings, key=(6, n)), body) for n in range(2))
+    gain = 1.8 * 100 / iso
+    for low, high in ((100, 400), (400, 1000), (1000, 2000), (2000, 4000), (4000, 9000)):
+        level = (signal >= low) & (signal < high)
+        count = int(level.sum())
+        assert count > 3000
+        expected = signal[level].mean() / gain + body.noise_dn(iso) ** 2 + 1 / 12
+        difference = one[level] - other[level]
+        # Levels mix variances; the fourth moment of the mixture stays below that of twice the spread.
+        assert difference.var() / 2 / expected == pytest.approx(1, abs=SIX_SIGMA * math.sqrt(3 / count))
+        bias = (one[level] + other[level]).mean() / 2 - body.black - signal[level].mean()
+        assert abs(bias) < SIX_SIGMA * math.sqrt(expected / 2 / count)
+
+
+def test_photosites_respond_as_unequally_as_asked(world: World, plain_world: World) -> None:
+    ratio = world.signal(WHITE, REFERENCE_EXPOSURE) / plain_world.signal(WHITE, REFERENCE_EXPOSURE).astype(
+        np.float64
+    )  # the worlds differ in leak, which white does not show, and in response
+    check_normal(ratio, 1, 0.003)
+
+
+def test_counts_end_at_saturation(world: World) -> None:
+    frame = world.expose(WHITE, ExposureSettings(iso=100, aperture=4, shutter_s=2), key=(7,))
+    assert frame.max() == world.body.saturation
+    assert (visible(frame, world.body) == world.body.saturation).mean() > 0.3
+
+
+def test_the_lamps_light_scales_the_picture_but_not_the_rooms_own() -> None:
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    world = World(sheet, BODIES["Test"], Room(ambient=0.001))
+    full = world.signal(WHITE, REFERENCE_EXPOSURE)
+    np.testing.assert_allclose(world.signal(WHITE, REFERENCE_EXPOSURE, lamp=0), full * (0.001 / 1.001), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("shutter_s", "percent"), [(1 / 60, 7), (1 / 8, 8.7), (0.25, 0.47), (0.5, 0.24), (1.0, 0.11)])
+def test_a_colour_wheel_shakes_the_colour_of_short_exposures(shutter_s: float, percent: float) -> None:
+    """Against an independent simulation of R/G with 0.5 ms of jitter and one turn in 1/60 s."""
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    body = replace(BODIES["Test"], sensor=(4, 16), visible=Rectangle(0, 8, 4, 8), masked=(), electrons_per_dn=1e9)
+    flat = Room(wheel_hz=60, response_spread=0, white_level_share=0.5, black_leak=0)
+    world = World(sheet, replace(body, read_noise_dn=1e-3, sensor_noise_e=0), flat)
+    settings = replace(REFERENCE_EXPOSURE, shutter_s=shutter_s, aperture=8 * math.sqrt(2 * shutter_s))
+    ratios: list[float] = []
+    for n in range(400):
+        # The camera's channels overlap, so each primary is shown by itself; the key makes it the same exposure.
+        red, green = (
+            visible(world.expose(PRIMARIES[i], settings, key=(n,)), body).mean() - body.black for i in range(2)
+        )
+        ratios.append(float(red / green))
+    found = 100 * np.std(ratios) / np.mean(ratios)
+    assert found == pytest.approx(percent, rel=0.2)
+
+
+def test_whole_turns_of_the_wheel_give_steady_light() -> None:
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    steady = World(sheet, BODIES["Test"], Room())
+    turning = World(sheet, BODIES["Test"], Room(wheel_hz=120, shutter_jitter_s=0))
+    frames = [world.expose(WHITE, REFERENCE_EXPOSURE, key=(9,)).astype(int) for world in (steady, turning)]
+    assert np.abs(frames[0] - frames[1]).max() <= 1
+
+
+def test_later_rectangles_cover_earlier_ones_and_paper_shows_between() -> None:
+    boxes = np.array([[20.0, 20, 160, 100], [40, 40, 100, 80], [60, 50, 80, 70]])
+    codes = np.array([[0, 0, 0], [255, 255, 255], [200, 0, 0]], dtype=np.uint8)
+    world = World(Print((180, 125), boxes, codes), BODIES["Test"], Room(response_spread=0, black_leak=0))
+    points = np.array([[10.0, 10], [30, 30], [50, 45], [70, 60], [120, 90]])
+    planes = channel_planes(world.signal(PRIMARIES[1], REFERENCE_EXPOSURE))
+    x, y = np.round(world.project(points)).astype(int).T
+    expected = world.reflected(codes[[1, 0, 1, 2, 0]], PRIMARIES[1], REFERENCE_EXPOSURE)
+    np.testing.assert_allclose(planes[y, x], expected * world.field(points)[:, 1, None], rtol=3e-3)
+
+
+def test_a_drawing_off_every_lattice_is_still_drawn(square_world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand crumbs have more edges than are kept apart; joining them moves the squares beside them little."""
+    monkeypatch.setattr("sim.world.drawing._MOST_LINES", 1500)
+    rng = np.random.default_rng(3)
+    corner = rng.uniform(0, [10, 115], (1000, 2))
+    crumbs = np.concatenate([corner, corner + rng.uniform(1, 5, (1000, 2))], axis=1)
+    squares = square_world.sheet
+    sheet = Print(
+        squares.page_mm,
+        np.concatenate([crumbs, squares.rectangles_mm]),
+        np.concatenate([rng.choice([0, 255], (1000, 3)), squares.rgb]).astype(np.uint8),
+    )
+    signal = World(sheet, square_world.body, square_world.room).signal(WHITE, REFERENCE_EXPOSURE)
+    beside = round(2 * square_world.project(np.array([18.0, 60.0]))[0])
+    change = np.abs(signal - square_world.signal(WHITE, REFERENCE_EXPOSURE))[:, beside:]
+    # A tenth of a photosite, at the steepest place of an edge with standard deviation 1.6 photosites.
+    assert 0 < change.max() < 0.1 * 0.25 * square_world.white(WHITE, REFERENCE_EXPOSURE).max()
+
+
+@pytest.mark.parametrize("page_mm", [(1189.0, 841.0), (105.0, 74.0), (148.0, 210.0)])
+def test_small_sheets_wave_like_large_ones(page_mm: tuple[float, float]) -> None:
+    sheet = Print(page_mm, np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    world = World(sheet, BODIES["Test"], Room(waviness_mm=3))
+    x, y = np.meshgrid(np.linspace(0, page_mm[0], 90), np.linspace(0, page_mm[1], 90))
+    height = np.ptp(world.view.surface.height(np.stack([x, y], axis=-1)))
+    assert height / math.hypot(*page_mm) == pytest.approx(3 / math.hypot(1189, 841), rel=0.03)
+
+
+def test_a_stain_and_a_fold_are_where_the_room_tells_and_as_deep() -> None:
+    """Bare paper beside itself, worn: what is lost is what `worn` says, and nothing elsewhere."""
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    room = Room(response_spread=0, stain_mm=25, stain_depth=0.4, fold_mm=2)
+    clean, worn = (World(sheet, BODIES["Test"], it) for it in (replace(room, stain_mm=0, fold_mm=0), room))
+    assert worn.stain is not None
+    assert worn.fold is not None
+    assert clean.stain is None
+    rows, columns = BODIES["Test"].half_size
+    x, y = np.meshgrid(np.arange(20, columns - 20, 7), np.arange(20, rows - 20, 7))
+    planes = channel_planes(worn.signal(WHITE, REFERENCE_EXPOSURE))[y, x]
+    for channel, offset in enumerate((-0.25, 0, 0.25)):
+        places = worn.view.locate((np.stack([x, y], axis=-1) + offset).astype(np.float64))
+        white = np.full((places[..., 0].size, 3), 255)
+        true = worn.seen(white, places.reshape(-1, 2), WHITE, REFERENCE_EXPOSURE)[:, channel].reshape(x.shape)
+        inside = ((places > 2) & (places < np.array(sheet.page_mm) - 2)).all(axis=-1)
+        # A stain's rim is blurred by the lens, paper is not.
+        rim = np.abs(np.linalg.norm(places - worn.stain.centre_mm, axis=-1) - 12.5) < 3
+        np.testing.assert_allclose(planes[..., channel][inside & ~rim], true[inside & ~rim], rtol=2e-3)
+    middle = np.array(worn.stain.centre_mm)
+    np.testing.assert_allclose(worn.stain.passed(middle), [0.88, 0.76, 0.6], atol=1e-6)
+    away = np.array(worn.fold.at_mm) + np.array([[-6.0, 0], [6, 0], [-80, 0]])
+    left, right, flat = worn.fold.shade(away).tolist()
+    assert left - 1 == pytest.approx(1 - right, rel=0.02)
+    assert abs(left - right) > 0.02, "a jump of the light across the crease"
+    assert flat == pytest.approx(1, abs=0.003)
+
+
+def test_a_fold_bends_the_picture() -> None:
+    sheet = Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))
+    flat, folded = (World(sheet, BODIES["Test"], Room(fold_mm=height)) for height in (0, 3))
+    assert folded.fold is not None
+    line = np.array(folded.fold.at_mm) + np.stack([np.linspace(-60, 60, 241), np.zeros(241)], axis=-1)
+    moved = folded.project(line) - flat.project(line)
+    assert np.linalg.norm(moved, axis=1).max() > 0.2
+    bend = np.linalg.norm(np.diff(moved, 2, axis=0), axis=1)
+    assert abs(int(bend.argmax()) - 119) <= 2, "the sharpest bend is the crease"
+
+
+def test_the_camera_may_stand_upside_down() -> None:
+    sheet = Print((180, 125), np.array([[30.0, 20, 60, 50]]), np.zeros((1, 3), dtype=np.uint8))
+    world = World(sheet, BODIES["Test"], Room(roll_deg=180, response_spread=0))
+    planes = channel_planes(world.signal(WHITE, REFERENCE_EXPOSURE))
+    x, y = np.round(world.project(np.array([45.0, 35.0]))).astype(int)
+    assert x > 200
+    assert y > 139
+    assert planes[y, x, 1] < 0.06 * world.white(WHITE, REFERENCE_EXPOSURE)[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda: Room(seed=-1), "seed is -1"),
+        (lambda: Room(fill=0), "fill is 0"),
+        (lambda: Room(vignetting=1.0), "vignetting is 1.0"),
+        (lambda: Room(blur_px=-0.5), "blur_px is -0.5"),
+        (lambda: Room(stain_mm=-1.0), "stain_mm is -1.0"),
+        (lambda: Room(stain_depth=1.0), "stain_depth is 1.0"),
+        (lambda: Print((10, 10), np.zeros((2, 4)), np.zeros((1, 3), dtype=np.uint8)), r"\(1, 3\)"),
+        (lambda: Print((10, 10), np.array([[5.0, 5, 4, 6]]), np.zeros((1, 3), dtype=np.uint8)), "before"),
+        (lambda: replace(BODIES["Test"], pattern="RGBB"), "pattern is 'RGBB'"),
+        (lambda: replace(BODIES["Test"], sensor=(100, 100)), "outside the sensor"),
+    ],
+)
+def test_what_cannot_be_is_refused(change: object, named: str) -> None:
+    assert callable(change)
+    with pytest.raises(ValueError, match=named):
+        change()
