@@ -51,6 +51,8 @@ class Plan:
         Package to the modules that a contract forbids to it.
     excepted
         Package to those of its modules for which that does not hold.
+    layers
+        Package to its rooms from the highest row to the lowest, where a contract lays them out.
     commands
         Package to its console commands.
     imports
@@ -60,6 +62,7 @@ class Plan:
     packages: tuple[str, ...]
     forbidden: Mapping[str, Set[str]]
     excepted: Mapping[str, Set[str]]
+    layers: Mapping[str, Sequence[Set[str]]]
     commands: Mapping[str, Sequence[str]]
     imports: Mapping[str, Set[str]]
 
@@ -73,14 +76,20 @@ def read_plan() -> Plan:
     project: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts: list[dict[str, Any]] = project["tool"]["importlinter"]["contracts"]
     roots: list[str] = project["tool"]["importlinter"]["root_packages"]
-    layers = next(c["layers"] for c in contracts if c["type"] == "layers" and set(c["layers"]) == set(roots))
+    tower = next(one["layers"] for one in contracts if one["type"] == "layers" and set(one["layers"]) == set(roots))
+    layers = {
+        container: [{f"{container}.{room.strip()}" for room in layer.split("|")} for layer in one["layers"]]
+        for one in contracts
+        if one["type"] == "layers"
+        for container in one.get("containers", ())
+    }
     forbidden: dict[str, set[str]] = {package: set() for package in roots}
     excepted: dict[str, set[str]] = {package: set() for package in roots}
     for contract in (one for one in contracts if one["type"] == "forbidden"):
-        for source in contract["source_modules"]:
-            forbidden[source.split(".")[0]] |= set(contract["forbidden_modules"])
+        for package in set(contract["source_modules"]) & set(roots):
+            forbidden[package] |= set(contract["forbidden_modules"])
         for ignored in contract.get("ignore_imports", ()):
-            module = ignored.split(" -> ")[0]
+            module = ignored.split(" -> ")[0].removesuffix(".**")
             excepted[module.split(".")[0]].add(module)
     commands: dict[str, list[str]] = {package: [] for package in roots}
     for command, place in project["project"]["scripts"].items():
@@ -91,7 +100,7 @@ def read_plan() -> Plan:
         room = room_of(module)
         imported = {room_of(one) for one in graph.find_modules_directly_imported_by(module)}
         imports[room] = imports.get(room, set()) | imported - {room}
-    return Plan(tuple(layers), forbidden, excepted, commands, imports)
+    return Plan(tuple(tower), forbidden, excepted, layers, commands, imports)
 
 
 def room_of(module: str) -> str:
@@ -108,6 +117,17 @@ def reach(imports: Mapping[str, Set[str]], room: str) -> set[str]:
                 found.add(one)
                 waiting.append(one)
     return found
+
+
+def rows_of(plan: Plan, package: str) -> dict[str, int]:
+    """Return the row of each room of a package, 0 at the bottom: that of its contract, or found from the imports."""
+    if package not in plan.layers:
+        return heights(plan.rooms(package), plan.imports)
+    rows = {room: row for row, layer in enumerate(reversed(plan.layers[package])) for room in layer}
+    lost = set(plan.rooms(package)) ^ set(rows)
+    if lost:
+        raise ValueError(f"the contract of the rooms of {package} and the rooms differ by {', '.join(sorted(lost))}")
+    return rows
 
 
 def heights(rooms: Sequence[str], imports: Mapping[str, Set[str]]) -> dict[str, int]:
@@ -204,7 +224,7 @@ def draw_rooms(plan: Plan) -> str:
     top = 20.0
     for package in plan.packages:
         rooms = plan.rooms(package)
-        rows = heights(rooms, plan.imports)
+        rows = rows_of(plan, package)
         notes = notes_of(plan, package)
         head = 44 + 15 * len(notes)
         height = head + ROW * (max(rows.values()) + 1) + 6
@@ -236,11 +256,22 @@ def notes_of(plan: Plan, package: str) -> list[tuple[str, str]]:
         if other in imported
     ]
     lines = wrapped("imports " + ", ".join(named), 122) if named else []
-    walls = sorted(plan.forbidden[package])
+    walls = grouped(plan.forbidden[package])
     doors = sorted(plan.excepted[package])
     but = f"; {', '.join(doors)} may" if doors else ""
     barred = wrapped(f"must not import {', '.join(walls)}{but}", 122) if walls else []
     return [(line, GREY) for line in lines] + [(line, WALL) for line in barred]
+
+
+def grouped(modules: Set[str]) -> list[str]:
+    """Return modules in alphabetical order, several of one package as one: ``drivers (canon, ptp)``."""
+    homes: dict[str, list[str]] = {}
+    for module in sorted(modules):
+        homes.setdefault(module.rpartition(".")[0] or module, []).append(module.rpartition(".")[2])
+    return [
+        home if names == [home] else f"{home} ({', '.join(names)})" if len(names) > 1 else f"{home}.{names[0]}"
+        for home, names in homes.items()
+    ]
 
 
 def draw_band(

@@ -10,7 +10,6 @@ import ast
 import statistics
 import tomllib
 from collections import defaultdict
-from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -25,7 +24,6 @@ FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("
 FILES_IN_A_ROOM = 12
 LINES_OF_A_FILE = 500
 MEDIAN_LINES = 170
-CONSTRUCTORS = {"__init__", "__post_init__", "__new__"}
 
 
 @cache
@@ -79,69 +77,3 @@ def test_a_public_class_name_has_one_home() -> None:
                 homes[node.name].append(place(path))
     shared = {name: files for name, files in homes.items() if len(files) > 1}
     assert not shared
-
-
-def test_an_object_is_whole_when_its_constructor_returns() -> None:
-    classes = {node.name: node for path in FILES for node in ast.walk(tree_of(path)) if isinstance(node, ast.ClassDef)}
-    late = [
-        f"{place(path)}:{line} {node.name}.{attribute}"
-        for path in FILES
-        for node in ast.walk(tree_of(path))
-        if isinstance(node, ast.ClassDef)
-        for attribute, line in assigned_late(node, classes)
-    ]
-    assert not late, "first assigned outside the constructor:\n" + "\n".join(late)
-
-
-def assigned_late(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> Iterator[tuple[str, int]]:
-    """Yield the attributes that methods assign and neither constructor nor class body, of the bases neither."""
-    known = attributes_at_birth(node, classes)
-    for method in methods_of(node):
-        if method.name in CONSTRUCTORS:
-            continue
-        for attribute, line in assigned_in(method):
-            if attribute not in known:
-                known.add(attribute)
-                yield attribute, line
-
-
-def attributes_at_birth(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> set[str]:
-    """Return the names an object has when its constructor returns, those of base classes in the product included."""
-    known: set[str] = set()
-    for base in node.bases:
-        name = base.value if isinstance(base, ast.Subscript) else base
-        parent = classes.get(name.id) if isinstance(name, ast.Name) else None
-        if parent is not None and parent is not node:
-            known |= attributes_at_birth(parent, classes)
-    for statement in node.body:
-        match statement:
-            case ast.FunctionDef(name=name) | ast.AnnAssign(target=ast.Name(id=name)):
-                known.add(name)
-            case ast.Assign(targets=targets):
-                known |= {target.id for target in targets if isinstance(target, ast.Name)}
-            case _:
-                pass
-    for method in methods_of(node):
-        if method.name in CONSTRUCTORS:
-            known |= {attribute for attribute, _ in assigned_in(method)}
-    return known
-
-
-def methods_of(node: ast.ClassDef) -> Iterator[ast.FunctionDef]:
-    """Yield the functions of a class body that have a first parameter and are no static or class methods."""
-    for statement in node.body:
-        if isinstance(statement, ast.FunctionDef) and statement.args.args:
-            marks = {mark.id for mark in statement.decorator_list if isinstance(mark, ast.Name)}
-            if not marks & {"staticmethod", "classmethod"}:
-                yield statement
-
-
-def assigned_in(method: ast.FunctionDef) -> Iterator[tuple[str, int]]:
-    """Yield each attribute of its object that a method assigns, in whatever statement, with the line."""
-    own = method.args.args[0].arg
-    for node in ast.walk(method):
-        match node:
-            case ast.Attribute(value=ast.Name(id=name), attr=attribute, ctx=ast.Store()) if name == own:
-                yield attribute, node.lineno
-            case _:
-                pass
