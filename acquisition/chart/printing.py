@@ -130,7 +130,7 @@ def field_drawing(chart: Chart, within_mm: tuple[float, float, float, float] | N
 
 
 def _part_boxes(chart: Chart) -> npt.NDArray[np.float64]:
-    """(N, 4) mm: tags with their white rims, cells, references."""
+    """Return the boxes (N, 4) float64 mm of tags with their white rims, then cells, then references."""
     rims = [_tag_rectangles(tag)[0][:1] for tag in chart.tags]
     half = np.array(chart.cell_mm) / 2
     cells = np.concatenate([chart.centres_mm - half, chart.centres_mm + half], axis=1)
@@ -254,7 +254,7 @@ def _require_whole_pixels(chart: Chart, dpi: int) -> None:
 
 
 def _even_resolutions(lengths: list[float]) -> str:
-    """Name the usual resolutions at which all lengths are whole pixels."""
+    """Return the names of the usual resolutions, dpi, at which all lengths (mm) are whole pixels."""
     pixels = {dpi: [length * dpi / MM_PER_INCH for length in lengths] for dpi in (1200, 600, 360)}
     even = [f"{dpi}" for dpi, sizes in pixels.items() if all(abs(size - round(size)) <= 1e-3 for size in sizes)]
     return " or ".join(even) or "another number of"

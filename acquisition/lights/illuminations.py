@@ -1,4 +1,4 @@
-"""The lights: the 707 of the paper by our recipe, and their file `illuminations.csv`.
+"""The lights of an experiment, as many as the paper's 707, and their file `illuminations.csv`.
 
 The paper (section 3.1) asks for chromaticities spread uniformly and for black bodies but gives no recipe. Ours: the
 points of a triangular grid r = i/n, b = j/n, g = 1 − r − b in linear light, and black bodies from 2000 K to 10 000 K;
@@ -186,7 +186,7 @@ def parse_ccts(text: str) -> tuple[float, ...]:
         if not 0 <= steps < MOST_CCTS:
             raise InputError(
                 f"{given}: steps of {step:g} K do not lead from {first:g} to {last:g} K in at most {MOST_CCTS} "
-                "temperatures; a fall has a step below 0"
+                "temperatures; a falling range has a step below 0"
             )
         return tuple(first + step * number for number in range(int(steps + 1e-9) + 1))
     _require_kelvin(named, given)

@@ -22,7 +22,7 @@ _NAMED_CCTS_K = (2000, 3000, 4000, 6000, 10000)
 
 
 def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:
-    """Plot the rb-chromaticities of lights (paper.tex, section 3.1), each point in the colour of its light.
+    """Plot the rb-chromaticities of lights (paper, section 3.1), each point in the colour of its light.
 
     Chromaticities are those of the linear light that a projector with the sRGB transfer function sends out:
     r = R / (R + G + B) and b = B / (R + G + B) of the decoded codes. A light without any light is left out.

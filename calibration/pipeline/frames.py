@@ -30,7 +30,7 @@ from foundation.files import read_whole
 from foundation.hashing import file_sha256
 
 _Array = npt.NDArray[np.float64]
-Progress = Callable[[int, int, str], None]
+ReportProgress = Callable[[int, int, str], None]
 """Called with frames done, frames in all, and what is being done."""
 
 _PAPER_PERCENTILE = 98
@@ -188,21 +188,21 @@ def strongest_channel(mosaic: Mosaic, black: _Array) -> Channel:
 
 def session_sha256(records: Sequence[FrameRecord]) -> str:
     """Return the hash that names a session: SHA-256 over kind, light and hash of each frame used, a line each."""
-    return frames_sha256(listed(records))
+    return frames_sha256(source_frames(records))
 
 
-def listed(records: Sequence[FrameRecord]) -> list[SourceFrame]:
-    """Return frames as a table lists them."""
+def source_frames(records: Sequence[FrameRecord]) -> list[SourceFrame]:
+    """Return frames as `frames.csv` of a table lists them."""
     return [SourceFrame(record.kind, record.illumination, record.file, record.sha256) for record in records]
 
 
-def lost_frames(lut: Lut, session: Session, progress: Progress | None = None) -> list[str]:
-    """Return which of the frames that a table was made of are not in a session, or not as they were, each in words.
+def frame_faults(lut: Lut, session: Session, progress: ReportProgress | None = None) -> list[str]:
+    """Return what is wrong with a session's frames that a table was made of, each fault in words: missing or changed.
 
     Raises
     ------
     FormatError
-        The table lists no frames, as those made before they were recorded.
+        The table lists no frames: it was made before they were recorded.
     """
     if not lut.frames:
         raise FormatError(f"{lut.folder} lists no frames; build it again from its session to have them listed")

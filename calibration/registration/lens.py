@@ -20,8 +20,8 @@ _PAIRS_FOR_ALL, _PAIRS_FOR_ONE = 48, 16
 not determine them, and each would fit noise."""
 
 _ON_ONE_LINE = (
-    "the marks of the chart that were found lie on one line, and marks spread over the sheet are expected; bring all of "
-    "the chart into the frame, and uncover it"
+    "the marks of the chart that were found lie on one line, and marks spread over the sheet are expected; bring all "
+    "of the chart into the frame, and uncover it"
 )
 
 _Array = npt.NDArray[np.float64]

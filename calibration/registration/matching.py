@@ -224,7 +224,7 @@ class Matcher:
 
     def _rectified(self, raster: Raster) -> tuple[_Float, _Mask]:
         """Return the frame as seen on the print's raster, (H, W, 3) float32, and where it exists, (H, W) bool."""
-        places = raster.spread(self.to_pixels)
+        places = raster.element_places(self.to_pixels)
         image = np.empty((*raster.shape, 3), dtype=np.float32)
         for channel, plane in enumerate(self._planes):
             image[..., channel] = cv2.remap(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from calibration.registration.lens import fit_lens
@@ -30,7 +31,7 @@ LINES = {
 
 
 @pytest.mark.parametrize("line", LINES.values(), ids=LINES)
-def test_marks_on_one_line_are_refused(line: tuple[np.ndarray, np.ndarray]) -> None:
+def test_marks_on_one_line_are_refused(line: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]) -> None:
     points = np.stack(line, axis=-1)
     # Seen by a camera, the line's places are off it by the error of a measured corner.
     places = 2 * points + (50, 80) + np.random.default_rng(1).normal(0, 0.1, points.shape)
@@ -42,7 +43,7 @@ def test_marks_on_one_line_are_refused(line: tuple[np.ndarray, np.ndarray]) -> N
 
 def test_two_small_tags_at_the_ends_of_a_sheet_are_not_on_one_line() -> None:
     square = np.array([(0, 0), (6, 0), (6, 6), (0, 6)], dtype=np.float64)
-    points = np.concatenate([square + (10, 10), square + (1170, 825)])
+    points = np.concatenate([square + np.array([10, 10]), square + np.array([1170, 825])])
     places = 2 * points + (50, 80)
     lens, residual = fit_lens(points, places, (2601, 1733))
     assert np.abs(residual).max() < 0.02
