@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.margins import GAP_PX
-from acquisition.chart.model import PAPER_WHITE, TAG_MODULES, Chart, Reference, Tag
+from acquisition.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, Reference, Tag
 from acquisition.chart.pixels import DESIGN_DPI, PX_MM
 from foundation.errors import InputError
 from foundation.version import software
@@ -42,7 +42,6 @@ SLOT_STEP_PX = 5
 LEAST_SLOT_PX = 25
 """A cell of 1.06 mm, a module of 0.42 mm: below, a printer's dots are too few to mix a colour."""
 
-TAG_FAMILY = "36h11"
 TAG_SLOTS = 4
 """Slots along a tag with its white rim: its ten modules are then 2/5 of a slot, whole pixels at 600 dpi."""
 

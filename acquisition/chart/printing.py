@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.margins import margin_marks
-from acquisition.chart.model import PAPER_WHITE, TAG_MODULES, Chart, Tag
+from acquisition.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, Tag
 from acquisition.chart.pixels import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, whole_px
 from foundation.errors import InputError
 from foundation.files import whole_file, write_whole
@@ -166,12 +166,12 @@ def tag_modules(tag: Tag) -> npt.NDArray[np.bool_]:
     """
     import cv2
 
-    if tag.family != "36h11":
-        raise InputError(f"tag {tag.id} is of family {tag.family}; only 36h11 can be printed")
+    if tag.family != TAG_FAMILY:
+        raise InputError(f"tag {tag.id} is of family {tag.family}; only {TAG_FAMILY} can be printed")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     if not 0 <= tag.id < len(dictionary.bytesList):
         raise InputError(
-            f"tag {tag.id} does not exist; family 36h11 has the numbers 0 to {len(dictionary.bytesList) - 1}"
+            f"tag {tag.id} does not exist; family {TAG_FAMILY} has the numbers 0 to {len(dictionary.bytesList) - 1}"
         )
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, tag.id, TAG_MODULES)) > 127
 

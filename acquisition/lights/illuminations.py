@@ -25,6 +25,8 @@ from foundation.srgb import encode_srgb
 
 Kind = Literal["uniform", "blackbody"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")
+"""Columns of `illuminations.csv` (docs/formats.md)."""
+
 GRID = 35
 """Steps along an edge of the chromaticity triangle: 666 points, which with 41 black bodies are the paper's 707."""
 
@@ -43,6 +45,11 @@ class Illumination:
     kind: Kind
     cct_k: float | None
     colour: Colour
+
+    @property
+    def codes(self) -> tuple[int, int, int]:
+        """Codes of red, green and blue that the projector shows, 0 … 255."""
+        return self.colour.red, self.colour.green, self.colour.blue
 
 
 def shown_colour(linear: npt.ArrayLike) -> Colour:
@@ -101,7 +108,7 @@ def illuminations_to_csv(illuminations: Sequence[Illumination]) -> str:
     for light in illuminations:
         # Whole kelvin without a point, anything else with all its digits.
         cct = "" if light.cct_k is None else repr(light.cct_k).removesuffix(".0")
-        writer.writerow([light.index, light.kind, cct, light.colour.red, light.colour.green, light.colour.blue])
+        writer.writerow([light.index, light.kind, cct, *light.codes])
     return text.getvalue()
 
 

@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import CHANNELS, Channel, frame_black, phases
+from acquisition.framing.planes import Channel, frame_black, strongest_channel
 from acquisition.session.folder import Session
 from acquisition.session.journal import FrameRecord
 from calibration.radiometry.primaries import pure_lights
@@ -32,9 +32,6 @@ from foundation.hashing import file_sha256
 _Array = npt.NDArray[np.float64]
 ReportProgress = Callable[[int, int, str], None]
 """Called with frames done, frames in all, and what is being done."""
-
-_PAPER_PERCENTILE = 98
-"""Bare paper is more than a fiftieth of a picture, and hot photosites and highlights are less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +138,7 @@ def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> Fra
     def brightness(record: FrameRecord) -> int:
         if record.illumination is None or record.illumination >= len(session.illuminations):
             return -1
-        colour = session.illuminations[record.illumination].colour
-        return min(colour.red, colour.green, colour.blue)
+        return min(session.illuminations[record.illumination].codes)
 
     return max((record for record in accepted if record.kind == "light"), key=brightness)
 
@@ -174,16 +170,6 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
     mosaic = decode_raw(data, path)
     black = frame_black(mosaic)
     return DecodedFrame(record, mosaic, black, strongest_channel(mosaic, black), saturation(mosaic))
-
-
-def strongest_channel(mosaic: Mosaic, black: _Array) -> Channel:
-    """Return the channel with the brightest paper, from every sixteenth block; `black` (2, 2) float64 counts."""
-    blocks = mosaic.block_planes()[:, :, ::16, ::16]
-    levels = [
-        max(float(np.percentile(blocks[place], _PAPER_PERCENTILE) - black[place]) for place in places)
-        for places in phases(mosaic).values()
-    ]
-    return CHANNELS[int(np.argmax(levels))]
 
 
 def session_sha256(records: Sequence[FrameRecord]) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, sparse
 
-from acquisition.chart.model import Chart
+from acquisition.chart.model import PAPER_WHITE, Chart
 from acquisition.framing.homography import rms
 from acquisition.framing.planes import Plane
 from calibration.registration.block_search import find_blocks
@@ -196,7 +196,7 @@ class Matcher:
 
     def _paper(self) -> _Array:
         """Return camera RGB (3,) of bare paper under even light."""
-        return self.colours.flat(np.array([[255, 255, 255]]))[0]
+        return self.colours.flat(np.array([PAPER_WHITE]))[0]
 
     def _fit_colours(self) -> ColourModel:
         seen = self._seen()

@@ -56,7 +56,7 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
 def _pictures(figures: TableFigures, session: Session) -> list[Picture]:
     chart, registration, window = session.chart, figures.registration, figures.cells.window
     frame = half_size(read_raw(session.folder / figures.session.registered_file))
-    codes = np.array([[light.colour.red, light.colour.green, light.colour.blue] for light in session.illuminations])
+    codes = np.array([light.codes for light in session.illuminations])
     black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
     seen = f"seen by the {figures.session.camera}"
     return [
