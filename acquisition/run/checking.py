@@ -65,7 +65,7 @@ def check_lab(
     lights = load_illuminations(settings.illuminations)
     lines = [f"lights      {len(lights)} in {settings.illuminations.name}"]
     with open_rig(settings, chart) as devices, tempfile.TemporaryDirectory() as scratch:
-        lines += _meet(devices, settings, announce)
+        lines += _make_devices_ready(devices, settings, announce)
         offered = devices.camera.shutter_speeds()
         shown: list[tuple[FrameKind, Colour]] = [("dark", BLACK), ("white", WHITE)]
         mosaics: dict[FrameKind, Mosaic] = {
@@ -93,7 +93,7 @@ def check_lab(
     return CheckReport(tuple(lines), tuple(faults))
 
 
-def _meet(devices: Devices, settings: LabSettings, announce: Callable[[str], None]) -> list[str]:
+def _make_devices_ready(devices: Devices, settings: LabSettings, announce: Callable[[str], None]) -> list[str]:
     """Make every device ready for a frame; return a line about each."""
     body = devices.camera.identity()
     name = body.model if body.model.startswith(body.maker.split()[0]) else f"{body.maker} {body.model}"
@@ -109,9 +109,9 @@ def _meet(devices: Devices, settings: LabSettings, announce: Callable[[str], Non
             lambda: keep_awake(devices.camera),
             lambda what, sentence: announce(f"{what}: {sentence}"),
         )
-        beamer = devices.projector.identity()
+        identity = devices.projector.identity()
         hours = ", ".join(f"{lamp.hours} h" for lamp in devices.projector.lamps()) or "no lamp"
-        lines.append(f"projector   {beamer.maker} {beamer.model} {beamer.name}, {hours}")
+        lines.append(f"projector   {identity.maker} {identity.model} {identity.name}, {hours}")
     return lines
 
 

@@ -204,7 +204,7 @@ def _of_neighbourhoods(log_ratios: _Array, near: npt.NDArray[np.intp]) -> tuple[
     """Return the mean (C, 3) over each neighbourhood and its standard error; NaN where too few cells are known."""
     there = np.isfinite(log_ratios)
     spread = _usual(log_ratios)
-    # A single cell may be far off; in a neighbourhood it weighs no more than four usual log_ratios beyond the median.
+    # A single cell may be far off; in a neighbourhood it weighs no more than four usual deviations beyond the median.
     values = log_ratios[near]
     with np.errstate(invalid="ignore"):
         known = there[near]

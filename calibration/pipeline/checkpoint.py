@@ -30,6 +30,7 @@ from foundation.files import partial_path, publish_folder, require_free, storage
 from foundation.held_folders import LOCK_FILE, held_folder
 
 CHECKPOINT = "checkpoint.npz"
+"""Name of the checkpoint in the hidden folder."""
 
 _TEXT = "text"
 """Name of the array that holds all that is no array, as JSON."""

@@ -39,7 +39,6 @@ _PAPER_WORTH = 10.0
 _ROUNDS = 5
 """Reweighted solutions in a row; Huber's weights, squared, have settled by then."""
 
-
 _Array = npt.NDArray[np.float64]
 
 

@@ -4,7 +4,7 @@ Laws that hold inside:
 
 - The projector's leak and ambient light cannot be separated and are one figure, read on bare paper.
 - They are part of every light: samples and ground truth contain them alike, so nothing is subtracted unless the user
-  wishes it (`calibration.radiometry.dark_subtraction`).
+  asks for it (`calibration.radiometry.dark_subtraction`).
 - A photosite is hot when it is an outlier in every dark frame; an outlier in a single one is a cosmic ray.
 """
 
@@ -85,7 +85,7 @@ class DarkFrameFigures:
     noise: _Array
 
     def to_json(self) -> dict[str, Any]:
-        """Return the figures as JSON holds them; `from_json` makes them again to the last bit."""
+        """Return the figures as JSON can hold them; `from_json` restores them to the last bit."""
         return {name: getattr(self, name).tolist() for name in ("black", "light", "error", "noise")}
 
     @staticmethod

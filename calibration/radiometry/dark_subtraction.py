@@ -10,7 +10,8 @@ Why so: `docs/decisions/0009-dark-light-is-predicted.md`.
 Laws that hold inside:
 
 - A frame's dark light is that of the last dark frame taken before it, or of the first, for frames before that.
-- The estimate after a dark frame depends on those before it alone, so that a table may grow.
+- The estimate after a dark frame depends on those before it alone, so that a build that was stopped goes on to the same
+  bits.
 """
 
 from __future__ import annotations

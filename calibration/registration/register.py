@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from acquisition.chart.model import Chart
 from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.homography import rms
-from acquisition.framing.outline import refined
+from acquisition.framing.outline import refine_edges
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
 from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
 from acquisition.framing.tagless_field import FoundField
@@ -162,7 +162,7 @@ def _outline(field: FoundField) -> Anchors:
 
 def _clear_edges(field: FoundField, planes: list[Plane], blur: float) -> FoundField:
     """Return the field with its outline measured finely, where it is clear enough for that."""
-    places, clear = refined(planes, field.outline_px, field.normals, blur)
+    places, clear = refine_edges(planes, field.outline_px, field.normals, blur)
     return replace(field, outline_mm=field.outline_mm[clear], outline_px=places[clear], normals=field.normals[clear])
 
 
