@@ -130,9 +130,14 @@ def _exposure_line(white: Mosaic, settings: LabSettings, offered_s: tuple[float,
     if settings.rig == "replay":
         # A recording cannot be exposed anew.
         return line
-    period = light_period_s(settings.lab.projector)
-    advice = exposure_advice(exposure.level, settings.camera.shutter_s, offered_s, period)
+    advice = exposure_advice(exposure.level, settings.camera.shutter_s, offered_s, _light_period_s(settings))
     return f"{line}; {advice}" if advice else line
+
+
+def _light_period_s(settings: LabSettings) -> float:
+    """Return the seconds after which the light repeats: that of the simulated room's wheel where it has one."""
+    wheel_hz = float(settings.simulated.room.get("wheel_hz", 0)) if settings.rig == "simulated" else 0.0
+    return 1 / wheel_hz if wheel_hz else light_period_s(settings.lab.projector)
 
 
 def _framing_lines(framing: Framing, blur: float) -> list[str]:

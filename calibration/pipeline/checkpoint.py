@@ -139,7 +139,8 @@ def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
     """
     require_free(out, "the table")
     folder = partial_path(out)
-    with held_folder(folder, f"{out} is being made by another program; wait for it, or name another place"):
+    busy = f"{out} is being made by another program; wait for it, or name another place"
+    with held_folder(folder, busy, of=out):
         unfinished = UnfinishedTable(folder, out)
         try:
             yield unfinished

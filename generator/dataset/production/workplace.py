@@ -179,7 +179,7 @@ def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Genera
     folder = partial_path(path).absolute()
     busy = f"{path} is being made by another program; wait for it, or name another place"
     planned = None if alone else (folder / "plan" / PLAN).is_file
-    with held_folder(folder, busy, share_if=planned) as lock:
+    with held_folder(folder, busy, share_if=planned, of=path) as lock:
         notes = LocalStore(folder / "plan")
         plan_id = _plan_id(identity)
         place = Workplace(LocalStore(folder / f"dataset-{plan_id}"), notes, str(path), plan_id)
