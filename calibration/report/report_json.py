@@ -15,6 +15,7 @@ from calibration.verdict.values import judged_values
 
 FORMAT = "crop.report"
 VERSION = 1
+"""The only version so far."""
 
 _Array = npt.NDArray[np.float64]
 

@@ -25,8 +25,11 @@ from foundation.clock import Clock
 from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 
 BAUD = 38400
+"""One of the speeds that the menu offers, 4800 to 115200; set it so."""
 TCP_PORT = 7142
+"""Where a projector on a network takes the same frames (as other drivers have it)."""
 _HEADER = 5
+"""Bytes before the data: kind, code, two numbers, length."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ _ERROR_BITS: Mapping[tuple[int, int], tuple[str, Severity]] = {
     (3, 2): ("temperature", Severity.WARNING),
 }
 _ERRORS_LENGTH = 12
+"""Bytes of data in the answer to 009, error status."""
 
 
 def checksum(data: bytes) -> int:

@@ -195,6 +195,7 @@ _COMMON_WHITE = (
 )
 _STYLES = (0x81, 0x82, 0x83, 0x84, 0x85, 0x86, 0x21, 0x22, 0x23)
 _BULB = 0x0C
+"""Code of the shutter time that has no number: B."""
 
 _CHOICES_550D = _Choices(
     model_id=0x80000270,
