@@ -25,6 +25,7 @@ from foundation.errors import InputError, ProtocolError
 TOLERANCE = 0.01
 """How far, of one, a wanted value may lie from a nominal one; neighbouring nominal values are 5 % apart or more."""
 _HIGHEST_CODE = 0xFF
+"""Codes are one byte: the law of stops has no meaning beyond."""
 
 
 @dataclass(frozen=True)

@@ -41,15 +41,25 @@ KEEP_ALIVE_S = 10.0
 SETTLE_LIMIT_S = 5.0
 """How long a body may take to report a value that it was given, or room for a frame."""
 RELEASE_TRIES = 5
+"""Presses in all, spread over `PASSING_LIMIT_S`: what keeps a body busy ends by itself or by what is fetched
+between."""
 CAPTURE_TIMEOUT_S = 100.0
 """Wait for the answer to a release; some bodies expose before they answer."""
 
 _REMOTE_ON, _REMOTE_OFF = 1, 0
+"""Parameter of SetRemoteMode, as the recorded conversations and libgphoto2 send it."""
 _WITHOUT_AF = 1
+"""Second parameter of RemoteReleaseOn: a release without autofocus."""
 _HOST_CLUSTERS, _HOST_CLUSTER_BYTES = 0x04FFFFFF, 0x1000
+"""Room announced to the body: so many clusters of so many bytes, 320 GiB, more than a session takes."""
 _PAUSES_S = (0.05, 0.1, 0.15, 0.2)
+"""Pauses between questions to the body, seconds; short at first, for most answers come at once (as libgphoto2
+waits)."""
 _PIECE_TRIES = 5
+"""Requests of one piece in all, with the longest pause between: a second for a fault that passes, then the frame is
+retaken."""
 _FREE_TRIES = 3
+"""Few, as the next `make_ready` tries again."""
 _LASTING = (ResponseCode.INVALID_OBJECT_HANDLE, ResponseCode.SESSION_NOT_OPEN, ResponseCode.DEVICE_BUSY)
 """Responses to a request for a piece that asking again does not change."""
 _RELEASE_RESULTS = {

@@ -51,6 +51,7 @@ _NOT_RAW = (ObjectFormat.EXIF_JPEG, ObjectFormat.JFIF, ObjectFormat.MOV, ObjectF
 _NOT_RAW_SUFFIXES = (".jpg", ".jpeg", ".hif", ".mov", ".mp4")
 _SILENT_OR_PLAIN = (DriveMode.SINGLE, DriveMode.SINGLE_SILENT)
 _BATTERY_LOW = 0
+"""Of EOS_BATTERY_POWER: 0 is low, as libgphoto2 reads it."""
 
 
 @dataclass(frozen=True)

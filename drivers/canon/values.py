@@ -19,8 +19,9 @@ from drivers.ptp.cursor import Cursor
 from drivers.ptp.datasets import MAX_DATASET, encode_integer
 
 _RAW: Final = 6
+"""Kind of a raw file, see `ImageFile`."""
 _LOSSLESS: Final = 4
-"""Kind and compression of a raw file, see `ImageFile`."""
+"""Compression of a raw file, see `ImageFile`."""
 
 _JPEG_SIZES: Final = {0: "L", 1: "M", 2: "S", 5: "M1", 6: "M2", 14: "S1", 15: "S2", 16: "S3"}
 

@@ -29,12 +29,15 @@ from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
 PORT = 20554
+"""TCP port of the external control (JVC external control specification)."""
 TIMEOUT_S = 5.0
+"""As long as the projector itself waits for PJREQ."""
 GREETING, REQUEST, ACCEPTED, BUSY, REFUSED = b"PJ_OK", b"PJREQ", b"PJACK", b"PJ_NG", b"PJNAK"
 UNIT = b"\x89\x01"
 FLAT_FIELD = b"SSTP02"
 LEVELS = {"red": b"SSFR", "green": b"SSFG", "blue": b"SSFB"}
 MAX_COMMAND = 64
+"""Bytes read at once; more than a greeting or an answer has, which are 5 and 6."""
 
 _OPERATION, _ACKNOWLEDGED, _END = b"!", b"\x06", b"\n"
 _SYSTEM_CLOCK = SystemClock()

@@ -42,14 +42,18 @@ if TYPE_CHECKING:
     from usb.backend import IBackend
 
 VENDOR = 0x0451
+"""USB vendor number of Texas Instruments."""
 PRODUCTS = {"DLPC350": 0x6401, "DLPC900": 0xC900}
 """USB product numbers by controller."""
 TIMEOUT_S = 2.0
+"""For one report: chosen long beside what 64 bytes take on USB; not tried on hardware."""
 SWITCHING_S = 3.0
 """How long the controller may take to change its mode; DLPC900 takes about 0.3 s."""
 
 _LOOK_AGAIN_S = 0.05
+"""Between questions whether a mode has been taken: some six of them in the 0.3 s that it takes."""
 _STALE_REPLIES = 8
+"""Replies to earlier questions that are skipped; more than a lost exchange leaves, and an end to reading."""
 _SETTLED = (
     # What is set, to what, and which bits of the answer say so (the rest means other things).
     (LightCrafterCommand.TEST_PATTERN, PATTERN_SOLID, 0x0F),

@@ -22,12 +22,15 @@ import numpy.typing as npt
 from foundation.errors import DeviceError
 
 _Z_PIXMAP = 2
+"""Format of GetImage: whole pixels one after the other (X protocol, GetImage; XYPixmap is 1)."""
 _ALL_PLANES = 0xFFFFFFFF
+"""Plane mask of GetImage: every bit of a pixel."""
 _REPLY_PRESENT = 8
 """Offset of `present` in a QueryExtension reply."""
 _REPLY_ATOM = 8
 """Offset of `atom` in an InternAtom reply."""
 _ANY_TYPE = 0
+"""AnyPropertyType of GetProperty: the value is wanted whatever its type."""
 
 
 _lost: set[int] = set()

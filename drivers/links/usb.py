@@ -34,12 +34,14 @@ UDEV_RULE = "70-crop-cameras.rules"
 """The file in `drivers/data` that lets users of a Linux machine open cameras."""
 
 _CLASS_OUT: Final = 0x21
+"""bmRequestType of requests of the class to the interface (USB 2.0, 9.3)."""
 _CLASS_IN: Final = 0xA1
-"""bmRequestType of requests of the class to the interface, and from it (USB 2.0, 9.3)."""
+"""bmRequestType of requests of the class from the interface."""
 
 _BULK: Final = 2
+"""Transfer type in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
 _INTERRUPT: Final = 3
-"""Transfer types in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
+"""Transfer type, as above."""
 
 _MAX_POLLING_S: Final = 0.05
 """Longest interval that is believed: a wrong descriptor must not slow the events down to seconds."""

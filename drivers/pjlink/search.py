@@ -25,6 +25,7 @@ from foundation.errors import LinkTimeout
 ASKED = 3
 """A datagram may be lost, so the search is sent so often, a second apart; a projector may answer each."""
 ASK_EVERY_S = 1.0
+"""Far enough apart that one disturbance of the network does not swallow two."""
 
 _SYSTEM_CLOCK = SystemClock()
 

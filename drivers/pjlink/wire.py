@@ -24,11 +24,13 @@ from drivers.projector import Fault, Lamp, Power, Severity
 from foundation.errors import ProtocolError
 
 PORT = 4352
+"""TCP and UDP port of PJLink (PJLink Specifications 1.04 and 2.00)."""
 MAX_LINE = 136
 """Bytes of a command or reply, its CR included."""
 MAX_DIGEST = 96
 """Characters before the first command: 32 with MD5, 32 of random number and 64 of digest with SHA-256."""
 MAX_PASSWORD = 32
+"""Characters of a password (PJLink Specifications 1.04, authentication)."""
 IDLE_LIMIT_S = 30.0
 """Projectors hang up after about this long without a command."""
 

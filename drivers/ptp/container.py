@@ -27,6 +27,7 @@ from drivers.ptp.messages import MAX_PARAMETERS, PtpEvent, PtpRequest, PtpRespon
 from foundation.errors import ProtocolError
 
 HEADER_LENGTH = 12
+"""Bytes of length, type, code and transaction (clause 7)."""
 UNKNOWN_LENGTH = 0xFFFFFFFF
 """A container's length where the payload goes on until a short packet: more than 4 GiB, or not known."""
 HIGH_SPEED_PACKET = 512
@@ -237,6 +238,7 @@ class ControlRequest(IntEnum):
 
 
 _CANCELLATION = 0x4001
+"""Cancellation code in the data of a CANCEL request (clause 5)."""
 MAX_DEVICE_STATUS = 0x14
 """Bytes that GET_DEVICE_STATUS is asked for: a header of 4, and parameters that name stalled pipes."""
 

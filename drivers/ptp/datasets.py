@@ -32,6 +32,7 @@ Value = int | str | tuple[int, ...]
 """A property's value: an integer, a string, or an array of integers."""
 
 _ARRAY = 0x4000
+"""Bit that makes an array of a type of integers (ISO 15740, table of data type codes)."""
 _INTEGERS: dict[int, tuple[int, bool]] = {
     DataType.INT8: (1, True),
     DataType.UINT8: (1, False),

@@ -28,15 +28,19 @@ from drivers.ptp.messages import MAX_PARAMETERS, PtpEvent, PtpRequest, PtpRespon
 from foundation.errors import ProtocolError
 
 PORT = 15740
+"""TCP port of PTP-IP (CIPA DC-005-2005)."""
 VERSION = 0x00010000
 """PTP/IP 1.0."""
 HEADER_LENGTH = 8
+"""Bytes of length and type."""
 MAX_PACKET = 4096
 """Bytes of the longest packet that is no data; the longest real one carries a name of 40 characters."""
 MAX_NAME_UNITS = 255
 """UTF-16 units of the longest name; the standard allows 39."""
 UNKNOWN_TOTAL = 0xFFFFFFFFFFFFFFFF
+"""Total length of a data phase whose sender does not know it yet."""
 GUID_LENGTH = 16
+"""Bytes of a GUID."""
 
 
 class PacketType(IntEnum):
@@ -172,7 +176,9 @@ Packet = (
 
 _DATA_TYPES = (PacketType.DATA, PacketType.END_DATA)
 _NO_DATA_OR_IN = 1
+"""Data phase information of an operation without data, or whose data come to the initiator."""
 _DATA_OUT = 2
+"""Data phase information of an operation whose data go to the responder."""
 
 
 def encode(packet: Packet) -> bytes:

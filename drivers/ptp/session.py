@@ -34,8 +34,11 @@ PASSING = (ResponseCode.DEVICE_BUSY, ResponseCode.EOS_OBJECT_NOT_READY, Response
 """Responses that mean: not now."""
 
 _FIRST_PAUSE_S = 0.05
+"""Before the first repetition: short to an operator, long beside the milliseconds of an operation."""
 _LONGEST_PAUSE_S = 1.0
+"""Pauses double up to here, so that a device that is free again waits for a second at most."""
 _LAST_SESSION = 8
+"""Session numbers tried where a device declines the transaction number, as libgphoto2 does; a few, then no more."""
 
 
 class OperationDeclined(DeviceRefused):

@@ -40,11 +40,17 @@ MAX_EVENTS = 4096
 """Events returned at once from a device that never stops raising them."""
 
 _CONTROL_S = 1.0
+"""For a control request, which a device answers in milliseconds if at all."""
 _READY_TRIES = 40
+"""Two seconds in all for a device to be ready after a cancellation or reset."""
 _READY_EVERY_S = 0.05
+"""Between two questions for the status: little beside what a reset takes."""
 _DRAIN_S = 0.05
+"""A device that has been silent for so long has sent all that it had."""
 _DRAIN_READS = 256
+"""Pieces thrown away, 128 MiB at most: more than a raw frame, and an end to a device that never stops."""
 _EMPTY_READS = 16
+"""Empty packets in a row that are skipped: one may follow a full packet, so many mean a fault."""
 
 
 class UsbTransport:

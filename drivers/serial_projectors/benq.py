@@ -33,7 +33,9 @@ from foundation.clock import Clock
 from foundation.errors import DeviceRefused, ProtocolError
 
 BAUD = 115200
+"""The highest of the speeds that the menu offers, 2400 to 115200 (RS232 Command Control)."""
 TCP_PORT = 8000
+"""Where a projector on a network takes the same text (not confirmed by a manual)."""
 PROMPT = b">"
 QUERY = "?"
 ILLEGAL = "Illegal format"

@@ -24,13 +24,16 @@ from foundation.clock import Clock
 from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
 
 BAUD = 9600
+"""With 8 data bits, no parity, 1 stop bit (ESC/VP21)."""
 TCP_PORT = 3629
+"""Port of ESC/VP.net (not confirmed by a manual: as other drivers have it)."""
 SWITCHING_LIMIT_S = 130.0
 """Three attempts to strike the lamp, and the time for which an abnormal state lasts."""
 
 HELLO = b"ESC/VP.net\x10\x03\x00\x00\x00\x00"
 """What opens a connection over TCP: name, version 1.0, the request to connect, no password."""
 WELCOME = 0x20
+"""State in the answer to `HELLO`: connected."""
 _HELLO_STATES = {
     0x40: "a bad request",
     0x41: "a password is wanted; switch the password for network control off in its menu",

@@ -25,8 +25,11 @@ from foundation.clock import Clock
 from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 
 BAUD = 38400
+"""One of the speeds that the menu offers, 4800 to 115200; set it so."""
 TCP_PORT = 7142
+"""Where a projector on a network takes the same frames (as other drivers have it)."""
 _HEADER = 5
+"""Bytes before the data: kind, code, two numbers, length."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +64,11 @@ MODEL = NecCommand(0, 0x85, b"\x04")
 INFORMATION = NecCommand(3, 0x8A)
 
 UNKNOWN_COMMAND = (0, 0)
+"""The two bytes with which a command is refused (table of error codes)."""
 POWER_IS_OFF = (2, 0x0D)
+"""Not possible in standby (same table)."""
 EXECUTION_FAILED = (2, 0x0E)
+"""Not confirmed by a manual."""
 _FAILURES = {
     (0, 0): "it does not know this command",
     (0, 1): "its model cannot do this",
@@ -91,6 +97,7 @@ _ERROR_BITS: Mapping[tuple[int, int], tuple[str, Severity]] = {
     (3, 2): ("temperature", Severity.WARNING),
 }
 _ERRORS_LENGTH = 12
+"""Bytes of data in the answer to 009, error status."""
 
 
 def checksum(data: bytes) -> int:

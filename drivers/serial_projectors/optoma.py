@@ -25,9 +25,11 @@ from foundation.clock import Clock
 from foundation.errors import DeviceRefused, ProtocolError
 
 BAUD = 9600
+"""With 8 data bits, no parity, 1 stop bit (RS232 Protocol Function List)."""
 EVERYBODY = 0
 """The number that every projector listens to."""
 
+# Numbers of commands and questions, as the RS232 Protocol Function List has them; 355 is not confirmed by it.
 POWER = 0
 AV_MUTE = 2
 LAMP_HOURS = 108

@@ -49,6 +49,7 @@ _LETTERS: Final = {
 }
 _HEADER: Final = struct.pack("<2sHI", b"II", 42, 8)
 _ALIGNMENT: Final = 16
+"""Bytes on whose multiple the pixels begin, so that samples of any type are aligned."""
 
 
 def text(value: str) -> Value:

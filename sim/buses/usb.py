@@ -37,6 +37,7 @@ _ERRORS = {
     errno.EPIPE: (-9, "Pipe error"),
 }
 _HIGH_SPEED = 3
+"""LIBUSB_SPEED_HIGH, 480 Mbit/s, as the real bodies."""
 _DEVICE_FIELDS = (
     "bLength",
     "bDescriptorType",

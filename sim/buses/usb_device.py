@@ -41,14 +41,20 @@ from sim.buses.responder import NoAnswer, Responder
 
 PACKET = HIGH_SPEED_PACKET
 INTERRUPT_PACKET = 8
+"""wMaxPacketSize of the interrupt pipe: an EOS splits its events over packets of 8 bytes."""
 BULK_IN = 0x81
+"""Endpoint address of a real EOS; bit 7 is the direction, to the host (USB 2.0, 9.6.6)."""
 BULK_OUT = 0x02
+"""Endpoint address of a real EOS."""
 INTERRUPT_IN = 0x83
-"""The endpoints' addresses, those of a real EOS."""
+"""Endpoint address of a real EOS; bit 7 as in `BULK_IN`."""
 
 _BULK, _INTERRUPT = 2, 3
+"""Transfer types in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
 _DEVICE, _CONFIGURATION, _STRING = 1, 2, 3
+"""Types of descriptors (USB 2.0, 9.4, table 9-5)."""
 _LANGUAGE_ENGLISH = 0x0409
+"""The one language of the string descriptors: LANGID of English, United States (USB 2.0, 9.6.7)."""
 
 
 class Stalled(Exception):

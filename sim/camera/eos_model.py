@@ -203,7 +203,9 @@ def custom_functions(group: int, functions: Mapping[int, int]) -> bytes:
 
 
 FOCUS_POINTS = 9
+"""As the 60D has them, in a cross."""
 FOCUS_CENTRE = 4
+"""Number of the one in the middle, of 0 to 8."""
 
 
 def focus_points(found: Iterable[int]) -> bytes:

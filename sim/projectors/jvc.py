@@ -17,6 +17,7 @@ from foundation.errors import LinkTimeout, ProtocolError
 from sim.projectors.screen import Screen
 
 _PATIENCE_S = 5.0
+"""For one read or write; a silent client is listened to again."""
 _CHANNELS = {text: channel for channel, text in jvc.LEVELS.items()}
 
 

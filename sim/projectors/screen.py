@@ -9,6 +9,7 @@ from foundation.clock import Clock
 from foundation.errors import DeviceError
 
 REFRESH_S = 1 / 60
+"""60 Hz, the usual picture rate."""
 
 
 @dataclass
