@@ -102,8 +102,8 @@ def find_chart(
     what
         The frame's name for messages.
     corners
-        (4, 2) half-size px, corners of the field of cells, clockwise from the printed top-left, for a chart without
-        tags; found automatically if not given.
+        (4, 2) float half-size px, corners of the field of cells, clockwise from the printed top-left, for a chart
+        without tags; found automatically if not given.
     near
         The framing of another frame of the session: a chart without tags then has the same orientation.
 

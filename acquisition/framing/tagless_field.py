@@ -98,10 +98,10 @@ def find_field(
     what
         The frame's name for messages.
     corners_px
-        (4, 2) half-size px, the field's corners if they are given by hand, clockwise from the printed top-left, to some
-        20 px; their order gives the orientation of the chart.
+        (4, 2) float half-size px, the field's corners if they are given by hand, clockwise from the printed top-left,
+        to some 20 px; their order gives the orientation of the chart.
     near_px
-        (4, 2) half-size px, the field's corners in another frame of the session, in the same order: they give the
+        (4, 2) float half-size px, the field's corners in another frame of the session, in the same order: they give the
         orientation, and the field may lie elsewhere.
 
     Raises

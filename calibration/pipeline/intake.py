@@ -86,7 +86,10 @@ class TakenIn:
         }
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return what a checkpoint stores as arrays."""
+        """Return what a checkpoint stores as arrays, (C, S, 3) float32 `even_sum` and others by name.
+
+        The rest stands at `CellStatistics.to_arrays` and `DarkLightEstimator.to_arrays`.
+        """
         return {**self.statistics.to_arrays(), **self.subtraction.to_arrays()}
 
 
@@ -135,7 +138,7 @@ class Intake:
         Parameters
         ----------
         stored, arrays
-            What `TakenIn.to_json` and `to_arrays` returned.
+            What `TakenIn.to_json` and `to_arrays` returned; each array has the same shape and dtype as there.
         begin
             What `before_all_frames` returned.
         """

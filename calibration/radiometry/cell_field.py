@@ -57,7 +57,7 @@ def field_of_cells(
     Parameters
     ----------
     rgb
-        (C, 3) printed codes, 0 … 255.
+        (C, 3) int printed codes, 0 … 255.
     cells_mm
         (C, 2) float64 mm, the cells' centres.
     level

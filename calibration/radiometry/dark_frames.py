@@ -175,7 +175,7 @@ class HotPixels:
         return {"dark_least": self._least, "dark_past": self._past}
 
     def restore(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `to_arrays` returned."""
+        """Go on from what `to_arrays` returned: int16 (C, S, 3) and float64 (C,) arrays by name."""
         self._least, self._past = arrays["dark_least"].copy(), arrays["dark_past"]
 
 

@@ -100,8 +100,8 @@ def register(
     what
         The frame's name for messages.
     corners
-        For a chart without tags: (4, 2) half-size px, the corners of the field of cells, clockwise from the printed
-        top-left, to some 20 px; found by themselves if not given.
+        For a chart without tags: (4, 2) float half-size px, the corners of the field of cells, clockwise from the
+        printed top-left, to some 20 px; found by themselves if not given.
     near
         An earlier registration of the same session: a chart without tags is then taken to hang the same way up.
 

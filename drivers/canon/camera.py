@@ -41,6 +41,8 @@ _SYSTEM_CLOCK = SystemClock()
 _CERTAIN_SHARE = 0.9
 """Share of the nominal shutter time that passes at least: 1/6 s is really 0.149 s."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 5.0
+"""Pauses between attempts to find the camera again, doubled from one to the other: soon for a cable put back, seldom
+enough that a body which starts is left alone."""
 _STUCK = (
     *PASSING,
     ResponseCode.UNDEFINED,

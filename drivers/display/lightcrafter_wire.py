@@ -24,6 +24,7 @@ FULL = 1023
 """The highest of the 10-bit codes of the test pattern."""
 
 _READ, _REPLY, _ERROR = 0x80, 0x40, 0x20
+"""Bits of the flags of a report: it reads, it is answered or is an answer, it is refused (same sources)."""
 
 
 class LightCrafterCommand(IntEnum):

@@ -38,7 +38,7 @@ _FIRST_PAUSE_S = 0.05
 _LONGEST_PAUSE_S = 1.0
 """Pauses double up to here, so that a device that is free again waits for a second at most."""
 _LAST_SESSION = 8
-"""Session numbers tried where a device declines the transaction number, as libgphoto2 does; a few, then it is refused."""
+"""Session numbers tried where a device declines the transaction number, as libgphoto2 does; a few, then no more."""
 
 
 class OperationDeclined(DeviceRefused):

@@ -64,8 +64,11 @@ MODEL = NecCommand(0, 0x85, b"\x04")
 INFORMATION = NecCommand(3, 0x8A)
 
 UNKNOWN_COMMAND = (0, 0)
+"""The two bytes with which a command is refused (table of error codes)."""
 POWER_IS_OFF = (2, 0x0D)
+"""Not possible in standby (same table)."""
 EXECUTION_FAILED = (2, 0x0E)
+"""Not confirmed by a manual."""
 _FAILURES = {
     (0, 0): "it does not know this command",
     (0, 1): "its model cannot do this",

@@ -50,7 +50,9 @@ INTERRUPT_IN = 0x83
 """Endpoint address of a real EOS; bit 7 as in `BULK_IN`."""
 
 _BULK, _INTERRUPT = 2, 3
+"""Transfer types in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
 _DEVICE, _CONFIGURATION, _STRING = 1, 2, 3
+"""Types of descriptors (USB 2.0, 9.4, table 9-5)."""
 _LANGUAGE_ENGLISH = 0x0409
 """The one language of the string descriptors: LANGID of English, United States (USB 2.0, 9.6.7)."""
 

@@ -33,6 +33,7 @@ ZERO_PACKET = 0x0040
 MAX_TRANSFER = 64 * 1024 * 1024
 """Bytes of the longest transfer that is taken."""
 
+# Codes of the operations before a device is imported, and of the messages after (usb/usbip_protocol).
 _LIST, _IMPORT = 0x8005, 0x8003
 _LIST_REPLY, _IMPORT_REPLY = 0x0005, 0x0003
 _SUBMIT, _UNLINK, _SUBMITTED, _UNLINKED = 1, 2, 3, 4

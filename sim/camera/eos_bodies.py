@@ -194,6 +194,7 @@ _COMMON_WHITE = (
     WhiteBalance.MANUAL,
 )
 _STYLES = (0x81, 0x82, 0x83, 0x84, 0x85, 0x86, 0x21, 0x22, 0x23)
+"""Codes of the picture styles: standard to monochrome, then the user's three (as libgphoto2 names them)."""
 _BULB = 0x0C
 """Code of the shutter time that has no number: B."""
 

@@ -117,9 +117,9 @@ def light(
     sigma_px
         Blur and aperture, photosites.
     x_lines, y_lines
-        Every x and every y, ascending, at which the drawing changes, mm.
+        (A,) and (B,) float64, every x and every y, ascending, at which the drawing changes, mm.
     labels
-        (len(y_lines) + 1, len(x_lines) + 1) int32, row of `signals` between the lines.
+        (B + 1, A + 1) int32, row of `signals` between the lines.
     signals
         (n, 3, 3) float32, signal of a colour [label, camera channel, primary] in full light, DN.
     channels

@@ -109,7 +109,7 @@ def ink_coverage(rgb: ArrayLike) -> NDArray[np.float64]:
     Parameters
     ----------
     rgb
-        (..., 3) codes 0 … 255.
+        (..., 3) float or int codes 0 … 255.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def print_reflectance(rgb: ArrayLike) -> NDArray[np.float64]:
     Parameters
     ----------
     rgb
-        (N, 3) codes 0 … 255.
+        (N, 3) float or int codes 0 … 255.
 
     Returns
     -------

@@ -156,7 +156,7 @@ class World:
         Parameters
         ----------
         rgb
-            (N, 3) codes 0 … 255.
+            (N, 3) float or int codes 0 … 255.
         colour, settings, lamp
             As for `expose`.
 
@@ -180,7 +180,7 @@ class World:
         Parameters
         ----------
         rgb
-            (N, 3) codes 0 … 255.
+            (N, 3) float or int codes 0 … 255.
         points_mm
             (N, 2) float64.
         colour, settings, lamp
