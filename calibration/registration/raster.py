@@ -46,7 +46,7 @@ class Raster:
 
     @classmethod
     def of(cls, low_mm: _Array, step_mm: _Array, size: _Array) -> Raster:
-        """Return the raster that begins at `low_mm` and has `size` (columns, rows) elements of `step_mm`."""
+        """Return the raster that begins at `low_mm` (2,) and has `size` (columns, rows) elements of `step_mm` (2,)."""
         return cls(low_mm, step_mm, (int(size[1]), int(size[0])))
 
     def point(self, column: float, row: float) -> _Array:

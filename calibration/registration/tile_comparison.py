@@ -80,7 +80,7 @@ def compare_tiles(
     window
         Elements over which gain and offset are taken for constant.
     to_pixels
-        The map.
+        The map, from points (N, 2) mm to places (N, 2) px.
     cell_px
         Half-size pixels along a cell's side; a tile is taken to be as large, or finer.
     without_gradient

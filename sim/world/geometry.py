@@ -72,7 +72,7 @@ class Waviness:
         return cls(shape.cycles, shape.phases, amplitudes * (peak_to_valley_mm / extent), page_mm)
 
     def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the height in mm, towards the camera, of (..., 2) points on the print; they may lie off the page."""
+        """Return the height (...) in mm, towards the camera, of points (..., 2) mm on the print, or off the page."""
         share = points_mm / np.array(self.page_mm)
         total = np.zeros(points_mm.shape[:-1])
         for (along_x, along_y), phase, amplitude in zip(self.cycles, self.phases, self.amplitudes_mm, strict=True):
@@ -89,7 +89,7 @@ class Surface(Protocol):
         ...
 
     def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the height in mm, towards the camera, of (..., 2) points on the print; they may lie off the page."""
+        """Return the height (...) in mm, towards the camera, of points (..., 2) mm on the print, or off the page."""
         ...
 
 
@@ -106,7 +106,7 @@ class Folded:
         return self.surface.page_mm
 
     def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the height in mm, towards the camera, of (..., 2) points on the print; they may lie off the page."""
+        """Return the height (...) in mm, towards the camera, of points (..., 2) mm on the print, or off the page."""
         return self.surface.height(points_mm) + self.fold.height(points_mm)
 
 

@@ -29,9 +29,6 @@ _OPEN_DTYPES = re.compile(r"\bArrayLike\b|NDArray\[[^]]*\b(?:Any|generic|number|
 _ARRAY = re.compile(r"\bNDArray\b|\bArrayLike\b")
 _CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*")
 
-WITHOUT_REASON: dict[str, str] = {}
-"""Constants that need none, `path:NAME`, each with why."""
-
 
 def modules(package: str) -> Iterator[tuple[Path, ast.Module, list[str]]]:
     """Yield each module of a package: its path, its tree, and its lines."""
@@ -51,9 +48,10 @@ def aliases(tree: ast.Module) -> dict[str, str]:
                 pass
             case _:
                 continue
-        text = ast.unparse(value)
-        if text.startswith(("npt.NDArray[", "npt.ArrayLike", "NDArray[", "tuple[npt.NDArray")):
-            found[name] = text
+        if isinstance(value, ast.Subscript | ast.Attribute | ast.BinOp):
+            text = re.sub(r"\b(\w+)\b", lambda word: found.get(word[1], word[1]), ast.unparse(value))
+            if _ARRAY.search(text):
+                found[name] = text
     return found
 
 
@@ -110,6 +108,7 @@ def public_functions(body: list[ast.stmt], prefix: str = "") -> Iterator[tuple[s
 def arrays_of(function: Function, known: dict[str, str]) -> dict[str, str]:
     """Return the arrays of a signature, parameters by name and what is returned as `return`, with their annotations."""
     every = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    every += [rest for rest in (function.args.vararg, function.args.kwarg) if rest]
     notes = [(argument.arg, argument.annotation) for argument in every] + [("return", function.returns)]
     written = {
         name: re.sub(r"\b(\w+)\b", lambda word: known.get(word[1], word[1]), ast.unparse(note))
@@ -134,7 +133,7 @@ def entries(docstring: str) -> tuple[str, dict[str, str]]:
 
 
 def without_shape(package: str) -> list[str]:
-    """Return the arrays of public functions of which no shape is stated, or no dtype although the annotation lacks it."""
+    """Return the arrays of public functions of which no shape is stated, or no dtype where it is open."""
     missing: list[str] = []
     for path, tree, _ in modules(package):
         for name, function in public_functions(tree.body):
@@ -203,7 +202,7 @@ def without_reason(package: str) -> list[str]:
         f"{path}:{node.lineno} {name}"
         for path, tree, lines in modules(package)
         for name, node, after in constants(tree)
-        if f"{path}:{name}" not in WITHOUT_REASON and not has_reason(node, after, lines)
+        if not has_reason(node, after, lines)
     ]
 
 
