@@ -162,7 +162,7 @@ def gather_values(
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
     """Return `table_values` of what `gather` returns, (N, S, 3) uint16, and the highest counts (N,) uint16.
 
-    In a third of the time of both; parameters as theirs: `black` (3,), `field` and `dark` (N, 3).
+    In a third of the time of both; parameters as theirs: `black` (2, 2), `field` and `dark` (N, 3).
     """
     from calibration.sampling import kernels
 
