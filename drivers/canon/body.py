@@ -35,16 +35,16 @@ PIECE_BYTES = 1 << 20
 MAX_FRAME_BYTES = 256 << 20
 """No raw file of an EOS body comes near it."""
 MAX_POLLS = 64
-"""GetEvent answers that one drain takes, at most."""
+"""GetEvent answers that one drain takes, at most: a few empty the queue, and some firmware repeats itself."""
 KEEP_ALIVE_S = 10.0
-"""After this long a body is asked to stay awake."""
+"""After this long a body is asked to stay awake, as libgphoto2 asks it."""
 SETTLE_LIMIT_S = 5.0
 """How long a body may take to report a value that it was given, or room for a frame."""
 RELEASE_TRIES = 5
 """Presses in all, spread over `PASSING_LIMIT_S`: what keeps a body busy ends by itself or by what is fetched
 between."""
 CAPTURE_TIMEOUT_S = 100.0
-"""Wait for the answer to a release; some bodies expose before they answer."""
+"""Wait for the answer to a release; some bodies expose before they answer. libgphoto2 waits as long."""
 
 _REMOTE_ON, _REMOTE_OFF = 1, 0
 """Parameter of SetRemoteMode, as the recorded conversations and libgphoto2 send it."""

@@ -29,11 +29,11 @@ from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
 RECOVERIES = 3
-"""How often one call renews the connection."""
+"""How often one call renews the connection: a fault that comes back more often lasts."""
 RECOVERY_LIMIT_S = 60.0
 """How long each renewal may take; a body that was switched off and on is back well within it."""
 FRAME_LIMIT_S = 90.0
-"""How long after its exposure a frame may be announced."""
+"""How long after its exposure a frame may be announced; libgphoto2 waits as long."""
 REDISCOVERY_S = 10.0
 """The same on a new connection, on which the body sends its whole state at once."""
 

@@ -23,7 +23,7 @@ from foundation.errors import ProtocolError
 
 SEARCH = b"%2SRCH\r"
 COLLECT_S = 30.0
-"""So long a controller collects answers."""
+"""So long a controller collects answers, which projectors delay by up to 10 s."""
 
 
 @dataclass(frozen=True)

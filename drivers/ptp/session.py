@@ -24,11 +24,11 @@ from foundation.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolE
 START_TIMEOUT_S = 1.5
 """Wait for the answer to OpenSession: a body that a killed host left behind never answers before a reset."""
 TIMEOUT_S = 20.0
-"""Wait for every other answer, unless the caller sets another."""
+"""Wait for every other answer, unless the caller sets another; libgphoto2 waits as long."""
 PASSING_LIMIT_S = 10.0
 """How long an operation is asked again when a device declines it for the moment."""
 OPEN_TRIES = 3
-"""Tries at OpenSession with a reset between them."""
+"""Tries at OpenSession with a reset between them, as many as libgphoto2 makes."""
 
 PASSING = (ResponseCode.DEVICE_BUSY, ResponseCode.EOS_OBJECT_NOT_READY, ResponseCode.EOS_MEMORY_STATUS_NOT_READY)
 """Responses that mean: not now."""

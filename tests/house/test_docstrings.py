@@ -1,9 +1,9 @@
 """Arrays say their shape, and numbers their reason.
 
-Every public function that takes or gives an array states a shape in its docstring, and the kind of number where the
-annotation leaves it open. Every numeric constant of a module stands next to its reason: in the string below it, in a
-comment above or beside it, or in the comment above the run of lines of which it is a member (a table of the codes of a
-standard, say).
+Every public function states the shape of each array that it takes or gives, in the entry of its docstring for that
+parameter or, where there is none, before the sections; and the kind of number where the annotation leaves it open.
+Every numeric constant of a module stands next to its reason: in the string below it, in a comment above or beside it,
+or in the comment above the run of lines of which it is a member (a table of the codes of a standard, say).
 """
 
 from __future__ import annotations
@@ -204,6 +204,33 @@ def without_reason(package: str) -> list[str]:
         for name, node, after in constants(tree)
         if not has_reason(node, after, lines)
     ]
+
+
+@pytest.mark.parametrize("text", ["(N, 2) px", "(3,)", "(...) float64", "(8**bits, S, 3)", "of any shape", "a scalar"])
+def test_a_shape_is_seen(text: str) -> None:
+    assert has_shape(text)
+
+
+@pytest.mark.parametrize("text", ["counts", "(x)", "(paper, equation 3)", "f(a, b)", "0.5 (judgement)", "(DNG 1.7)"])
+def test_prose_is_no_shape(text: str) -> None:
+    assert not has_shape(text)
+
+
+@pytest.mark.parametrize(
+    ("source", "reasoned"),
+    [
+        ("A = 3", False),
+        ('A = 3\n"""Why three."""', True),
+        ("# Clause 5.\nA = 3\n_B: Final = 1 << 4", True),
+        ('A, B = 3, -4\n\n"""Why these."""', True),
+        ("A = 3  # why", True),
+        ('"""A module."""\nA = 2 * B', False),
+    ],
+)
+def test_a_reason_is_seen(source: str, reasoned: bool) -> None:
+    found = [has_reason(node, after, source.splitlines()) for _, node, after in constants(ast.parse(source))]
+    assert found
+    assert all(found) is reasoned
 
 
 @pytest.mark.parametrize("package", PACKAGES)
