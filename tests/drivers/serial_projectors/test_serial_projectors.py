@@ -53,7 +53,7 @@ def _errors(faults: frozenset[Fault]) -> frozenset[Fault]:
     return frozenset(fault for fault in faults if fault.severity is Severity.ERROR)
 
 
-TOLD: dict[str, Callable[[frozenset[Fault]], frozenset[Fault]]] = {
+REPORTED: dict[str, Callable[[frozenset[Fault]], frozenset[Fault]]] = {
     "benq": lambda faults: frozenset(),
     "epson": _errors,
     "nec": lambda faults: faults,
@@ -83,7 +83,7 @@ def bench_of(name: str, device: SimulatedProjector, projector: Projector, catch_
 
     traits = device.traits
     return Bench(
-        projector, wait, break_part, repair, IDENTITIES[name], traits.warm_up_s, traits.cool_down_s, TOLD[name]
+        projector, wait, break_part, repair, IDENTITIES[name], traits.warm_up_s, traits.cool_down_s, REPORTED[name]
     )
 
 
