@@ -594,7 +594,7 @@ def test_half_an_answer_is_no_answer(name: str, data: st.DataObject) -> None:
 
 
 TAKERS: list[Callable[[bytes], tuple[Any, int] | None]] = [
-    benq.reply_taker(b"\r*pow=?#\r"),
+    benq.reply_parser(b"\r*pow=?#\r"),
     epson.take_reply,
     epson.take_welcome,
     nec.take_reply,
