@@ -178,8 +178,8 @@ def memory(folder: Path, lights: int) -> None:
         "sys.exit(code)"
     )
     command = [sys.executable, "-c", program, session.folder, folder / f"lut_{lights}"]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    peak = float(said.rsplit("VmHWM:", 1)[1].split()[0]) / 1e6
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    peak = float(output.rsplit("VmHWM:", 1)[1].split()[0]) / 1e6
     against = f"{lights} lights, {thread_count()} threads; below 2 GB wanted whatever the number"
     report(f"memory of a build, EOS 6D Mark II, {lights} lights", peak, "GB", against)
 

@@ -3,7 +3,7 @@
 The lock is advisory (`flock(2)`) and lies on the folder itself, so that a program that is killed leaves none behind.
 Network file systems refuse to lock a folder (`EBADF` on NFS, where `flock` needs write access); a file in it is locked
 there instead, and removed by the last who holds it. Where the file system has no locks at all, the work goes on with a
-warning: nobody else may work there, and nothing can see to it.
+warning: no other program may work there, and nothing prevents it.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ A code counts eighths of a stop. What the camera shows, and what people write, i
 1/64 s, f/3.5 for f/3.564. Third stops and half stops share some nominal values (1/10 s is 0x53 and 0x54); a body
 works in one or the other, so that its own list of available codes decides.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A value is found by its nominal number within 1 %, or not at all: nothing is rounded to a neighbour. The error lists
   what is near.
@@ -117,7 +117,7 @@ class Scale:
 
 
 def _number(wanted: float | str) -> float | None:
-    """Return the positive number that `wanted` is or says, or None."""
+    """Return the positive number that `wanted` is or spells, or None."""
     if isinstance(wanted, str):
         over, slash, under = wanted.strip().lower().removesuffix("s").removeprefix("f/").partition("/")
         try:

@@ -1,6 +1,6 @@
 """An EOS body in one session: from the connection to the last byte of a frame.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Every step is one that the recorded conversations have, or one that libgphoto2 takes; an operation that the body does
   not list is never sent.
@@ -96,7 +96,7 @@ class EosBody:
         return self._session.label
 
     def identity(self) -> CameraIdentity:
-        """Return what the body says of itself; the serial number is the engraved one, where it sends that."""
+        """Return maker, model, serial number and firmware; the serial number is the engraved one where it is sent."""
         serial = self.state.text(Property.EOS_SERIAL_NUMBER) or self._info.serial_number
         return CameraIdentity(self._info.manufacturer, self._info.model, serial, self._info.device_version)
 
@@ -106,7 +106,7 @@ class EosBody:
         Raises
         ------
         DeviceRefused
-            It is no EOS body, or offers no way to send frames to the host.
+            It is no EOS body, or cannot send frames to the host.
         LinkError, ProtocolError
             From the cable.
         """
@@ -179,7 +179,7 @@ class EosBody:
         """
         self.drain()
         self.free_waiting()
-        # A body whose "idle" was lost would seem busy for ever; it says itself whether it takes the release.
+        # A body whose "idle" was lost would seem busy for ever; its answer shows whether it takes the release.
         self._settled(lambda: not self.state.busy)
         self.free_waiting()
         if not self._settled(lambda: self.state.number(Property.EOS_AVAILABLE_SHOTS) != 0):

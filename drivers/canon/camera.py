@@ -1,6 +1,6 @@
 """A Canon EOS body as the suite's `Camera`: one raw frame after another, for hours, without a human.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A connection that fails is renewed, a limited number of times for one call and a limited time for each: reset, closed,
   opened again wherever the body is now, and given the settings again. `drivers.canon.body` is one connection.
@@ -104,7 +104,7 @@ class CanonEos:
         Raises
         ------
         DeviceRefused
-            The body does not offer a value, or is set up in a way that spoils a series; all of it in one message.
+            The body does not offer a value, or has a setting that spoils a series; all of it in one message.
         DeviceError
             It cannot be reached.
         """
@@ -195,7 +195,7 @@ class CanonEos:
 
         def released(body: EosBody) -> _Shot:
             body.make_ready()
-            _apply(body, settings)  # says nothing on the wire unless a dial was turned
+            _apply(body, settings)  # sends nothing unless a dial was turned
             now = self._clock.monotonic()
             exposed = now + _CERTAIN_SHARE * settings.shutter_s
             until = now + settings.shutter_s + FRAME_LIMIT_S

@@ -1,6 +1,6 @@
 """The values of a Canon body's properties as they travel: numbers, text, image formats, and how one is set.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - ``decode`` and ``encode`` undo each other on well-formed bytes.
 - Properties travel as bytes: 32 bits for every number, text with a closing NUL, structures for a few. Nothing here

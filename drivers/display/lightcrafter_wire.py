@@ -28,7 +28,7 @@ _READ, _REPLY, _ERROR = 0x80, 0x40, 0x20
 
 
 class LightCrafterCommand(IntEnum):
-    """What of the controller is set and read here."""
+    """The commands that are used here."""
 
     TEST_PATTERN = 0x1203
     PATTERN_COLOUR = 0x1204

@@ -1,6 +1,6 @@
 """What an X server has on its screen, read as a screenshot program reads it; a hold on its screen saver; its end.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A connection of its own, beside that of the window: what it reads is what the server shows, whoever drew it.
 - Through libxcb, which returns errors to its caller. Xlib, which the window needs, ends the process when its server
@@ -140,7 +140,7 @@ class XScreen:
             self._libc.free(reply)
 
     def has_extension(self, name: str) -> bool:
-        """Return whether the server knows the extension `name`."""
+        """Return whether the server has the extension `name`."""
         if self._connection is None:
             return False
         cookie = self._xcb.xcb_query_extension(self._connection, len(name), name.encode("ascii"))

@@ -1,6 +1,6 @@
 """The datasets of PTP as bytes and as values: device, object, storage, property.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - ``decode`` and ``encode`` undo each other on well-formed bytes, so that both ends of the cable share one type.
 - A device's counts and lengths are not trusted: malformed bytes raise `ProtocolError`, and a dataset of more than
@@ -337,7 +337,7 @@ class RangeForm:
 class EnumerationForm:
     """A property takes the values of a list.
 
-    `widened` says that a device sends values of one byte as two, as the EOS 60D does for the battery's level
+    `widened`: the device sends values of one byte as two, as the EOS 60D does for the battery's level
     (0x5001: 100, 75, 50, 25, 0); the standard does not allow it, but the bytes that are left show it.
     """
 

@@ -1,14 +1,14 @@
 """PTP over TCP as bytes: every packet of both channels, and a cutter for the stream.
 
-A packet is its length (32 bits, these included), its type (32), then what the type says. The initiator opens the
+A packet is its length (32 bits, these included), its type (32), then the fields of that type. The initiator opens the
 command channel and sends `InitCommandRequest`, the responder answers `InitCommandAck` with a number; the initiator
 opens the event channel and sends that number in `InitEventRequest`, the responder answers `InitEventAck`. `InitFail`
 may stand for either answer. Transactions run on the command channel; events, `Ping` and `Pong` on the other.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - `PacketCutter` takes a stream in any pieces. Data packets may be of any length, whatever comes of them is handed on
-  as `Data` at once and only their last bytes as `EndData`, which says the same; every other packet is at most
+  as `Data` at once and only their last bytes as `EndData`, which means the same; every other packet is at most
   `MAX_PACKET` bytes.
 - Whatever arrives, the only error is `ProtocolError`; after it the stream has lost its place and every further
   `feed` raises too.
@@ -91,7 +91,7 @@ class InitCommandAck:
 
 @dataclass(frozen=True)
 class InitEventRequest:
-    """The initiator says which connection the event channel belongs to."""
+    """The initiator names the connection that the event channel belongs to."""
 
     connection: int
 
@@ -245,7 +245,7 @@ def decode(data: bytes) -> Packet:
 
 
 class PacketCutter:
-    """Cuts a channel's stream into packets, however it was split on its way. One for each channel."""
+    """Cuts a channel's stream into packets, however it was split in transit. One for each channel."""
 
     def __init__(self) -> None:
         self._waiting: bytes = b""

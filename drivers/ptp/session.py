@@ -1,6 +1,6 @@
 """A PTP session: numbered transactions between its opening and its closing, over any cable.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A response other than OK raises `OperationDeclined`, which has its code by number and by name; what a device declines
   for the moment only (`PASSING`) is asked again, for a limited time.

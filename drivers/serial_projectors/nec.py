@@ -10,7 +10,7 @@ Rules that hold inside:
 
 Source: NEC, Projector Control Command Reference Manual, revision 6.1 (037, 078-2 to 078-5), and Control Commands
 (Basic), revision 5.16 (009, 015, table of error codes). Not confirmed by a manual: the bytes of 016 power off, 020 and
-021 picture mute (as other drivers have them), 02h 0Eh, and what the running status says during warm-up.
+021 picture mute (as other drivers have them), 02h 0Eh, and the running status during warm-up.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _HEADER = 5
 
 @dataclass(frozen=True)
 class NecCommand:
-    """What we say."""
+    """A command, as the controller sends it."""
 
     kind: int
     code: int
@@ -43,7 +43,7 @@ class NecCommand:
 
 @dataclass(frozen=True)
 class NecReply:
-    """What the projector says; `failed` holds the two bytes that give the reason why it did not do it."""
+    """An answer; `failed` holds the two bytes that give the reason why it did not do it."""
 
     kind: int
     code: int

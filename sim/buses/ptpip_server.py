@@ -1,6 +1,6 @@
 """A simulated device on the network: PTP/IP on a TCP port, for any initiator.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - One initiator at a time, known by the number that joins its two connections; a second one hears that the device is
   busy.

@@ -2,7 +2,7 @@
 
 Hand a `SimulatedBus` to `drivers.links.usb` as its backend.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A device that is plugged in gets an address that none had before, as on a real bus; its port stays.
 - Nothing waits: a pipe that says nothing is a timeout at once.

@@ -1,6 +1,6 @@
 """The device's side of a USB cable as a pure machine: descriptors, control requests, and PTP on the bulk pipes.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Packets count, as on a wire: a transfer from the host has ended only with a packet that is not full, and one to the
   host is closed by a zero-length packet when it fills its last one.
@@ -66,8 +66,8 @@ class Overflowed(Exception):
 
 
 @dataclass(frozen=True)
-class Identity:
-    """What a device says about itself before PTP begins; the default is an EOS 550D's. `serial` None: it has none."""
+class UsbIdentity:
+    """How a device identifies itself before PTP begins; the default is an EOS 550D's. `serial` None: it has none."""
 
     vendor: int = VENDOR_CANON_USB
     product: int = 0x31EA
@@ -119,8 +119,8 @@ class _Exchange:
 class PtpUsbDevice:
     """A still image device of one configuration and one interface, at high speed."""
 
-    def __init__(self, responder: Responder, identity: Identity | None = None) -> None:
-        self.identity = identity or Identity()
+    def __init__(self, responder: Responder, identity: UsbIdentity | None = None) -> None:
+        self.identity = identity or UsbIdentity()
         self._responder = responder
         self._halted: set[int] = set()
         self._configuration = 1

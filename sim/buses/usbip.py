@@ -2,7 +2,7 @@
 
 On Linux, as root: ``modprobe vhci-hcd``, then ``usbip attach -r 127.0.0.1 -b 1-1``.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A device is lent to one client at a time, and only the thread of its connection uses it.
 - A transfer in that finds nothing waits, in order, until the device has something to say or the client unlinks it;

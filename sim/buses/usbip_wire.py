@@ -3,7 +3,7 @@
 A connection begins with one operation: to list the devices, or to import one. Once a device is imported, the same
 connection carries its transfers, each with a number under which its result comes back, in any order.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - `RequestReader` takes a stream in any pieces. Whatever arrives, the only error is `ProtocolError`; after it the stream
   has lost its place.

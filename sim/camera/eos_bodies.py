@@ -1,7 +1,7 @@
-"""The EOS bodies that the simulated camera can be: what each says of itself, its properties, its lists.
+"""The EOS bodies that the simulated camera can be: how each identifies itself, its properties, its lists.
 
 A body is a table of facts, without behaviour. Nobody has published a recording of an EOS 550D or a 6D Mark II on the
-wire, so that much is borrowed from the one body that was recorded, an EOS 60D; each table says what. The laws:
+wire, so that much is borrowed from the one body that was recorded, an EOS 60D; each table says what. The rules:
 
 - Properties stand in the order in which the 60D sends them; one whose value is None has a list record, but its value
   is sent on request only, as by the 60D.

@@ -1,4 +1,4 @@
-"""The simulated EOS's release: focus, the press, drive modes and brackets, and the frame on its way to a file.
+"""The simulated EOS's release: focus, the press, drive modes and brackets, and the frame until it is a file.
 
 The rules stand in `sim.camera.eos`.
 """

@@ -2,7 +2,7 @@
 
 Rules that hold inside:
 
-- It is physics and knows no bytes; `sim.projectors.pjlink` and `sim.projectors.serial` speak for it.
+- It has states and no bytes; `sim.projectors.pjlink` and `sim.projectors.serial` translate for it.
 - State moves with the time that is handed in, and only when somebody looks.
 - What the world needs is `light`: how much of the full light reaches the screen now.
 """

@@ -14,7 +14,7 @@ REFRESH_S = 1 / 60
 
 @dataclass
 class Screen:
-    """What stands on the screen now; shared by the presenter, who writes, and the camera, who looks."""
+    """The colour shown now; shared by the presenter, who writes, and the camera, who looks."""
 
     colour: Colour = BLACK
 

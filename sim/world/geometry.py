@@ -6,7 +6,7 @@ camera. The sheet is turned by roll, then tilt, then pan, and seen through a pin
 The paper does not stretch: its heights are so small against their wavelengths that a point keeps its x and y.
 
 Pixels are half-size, centres at integers, x right, y down; millimetres on the print, origin at its top-left corner.
-Pure functions of frozen values; nothing here knows light.
+Pure functions of frozen values; light is not treated here.
 """
 
 from __future__ import annotations

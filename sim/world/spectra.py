@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 5.0)
 """(81,) float64, the wavelengths of every spectrum here."""
 
-Lamp = Literal["uhp", "led"]
+LampSpectrum = Literal["uhp", "led"]
 
 SURFACE_REFLECTANCE = 0.03
 """Light that matte paper returns before it meets ink (share of the incident)."""
@@ -60,7 +60,7 @@ def _rise(centre_nm: float, width_nm: float) -> NDArray[np.float64]:
     return 1 / (1 + np.exp(-(WAVELENGTHS_NM - centre_nm) / width_nm))
 
 
-def projector_primaries(lamp: Lamp = "uhp") -> NDArray[np.float64]:
+def projector_primaries(lamp: LampSpectrum = "uhp") -> NDArray[np.float64]:
     """Return the light of each primary at full drive.
 
     Parameters

@@ -37,7 +37,7 @@ from generator.stores.store import LocalStore, RemoteStore, Store, open_store
 PLAN: Final = "plan.json"
 RECORDS: Final = "shards"
 _NOTES: Final = ".plan"
-Identity = Mapping[str, Any]
+PlanIdentity = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class Workplace:
         return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}.json"
 
 
-def finished(out: str | Path, identity: Identity) -> bool:
+def finished(out: str | Path, identity: PlanIdentity) -> bool:
     """Return whether the dataset of this plan is complete; notes that a killed program left are removed then."""
     notes = _notes(out)
     if not open_store(out).has(DESCRIPTION):
@@ -151,7 +151,7 @@ def require_free_place(out: str | Path) -> None:
 
 
 @contextmanager
-def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Generator[Workplace]:
+def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Generator[Workplace]:
     """Open the place where the dataset `out` is being made, or begin one.
 
     Parameters
@@ -198,7 +198,7 @@ def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Genera
             raise
 
 
-def stored_identity(out: str | Path) -> Identity:
+def stored_identity(out: str | Path) -> PlanIdentity:
     """Return the identity of the plan of a dataset that is being made.
 
     Raises
@@ -218,7 +218,7 @@ def _notes(out: str | Path) -> Store:
     return LocalStore(partial_path(local_path(out)) / "plan")
 
 
-def _remote(out: str, identity: Identity) -> Generator[Workplace]:
+def _remote(out: str, identity: PlanIdentity) -> Generator[Workplace]:
     files, notes = RemoteStore(out), RemoteStore(f"{out.rstrip('/')}/{_NOTES}")
     place = Workplace(files, notes, out, _plan_id(identity))
     if files.has(DESCRIPTION):
@@ -254,16 +254,16 @@ def _begin(folder: Path, plan_id: str) -> None:
         raise storage_error(folder, error) from error
 
 
-def _text(identity: Identity) -> bytes:
+def _text(identity: PlanIdentity) -> bytes:
     return (json.dumps(identity, indent=1) + "\n").encode()
 
 
-def _plan_id(identity: Identity) -> str:
+def _plan_id(identity: PlanIdentity) -> str:
     """Return the first 16 hexadecimal digits of the SHA-256 of the plan's identity."""
     return hashlib.sha256(json.dumps(_plain(identity), sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _plain(identity: Identity) -> Any:
+def _plain(identity: PlanIdentity) -> Any:
     """Return an identity as it is read back."""
     return json.loads(_text(identity))
 
@@ -276,7 +276,7 @@ def _load(notes: Store) -> dict[str, Any]:
     return dict(loaded)
 
 
-def _require_same(notes: Store, identity: Identity, out: str | Path, remedy: str) -> None:
+def _require_same(notes: Store, identity: PlanIdentity, out: str | Path, remedy: str) -> None:
     stored = _load(notes)
     differing = list(_differences(stored, _plain(identity)))
     if differing:
