@@ -185,6 +185,7 @@ def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Ge
         place = Workplace(LocalStore(folder / f"dataset-{plan_id}"), notes, str(path), plan_id)
         try:
             if not notes.has(PLAN):
+                _require_still_free(path, folder)
                 _begin(folder, plan_id)
                 notes.put(PLAN, _text(identity))
                 notes.sync([PLAN])
@@ -235,6 +236,21 @@ def _remote(out: str, identity: PlanIdentity) -> Generator[Workplace]:
         with contextlib.suppress(Exception):
             if not begun and not any(notes.names(RECORDS)):
                 files.remove("")
+        raise
+
+
+def _require_still_free(path: Path, folder: Path) -> None:
+    """Refuse when another program finished the dataset while its hold was waited for; `folder` is new and empty then.
+
+    Raises
+    ------
+    InputError
+        The dataset is there.
+    """
+    try:
+        require_free(path, "the dataset")
+    except InputError:
+        shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
