@@ -1,6 +1,6 @@
 """Where the chart is in a picture: its tags, or the field of a chart without tags, found and its pose measured.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - One linear colour plane at a time, the strongest of the frame: a square root moves a tag's corner by a quarter pixel,
   a sum of planes under deep red or blue by a fifth.

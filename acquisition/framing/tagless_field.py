@@ -1,6 +1,6 @@
 """A chart without tags in a picture: the field of its cells is found by its outline, and recognised by its colours.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Candidates for the field come from the outlines in the picture (the field against its white margin, the sheet
   against what is behind), or from corners given by hand; each is drawn onto the edge between cells and paper, and the

@@ -4,7 +4,7 @@ A stain leaves its cells of one colour each, so that neither rim nor noise of a 
 the colours of a dirty print. It is recognised by a whole neighbourhood that deviates at once, while the same codes,
 which lie at random over the sheet, are right everywhere else.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - What a code gives is predicted from the codes next to it in colour, which lie elsewhere on the sheet: no model of ink
   or paper, and next to nothing in common with the cell's own place.

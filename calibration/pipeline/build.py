@@ -1,6 +1,6 @@
 """A session becomes a table: frames → measured → taken in → saved → figures → verdict → table.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A session that lacks a light makes no table.
 - The table appears whole or not at all. Until then it is made under a hidden name (`calibration.pipeline.checkpoint`),

@@ -1,6 +1,6 @@
 """What frames show of the cells, in the order taken: evenness, highest counts, and which cells are unfit for use.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Frames enter in the order taken, and what one adds depends on those before it alone: statistics that were stored in a
   checkpoint and restored end in the same bits.

@@ -1,6 +1,6 @@
 """An unfinished table: its hidden folder, and the checkpoint from which a later program goes on.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The folder stands beside the table's place under a hidden name until the table is complete, so that under the final
   name there is never a table that lacks a light.

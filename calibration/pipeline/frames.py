@@ -1,6 +1,6 @@
 """The frames that a table is made of: which, in what order, and each read once, its hash checked, and decoded.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A frame's SHA-256 is checked against the journal before one of its counts is used.
 - The last accepted frame of a light counts.

@@ -1,6 +1,6 @@
 """Take in frames, one after another, in the order taken; what is known after each is one frozen value.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - What a frame adds depends on those before it alone, so that a build that was stopped goes on to the same bits.
 - A frame measured before its turn counts only if the frame registered last is still the one it was measured with.

@@ -7,7 +7,7 @@ rise by one and the same factor, and a factor that depends on the level is the s
 cannot be seen so, a power of the light, and for it the exposure times are needed: stated to some per cent only, as
 cameras write 0.3 s for 0.315 s, they enter all together.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The series is no part of a table: no sample depends on it, and its figures are in the report alone.
 - A frame that is not of the series (another camera, ISO speed or aperture, the chart elsewhere) is refused by name.

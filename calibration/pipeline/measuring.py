@@ -1,6 +1,6 @@
 """What one frame shows: how the chart has moved, its paper and greys, its samples.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A frame is measured with the baseline, the frame registered last, and the dark light, and with nothing else, so that
   frames can be measured in any order and by any thread.

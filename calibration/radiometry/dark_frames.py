@@ -1,6 +1,6 @@
 """Dark frames: the light that is there while the projector shows black, read noise, and hot photosites.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The projector's leak and ambient light cannot be separated and are one figure, read on bare paper.
 - They are part of every light: samples and ground truth contain them alike, so nothing is subtracted unless the user

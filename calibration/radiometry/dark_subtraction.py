@@ -7,7 +7,7 @@ each channel (empirical Bayes; B. Efron and C. Morris, Journal of the American S
 
 Why so: `docs/decisions/0009-dark-light-is-predicted.md`.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A frame's dark light is that of the last dark frame taken before it, or of the first, for frames before that.
 - The estimate after a dark frame depends on those before it alone, so that a build that was stopped goes on to the same

@@ -1,6 +1,6 @@
 """The grey references: what each printed level gives under each light, compared with bare paper.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A level is the mean of its patches after the field is divided out, without outliers; its standard error is that of
   the mean.

@@ -1,6 +1,6 @@
 """The map from print to frame moved until both coincide: what tags and lens leave is measured on the cells themselves.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The frame is rectified to the print, compared with the print's colours as the camera sees them (a colour model fitted
   on the frame itself), and a smooth displacement is fitted to what does not coincide.

@@ -1,6 +1,6 @@
 """Where every point of the print lies in a frame: tags or the field's outline first, then the cells themselves.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Tags give a homography and Brown's distortion and nothing finer: 35 of them cannot sample a wavy sheet. The local
   part is measured on the cells: the frame is rectified to the print, compared with the print's colours as the camera

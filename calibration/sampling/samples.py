@@ -1,6 +1,6 @@
 """The samples of every cell, taken as the sensor gave them.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A cell's samples are the 5×5 half-size pixels around its rounded centre (paper, section 3.2), or another odd window.
   Pixels are taken whole; nothing is interpolated, which would alter the noise that the samples are for.

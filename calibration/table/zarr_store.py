@@ -4,7 +4,7 @@ Zarr specification version 3 with the codec `sharding_indexed`: one light is a c
 Blosc (Zstandard after bit shuffle), about two thirds of `samples.npy`. The table's other files are attributes, word for
 word, so that a table that was fetched is the one that was published, hash by hash.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The attributes are completed last: an array without the attribute `whole` was never finished.
 - Nothing is overwritten but such an array.
