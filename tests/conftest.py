@@ -8,58 +8,77 @@ import pytest
 
 TESTS = Path(__file__).parent
 SLOW = (
-    "acquisition/test_annotated.py",
+    "acquisition/chart/test_layout.py",
+    "acquisition/chart/test_margins.py",
+    "acquisition/chart/test_model.py",
+    "acquisition/chart/test_printing.py",
+    "acquisition/chart/test_proof.py",
+    "acquisition/framing/test_annotated.py",
+    "acquisition/framing/test_finding.py",
+    "acquisition/framing/test_tagless_field.py",
+    "acquisition/framing/test_visibility.py",
+    "acquisition/session/test_states.py",
     "acquisition/test_chart_command.py",
-    "acquisition/test_field.py",
-    "acquisition/test_framing.py",
-    "acquisition/test_layout.py",
-    "acquisition/test_marks.py",
-    "acquisition/test_movement.py",
-    "acquisition/test_printing.py",
-    "acquisition/test_proof.py",
-    "acquisition/test_visibility.py",
-    "calibration/test_build.py",
-    "calibration/test_cell_field.py",
-    "calibration/test_growing.py",
-    "calibration/test_labels.py",
-    "calibration/test_linearity.py",
-    "calibration/test_plain_chart.py",
-    "calibration/test_plain_session.py",
-    "calibration/test_registration.py",
-    "calibration/test_small_charts.py",
-    "calibration/test_stains.py",
-    "calibration/test_subtraction.py",
-    "calibration/test_verdict.py",
-    "calibration/test_windows.py",
-    "drivers/ptp/test_ptp_malformed.py",
-    "drivers/test_fullscreen.py",
+    "calibration/checks/test_frame_consistency.py",
+    "calibration/checks/test_light_codes.py",
+    "calibration/checks/test_stains.py",
+    "calibration/pipeline/test_build.py",
+    "calibration/pipeline/test_checkpoint.py",
+    "calibration/pipeline/test_linearity.py",
+    "calibration/pipeline/test_options.py",
+    "calibration/pipeline/test_plain_session.py",
+    "calibration/pipeline/test_refused_table.py",
+    "calibration/pipeline/test_small_charts.py",
+    "calibration/radiometry/test_cell_field.py",
+    "calibration/radiometry/test_dark_subtraction.py",
+    "calibration/registration/test_movement.py",
+    "calibration/registration/test_register.py",
+    "calibration/registration/test_register_without_tags.py",
+    "calibration/sampling/test_windows.py",
+    "drivers/display/test_fullscreen.py",
+    "drivers/ptp/test_malformed.py",
+    "drivers/raw/test_rawfile.py",
     "drivers/test_gphoto2_camera.py",
-    "drivers/test_rawfile.py",
     "end_to_end",
+    "evaluation/test_cli.py",
     "foundation/test_compiled.py",
-    "generator/test_choices.py",
-    "generator/test_dataset.py",
-    "generator/test_engines.py",
-    "generator/test_generate_command.py",
-    "generator/test_layouts.py",
+    "generator/dataset/production/test_engines.py",
+    "generator/dataset/production/test_layouts.py",
+    "generator/dataset/production/test_workplace.py",
+    "generator/dataset/test_making.py",
+    "generator/dataset/test_reader.py",
+    "generator/kernels/test_choice_statistics.py",
+    "generator/kernels/test_patches.py",
+    "generator/test_cli.py",
     "generator/test_library.py",
-    "generator/test_patches.py",
-    "generator/test_resuming.py",
     "house/test_commands.py",
     "house/test_contributing.py",
-    "sim/test_dng.py",
-    "sim/test_geometry.py",
-    "sim/test_world.py",
+    "sim/camera/test_dng.py",
+    "sim/world/test_geometry.py",
+    "sim/world/test_world.py",
 )
 """Folders and files, below this one, whose tests take more than their share of the minute."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of slow files and folders."""
+def pytest_configure() -> None:
+    """Refuse a list that names what is not there."""
     missing = [name for name in SLOW if not (TESTS / name).exists()]
     if missing:
         raise pytest.UsageError(f"{__file__}: SLOW names {', '.join(missing)}, which are not there; correct the list")
-    slow = [TESTS / name for name in SLOW]
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave slow files unread where they are not wanted: what they import takes seconds, too."""
+    return True if config.getoption("markexpr") == "not slow" and is_slow(collection_path) else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of slow files and folders."""
     for item in items:
-        if any(item.path == place or place in item.path.parents for place in slow):
+        if is_slow(item.path):
             item.add_marker(pytest.mark.slow)
+
+
+def is_slow(path: Path) -> bool:
+    """Return whether a file or folder is on the list, or below a folder on it."""
+    return any(path == place or place in path.parents for place in (TESTS / name for name in SLOW))

@@ -1,5 +1,7 @@
 """The methods that the command knows, with the constants that are usual in the field.
 
+Where they come from::
+
     method              source                                                  n, p, σ of the Gray-Edge framework
     White-Patch         B. Funt, L. Shi, "The rehabilitation of MaxRGB", 2010   0, ∞, 0
     Gray-world          G. Buchsbaum, "A spatial processor model for object     0, 1, 0
