@@ -66,7 +66,7 @@ def chart(
     from acquisition.chart.layout import design_chart, paper_chart
     from acquisition.chart.printing import save_pdf, save_preview, save_tiff
     from acquisition.chart.proof import save_instructions, save_proof
-    from acquisition.framing.visibility import warning
+    from acquisition.framing.visibility import small_parts_warning
     from foundation.files import whole_folder
 
     if arrangement is Arrangement.PAPER:
@@ -89,7 +89,7 @@ def chart(
         f"{out}: {design.colour_count} colours, {len(design.tags)} tags, {len(design.references)} references "
         f"on {width:g} × {height:g} mm, cells of {cell} mm"
     )
-    small = warning(design)
+    small = small_parts_warning(design)
     if small is not None:
         print(f"warning: {small}", file=sys.stderr)
 
@@ -169,7 +169,7 @@ def check(
         ),
     ] = None,
 ) -> None:
-    """Talk to every device, find the chart, judge focus, framing and exposure; records nothing.
+    """Talk to every device, find the chart, judge focus, framing and exposure; record nothing.
 
     Reads LAB.toml, the chart and the lights it names. Writes nothing unless asked with --picture. Ends with 4 when the
     frame is not good enough.

@@ -73,7 +73,7 @@ class SimulatedSettings(_Settings):
     """The simulated lab."""
 
     body: str = "EOS 550D"
-    """Which camera hangs in it: EOS 550D, EOS 6D Mark II, Test."""
+    """Camera body in it: EOS 550D, EOS 6D Mark II, Test."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of everything that chance decides: paper, noise."""
     room: dict[str, bool | int | float | str] = {}
@@ -185,7 +185,7 @@ class LabSettings(_Settings):
 
 
 def unknown_key(key: str, known: Iterable[str], where: str) -> ConfigurationError:
-    """Return the error for a key that nobody knows, naming the nearest one that is known."""
+    """Return the error for an unknown key, naming the nearest one that is known."""
     names = sorted(known)
     near = difflib.get_close_matches(key.rsplit(".", 1)[-1], names, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}"

@@ -1,13 +1,13 @@
-"""How true a table is: sessions of full-size frames in simulated rooms, built, and held against the rooms.
+"""The accuracy of a table: built from sessions of full-size frames in simulated rooms, and compared with the rooms.
 
 `python -m benchmarks.accuracy` prints one JSON object a line for each figure: for both cameras in the default room, for
 one where the lamp fades by 3 % and the projector's light falls off by 30 %, and there again with primaries that fall
-off differently, of which white paper alone does not tell. Takes some ten minutes.
+off differently, which white paper alone does not show. Takes some ten minutes.
 
-A mean of 25 samples has noise of its own, 1 % at 300 counts, which no table can be without. What is asked for is the
-error beyond it. So the noise that light and sensor must have is predicted for every cell, and the systematic error is
-the root of mean square error less mean square noise (`beyond_noise`); its uncertainty comes from the spread over
-lights, since errors within a light hang together.
+A mean of 25 samples has noise, 1 % at 300 counts, which no table can be without. What matters is the error
+beyond it. So the noise that light and sensor must have is predicted for every cell, and the systematic error is the
+root of mean square error less mean square noise (`beyond_noise`); its uncertainty comes from the spread over lights,
+since errors within a light are correlated.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ def report(name: str, value: float, unit: str, against: str) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
-    """A table held against the room.
+class TableErrors:
+    """The errors of a table against the room that it was taken in.
 
     Attributes
     ----------
@@ -91,8 +91,10 @@ def sample_variance(counts: _Array, body: Body, iso: int = 100, response: float 
     return photosite / PHOTOSITES
 
 
-def hold(lut: Lut, world: World, chart: Chart, fields: Sequence[_Array], exposure: ExposureSettings) -> Held:
-    """Return a table against the room it was taken in, which must be without light of its own (`Room.ambient`).
+def table_errors(
+    lut: Lut, world: World, chart: Chart, fields: Sequence[_Array], exposure: ExposureSettings
+) -> TableErrors:
+    """Return the errors of a table against its room, which must have no light but the projector's (`Room.ambient`).
 
     Parameters
     ----------
@@ -119,7 +121,7 @@ def hold(lut: Lut, world: World, chart: Chart, fields: Sequence[_Array], exposur
         scatter[number] = samples.var(axis=1, ddof=1) / (spread / fields[number] ** 2 + 1 / 12)
     clean = np.ones(chart.colour_count, dtype=np.bool_)
     clean[[cell.colour for cell in lut.provenance.unfit]] = False
-    return Held(level, error, noise, scatter, clean)
+    return TableErrors(level, error, noise, scatter, clean)
 
 
 def beyond_noise(error: _Array, noise: _Array, chosen: _Mask) -> tuple[float, float, float, float]:
@@ -145,7 +147,7 @@ def beyond_noise(error: _Array, noise: _Array, chosen: _Mask) -> tuple[float, fl
 def repeated_variance(
     one: npt.NDArray[np.uint16], other: npt.NDArray[np.uint16], counts: _Array, field: _Array, body: Body, iso: int
 ) -> _Array:
-    """Return (C, 3) how the noise between two frames of one light compares with photons and read noise.
+    """Return (C, 3), the variance between two frames of one light over that of photons and read noise.
 
     The difference of two frames is free of all that stands still: response, bleed, unevenness.
 
@@ -170,7 +172,7 @@ def lights_with_repeats() -> tuple[Illumination, ...]:
 
 
 def measure(case: str, body: str, room: Changes, folder: Path) -> None:
-    """Take, build and judge one session."""
+    """Take and build one session, and print its errors."""
     settings = LabSettings(
         rig="simulated",
         chart=folder / "chart.json",
@@ -206,11 +208,11 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
 
     frames = {frame.record.illumination: frame for frame in result.figures.frames if frame.record.kind == "light"}
     fields = [frames[number].paper.field.at(cells) for number in range(len(lights))]
-    held = hold(lut, world, chart, fields, exposure)
+    errors = table_errors(lut, world, chart, fields, exposure)
     against = "World.reflected over World.white, noise by EMVA 1288 taken out"
     for low, high in ((WELL_LIT_DN, np.inf), *BINS_DN):
-        chosen = held.where(low, high)
-        total, alone, systematic, bound = beyond_noise(held.error, held.noise, chosen)
+        chosen = errors.where(low, high)
+        total, alone, systematic, bound = beyond_noise(errors.error, errors.noise, chosen)
         name = (
             f"{case}: cell means, {low} counts and more" if high == np.inf else f"{case}: cell means, {low} to {high}"
         )
@@ -218,7 +220,7 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
         report(f"{name}, noise of 25 samples in it", 100 * alone, "%", "EMVA 1288 model")
         report(f"{name}, systematic error, RMS", 100 * systematic, "%", against)
         report(f"{name}, systematic error, upper bound", 100 * bound, "%", "two standard errors over lights")
-        scatter = held.scatter[chosen]
+        scatter = errors.scatter[chosen]
         report(
             f"{name}, variance of samples, mean over cells",
             float(scatter.mean()),
@@ -245,10 +247,10 @@ def measure(case: str, body: str, room: Changes, folder: Path) -> None:
     )
     for one, other in ((9, len(lights) - 2), (0, len(lights) - 1)):
         ratio = repeated_variance(
-            lut.samples[one], lut.samples[other], held.level[one] * fields[one], fields[one], world.body, exposure.iso
+            lut.samples[one], lut.samples[other], errors.level[one] * fields[one], fields[one], world.body, exposure.iso
         )
         for low, high in ((30, 300), *BINS_DN):
-            chosen = (held.level[one] >= low) & (held.level[one] < high) & held.clean[:, None]
+            chosen = (errors.level[one] >= low) & (errors.level[one] < high) & errors.clean[:, None]
             if chosen.sum() > 1000:
                 report(
                     f"{case}: variance between two frames of light {one}, {low} to {high} counts",

@@ -34,7 +34,7 @@ from acquisition.session.folder import Session
 from acquisition.session.journal import ACCEPTED
 from acquisition.session.plan import plan_steps
 from calibration.pipeline.build import build
-from calibration.pipeline.prefetching import threads
+from calibration.pipeline.prefetching import thread_count
 from calibration.registration.register import register
 from calibration.sampling.samples import gather_values, sites_at
 from drivers.raw.rawfile import read_raw
@@ -120,7 +120,7 @@ def build_timed(session: Session, out: Path) -> Costs:
     shutil.rmtree(out)
     # The first mark is set before the chart is sought, the second when the first frame is done, the last after all. As
     # many frames are under way at the first one counted as at the last one: towards the end, threads run out of work.
-    first, last, frames = marks[1], marks[-2 - threads()], len(marks) - 3 - threads()
+    first, last, frames = marks[1], marks[-2 - thread_count()], len(marks) - 3 - thread_count()
     return Costs((last.wall - first.wall) / frames, (last.processor - first.processor) / frames)
 
 
@@ -133,7 +133,7 @@ def compare(session: Session, out: Path, kind: str) -> None:
     dcraw = shutil.which("dcraw")
 
     def unpack_all() -> None:
-        with ThreadPoolExecutor(threads()) as pool:
+        with ThreadPoolExecutor(thread_count()) as pool:
             list(pool.map(unpack, files))
 
     def develop() -> None:
@@ -153,7 +153,7 @@ def compare(session: Session, out: Path, kind: str) -> None:
             *((b.wall / u.wall, b.processor / u.processor, b.wall / d) for b, u, d in rounds), strict=True
         )
     )
-    count = f"{threads()} threads"
+    count = f"{thread_count()} threads"
     report(f"one frame of a build, {kind}", float(np.median([b.wall for b, _, _ in rounds])), "s", count)
     report(f"one frame of a build, {kind}, to unpacking", wall, "1", f"rawpy's unpack alone, {count}")
     report(f"one frame of a build, {kind}, to unpacking, processor time", processor, "1", "rawpy's unpack alone")
@@ -178,9 +178,9 @@ def memory(folder: Path, lights: int) -> None:
         "sys.exit(code)"
     )
     command = [sys.executable, "-c", program, session.folder, folder / f"lut_{lights}"]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    peak = float(said.rsplit("VmHWM:", 1)[1].split()[0]) / 1e6
-    against = f"{lights} lights, {threads()} threads; below 2 GB wanted whatever the number"
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    peak = float(output.rsplit("VmHWM:", 1)[1].split()[0]) / 1e6
+    against = f"{lights} lights, {thread_count()} threads; below 2 GB wanted whatever the number"
     report(f"memory of a build, EOS 6D Mark II, {lights} lights", peak, "GB", against)
 
 

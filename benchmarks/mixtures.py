@@ -1,9 +1,9 @@
-"""How true mixed light is: every light of a table left out, made of the others, and held against its own frames.
+"""The accuracy of mixed lights: each light of a table is left out, mixed from the others, and compared with its frames.
 
 `python -m benchmarks.mixtures [LUT]` prints one JSON object a line for each figure. Without a table it takes a session
 of all 707 lights in the simulated room, with a chart of 512 colours before the small body, which takes minutes.
 
-Two ways, neither of which sees the frames of the light left out but to compare:
+Two methods, neither of which uses the frames of the light left out except to compare:
 
 codes    its proportion of the three primaries, known from the codes shown and the transfer function (sRGB), is mixed
          from those of its neighbours; the white and the colours that this mixture gives are a prediction.
@@ -62,8 +62,8 @@ class Cells:
 
 
 @dataclass(frozen=True)
-class Left:
-    """A light left out, and the mixture of others that stands for it."""
+class LeftOut:
+    """A light left out, and the mixture of others that replaces it."""
 
     light: int
     others: tuple[int, ...]
@@ -81,9 +81,9 @@ def drives(lights: Sequence[Illumination]) -> _Array:
     return decode_srgb(np.array(codes) / 255)
 
 
-def leave_out(rgb: _Array) -> list[Left]:
-    """Return for each light that others can make the mixture of those others, by what each is in linear `rgb`."""
-    found: list[Left] = []
+def leave_out(rgb: _Array) -> list[LeftOut]:
+    """Return for each light that the others can make their mixture; `rgb` (L, 3) float64 is linear light."""
+    found: list[LeftOut] = []
     for light in range(len(rgb)):
         others = np.delete(np.arange(len(rgb)), light)
         try:
@@ -91,12 +91,12 @@ def leave_out(rgb: _Array) -> list[Left]:
         except OutsideGamutError:
             continue
         lights = tuple(int(others[number]) for number in match.mixture.lights)
-        found.append(Left(light, lights, match.mixture.weights))
+        found.append(LeftOut(light, lights, match.mixture.weights))
     return found
 
 
-def judge(way: str, found: Sequence[Left], lut: Lut, cells: Cells) -> None:
-    """Print how far predictions are from what was measured."""
+def judge(method: str, found: Sequence[LeftOut], lut: Lut, cells: Cells) -> None:
+    """Print the errors of predicted lights and colours against those measured."""
     angles: list[float] = []
     errors: list[_Array] = []
     noises: list[_Array] = []
@@ -121,24 +121,24 @@ def judge(way: str, found: Sequence[Left], lut: Lut, cells: Cells) -> None:
             worst.append(float(np.sqrt((error[lit] ** 2).mean())))
     among = f"{len(found)} lights of {len(lut.white)}, each made of others"
     count = np.bincount([len(left.others) for left in found], minlength=4)
-    report(f"{way}: lights in a mixture, mean", float((count @ np.arange(len(count))) / len(found)), "lights", among)
-    report(f"{way}: white, median angle", float(np.median(angles)), "degrees", among)
-    report(f"{way}: white, worst angle", float(np.max(angles)), "degrees", among)
+    report(f"{method}: lights in a mixture, mean", float((count @ np.arange(len(count))) / len(found)), "lights", among)
+    report(f"{method}: white, median angle", float(np.median(angles)), "degrees", among)
+    report(f"{method}: white, worst angle", float(np.max(angles)), "degrees", among)
     error, noise = np.concatenate(errors), np.concatenate(noises)
     rms = float(np.sqrt((error**2).mean()))
     alone = float(np.sqrt(noise.mean()))
     above = f"colour over white, cells above {WELL_LIT_DN} counts, {among}"
-    report(f"{way}: colour means, RMS", 100 * rms, "%", above)
-    report(f"{way}: colour means, RMS that noise alone gives", 100 * alone, "%", above)
+    report(f"{method}: colour means, RMS", 100 * rms, "%", above)
+    report(f"{method}: colour means, RMS that noise alone gives", 100 * alone, "%", above)
     often = times >= len(found) / 4
     report(
-        f"{way}: colour means, RMS of each colour's error averaged over lights, which takes the noise out",
+        f"{method}: colour means, RMS of each colour's error averaged over lights, which takes the noise out",
         100 * float(np.sqrt(((summed[often] / times[often]) ** 2).mean())),
         "%",
         f"{int(often.sum())} channels of colours that are above {WELL_LIT_DN} counts under a quarter of the lights",
     )
-    report(f"{way}: colour means, mean error", 100 * float(error.mean()), "%", above)
-    report(f"{way}: colour means, RMS of the worst light", 100 * max(worst), "%", above)
+    report(f"{method}: colour means, mean error", 100 * float(error.mean()), "%", above)
+    report(f"{method}: colour means, RMS of the worst light", 100 * max(worst), "%", above)
 
 
 def judge_black_bodies(lut: Lut) -> None:
@@ -172,7 +172,7 @@ def small_table(folder: Path) -> Lut:
 
 
 def measure(lut: Lut) -> None:
-    """Judge one table."""
+    """Print the errors of one table."""
     cells = Cells.of(lut)
     judge("codes", leave_out(drives(lut.illuminations)), lut, cells)
     judge("match", leave_out(lut.white), lut, cells)
@@ -180,7 +180,7 @@ def measure(lut: Lut) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Judge the table named, or one made for the purpose."""
+    """Print the errors of the table named, or of one made for the purpose, and return 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("lut", nargs="?", type=Path, help="folder of a table of many lights")
     folder: Path | None = parser.parse_args(argv).lut

@@ -1,7 +1,7 @@
-"""Rooms that nothing was tuned for: whole charts hung in random rooms, registered, and held against the truth.
+"""Registration in rooms that nothing was tuned for: whole charts in random rooms, compared with the truth.
 
 `python -m benchmarks.rooms [--rooms N] [--first SEED]` prints one JSON object a line for each room, then a summary.
-A room fails loudly when registration or the verdict refuses it, which is honest, and silently when it is accepted and
+A room fails loudly when registration or the verdict refuses it, which is allowed, and silently when it is accepted and
 a cell lies `SILENT_PX` or more from the truth, or its samples are wrong by more than `SILENT_SHARE`, which must not
 happen. About 10 s a room on one core.
 """
@@ -91,13 +91,13 @@ def random_case(seed: int) -> Case:
 
 
 @dataclass(frozen=True, eq=False)
-class Hung:
-    """A room with its chart, photographed once.
+class PhotographedChart:
+    """One frame of a chart in a room.
 
     Attributes
     ----------
     case, chart, world
-        What hangs where.
+        The random case, the chart in its room, and the room.
     mosaic
         The frame as read from its file.
     """
@@ -107,14 +107,14 @@ class Hung:
     world: World
     mosaic: Mosaic
 
-    def aside_px(self) -> npt.NDArray[np.float64]:
-        """Return how far the frame as read begins from the visible frame as the room has it, half-size px."""
+    def crop_offset_px(self) -> npt.NDArray[np.float64]:
+        """Return (2,) float64, half-size px: column and row of the visible frame where the frame as read begins."""
         visible = self.world.body.visible
         return np.array([self.mosaic.visible.left - visible.left, self.mosaic.visible.top - visible.top]) / 2
 
     def miss_px(self, registration: Registration) -> npt.NDArray[np.float64]:
-        """Return how far each registered cell lies from the truth."""
-        places = self.world.project(self.chart.centres_mm) - self.aside_px()
+        """Return (C,) float64, the distance of each registered cell from its true place, half-size px."""
+        places = self.world.project(self.chart.centres_mm) - self.crop_offset_px()
         return np.linalg.norm(registration.to_pixels(self.chart.centres_mm) - places, axis=1)
 
     def sample_error(self, registration: Registration) -> float:
@@ -125,7 +125,7 @@ class Hung:
         height, width = self.mosaic.block_planes().shape[2:]
         sites = sites_at(registration.to_pixels(self.chart.centres_mm), (height, width))
         samples, _ = gather(self.mosaic, frame_black(self.mosaic), sites)
-        middle = self.world.view.locate(np.column_stack([sites.columns, sites.rows]) + self.aside_px())
+        middle = self.world.view.locate(np.column_stack([sites.columns, sites.rows]) + self.crop_offset_px())
         light, room = LIGHTS[self.case.light], self.case.room
         true = self.world.seen(self.chart.rgb, middle, light, SETTINGS)
         error = samples.mean(axis=1) / true - 1
@@ -134,13 +134,13 @@ class Hung:
         return float(np.sqrt(max(float((error**2 - noise)[lit].mean()), 0.0)))
 
 
-def hang(case: Case, bits: int = 5, page: str = "A0") -> Hung:
-    """Return the room of a case with its chart hung up and photographed."""
+def photographed_case(case: Case, bits: int = 5, page: str = "A0") -> PhotographedChart:
+    """Return a frame of a new chart in the room of a case."""
     return photographed(case, design_chart(bits, A_SERIES_MM[page], case.seed))
 
 
-def photographed(case: Case, chart: Chart) -> Hung:
-    """Return the room of a case with a chart hung up and photographed."""
+def photographed(case: Case, chart: Chart) -> PhotographedChart:
+    """Return a frame of a chart in the room of a case."""
     drawn = drawing(chart)
     world = World(Print(drawn.page_mm, drawn.rectangles_mm, drawn.rgb), BODIES[case.body], case.room)
     stream = BytesIO()
@@ -150,23 +150,23 @@ def photographed(case: Case, chart: Chart) -> Hung:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "room.dng"
         path.write_bytes(stream.getvalue())
-        return Hung(case, chart, world, read_raw(path))
+        return PhotographedChart(case, chart, world, read_raw(path))
 
 
 def miss(case: Case, bits: int = 5, page: str = "A0") -> npt.NDArray[np.float64]:
-    """Return how far each registered cell lies from the truth, px.
+    """Return (C,) float64, the distance of each registered cell from its true place, half-size px.
 
     Raises
     ------
     QualityError
         The room was refused.
     """
-    hung = hang(case, bits, page)
-    return hung.miss_px(register(hung.mosaic, hung.chart, f"room {case.seed}"))
+    shot = photographed_case(case, bits, page)
+    return shot.miss_px(register(shot.mosaic, shot.chart, f"room {case.seed}"))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Try rooms and print what became of each; 1 when one failed silently."""
+    """Try rooms, print the result of each, and return 1 if one failed silently, else 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rooms", type=int, default=50)
     parser.add_argument("--first", type=int, default=0)
@@ -176,30 +176,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     loud = silent = remarked = 0
     for seed in range(given.first, given.first + given.rooms):
         case, started = random_case(seed), time.perf_counter()
-        told: dict[str, object] = {"room": seed, "body": case.body, "light": case.light}
-        told |= {"blur_px": round(case.room.blur_px, 3), "waves_mm": round(case.room.waviness_mm, 1)}
-        hung = hang(case)
+        row: dict[str, object] = {"room": seed, "body": case.body, "light": case.light}
+        row |= {"blur_px": round(case.room.blur_px, 3), "waves_mm": round(case.room.waviness_mm, 1)}
+        shot = photographed_case(case)
         try:
-            found = register(hung.mosaic, hung.chart, f"room {seed}")
+            found = register(shot.mosaic, shot.chart, f"room {seed}")
         except CropError as refused:
             loud += 1
-            told["refused"] = str(refused)
+            row["refused"] = str(refused)
         else:
-            error, wrong = hung.miss_px(found), hung.sample_error(found)
+            error, wrong = shot.miss_px(found), shot.sample_error(found)
             places.append((case.room.waviness_mm, float(np.sqrt((error**2).mean())), float(error.max())))
             mixed = bleed(found.cell_px, found.blur_px)
             verdict = judge({"cell_px": found.cell_px, "bleed": mixed, "tag_residual_px": found.lens_residual_px})
-            told |= {"rms_px": round(places[-1][1], 4), "max_px": round(places[-1][2], 3)}
-            told |= {"cell_px": round(found.cell_px, 2), "bleed": round(mixed, 4)}
-            told |= {"samples": round(wrong, 5), "verdict": verdict.outcome}
+            row |= {"rms_px": round(places[-1][1], 4), "max_px": round(places[-1][2], 3)}
+            row |= {"cell_px": round(found.cell_px, 2), "bleed": round(mixed, 4)}
+            row |= {"samples": round(wrong, 5), "verdict": verdict.outcome}
             if verdict.outcome == "refuse":
                 loud += 1
             else:
                 remarked += verdict.outcome == "accept with remarks"
                 samples.append(wrong)
                 silent += bool(error.max() >= SILENT_PX or wrong > SILENT_SHARE)
-        told["seconds"] = round(time.perf_counter() - started, 1)
-        print(json.dumps(told), flush=True)
+        row["seconds"] = round(time.perf_counter() - started, 1)
+        print(json.dumps(row), flush=True)
     against = f"{given.rooms} random rooms"
     figures = {"rooms refused": loud, "rooms with remarks": remarked, "rooms wrong without a word": silent}
     for name, value in figures.items():

@@ -191,11 +191,10 @@ def build_lut(
     else:
         from acquisition.framing.corners import parse_corners
         from calibration.pipeline.options import BuildOptions
+        from calibration.sampling.samples import WINDOW
 
         if picture is not None and not check:
             raise InputError("--picture goes with --check; a table that is built has its report")
-        from calibration.sampling.samples import WINDOW
-
         places = None if corners is None else parse_corners(corners)
         options = BuildOptions(WINDOW if window is None else window, subtract_dark, places)
         _make(session, lut, check, append, options, linearity, picture)
@@ -223,6 +222,7 @@ def _make(
     if lut is None:
         raise InputError("a folder for the table is expected: build-lut SESSION LUT, or --check to judge only")
     from calibration.pipeline.build import TableProgress
+    from calibration.table.file_names import REPORT_PAGE
 
     with Session.open(session) as opened:
         result = _build(opened, lut, append, options, linearity)
@@ -233,7 +233,7 @@ def _make(
         )
         return
     _print_result(result)
-    print(f"{lut}: {result.figures.session.lights} lights, {result.figures.session.camera}; see {lut / 'report.html'}")
+    print(f"{lut}: {result.figures.session.lights} lights, {result.figures.session.camera}; see {lut / REPORT_PAGE}")
 
 
 def _check(session: Session, options: BuildOptions, linearity: Path | None, picture: Path | None) -> None:
@@ -276,10 +276,10 @@ def _verify(folder: Path, session: Path | None) -> None:
         faults = find_faults(lut, lambda done, total: progress(done, total, "reading the samples"))
     if session is not None:
         from acquisition.session.folder import Session
-        from calibration.pipeline.frames import lost_frames
+        from calibration.pipeline.frames import frame_faults
 
         with Session.open(session) as opened, _bar("reading the frames") as progress:
-            faults += lost_frames(lut, opened, progress)
+            faults += frame_faults(lut, opened, progress)
     for fault in faults:
         print(fault)
     if faults:
@@ -320,7 +320,7 @@ def _fetch(url: str, folder: Path) -> None:
 
 @contextmanager
 def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
-    """Show a bar of progress on stderr; yields what is to be called with done, total, and the present work."""
+    """Show a bar of progress on stderr; yield what is to be called with done, total, and the present work."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -332,7 +332,6 @@ def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(beginning, total=None)
-
         yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
 
 

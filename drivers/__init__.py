@@ -1,1 +1,1 @@
-"""Every foreign wire, bus, display and file that the lab touches; knows none of the rooms above."""
+"""Every foreign wire, bus, display and file that the lab uses; imports none of the packages above it."""

@@ -1,4 +1,4 @@
-"""What the suite asks of a tethered camera, and the values that pass between them.
+"""The interface of a tethered camera, and the values that it takes and returns.
 
 Kept small so that a second maker fits beside the first: a camera is configured once, then asked for one raw frame
 after another, each written whole into a file that the caller opened.
@@ -13,7 +13,7 @@ from typing import BinaryIO, Protocol, runtime_checkable
 
 @dataclass(frozen=True)
 class CameraIdentity:
-    """Which body hangs on the cable."""
+    """Maker, model, serial number and firmware of the connected body."""
 
     maker: str
     model: str
@@ -92,8 +92,8 @@ class Camera(Protocol):
 
 
 @runtime_checkable
-class Patient(Protocol):
-    """A camera that must be asked for events in long pauses: to stay awake, and to empty its queue."""
+class NeedsKeepAlive(Protocol):
+    """A camera that must be polled for events in long pauses: to stay awake, and to empty its queue."""
 
     def idle(self) -> None:
         """Keep the camera awake and empty its queue of events; call it every few seconds of a pause."""
@@ -101,6 +101,6 @@ class Patient(Protocol):
 
 
 def keep_awake(camera: Camera) -> None:
-    """Speak to a camera that wants it; to be called every few seconds of a pause."""
-    if isinstance(camera, Patient):
+    """Keep a camera awake that would fall asleep; call it every few seconds of a pause."""
+    if isinstance(camera, NeedsKeepAlive):
         camera.idle()

@@ -1,10 +1,10 @@
-"""Any tethered camera that libgphoto2 knows, as the suite's `Camera`: the way for makers without a driver of our own.
+"""Any tethered camera that libgphoto2 supports, as a `Camera`: for makers that have no driver of their own here.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - python-gphoto2 is an optional extra and is imported only when a camera is opened.
 - libgphoto2's errors become ours in `_speaking`. After a fault the connection is dropped, and the next call opens a
-  new one; a frame that was on its way is lost and may be retaken.
+  new one; a frame that was being transferred is lost and may be retaken.
 - Settings are chosen from the lists that libgphoto2 shows for the body, and read back.
 
 libgphoto2 may focus before it releases, so that a body that does not focus by hand is refused.
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import gphoto2
 
 TOLERANCE = 0.06
-"""How far, of one, a label may lie from the value asked for: libgphoto2 says 6.3 s where the dial says 6."""
+"""Relative difference allowed between a label and the value wanted: libgphoto2 lists 6.3 s where the dial shows 6."""
 
 _SYSTEM_CLOCK = SystemClock()
 _MANUAL = ("Manual", "M")
@@ -73,7 +73,7 @@ class Gphoto2Camera:
         Raises
         ------
         DeviceRefused
-            The body does not offer a value, or is set up in a way that spoils a series; all of it in one message.
+            The body does not offer a value, or has a setting that spoils a series; all of it in one message.
         """
         self._settings = None
         with self._speaking() as camera:
@@ -152,12 +152,12 @@ class Gphoto2Camera:
         if self._port is not None:
             ports = gp.PortInfoList()
             ports.load()
-            with _known(f"port {self._port!r}", "such as usb:001,004 or ptpip:192.168.1.20"):
+            with _lookup_errors_translated(f"port {self._port!r}", "such as usb:001,004 or ptpip:192.168.1.20"):
                 camera.set_port_info(ports[ports.lookup_path(self._port)])
         if self._model is not None:
             models = gp.CameraAbilitiesList()
             models.load()
-            with _known(f"model {self._model!r}", "gphoto2 --list-cameras lists those it knows"):
+            with _lookup_errors_translated(f"model {self._model!r}", "gphoto2 --list-cameras lists those it knows"):
                 camera.set_abilities(models[models.lookup_model(self._model)])
         camera.init()
         return camera
@@ -215,8 +215,8 @@ def library():
 
 
 @contextmanager
-def _known(what: str, remedy: str) -> Generator[None]:
-    """Tell what was looked up in vain as a mistake of the settings."""
+def _lookup_errors_translated(what: str, remedy: str) -> Generator[None]:
+    """Raise what libgphoto2 does not find as a ConfigurationError that lists what it does."""
     gp = library()
     try:
         yield

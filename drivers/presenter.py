@@ -1,4 +1,4 @@
-"""What the suite asks of whatever fills the projector's picture with one plain colour."""
+"""The interface of whatever fills the projector's picture with one plain colour."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What the suite asks of a projector's control port: its lamp, its health, its name.
+"""The interface of a projector's control port: its lamp, its faults, its name.
 
-What the projector *shows* is not asked here; see `drivers.presenter`.
+What the projector *shows* is set elsewhere; see `drivers.presenter`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Lamp:
 
 @dataclass(frozen=True)
 class ProjectorIdentity:
-    """Which projector answers, as it names itself; empty where it does not say."""
+    """Which projector answers, as it names itself; empty where it reports none."""
 
     maker: str
     model: str

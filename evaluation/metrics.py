@@ -27,7 +27,7 @@ def recovery_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDArray
     Parameters
     ----------
     estimate, truth
-        (..., 3), linear camera RGB of any length > 0.
+        (..., 3) float or int, linear camera RGB of any length > 0.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDA
     Parameters
     ----------
     estimate, truth
-        (..., 3), linear camera RGB of any length > 0; a channel of the estimate at zero gives the limit.
+        (..., 3) float or int, linear camera RGB of any length > 0; a channel of the estimate at zero gives the limit.
 
     Returns
     -------

@@ -12,7 +12,7 @@ def angles_deg(one: npt.ArrayLike, other: npt.ArrayLike) -> npt.NDArray[np.float
     Parameters
     ----------
     one, other
-        (..., 3) each, broadcast against each other; linear RGB of any length above 0.
+        (..., 3) float or int each, broadcast against each other; linear RGB of any length above 0.
 
     Returns
     -------

@@ -11,7 +11,7 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """What the suite knows of time."""
+    """The interface of a clock: the date, seconds that pass, and waiting."""
 
     def now(self) -> datetime:
         """Return the wall-clock time, timezone-aware, UTC."""

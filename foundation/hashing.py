@@ -43,7 +43,7 @@ def file_sha256(path: Path) -> str:
 
 
 class HashingWriter(io.RawIOBase):
-    """A stream that is written in order, and hashed and counted on the way.
+    """A stream that is written in order, hashed and counted meanwhile.
 
     Parameters
     ----------

@@ -3,7 +3,7 @@
 The lock is advisory (`flock(2)`) and lies on the folder itself, so that a program that is killed leaves none behind.
 Network file systems refuse to lock a folder (`EBADF` on NFS, where `flock` needs write access); a file in it is locked
 there instead, and removed by the last who holds it. Where the file system has no locks at all, the work goes on with a
-warning: nobody else may work there, and nothing can see to it.
+warning: no other program may work there, and nothing prevents it.
 """
 
 from __future__ import annotations
@@ -50,7 +50,9 @@ class FolderLock:
 
 
 @contextmanager
-def held_folder(folder: Path, busy: str, share_if: Callable[[], bool] | None = None) -> Generator[FolderLock]:
+def held_folder(
+    folder: Path, busy: str, share_if: Callable[[], bool] | None = None, of: Path | None = None
+) -> Generator[FolderLock]:
     """Hold a folder while the block runs; it is made if it is not there.
 
     Parameters
@@ -62,6 +64,8 @@ def held_folder(folder: Path, busy: str, share_if: Callable[[], bool] | None = N
     share_if
         Where given, another program's hold is waited for until it is shared (`FolderLock.share`), and joined if this
         returns true then; if not, the attempt begins anew.
+    of
+        What is made in the folder, named in the messages of errors; the folder itself if None.
 
     Raises
     ------
@@ -71,7 +75,7 @@ def held_folder(folder: Path, busy: str, share_if: Callable[[], bool] | None = N
         The folder cannot be made or opened.
     """
     while True:
-        make_folder(folder)
+        make_folder(folder, of)
         with ExitStack() as opened:
             try:
                 place = _opened(folder, opened)
@@ -81,7 +85,7 @@ def held_folder(folder: Path, busy: str, share_if: Callable[[], bool] | None = N
             except BlockingIOError as error:
                 raise InputError(busy) from error
             except OSError as error:
-                raise storage_error(folder, error) from error
+                raise storage_error(folder if of is None else of, error) from error
             if not _is_at(place, folder) or (together and share_if is not None and not share_if()):
                 continue
             yield FolderLock(handle)

@@ -21,7 +21,7 @@ _HUBER_SIGMAS: Final = 2.0
 
 
 def sigma_of(residual: npt.NDArray[np.floating]) -> float:
-    """Return the standard deviation of normal residuals about zero, of any shape, by the median of their sizes."""
+    """Return the standard deviation of normal residuals about zero, float of any shape, by their median size."""
     return MAD_TO_SIGMA * float(np.median(np.abs(residual)))
 
 
@@ -31,7 +31,7 @@ def huber_weights(size: npt.NDArray[np.float64], sigma: float) -> npt.NDArray[np
     Parameters
     ----------
     size
-        Absolute residuals.
+        (...) float64, absolute residuals.
     sigma
         Their usual size, > 0 (`sigma_of`); residuals beyond twice that weigh in inverse proportion to their size.
     """
@@ -44,7 +44,7 @@ def biweight(size: npt.NDArray[np.float64], sigma: float, cut: float = 6.0) -> n
     Parameters
     ----------
     size
-        Absolute residuals.
+        (...) float64, absolute residuals.
     sigma
         Their usual size, > 0 (`sigma_of`).
     cut

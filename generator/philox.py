@@ -75,7 +75,7 @@ def words(
     seed
         0 … 2⁶⁴ − 1.
     a, b, number
-        The first three counter words, 0 … 2³² − 1 each, of shapes that broadcast.
+        (...) int, the first three counter words, 0 … 2³² − 1 each, of shapes that broadcast.
     purpose
         The fourth.
 

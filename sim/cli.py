@@ -133,7 +133,7 @@ def camera(
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError
     from sim.buses.ptpip_server import serve_ptpip
-    from sim.buses.usb_device import Identity, PtpUsbDevice
+    from sim.buses.usb_device import PtpUsbDevice, UsbIdentity
     from sim.buses.usbip import serve_usbip
     from sim.camera.eos import SimulatedEos
     from sim.camera.eos_bodies import EOS_BODIES
@@ -156,7 +156,7 @@ def camera(
             with serve_ptpip(eos, port, name=eos.body.model) as server:
                 _until_interrupted("PTP/IP camera {} at {}:{}".format(eos.body.model, *server.address))
         elif usbip is not None:
-            device = PtpUsbDevice(eos, Identity(*eos.body.usb, serial=eos.serial, name=eos.body.model))
+            device = PtpUsbDevice(eos, UsbIdentity(*eos.body.usb, serial=eos.serial, name=eos.body.model))
             with serve_usbip([device], usbip) as server:
                 _until_interrupted("USB/IP camera {} at {}:{}, bus id 1-1".format(eos.body.model, *server.address))
 

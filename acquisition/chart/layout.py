@@ -27,7 +27,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.chart.model import PAPER_WHITE, TAG_MODULES, Chart, Reference, Tag
+from acquisition.chart.margins import GAP_PX
+from acquisition.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, Reference, Tag
 from acquisition.chart.pixels import DESIGN_DPI, PX_MM
 from foundation.errors import InputError
 from foundation.version import software
@@ -41,7 +42,6 @@ SLOT_STEP_PX = 5
 LEAST_SLOT_PX = 25
 """A cell of 1.06 mm, a module of 0.42 mm: below, a printer's dots are too few to mix a colour."""
 
-TAG_FAMILY = "36h11"
 TAG_SLOTS = 4
 """Slots along a tag with its white rim: its ten modules are then 2/5 of a slot, whole pixels at 600 dpi."""
 
@@ -59,6 +59,9 @@ PAPER_BLOCKS = {1: (2, 1), 2: (2, 2), 3: (4, 2), 4: (4, 4), 5: (8, 4)}
 
 PAPER_REFERENCE_MM = 100.0
 """Largest distance between the patches of bare paper in the margin of the paper's grid."""
+
+PAPER_REFERENCE_PX = 118
+"""Side of these patches, 5 mm: about that of a cell, and even, so that its middle is a whole pixel."""
 
 PAPER_REFERENCES = 4
 """Parts into which these patches divide the upper and the right margin at least."""
@@ -103,6 +106,7 @@ class _Grid:
 
     @classmethod
     def on(cls, page_mm: tuple[float, float], slot_px: int = SLOT_PX) -> _Grid:
+        """Return the largest grid of slots that fits on a page within its margins, in the middle."""
         page_px = [math.floor(side / PX_MM) for side in page_mm]
         margin_px = math.ceil(MARGIN_MM / PX_MM)
         columns, rows = (max(0, side - 2 * margin_px) // slot_px for side in page_px)
@@ -125,19 +129,19 @@ class _Grid:
         return self.columns * self.rows - len(self.tag_slots) * TAG_SLOTS**2
 
     def holds(self, bits: int) -> bool:
-        """Whether the colours, two by two tags and enough references find a place."""
+        """Return whether the colours, two by two tags and enough references find a place."""
         if min(self.columns, self.rows) < 2 * TAG_SLOTS or len(self.tag_slots) > TAG_IDS:
             return False
         return self.reference_count >= 8**bits + _least_references(bits)
 
     def mm(self, column: float, row: float) -> tuple[float, float]:
-        """Place on the print of a point of the slot grid."""
+        """Return the place (x, y), mm on the print, of a point of the slot grid."""
         x0, y0 = self.origin_px
         return (x0 + column * self.slot_px) * PX_MM, (y0 + row * self.slot_px) * PX_MM
 
 
 def _tag_starts(slots: int) -> list[int]:
-    """First slots of the tags along a side: evenly spread, the outermost at the edges."""
+    """Return the first slots of the tags along a side: evenly spread, the outermost at the edges."""
     last = slots - TAG_SLOTS
     steps = max(1, math.ceil(last / TAG_SPACING_SLOTS))
     return [round(step * last / steps) for step in range(steps + 1)]
@@ -329,9 +333,9 @@ def paper_chart(page: str | tuple[float, float] | None = None, bits: int = 5) ->
 
 
 def _margin_whites(field_px: tuple[int, int, int, int]) -> list[Reference]:
-    """Return patches of bare paper around a field, a margin's clear 1.5 mm away from it."""
+    """Return patches of bare paper around a field, `GAP_PX` of bare paper away from it."""
     left, top, right, bottom = field_px
-    side, away, step = 118, 35 + 59, PAPER_REFERENCE_MM / PX_MM
+    side, away, step = PAPER_REFERENCE_PX, GAP_PX + PAPER_REFERENCE_PX // 2, PAPER_REFERENCE_MM / PX_MM
     sides = ((left, right), (top, bottom))
     across, down = (max(PAPER_REFERENCES, math.ceil((high - low) / step)) for low, high in sides)
     places = [(x, y) for y in (top - away, bottom + away) for x in (left - away, right + away)]
@@ -367,9 +371,9 @@ def _tag(grid: _Grid, number: int, column: int, row: int) -> Tag:
 
 
 def _references(grid: _Grid, referenced: _Slots, rng: np.random.Generator) -> list[Reference]:
-    """Give each level of grey an eighth of the references, evenly over the field, and leave the rest white.
+    """Return the references: of each level of grey an eighth, evenly over the field, and the rest white.
 
-    Where they are few the greys get less, so that there are `LEAST_WHITES`.
+    Where they are few there is less of each grey, so that there are `LEAST_WHITES` white ones.
     """
     codes = np.zeros(referenced.shape, dtype=np.int64)
     codes[referenced] = PAPER_WHITE[0]
@@ -393,7 +397,7 @@ def _references(grid: _Grid, referenced: _Slots, rng: np.random.Generator) -> li
 
 
 def spread(allowed: _Slots, count: int, rng: np.random.Generator) -> _Slots:
-    """Choose slots that are spread evenly over a grid, without a lattice.
+    """Return a choice of slots that are spread evenly over a grid, without a lattice.
 
     After the void-and-cluster method (Ulichney, "The void-and-cluster method for dither array generation", 1993):
     from a random choice, each slot in turn moves to the emptiest place. Once round is enough: on A0 no two references
@@ -452,7 +456,7 @@ def _nearness(count: int, sigma: float) -> npt.NDArray[np.float64]:
 
 
 def _quotas(sizes: list[int], count: int) -> list[int]:
-    """Share `count` among the quarters in proportion to their sizes, whole and none above its size."""
+    """Return shares of `count` for the quarters in proportion to their sizes: whole, none above its size."""
     exact = [count * size / sum(sizes) for size in sizes]
     shares = [math.floor(share) for share in exact]
     largest = sorted(range(len(sizes)), key=lambda quarter: shares[quarter] - exact[quarter])

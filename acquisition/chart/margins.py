@@ -84,7 +84,7 @@ def text_boxes(text: str, dot_px: int = _DOT_PX) -> Boxes:
 
 
 def _boxes_of(bitmap: npt.NDArray[np.bool_]) -> Boxes:
-    """Cut a bitmap into boxes: runs along its rows, equal ones below each other joined."""
+    """Return a bitmap (H, W) as boxes (N, 4): runs along its rows, equal ones below each other joined."""
     edges = np.diff(np.pad(bitmap.astype(np.int8), ((0, 0), (1, 1))), axis=1)
     rows, starts = np.nonzero(edges == 1)
     ends = np.nonzero(edges == -1)[1]
@@ -283,7 +283,7 @@ def target_boxes() -> Boxes:
 
 
 def _meet(some: Boxes, others: Boxes) -> bool:
-    """Whether any of some boxes overlaps any of the others."""
+    """Return whether any of some boxes (N, 4) overlaps any of the others (M, 4)."""
     return bool(
         (
             (some[:, None, :2] < others[None, :, 2:]).all(axis=2)

@@ -28,6 +28,9 @@ VERSION = 1
 PAPER_WHITE = (255, 255, 255)
 """Printed code of bare paper: no ink."""
 
+TAG_FAMILY = "36h11"
+"""Family of the AprilTags: codes of 36 bits, any two of which differ in 11 or more (E. Olson, ICRA 2011)."""
+
 TAG_MODULES = 8
 """Modules along the black square of a tag 36h11: 6 of data and a black border of one; the white rim comes on top."""
 

@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.margins import margin_marks
-from acquisition.chart.model import PAPER_WHITE, TAG_MODULES, Chart, Tag
+from acquisition.chart.model import PAPER_WHITE, TAG_FAMILY, TAG_MODULES, Chart, Tag
 from acquisition.chart.pixels import DESIGN_DPI, MM_PER_INCH, PX_MM, Boxes, whole_px
 from foundation.errors import InputError
 from foundation.files import whole_file, write_whole
@@ -130,7 +130,7 @@ def field_drawing(chart: Chart, within_mm: tuple[float, float, float, float] | N
 
 
 def _part_boxes(chart: Chart) -> npt.NDArray[np.float64]:
-    """(N, 4) mm: tags with their white rims, cells, references."""
+    """Return the boxes (N, 4) float64 mm of tags with their white rims, then cells, then references."""
     rims = [_tag_rectangles(tag)[0][:1] for tag in chart.tags]
     half = np.array(chart.cell_mm) / 2
     cells = np.concatenate([chart.centres_mm - half, chart.centres_mm + half], axis=1)
@@ -166,12 +166,12 @@ def tag_modules(tag: Tag) -> npt.NDArray[np.bool_]:
     """
     import cv2
 
-    if tag.family != "36h11":
-        raise InputError(f"tag {tag.id} is of family {tag.family}; only 36h11 can be printed")
+    if tag.family != TAG_FAMILY:
+        raise InputError(f"tag {tag.id} is of family {tag.family}; only {TAG_FAMILY} can be printed")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     if not 0 <= tag.id < len(dictionary.bytesList):
         raise InputError(
-            f"tag {tag.id} does not exist; family 36h11 has the numbers 0 to {len(dictionary.bytesList) - 1}"
+            f"tag {tag.id} does not exist; family {TAG_FAMILY} has the numbers 0 to {len(dictionary.bytesList) - 1}"
         )
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, tag.id, TAG_MODULES)) > 127
 
@@ -254,7 +254,7 @@ def _require_whole_pixels(chart: Chart, dpi: int) -> None:
 
 
 def _even_resolutions(lengths: list[float]) -> str:
-    """Name the usual resolutions at which all lengths are whole pixels."""
+    """Return the names of the usual resolutions, dpi, at which all lengths (mm) are whole pixels."""
     pixels = {dpi: [length * dpi / MM_PER_INCH for length in lengths] for dpi in (1200, 600, 360)}
     even = [f"{dpi}" for dpi, sizes in pixels.items() if all(abs(size - round(size)) <= 1e-3 for size in sizes)]
     return " or ".join(even) or "another number of"

@@ -1,9 +1,9 @@
 """What goes to the print shop with the sheet: a proof page on A4, and how to print both.
 
 The proof is cut from the sheet at true size, so that colour management, scale and sharpness can be judged for little
-money before the sheet is ordered. It is made of the sheet's own rectangles and marks; the one thing that is none is a
-strip printed twice, as rectangles and as an image: printers that manage colours treat the two differently, and a seam
-shows it.
+money before the sheet is ordered. It is made of the sheet's own rectangles and marks; besides, a strip of greys is
+printed twice, as rectangles and as an image: printers that manage colours treat the two differently, and a seam shows
+it.
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ WEDGE_CODES = (*range(0, 256, 8), 255)
 
 TEXT_TOP_MM, TEXT_LINE_MM, TEXT_DOT_PX = 154.0, 4.8, 3
 """Place of the text, from line to line, and its dots: capitals are 1.9 mm high."""
-
 
 LOOK_FOR = (
     "1 Scale: each 100 mm of both rulers measure 100 mm with a steel rule, to 0.3 mm. Else something scaled the page.",

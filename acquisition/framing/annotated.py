@@ -18,9 +18,10 @@ from acquisition.framing.tags import find_tags
 from drivers.raw.rawfile import Mosaic
 
 _GREEN, _RED, _AMBER, _GREY = (60, 200, 60), (40, 40, 255), (40, 200, 255), (200, 200, 200)
+"""BGR codes: of the page, of tags and outlines that place it, of mere candidates and numbers, of the ticks."""
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _TICK_RAW_PX = 500
-"""Raw pixels from tick to tick along the border."""
+"""Raw pixels from tick to tick along the border: about ten on the longer side of an 18-megapixel frame."""
 
 _Image = npt.NDArray[np.uint8]
 _Points = npt.NDArray[np.float64]

@@ -49,7 +49,7 @@ def parse_corners(texts: Sequence[str]) -> Corners:
 
 
 def corners_text(corners_px: npt.ArrayLike) -> str:
-    """Return corners (N, 2) half-size px as a person gives them: "X,Y X,Y", whole raw pixels."""
+    """Return corners (N, 2) float half-size px as a person gives them: "X,Y X,Y", whole raw pixels."""
     return " ".join(f"{2 * x + 0.5:.0f},{2 * y + 0.5:.0f}" for x, y in np.asarray(corners_px).reshape(-1, 2))
 
 

@@ -1,6 +1,6 @@
 """Where the chart is in a picture: its tags, or the field of a chart without tags, found and its pose measured.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - One linear colour plane at a time, the strongest of the frame: a square root moves a tag's corner by a quarter pixel,
   a sum of planes under deep red or blue by a fifth.
@@ -102,8 +102,8 @@ def find_chart(
     what
         The frame's name for messages.
     corners
-        (4, 2) half-size px, corners of the field of cells, clockwise from the printed top-left, for a chart without
-        tags; found automatically if not given.
+        (4, 2) float half-size px, corners of the field of cells, clockwise from the printed top-left, for a chart
+        without tags; found automatically if not given.
     near
         The framing of another frame of the session: a chart without tags then has the same orientation.
 

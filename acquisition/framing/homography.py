@@ -10,6 +10,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+FLAT = 1e-6
+"""Extent of points across a line, over that along it, below which they lie on it: rounding of coordinates leaves 1e-9,
+and the corners of two small tags at the ends of an A0 sheet have 1e-3."""
+
 _Points = npt.NDArray[np.float64]
 
 
@@ -54,8 +58,18 @@ def robust_homography(
     return homography, good
 
 
+def on_one_line(points: _Points) -> bool:
+    """Return whether points (N, 2) float64 lie on one line, whatever its direction, to `FLAT`; NaN does not."""
+    if not np.isfinite(points).all():
+        return False
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(extents[-1] <= FLAT * extents[0])
+
+
 def fit_homography(points: _Points, places: _Points, tolerance: float | None = None) -> npt.NDArray[np.float64] | None:
-    """Return the homography (3, 3) through point pairs (N, 2), or None where they have none.
+    """Return the homography (3, 3) float64 through point pairs, or None where they do not determine one.
+
+    Points on one line, on either side, do not; OpenCV returns a matrix for some of them all the same.
 
     Parameters
     ----------
@@ -64,7 +78,9 @@ def fit_homography(points: _Points, places: _Points, tolerance: float | None = N
     tolerance
         In units of `places`; if given, pairs further off are left out (RANSAC), else all count (least squares).
     """
-    # OpenCV answers None for degenerate pairs, which becomes an array without shape.
+    if on_one_line(points) or on_one_line(places):
+        return None
+    # OpenCV returns None for other degenerate pairs, which becomes an array without shape.
     method, threshold = (0, 3.0) if tolerance is None else (cv2.RANSAC, tolerance)
     found = np.asarray(cv2.findHomography(points, places, method, threshold)[0], dtype=np.float64)
     return found if found.shape == (3, 3) else None

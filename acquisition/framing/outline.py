@@ -99,7 +99,7 @@ class PreparedPicture:
 
     @classmethod
     def of(cls, planes: Sequence[Plane]) -> PreparedPicture:
-        """Prepare the planes of red, green and blue."""
+        """Return the planes of red, green and blue prepared for the search."""
         height, width = planes[0].values.shape
         factor = max(1, round(width / _SMALL_WIDTH_PX))
         size = (width // factor, height // factor)
@@ -167,7 +167,7 @@ class PreparedPicture:
                 quad = quad * self.factor + (self.factor - 1) / 2
                 if cv2.contourArea(quad.astype(np.float32), oriented=True) < 0:
                     quad = quad[::-1]
-                if not any(alike(quad, other, 2.0 * self.factor) for other in found):
+                if not any(same_corners(quad, other, 2.0 * self.factor) for other in found):
                     found.append(quad)
         return found
 
@@ -188,7 +188,7 @@ class Outline:
     normals: tuple[_Points, ...]
 
 
-def alike(one: _Points, other: _Points, tolerance: float) -> bool:
+def same_corners(one: _Points, other: _Points, tolerance: float) -> bool:
     """Return whether two quadrilaterals (4, 2) agree to a tolerance in their unit, whichever corner they begin with."""
     return any(np.abs(one - np.roll(other, turn, axis=0)).max() < tolerance for turn in range(4))
 
@@ -199,7 +199,7 @@ def _outwards(start: _Points, end: _Points) -> _Points:
     return np.array([y, -x])
 
 
-def follow(picture: PreparedPicture, corners_px: _Points) -> Outline | None:
+def trace_outline(picture: PreparedPicture, corners_px: _Points) -> Outline | None:
     """Return the edge between cells and paper near a quadrilateral; None where there is none along one of its sides.
 
     In rounds of shrinking reach (`_ROUNDS`) the steepest rise to paper is looked for across each side, and a curve, a
@@ -227,7 +227,6 @@ def follow(picture: PreparedPicture, corners_px: _Points) -> Outline | None:
             if np.linalg.norm(end - start) < 4 * reach:
                 return None
             normal = _outwards(start, end)
-
             middle = _bent(along, curves[side], start, end)
             off, strength = _edges(picture.pale_at(middle[:, None] + across[None, :, None] * normal), across, known)
             seen = strength > _MIN_EDGE
@@ -244,7 +243,7 @@ def follow(picture: PreparedPicture, corners_px: _Points) -> Outline | None:
     return Outline(corners, tuple(seen_px), tuple(normals))
 
 
-def refined(
+def refine_edges(
     planes: Sequence[Plane], places_px: _Points, normals: _Points, blur_px: float
 ) -> tuple[_Points, npt.NDArray[np.bool_]]:
     """Return places of the edge, (N, 2) float64 half-size px, found anew where it is clear, and where it is, (N,) bool.

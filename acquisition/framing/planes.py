@@ -26,6 +26,10 @@ CLIPPING_SHARE = 0.98
 MIN_SIGNAL = 12.0
 """Counts above black that the brightest parts of the strongest plane must have for a chart to be looked for."""
 
+PAPER_PERCENTILE = 98
+"""Percentile of the counts that stands for paper: bare paper is more than a fiftieth of a picture, hot photosites and
+highlights are less."""
+
 _Float = npt.NDArray[np.float32]
 
 
@@ -78,12 +82,20 @@ def plane_of(mosaic: Mosaic, channel: Channel, black: npt.NDArray[np.float64] | 
 def strongest_plane(mosaic: Mosaic, black: npt.NDArray[np.float64] | None = None) -> Plane:
     """Return the colour with the brightest paper; `black` (2, 2) float64 counts as in `plane_of`."""
     black = frame_black(mosaic) if black is None else black
-    blocks = mosaic.block_planes()[:, :, ::8, ::8]
+    return plane_of(mosaic, strongest_channel(mosaic, black, every=8), black)
+
+
+def strongest_channel(mosaic: Mosaic, black: npt.NDArray[np.float64], every: int = 16) -> Channel:
+    """Return the colour with the brightest paper, from one block in `every` along rows and columns.
+
+    `black` (2, 2) float64 counts.
+    """
+    blocks = mosaic.block_planes()[:, :, ::every, ::every]
     levels = [
-        max(float(np.percentile(blocks[place], 98) - black[place]) for place in places)
+        max(float(np.percentile(blocks[place], PAPER_PERCENTILE) - black[place]) for place in places)
         for places in phases(mosaic).values()
     ]
-    return plane_of(mosaic, CHANNELS[int(np.argmax(levels))], black)
+    return CHANNELS[int(np.argmax(levels))]
 
 
 def paper_level(plane: Plane) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr
 
 from acquisition.chart.model import TAG_MODULES
 from acquisition.framing.finding import Framing
@@ -35,10 +36,10 @@ def blur_px(framing: Framing) -> float:
     Median over edges: the tags', or of a chart without tags its field's against the margin. Across a tag's edge lie the
     tag's data, its black border, its white rim and what is beyond, the middle two one module wide: a staircase of four
     unknown levels and known steps, blurred. The σ whose staircase fits the pixels best, each at its own distance from
-    the edge, is taken; nothing is interpolated, which would blur as well (a slanted edge, as in ISO 12233). Contained
-    is what lens, focus and movement do, and the photosites' own size and spacing: 0.29 px for green (two photosites
-    half a pixel apart), 0.14 px for red and blue. Good to 0.01 px up to a quarter of a module, beyond that read up to a
-    tenth high, as the corners themselves are less sure.
+    the edge, is taken; nothing is interpolated, which would blur as well (a slanted edge, as in ISO 12233). It
+    contains what lens, focus and movement do, and the photosites' own size and spacing: 0.29 px for green (two
+    photosites half a pixel apart), 0.14 px for red and blue. Good to 0.01 px up to a quarter of a module, beyond that
+    read up to a tenth high, as the corners themselves are less sure.
     """
     if framing.field is not None:
         found = _outline_blurs(framing.plane, framing.field)
@@ -96,7 +97,7 @@ def _outline_blurs(plane: Plane, field: FoundField) -> npt.NDArray[np.float64]:
 def _sigma(seen: _Points, aside: _Points, steps_at: Sequence[float]) -> float:
     """Return the σ whose blurred staircase fits counts best: steps of unknown height at places across an edge."""
     sigma = _BLURS[:, None]
-    steps = [_normal_cdf((aside - at) / sigma) for at in steps_at]
+    steps = [ndtr((aside - at) / sigma) for at in steps_at]
     # The slope of the edge itself takes up what its place is off.
     slope = np.exp(-0.5 * (aside / sigma) ** 2)
     basis = np.linalg.qr(np.stack([np.ones_like(slope), *steps, slope], axis=-1)).Q
@@ -105,9 +106,3 @@ def _sigma(seen: _Points, aside: _Points, steps_at: Sequence[float]) -> float:
     before, least, after = misfit[best - 1 : best + 2]
     part = 0.5 * (before - after) / max(before - 2 * least + after, 1e-12)
     return float(_BLURS[best] * (_BLURS[1] / _BLURS[0]) ** float(np.clip(part, -1, 1)))
-
-
-def _normal_cdf(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    from scipy.special import ndtr
-
-    return np.asarray(ndtr(x), dtype=np.float64)

@@ -1,6 +1,6 @@
 """A chart without tags in a picture: the field of its cells is found by its outline, and recognised by its colours.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Candidates for the field come from the outlines in the picture (the field against its white margin, the sheet
   against what is behind), or from corners given by hand; each is drawn onto the edge between cells and paper, and the
@@ -25,7 +25,7 @@ import numpy.typing as npt
 from acquisition.chart.model import Chart
 from acquisition.framing.corners import corners_text, require_corners
 from acquisition.framing.homography import fit_homography, project
-from acquisition.framing.outline import SAME_PX, Outline, PreparedPicture, alike, follow
+from acquisition.framing.outline import SAME_PX, Outline, PreparedPicture, same_corners, trace_outline
 from acquisition.framing.planes import MIN_SIGNAL, Plane, paper_level
 from foundation.errors import InputError, RegistrationError
 from foundation.robust import huber_weights, sigma_of
@@ -98,10 +98,10 @@ def find_field(
     what
         The frame's name for messages.
     corners_px
-        (4, 2) half-size px, the field's corners if they are given by hand, clockwise from the printed top-left, to some
-        20 px; their order gives the orientation of the chart.
+        (4, 2) float half-size px, the field's corners if they are given by hand, clockwise from the printed top-left,
+        to some 20 px; their order gives the orientation of the chart.
     near_px
-        (4, 2) half-size px, the field's corners in another frame of the session, in the same order: they give the
+        (4, 2) float half-size px, the field's corners in another frame of the session, in the same order: they give the
         orientation, and the field may lie elsewhere.
 
     Raises
@@ -126,10 +126,12 @@ def find_field(
     outlines: list[Outline] = []
     for quad in picture.quads():
         for start in _starts(quad, chart):
-            if any(alike(start, known.corners_px, SAME_PX) for known in outlines):
+            if any(same_corners(start, known.corners_px, SAME_PX) for known in outlines):
                 continue
-            outline = follow(picture, start)
-            if outline is None or any(alike(outline.corners_px, known.corners_px, SAME_PX) for known in outlines):
+            outline = trace_outline(picture, start)
+            if outline is None or any(
+                same_corners(outline.corners_px, known.corners_px, SAME_PX) for known in outlines
+            ):
                 continue
             outlines.append(outline)
             for turn, placed in _orientations(outline, chart, near_px):
@@ -172,7 +174,7 @@ def _given_field(picture: PreparedPicture, chart: Chart, corners_px: _Points, wh
     """Return the field whose corners (4, 2) half-size px are given by hand."""
     require_corners(corners_px, picture.shape)
     text = corners_text(corners_px)
-    outline = follow(picture, corners_px)
+    outline = trace_outline(picture, corners_px)
     if outline is None:
         raise RegistrationError(
             f"{what}: near the corners given, {text}, no edge is seen between cells and bare paper on all four sides; "
@@ -240,7 +242,7 @@ class _Placed:
 
     @classmethod
     def of(cls, outline: Outline, chart: Chart, turn: int) -> _Placed:
-        """Lay the chart into an outline in one of eight orientations: 0 … 3 quarter turns, 4 … 7 the same mirrored."""
+        """Return the chart laid into an outline in orientation `turn`: 0 … 3 quarter turns, 4 … 7 the same mirrored."""
         order = np.roll(np.arange(4), -turn)
         if turn >= MIRRORED:
             order = order[::-1]

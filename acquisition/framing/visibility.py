@@ -1,4 +1,4 @@
-"""How large a chart's parts are in a camera's frames, and what is said when they are too small.
+"""How large a chart's parts are in a camera's frames, and the warning when they are too small.
 
 A chart fills its share of the frame whatever its size in millimetres, so what counts is how many cells stand side by
 side: a small sheet is photographed from nearer. Half-size pixels. Knows sizes of frames, nothing of lenses or prints.
@@ -25,7 +25,7 @@ FILL = 0.94
 
 
 @dataclass(frozen=True)
-class Size:
+class ApparentSize:
     """What a camera sees of a chart: pixels of a cell's shorter side and of a tag's module (None without tags)."""
 
     camera: str
@@ -43,20 +43,20 @@ class Size:
         return f"{self.camera}: {self.cell_px:.1f} px a cell{module}"
 
 
-def sizes(chart: Chart) -> list[Size]:
+def apparent_sizes(chart: Chart) -> list[ApparentSize]:
     """Return what each of the paper's cameras sees of a chart that fills 94 % of its frame, turned as it fits best."""
     module_mm = min((float(np.ptp(tag.corners_mm[:, 0])) / TAG_MODULES for tag in chart.tags), default=None)
     page = sorted(chart.page_mm)
-    seen: list[Size] = []
+    seen: list[ApparentSize] = []
     for camera, frame in HALF_SIZE_PX.items():
         px_per_mm = FILL * min(pixels / side for pixels, side in zip(sorted(frame), page, strict=True))
-        seen.append(Size(camera, min(chart.cell_mm) * px_per_mm, module_mm and module_mm * px_per_mm))
+        seen.append(ApparentSize(camera, min(chart.cell_mm) * px_per_mm, module_mm and module_mm * px_per_mm))
     return seen
 
 
-def warning(chart: Chart) -> str | None:
+def small_parts_warning(chart: Chart) -> str | None:
     """Return a sentence when a camera cannot separate the chart's cells or read its tags, else None."""
-    seen = sizes(chart)
+    seen = apparent_sizes(chart)
     if all(size.enough for size in seen):
         return None
     least = "" if seen[0].module_px is None else f" and {MIN_MODULE_PX:g} px a tag module"

@@ -1,4 +1,4 @@
-"""The lights: the 707 of the paper by our recipe, and their file `illuminations.csv`.
+"""The lights of an experiment, as many as the paper's 707, and their file `illuminations.csv`.
 
 The paper (section 3.1) asks for chromaticities spread uniformly and for black bodies but gives no recipe. Ours: the
 points of a triangular grid r = i/n, b = j/n, g = 1 − r − b in linear light, and black bodies from 2000 K to 10 000 K;
@@ -25,6 +25,8 @@ from foundation.srgb import encode_srgb
 
 Kind = Literal["uniform", "blackbody"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")
+"""Columns of `illuminations.csv` (docs/formats.md)."""
+
 GRID = 35
 """Steps along an edge of the chromaticity triangle: 666 points, which with 41 black bodies are the paper's 707."""
 
@@ -43,6 +45,11 @@ class Illumination:
     kind: Kind
     cct_k: float | None
     colour: Colour
+
+    @property
+    def codes(self) -> tuple[int, int, int]:
+        """Codes of red, green and blue that the projector shows, 0 … 255."""
+        return self.colour.red, self.colour.green, self.colour.blue
 
 
 def shown_colour(linear: npt.ArrayLike) -> Colour:
@@ -101,7 +108,7 @@ def illuminations_to_csv(illuminations: Sequence[Illumination]) -> str:
     for light in illuminations:
         # Whole kelvin without a point, anything else with all its digits.
         cct = "" if light.cct_k is None else repr(light.cct_k).removesuffix(".0")
-        writer.writerow([light.index, light.kind, cct, light.colour.red, light.colour.green, light.colour.blue])
+        writer.writerow([light.index, light.kind, cct, *light.codes])
     return text.getvalue()
 
 
@@ -186,7 +193,7 @@ def parse_ccts(text: str) -> tuple[float, ...]:
         if not 0 <= steps < MOST_CCTS:
             raise InputError(
                 f"{given}: steps of {step:g} K do not lead from {first:g} to {last:g} K in at most {MOST_CCTS} "
-                "temperatures; a fall has a step below 0"
+                "temperatures; a falling range has a step below 0"
             )
         return tuple(first + step * number for number in range(int(steps + 1e-9) + 1))
     _require_kelvin(named, given)

@@ -17,12 +17,14 @@ from foundation.files import whole_file
 from foundation.srgb import decode_srgb
 
 FORMATS = ("png", "pdf", "svg")
+"""Endings of a figure's file name, and Matplotlib's names of these formats."""
+
 _NAMED_CCTS_K = (2000, 3000, 4000, 6000, 10000)
 """Temperatures that the figure names, kelvin: few enough for their names not to touch."""
 
 
 def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> None:
-    """Plot the rb-chromaticities of lights (paper.tex, section 3.1), each point in the colour of its light.
+    """Plot the rb-chromaticities of lights (paper, section 3.1), each point in the colour of its light.
 
     Chromaticities are those of the linear light that a projector with the sRGB transfer function sends out:
     r = R / (R + G + B) and b = B / (R + G + B) of the decoded codes. A light without any light is left out.
@@ -47,8 +49,8 @@ def plot_illuminations(illuminations: Sequence[Illumination], path: Path) -> Non
     ending = path.suffix.lower().removeprefix(".")
     if ending not in FORMATS:
         raise InputError(f"a figure cannot be written as {path.name}; end its name with .{', .'.join(FORMATS)}")
-    lit = [light for light in illuminations if any((light.colour.red, light.colour.green, light.colour.blue))]
-    codes = np.array([(light.colour.red, light.colour.green, light.colour.blue) for light in lit]).reshape(-1, 3) / 255
+    lit = [light for light in illuminations if any(light.codes)]
+    codes = np.array([light.codes for light in lit]).reshape(-1, 3) / 255
     linear = decode_srgb(codes)
     r, _, b = (linear / linear.sum(axis=1, keepdims=True)).T
     black_body = np.array([light.kind == "blackbody" for light in lit], dtype=np.bool_)

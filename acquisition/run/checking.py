@@ -65,7 +65,7 @@ def check_lab(
     lights = load_illuminations(settings.illuminations)
     lines = [f"lights      {len(lights)} in {settings.illuminations.name}"]
     with open_rig(settings, chart) as devices, tempfile.TemporaryDirectory() as scratch:
-        lines += _meet(devices, settings, announce)
+        lines += _make_devices_ready(devices, settings, announce)
         offered = devices.camera.shutter_speeds()
         shown: list[tuple[FrameKind, Colour]] = [("dark", BLACK), ("white", WHITE)]
         mosaics: dict[FrameKind, Mosaic] = {
@@ -93,7 +93,7 @@ def check_lab(
     return CheckReport(tuple(lines), tuple(faults))
 
 
-def _meet(devices: Devices, settings: LabSettings, announce: Callable[[str], None]) -> list[str]:
+def _make_devices_ready(devices: Devices, settings: LabSettings, announce: Callable[[str], None]) -> list[str]:
     """Make every device ready for a frame; return a line about each."""
     body = devices.camera.identity()
     name = body.model if body.model.startswith(body.maker.split()[0]) else f"{body.maker} {body.model}"
@@ -109,9 +109,9 @@ def _meet(devices: Devices, settings: LabSettings, announce: Callable[[str], Non
             lambda: keep_awake(devices.camera),
             lambda what, sentence: announce(f"{what}: {sentence}"),
         )
-        beamer = devices.projector.identity()
+        identity = devices.projector.identity()
         hours = ", ".join(f"{lamp.hours} h" for lamp in devices.projector.lamps()) or "no lamp"
-        lines.append(f"projector   {beamer.maker} {beamer.model} {beamer.name}, {hours}")
+        lines.append(f"projector   {identity.maker} {identity.model} {identity.name}, {hours}")
     return lines
 
 
@@ -130,9 +130,14 @@ def _exposure_line(white: Mosaic, settings: LabSettings, offered_s: tuple[float,
     if settings.rig == "replay":
         # A recording cannot be exposed anew.
         return line
-    period = light_period_s(settings.lab.projector)
-    advice = exposure_advice(exposure.level, settings.camera.shutter_s, offered_s, period)
+    advice = exposure_advice(exposure.level, settings.camera.shutter_s, offered_s, _light_period_s(settings))
     return f"{line}; {advice}" if advice else line
+
+
+def _light_period_s(settings: LabSettings) -> float:
+    """Return the seconds after which the light repeats: that of the simulated room's wheel where it has one."""
+    wheel_hz = float(settings.simulated.room.get("wheel_hz", 0)) if settings.rig == "simulated" else 0.0
+    return 1 / wheel_hz if wheel_hz else light_period_s(settings.lab.projector)
 
 
 def _framing_lines(framing: Framing, blur: float) -> list[str]:

@@ -31,7 +31,7 @@ from foundation.hashing import file_sha256
 
 @dataclass(frozen=True)
 class ListedFrame:
-    """One row of the list; empty text and None where it is silent."""
+    """One row of the list; empty text and None where it states nothing."""
 
     kind: FrameKind
     illumination: int | None
@@ -66,7 +66,7 @@ def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, 
     Raises
     ------
     FormatError
-        The list is missing, lacks a column, or holds an unusable row, the message names it; or the lights are unusable.
+        The list is missing, lacks a column, or has an unusable row, which is named; or the lights are unusable.
     """
     try:
         rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))

@@ -54,7 +54,7 @@ class Exposure:
 
 
 def measure_exposure(mosaic: Mosaic) -> Exposure:
-    """Measure the counts of a mosaic's visible area; every fourth 2×2 block is enough for the percentile."""
+    """Return how bright a mosaic's visible area is; every fourth 2×2 block is enough for the percentile."""
     black = frame_black(mosaic)
     clipped = np.count_nonzero(mosaic.counts >= CLIPPING_SHARE * mosaic.white_level) / mosaic.counts.size
     planes = mosaic.block_planes()[:, :, ::2, ::2].reshape(2, 2, -1)

@@ -89,7 +89,7 @@ def require_healthy(projector: Projector) -> None:
         )
     power = projector.power()
     if power is not Power.ON:
-        raise DeviceFault(f"the projector is in {power.value} in the midst of the session; switch it on")
+        raise DeviceFault(f"the projector is in {power.value} during the session; switch it on")
     if projector.muted():
         raise DeviceFault("the projector's picture is muted; release mute on its remote control")
     if isinstance(projector, ReportsPictureFault) and (fault := projector.picture_fault()):

@@ -10,7 +10,7 @@ from acquisition.chart.model import load_chart
 from acquisition.config import LabSettings, parse_lab
 from acquisition.lights.illuminations import load_illuminations
 from acquisition.run.rig.opening import open_rig
-from acquisition.run.sequencer import Outcome, take_session
+from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.session.folder import Session, session_exists
 from acquisition.session.plan import plan_steps
 from foundation.errors import ConfigurationError
@@ -24,7 +24,7 @@ def run_session(
     folder: Path,
     observe: Callable[[int, int], None],
     announce: Callable[[str], None] = lambda sentence: None,
-) -> Outcome:
+) -> RunOutcome:
     """Take the session `folder`, new or interrupted, with the rig that the settings name.
 
     Parameters
@@ -46,7 +46,7 @@ def run_session(
         done = len(session.done_steps())
         observe(done, total)
         if done == total:
-            return Outcome(total, 0, ())
+            return RunOutcome(total, 0, ())
 
         def count(step: object, accepted: bool) -> None:
             nonlocal done
@@ -80,7 +80,7 @@ def open_session(settings: LabSettings, folder: Path) -> Session:
 
 
 def _require_same(session: Session, settings: LabSettings) -> None:
-    before = parse_lab(session.settings(), str(session.folder / "session.toml"))
+    before = parse_lab(session.settings_text(), str(session.folder / "session.toml"))
     for key in FIXED:
         old, new = _value(before, key), _value(settings, key)
         if old != new:

@@ -24,7 +24,7 @@ REFUSED_IN_A_ROW = 3
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunOutcome:
     """Why a run ended: `left` steps are without an accepted frame; `refused` says why, one line a step."""
 
     total: int
@@ -43,7 +43,7 @@ def take_session(
     settings: LabSettings,
     observe: Callable[[SessionStep, bool], None] = lambda step, accepted: None,
     announce: Callable[[str], None] = lambda sentence: None,
-) -> Outcome:
+) -> RunOutcome:
     """Take every step of the session's plan that has no accepted frame yet.
 
     Parameters
@@ -70,7 +70,7 @@ def _take(
     settings: LabSettings,
     observe: Callable[[SessionStep, bool], None],
     announce: Callable[[str], None],
-) -> Outcome:
+) -> RunOutcome:
     clock = devices.clock
     for stray in session.set_aside_strays():
         session.journal.note(clock.now(), "stray", f"{stray.name}: complete, but not in the journal; kept, not used")
@@ -78,7 +78,7 @@ def _take(
     done = session.done_steps()
     open_steps = [step for step in steps if step.number not in done]
     if not open_steps:
-        return Outcome(len(steps), 0, ())
+        return RunOutcome(len(steps), 0, ())
     session.journal.note(clock.now(), "start", f"{len(open_steps)} of {len(steps)} frames to take")
     devices.camera.configure(settings.camera.exposure)
 
@@ -103,7 +103,7 @@ def _take(
         in_a_row += 1
         if in_a_row == REFUSED_IN_A_ROW:
             break
-    outcome = Outcome(len(steps), len(open_steps) - taken, tuple(refused))
+    outcome = RunOutcome(len(steps), len(open_steps) - taken, tuple(refused))
     if outcome.complete and settings.sequence.switch_off and devices.projector is not None:
         devices.projector.switch_off()
     session.journal.note(clock.now(), "complete" if outcome.complete else "incomplete", f"{outcome.left} frames left")

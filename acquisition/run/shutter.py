@@ -105,6 +105,6 @@ def exposure_advice(level: float, shutter_s: float, offered_s: Iterable[float], 
         return f"{wanted}, try camera.shutter_s = {better:.4g}"
     aperture, speed = ("higher", "lower") if level > high else ("lower", "higher")
     return (
-        f"{wanted}, and no shutter time that the camera offers and that holds whole turns of the colour wheel "
-        f"({1 / period_s:g} a second) leads there: set a {aperture} f-number or a {speed} ISO speed"
+        f"{wanted}, and no shutter time that the camera offers and that is a whole multiple of {period_s:.4g} s, after "
+        f"which the projector's light repeats, leads there: set a {aperture} f-number or a {speed} ISO speed"
     )

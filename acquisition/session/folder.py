@@ -36,7 +36,7 @@ FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure
 
 
 @dataclass(frozen=True)
-class Received:
+class ReceivedFile:
     """A raw file that is complete on the disk, not yet counted."""
 
     path: Path
@@ -154,7 +154,7 @@ class Session:
         with held_folder(self.folder, busy):
             yield
 
-    def settings(self) -> str:
+    def settings_text(self) -> str:
         """Return the text of `session.toml`.
 
         Raises
@@ -171,7 +171,7 @@ class Session:
                 f"cannot read {path}, the settings of the session: {reason}; restore it from a copy"
             ) from error
 
-    def receive(self, stem: str, capture: Callable[[BinaryIO], CapturedFrame]) -> Received:
+    def receive(self, stem: str, capture: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
         """Let the camera write a raw file into `frames/`; it is complete and on the disk when this returns.
 
         Parameters
@@ -199,7 +199,7 @@ class Session:
             stream.seek(0)
             sha256 = stream_sha256(stream)
             path = path.with_name(stem + Path(captured.name).suffix.lower())
-        return Received(path, size, sha256, captured)
+        return ReceivedFile(path, size, sha256, captured)
 
     def commit(
         self,

@@ -1,8 +1,9 @@
 """What a step of a session goes through, as data: the states, and which may follow which.
 
 The sequencer (`acquisition.run.sequencer`) takes the steps; the journal keeps what must survive a power cut: that an
-attempt has begun, and how it ended. `docs/architecture.md` draws the table, `tests/acquisition/test_states.py` checks
-that sessions taken in the simulated lab follow it and that each line of it happens.
+attempt has begun, and how it ended. `docs/architecture.md` draws the table, and
+`tests/acquisition/session/test_states.py` checks that sessions taken in the simulated lab follow it and that each line
+of it happens.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class Transition:
 
 
 TRANSITIONS = (
-    Transition(StepState.PLANNED, StepState.BEGUN, "the projector is well; the journal has a row"),
+    Transition(StepState.PLANNED, StepState.BEGUN, "the projector is healthy; the journal has a row"),
     Transition(StepState.BEGUN, StepState.LIT, "the presenter shows the step's codes"),
     Transition(StepState.LIT, StepState.SETTLED, "settle_s have passed"),
     Transition(StepState.SETTLED, StepState.EXPOSED, "the camera has released and handed over its raw file"),

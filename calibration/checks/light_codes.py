@@ -65,7 +65,7 @@ def angles_off_codes_deg(lights: Sequence[Illumination], white: _Array, errors_d
     ndarray or None
         (L,) float64 degrees, ≥ 0; None where there are fewer than `LIGHTS_A_TERM` lights for each coefficient.
     """
-    terms = _terms(np.array([(light.colour.red, light.colour.green, light.colour.blue) for light in lights]))
+    terms = _terms(np.array([light.codes for light in lights]))
     if len(lights) < LIGHTS_A_TERM * terms.shape[1]:
         return None
     length = np.linalg.norm(white, axis=1)

@@ -4,7 +4,7 @@ A stain leaves its cells of one colour each, so that neither rim nor noise of a 
 the colours of a dirty print. It is recognised by a whole neighbourhood that deviates at once, while the same codes,
 which lie at random over the sheet, are right everywhere else.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - What a code gives is predicted from the codes next to it in colour, which lie elsewhere on the sheet: no model of ink
   or paper, and next to nothing in common with the cell's own place.
@@ -204,7 +204,7 @@ def _of_neighbourhoods(log_ratios: _Array, near: npt.NDArray[np.intp]) -> tuple[
     """Return the mean (C, 3) over each neighbourhood and its standard error; NaN where too few cells are known."""
     there = np.isfinite(log_ratios)
     spread = _usual(log_ratios)
-    # A single cell may be far off; in a neighbourhood it weighs no more than four usual log_ratios beyond the median.
+    # A single cell may be far off; in a neighbourhood it weighs no more than four usual deviations beyond the median.
     values = log_ratios[near]
     with np.errstate(invalid="ignore"):
         known = there[near]

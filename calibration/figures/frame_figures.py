@@ -35,7 +35,7 @@ class FrameFigures:
     reregistered
         Whether the chart had moved so far that it was registered again in this frame.
     paper
-        FlatField and white.
+        Flat field and white of bare paper.
     consistency
         How much the frame differs from the print as it was first registered.
     greys, grey_errors

@@ -28,7 +28,7 @@ _Array = npt.NDArray[np.float64]
 
 @compiled
 def linear_combinations(basis: _Array, factors: _Array, out: _Array) -> None:
-    """Fill out (3, N) with the sums over k of factors[c, k] · basis[k, n]; basis (K, N), factors (3, K)."""
+    """Fill out (3, N) with the sums over k of factors[c, k] · basis[k, n]; basis (K, N), factors (3, K); float64."""
     out[:] = 0
     for start in range(0, basis.shape[1], _POINTS_AT_A_TIME):
         end = min(start + _POINTS_AT_A_TIME, basis.shape[1])
@@ -44,7 +44,7 @@ def linear_combinations(basis: _Array, factors: _Array, out: _Array) -> None:
 
 @compiled
 def weighted_fit(design: _Array, values: _Array, weights: _Array) -> _Array:
-    """Return the x (K,) that minimises Σ w (values − design x)²; design (N, K), values and weights (N,)."""
+    """Return the x (K,) that minimises Σ w (values − design x)²; design (N, K), values and weights (N,), float64."""
     count, unknowns = design.shape
     gram, solution = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
     for point in range(count):

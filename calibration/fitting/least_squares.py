@@ -102,5 +102,5 @@ def robust_least_squares(design: _Array, values: _Array, rounds: int) -> tuple[_
 
 
 def _plain(array: _Array) -> _Array:
-    """Return an array as one kind, whatever comes, so that there is one kind of machine code."""
+    """Return an array as float64, C order, writable: numba compiles a function anew for each other kind."""
     return np.require(array, np.float64, ["C", "W"])

@@ -42,7 +42,7 @@ def page_polynomial(points_mm: npt.ArrayLike, page_mm: tuple[float, float], orde
     Parameters
     ----------
     points_mm
-        (N, 2) mm on the print.
+        (N, 2) float mm on the print.
     page_mm
         Width and height of the page.
     order
@@ -83,7 +83,7 @@ def code_polynomial(rgb: npt.ArrayLike, degree: int) -> _Array:
     Parameters
     ----------
     rgb
-        (C, 3) printed codes, 0 … 255.
+        (C, 3) int printed codes, 0 … 255.
     degree
         Total degree.
 

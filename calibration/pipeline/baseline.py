@@ -1,7 +1,8 @@
-"""What the frame that is registered first settles for all frames of a session.
+"""What holds for all frames of a session, determined from the frame that is registered first.
 
-Its light's shape is the base of all others', its cells what every frame's are expected to look like, and the primaries'
-frames how the field of a coloured cell differs from that of paper. A baseline does not change, so threads share it.
+The shape of its light is the base of all others', and its cells are what those of every frame are compared with; the
+frames of the primaries show how the field of a coloured cell differs from that of paper. A baseline does not change, so
+threads share it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from acquisition.chart.model import Chart
 from acquisition.framing.planes import CLIPPING_SHARE, Channel
 from calibration.checks.frame_consistency import ConsistencyCheck
 from calibration.pipeline.frames import DecodedFrame
-from calibration.pipeline.options import AS_IN_THE_PAPER, BuildOptions
+from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
 from calibration.pipeline.registered_frame import ChartPoints, RegisteredFrame, gauges_of, register_frame
 from calibration.radiometry.cell_field import field_of_cells
 from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances
@@ -69,8 +70,8 @@ class Baseline:
         Reads flat field and white of frames, with the shape of this one's as base.
     transfer
         Photon-transfer curve of its cells.
-    expectation
-        What its cells lead to expect of other frames'.
+    consistency_check
+        Compares other frames' cells with those of this one.
     primaries
         The primaries each alone; None where they were not given or cannot be used.
     """
@@ -84,11 +85,11 @@ class Baseline:
     means: _Array
     paper: PaperReader
     transfer: PhotonTransfer
-    expectation: ConsistencyCheck
+    consistency_check: ConsistencyCheck
     primaries: Primaries | None = None
 
     def require_layout(self, mosaic: Mosaic, what: str) -> None:
-        """Refuse a frame, called `what`, of another sensor or setting than the first.
+        """Refuse a frame, called `what`, whose sensor or setting is not that of the first.
 
         Raises
         ------
@@ -155,7 +156,7 @@ class Baseline:
             peaks.append(highest)
         return np.concatenate(means), np.concatenate(peaks)
 
-    def subtraction(self) -> DarkLightEstimator:
+    def dark_light_estimator(self) -> DarkLightEstimator:
         """Return the estimate of the dark light before any dark frame, with the reflectances of the first frame."""
         paper, shape = self.paper.read(self.whites, self.first.file)
         field = np.concatenate([shape, paper.field.at(self.points.references_mm)])
@@ -163,8 +164,8 @@ class Baseline:
         return DarkLightEstimator(reflectances(self.means, field, paper.white), inside, self.options.samples)
 
 
-def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = AS_IN_THE_PAPER) -> Baseline:
-    """Return what the frame that is registered first settles; without primaries, which are measured by it.
+def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = PAPER_OPTIONS) -> Baseline:
+    """Return what holds for all frames, from the one that is registered first; still without the primaries.
 
     Parameters
     ----------
@@ -205,7 +206,7 @@ def baseline_of(chart: Chart, first: DecodedFrame, options: BuildOptions = AS_IN
         means=np.concatenate([level, references.mean(axis=1, dtype=np.float64)]),
         paper=PaperReader(points.whites_mm, points.cells_mm, chart.page_mm, base, order),
         transfer=photon_transfer(level, cells.var(axis=1, ddof=1), options.samples),
-        expectation=ConsistencyCheck(codes, points.cells_mm, level / base.at(points.cells_mm), there),
+        consistency_check=ConsistencyCheck(codes, points.cells_mm, level / base.at(points.cells_mm), there),
     )
 
 

@@ -1,6 +1,6 @@
 """A session becomes a table: frames → measured → taken in → saved → figures → verdict → table.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A session that lacks a light makes no table.
 - The table appears whole or not at all. Until then it is made under a hidden name (`calibration.pipeline.checkpoint`),
@@ -29,8 +29,15 @@ from calibration.figures.table_figures import TableFigures
 from calibration.pipeline.baseline import baseline_of
 from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
 from calibration.pipeline.collecting import check_figures, table_figures
-from calibration.pipeline.frames import Progress, SelectedFrames, decode_frame, listed, select_frames, session_sha256
-from calibration.pipeline.intake import EarlyMeasurement, Intake, TakenIn
+from calibration.pipeline.frames import (
+    ReportProgress,
+    SelectedFrames,
+    decode_frame,
+    select_frames,
+    session_sha256,
+    source_frames,
+)
+from calibration.pipeline.intake import EarlyMeasurement, Intake, IntakeState
 from calibration.pipeline.linearity import read_linearity
 from calibration.pipeline.measuring import (
     MeasuredFrame,
@@ -38,12 +45,12 @@ from calibration.pipeline.measuring import (
     measure_registered_frame,
     sample_dark_frame,
 )
-from calibration.pipeline.options import AS_IN_THE_PAPER, BuildOptions
+from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
 from calibration.pipeline.prefetching import prefetched
 from calibration.radiometry.corrections import corrections
 from calibration.radiometry.greys import references_csv
 from calibration.registration.movement import Shift
-from calibration.table.file_names import REFERENCES, SAMPLES
+from calibration.table.file_names import REFERENCES, REPORT_JSON, REPORT_PAGE, SAMPLES
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
 from calibration.verdict.result import BuildResult
@@ -55,7 +62,7 @@ from foundation.errors import FormatError, QualityError, RegistrationError, firs
 from foundation.files import write_whole
 from foundation.version import software
 
-REPORT_FILES = ("report.html", "report.json")
+REPORT_FILES = (REPORT_PAGE, REPORT_JSON)
 """What is kept of a refused table, where a report was written."""
 
 CHECKPOINT_EVERY = 16
@@ -67,13 +74,13 @@ METHOD = 5
 _IN_PLACE = Shift(0.0, 0.0, 0.0, 0)
 """The movement of the frame in which the chart is registered first."""
 
-Report = Callable[[BuildResult, Session, Path], None]
+WriteReport = Callable[[BuildResult, Session, Path], None]
 """Writes the report of a result and its session into a folder; `calibration.report.report.write_report`."""
 
 
 @dataclass(frozen=True)
 class TableProgress:
-    """How far a table is that still lacks frames.
+    """How far a table has come that still lacks frames.
 
     Attributes
     ----------
@@ -92,9 +99,9 @@ class TableProgress:
 def build(
     session: Session,
     out: Path,
-    progress: Progress | None = None,
-    report: Report | None = None,
-    options: BuildOptions = AS_IN_THE_PAPER,
+    progress: ReportProgress | None = None,
+    report: WriteReport | None = None,
+    options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
     thresholds: Sequence[Threshold] = THRESHOLDS,
 ) -> BuildResult:
@@ -149,16 +156,16 @@ def build(
 def append(
     session: Session,
     out: Path,
-    progress: Progress | None = None,
-    report: Report | None = None,
-    options: BuildOptions = AS_IN_THE_PAPER,
+    progress: ReportProgress | None = None,
+    report: WriteReport | None = None,
+    options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
     thresholds: Sequence[Threshold] = THRESHOLDS,
 ) -> BuildResult | TableProgress:
     """Take in the frames that have come so far of a session that is being taken.
 
     The table is made under a hidden name and appears when the plan's last frame has been taken in, the same to the byte
-    as if it had been built at once. Parameters and errors are those of `build`, but that lights may lack.
+    as if it had been built at once. Parameters and errors are those of `build`, except that lights may be missing.
     """
     selected = select_frames(session)
     # The plan of a session that was put together otherwise may be empty; its lights are the plan then.
@@ -178,7 +185,7 @@ def append(
 
 def check(
     session: Session,
-    options: BuildOptions = AS_IN_THE_PAPER,
+    options: BuildOptions = PAPER_OPTIONS,
     linearity: Path | None = None,
     picture: Path | None = None,
     thresholds: Sequence[Threshold] = THRESHOLDS,
@@ -230,14 +237,14 @@ def check(
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """What is to be made of which frames, and where."""
+    """A build as it was asked for: which frames, how, and where the table is made."""
 
     session: Session
     selected: SelectedFrames
     options: BuildOptions
-    series: Path | None
+    linearity: Path | None
     unfinished: UnfinishedTable
-    progress: Progress
+    progress: ReportProgress
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -276,7 +283,7 @@ class _Job:
         self.unfinished.begin_anew()
         return LutWriter(folder, *shape), None
 
-    def save(self, work: _Work) -> None:
+    def save(self, work: _BuildState) -> None:
         """Write a checkpoint: a later program goes on from here."""
         taken = work.taken
         values = taken.to_json() | {"sha256": work.writer.sha256}
@@ -284,18 +291,18 @@ class _Job:
 
 
 @dataclass(frozen=True, eq=False)
-class _Work:
-    """How far the work has come: the frames taken in, and their samples on the disk."""
+class _BuildState:
+    """How far a build has come: the frames taken in, and their samples on the disk."""
 
     intake: Intake
-    taken: TakenIn
+    taken: IntakeState
     writer: LutWriter
     camera: str
     linearity: LinearityFigures | None
 
 
-def _take_in_all(job: _Job, checkpoint: Checkpoint | None) -> _Work:
-    """Measure every frame that was not taken in before."""
+def _take_in_all(job: _Job, checkpoint: Checkpoint | None) -> _BuildState:
+    """Return the state with every frame taken in, after measuring those that were not yet."""
     records = job.selected.records
     writer, checkpoint = job.writer(checkpoint)
     job.progress(0, len(records), "finding the chart")
@@ -317,23 +324,25 @@ def _take_in_all(job: _Job, checkpoint: Checkpoint | None) -> _Work:
     return replace(work, taken=taken)
 
 
-def _begin(job: _Job, checkpoint: Checkpoint | None, writer: LutWriter) -> _Work:
-    """Register the chart, and return the work as an earlier program left it, or before any frame."""
+def _begin(job: _Job, checkpoint: Checkpoint | None, writer: LutWriter) -> _BuildState:
+    """Register the chart, and return the state that an earlier program left, or the one before any frame."""
     session, selected = job.session, job.selected
     first = decode_frame(session, selected.registered)
     baseline = baseline_of(session.chart, first, job.options)
     primaries = measure_primaries(baseline, (decode_frame(session, record) for record in selected.primaries))
     intake = Intake(session, selected, replace(baseline, primaries=primaries))
-    linearity = None if job.series is None else read_linearity(job.series, baseline)
+    linearity = None if job.linearity is None else read_linearity(job.linearity, baseline)
     taken = intake.before_all_frames(first.saturation)
     if checkpoint is not None:
         taken = intake.restored(checkpoint.values, checkpoint.arrays, taken)
     # The first frame's counts are not held any longer: it is read again in its turn.
-    return _Work(intake, intake.with_dark_light(taken), writer, first.mosaic.camera, linearity)
+    return _BuildState(intake, intake.with_dark_light(taken), writer, first.mosaic.camera, linearity)
 
 
-def _finish(job: _Job, work: _Work, out: Path, report: Report | None, thresholds: Sequence[Threshold]) -> BuildResult:
-    """Judge the table and give it its name."""
+def _finish(
+    job: _Job, work: _BuildState, out: Path, report: WriteReport | None, thresholds: Sequence[Threshold]
+) -> BuildResult:
+    """Judge the table, give it its name, and return the result."""
     unfinished, frames = job.unfinished, len(work.taken.figures)
     job.progress(frames, frames, "writing the report")
     figures = table_figures(work.intake, work.taken, work.camera, work.linearity)
@@ -348,7 +357,7 @@ def _finish(job: _Job, work: _Work, out: Path, report: Report | None, thresholds
     return result
 
 
-def _write_table(work: _Work, figures: TableFigures) -> None:
+def _write_table(work: _BuildState, figures: TableFigures) -> None:
     """Write all of the table but its samples, which are there, and its report."""
     session, records, lights, greys = work.intake.session, work.taken.records, figures.lights, figures.greys
     by_light = {frame.record.illumination: frame for frame in figures.frames if frame.record.kind == "light"}
@@ -377,7 +386,7 @@ def _write_table(work: _Work, figures: TableFigures) -> None:
     )
     references = references_csv(greys.names, lights.white, lights.white_error, greys.values, greys.errors)
     files = {REFERENCES: references} if greys.names else {}
-    work.writer.finish(session.illuminations, lights.white, provenance, listed(records), files)
+    work.writer.finish(session.illuminations, lights.white, provenance, source_frames(records), files)
 
 
 def _require_dark_frames(session: Session, options: BuildOptions) -> None:

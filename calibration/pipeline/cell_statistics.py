@@ -1,6 +1,6 @@
 """What frames show of the cells, in the order taken: evenness, highest counts, and which cells are unfit for use.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Frames enter in the order taken, and what one adds depends on those before it alone: statistics that were stored in a
   checkpoint and restored end in the same bits.
@@ -132,7 +132,11 @@ class CellStatistics:
         return replace(self, hot=hot, darks=(*self.darks, measured.figures))
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return what a checkpoint stores of the statistics: all but chart and figures of dark frames."""
+        """Return what a checkpoint stores of the statistics: all but chart and figures of dark frames.
+
+        (C,) uint16, int64 and bool, (C, S, 3) float32 and (C, 3) float64 by the attributes' names, `even_frames` as a
+        scalar int64; and what `HotPixels.to_arrays` returns.
+        """
         return {
             "highest": self.highest,
             "highest_at": self.highest_at,
@@ -145,7 +149,10 @@ class CellStatistics:
         }
 
     def from_arrays(self, stored: dict[str, npt.NDArray[Any]], darks: tuple[DarkFrameFigures, ...]) -> CellStatistics:
-        """Return statistics of the same chart from what `to_arrays` returned, and the figures of the dark frames."""
+        """Return statistics of the same chart from what `to_arrays` returned, and the figures of the dark frames.
+
+        Each array of `stored` has the same shape and dtype as there; that is not checked.
+        """
         hot = deepcopy(self.hot)
         hot.restore(stored)
         return replace(

@@ -1,6 +1,6 @@
 """An unfinished table: its hidden folder, and the checkpoint from which a later program goes on.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The folder stands beside the table's place under a hidden name until the table is complete, so that under the final
   name there is never a table that lacks a light.
@@ -30,6 +30,7 @@ from foundation.files import partial_path, publish_folder, require_free, storage
 from foundation.held_folders import LOCK_FILE, held_folder
 
 CHECKPOINT = "checkpoint.npz"
+"""Name of the checkpoint in the hidden folder."""
 
 _TEXT = "text"
 """Name of the array that holds all that is no array, as JSON."""
@@ -138,7 +139,8 @@ def unfinished_table(out: Path) -> Generator[UnfinishedTable]:
     """
     require_free(out, "the table")
     folder = partial_path(out)
-    with held_folder(folder, f"{out} is being made by another program; wait for it, or name another place"):
+    busy = f"{out} is being made by another program; wait for it, or name another place"
+    with held_folder(folder, busy, of=out):
         unfinished = UnfinishedTable(folder, out)
         try:
             yield unfinished

@@ -1,4 +1,4 @@
-"""The figures of a whole table, or of a check, from what its frames have left."""
+"""The figures of a whole table, or of a check, collected from its frames."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from calibration.figures.table_figures import (
     direction_error_deg,
 )
 from calibration.pipeline.baseline import Baseline
-from calibration.pipeline.intake import Intake, TakenIn
+from calibration.pipeline.intake import Intake, IntakeState
 from calibration.radiometry.projector import additivity, drift_gains
 
 _SAME_EXPOSURE = 1.01
@@ -33,13 +33,13 @@ _LEAST_WHITE = 1e-3
 _Array = npt.NDArray[np.float64]
 
 
-def table_figures(intake: Intake, taken: TakenIn, camera: str, linearity: LinearityFigures | None) -> TableFigures:
+def table_figures(intake: Intake, taken: IntakeState, camera: str, linearity: LinearityFigures | None) -> TableFigures:
     """Return the figures of a table, all of whose frames have been taken in.
 
     Parameters
     ----------
     intake, taken
-        The frames, and what they have left.
+        The frames, and what they have given.
     camera
         Maker and model as the raw files name it.
     linearity
@@ -60,7 +60,7 @@ def table_figures(intake: Intake, taken: TakenIn, camera: str, linearity: Linear
     )
 
 
-def check_figures(intake: Intake, taken: TakenIn, camera: str, linearity: LinearityFigures | None) -> TableFigures:
+def check_figures(intake: Intake, taken: IntakeState, camera: str, linearity: LinearityFigures | None) -> TableFigures:
     """Return the figures of a check, which has taken in the frame that is registered, and a dark one where there is.
 
     Parameters
@@ -103,7 +103,7 @@ def _session_figures(session: Session, intake: Intake, camera: str, lights: int)
 def _figures(
     session: SessionFigures,
     baseline: Baseline,
-    taken: TakenIn,
+    taken: IntakeState,
     even: FrameFigures,
     lights: LightFigures,
     greys: tuple[_Array, _Array],
@@ -131,7 +131,7 @@ def _figures(
     )
 
 
-def _light_figures(intake: Intake, taken: TakenIn, by_light: Sequence[FrameFigures]) -> LightFigures:
+def _light_figures(intake: Intake, taken: IntakeState, by_light: Sequence[FrameFigures]) -> LightFigures:
     """Return what was measured of the lights, whose frames are `by_light`."""
     illuminations, subtract_dark = intake.session.illuminations, intake.subtracts_dark
     error = np.array([frame.paper.error for frame in by_light])

@@ -1,6 +1,6 @@
 """The frames that a table is made of: which, in what order, and each read once, its hash checked, and decoded.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A frame's SHA-256 is checked against the journal before one of its counts is used.
 - The last accepted frame of a light counts.
@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import CHANNELS, Channel, frame_black, phases
+from acquisition.framing.planes import Channel, frame_black, strongest_channel
 from acquisition.session.folder import Session
 from acquisition.session.journal import FrameRecord
 from calibration.radiometry.primaries import pure_lights
@@ -30,11 +30,8 @@ from foundation.files import read_whole
 from foundation.hashing import file_sha256
 
 _Array = npt.NDArray[np.float64]
-Progress = Callable[[int, int, str], None]
+ReportProgress = Callable[[int, int, str], None]
 """Called with frames done, frames in all, and what is being done."""
-
-_PAPER_PERCENTILE = 98
-"""Bare paper is more than a fiftieth of a picture, and hot photosites and highlights are less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +138,7 @@ def _frame_to_register(session: Session, accepted: Sequence[FrameRecord]) -> Fra
     def brightness(record: FrameRecord) -> int:
         if record.illumination is None or record.illumination >= len(session.illuminations):
             return -1
-        colour = session.illuminations[record.illumination].colour
-        return min(colour.red, colour.green, colour.blue)
+        return min(session.illuminations[record.illumination].codes)
 
     return max((record for record in accepted if record.kind == "light"), key=brightness)
 
@@ -176,33 +172,23 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
     return DecodedFrame(record, mosaic, black, strongest_channel(mosaic, black), saturation(mosaic))
 
 
-def strongest_channel(mosaic: Mosaic, black: _Array) -> Channel:
-    """Return the channel with the brightest paper, from every sixteenth block; `black` (2, 2) float64 counts."""
-    blocks = mosaic.block_planes()[:, :, ::16, ::16]
-    levels = [
-        max(float(np.percentile(blocks[place], _PAPER_PERCENTILE) - black[place]) for place in places)
-        for places in phases(mosaic).values()
-    ]
-    return CHANNELS[int(np.argmax(levels))]
-
-
 def session_sha256(records: Sequence[FrameRecord]) -> str:
     """Return the hash that names a session: SHA-256 over kind, light and hash of each frame used, a line each."""
-    return frames_sha256(listed(records))
+    return frames_sha256(source_frames(records))
 
 
-def listed(records: Sequence[FrameRecord]) -> list[SourceFrame]:
-    """Return frames as a table lists them."""
+def source_frames(records: Sequence[FrameRecord]) -> list[SourceFrame]:
+    """Return frames as `frames.csv` of a table lists them."""
     return [SourceFrame(record.kind, record.illumination, record.file, record.sha256) for record in records]
 
 
-def lost_frames(lut: Lut, session: Session, progress: Progress | None = None) -> list[str]:
-    """Return which of the frames that a table was made of are not in a session, or not as they were, each in words.
+def frame_faults(lut: Lut, session: Session, progress: ReportProgress | None = None) -> list[str]:
+    """Return what is wrong with a session's frames that a table was made of, each fault in words: missing or changed.
 
     Raises
     ------
     FormatError
-        The table lists no frames, as those made before they were recorded.
+        The table lists no frames: it was made before they were recorded.
     """
     if not lut.frames:
         raise FormatError(f"{lut.folder} lists no frames; build it again from its session to have them listed")

@@ -1,6 +1,6 @@
-"""Take in frames, one after another, in the order taken: what all of them have left so far is one frozen value.
+"""Take in frames, one after another, in the order taken; what is known after each is one frozen value.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - What a frame adds depends on those before it alone, so that a build that was stopped goes on to the same bits.
 - A frame measured before its turn counts only if the frame registered last is still the one it was measured with.
@@ -41,8 +41,8 @@ EarlyMeasurement = MeasuredFrame | MeasuredDarkFrame | None
 
 
 @dataclass(frozen=True, eq=False)
-class TakenIn:
-    """What the frames so far have left.
+class IntakeState:
+    """What the frames taken in so far have given.
 
     Attributes
     ----------
@@ -54,8 +54,8 @@ class TakenIn:
         Raw count of saturation, the lowest that a frame shows.
     registered
         The frame registered last.
-    subtraction
-        The estimate of the dark light; only dark frames that are subtracted enter it.
+    estimator
+        Estimates the dark light; only dark frames that are subtracted enter it.
     dark
         What is subtracted from the frames that follow; None where nothing is.
     """
@@ -64,7 +64,7 @@ class TakenIn:
     statistics: CellStatistics
     saturation: int
     registered: RegisteredFrame
-    subtraction: DarkLightEstimator
+    estimator: DarkLightEstimator
     dark: DarkLight | None
 
     @cached_property
@@ -86,8 +86,11 @@ class TakenIn:
         }
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return what a checkpoint stores as arrays."""
-        return {**self.statistics.to_arrays(), **self.subtraction.to_arrays()}
+        """Return what a checkpoint stores as arrays, (C, S, 3) float32 `even_sum` and others by name.
+
+        The rest stands at `CellStatistics.to_arrays` and `DarkLightEstimator.to_arrays`.
+        """
+        return {**self.statistics.to_arrays(), **self.estimator.to_arrays()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,25 +120,25 @@ class Intake:
         """Return whether the frames after this one can be measured only when it has been taken in."""
         return self.subtracts_dark and record.kind == "dark"
 
-    def before_all_frames(self, saturation: int) -> TakenIn:
+    def before_all_frames(self, saturation: int) -> IntakeState:
         """Return the state before any frame; `saturation` is the raw count that the first registered frame shows."""
         baseline = self.baseline
-        return TakenIn(
+        return IntakeState(
             figures=(),
             statistics=CellStatistics.before_all_frames(baseline.chart, baseline.options.samples, baseline.first),
             saturation=saturation,
             registered=baseline.first,
-            subtraction=baseline.subtraction(),
+            estimator=baseline.dark_light_estimator(),
             dark=None,
         )
 
-    def restored(self, stored: dict[str, Any], arrays: dict[str, npt.NDArray[Any]], begin: TakenIn) -> TakenIn:
+    def restored(self, stored: dict[str, Any], arrays: dict[str, npt.NDArray[Any]], begin: IntakeState) -> IntakeState:
         """Return the state that a checkpoint stored.
 
         Parameters
         ----------
         stored, arrays
-            What `TakenIn.to_json` and `to_arrays` returned.
+            What `IntakeState.to_json` and `to_arrays` returned; each array has the same shape and dtype as there.
         begin
             What `before_all_frames` returned.
         """
@@ -150,28 +153,28 @@ class Intake:
         if stored["registered"] != registered.file:
             record = next(record for record in self.selected.records if record.file == stored["registered"])
             registered = self.baseline.register(decode_frame(self.session, record))
-        subtraction = deepcopy(begin.subtraction)
-        subtraction.restore(arrays)
+        estimator = deepcopy(begin.estimator)
+        estimator.restore(arrays)
         darks = tuple(dark for dark in figures if isinstance(dark, DarkFrameFigures))
-        return TakenIn(
+        return IntakeState(
             figures=figures,
             statistics=begin.statistics.from_arrays(arrays, darks),
             saturation=int(stored["saturation"]),
             registered=registered,
-            subtraction=subtraction,
-            dark=subtraction.current,
+            estimator=estimator,
+            dark=estimator.current,
         )
 
-    def with_dark_light(self, state: TakenIn) -> TakenIn:
+    def with_dark_light(self, state: IntakeState) -> IntakeState:
         """Return the state with the dark light that frames before the first dark one get, which is that one's."""
         if not self.subtracts_dark or state.dark is not None:
             return state
         record = next(record for record in self.selected.records if record.kind == "dark")
         measured = sample_dark_frame(self.baseline, decode_frame(self.session, record), self.baseline.first)
-        return replace(state, dark=self._learn(self.baseline.subtraction(), measured))
+        return replace(state, dark=self._learn(self.baseline.dark_light_estimator(), measured))
 
-    def measure(self, record: FrameRecord, state: TakenIn) -> EarlyMeasurement:
-        """Return what a frame shows as things stand; None where the chart has to be registered again. Thread-safe."""
+    def measure(self, record: FrameRecord, state: IntakeState) -> EarlyMeasurement:
+        """Return what a frame shows in this state; None where the chart has to be registered again. Thread-safe."""
         decoded = decode_frame(self.session, record)
         if record.kind == "dark":
             return sample_dark_frame(self.baseline, decoded, state.registered)
@@ -180,8 +183,8 @@ class Intake:
         return None if isinstance(measured, Shift) else measured
 
     def take_in(
-        self, record: FrameRecord, early: EarlyMeasurement, state: TakenIn
-    ) -> tuple[TakenIn, MeasuredFrame | MeasuredDarkFrame]:
+        self, record: FrameRecord, early: EarlyMeasurement, state: IntakeState
+    ) -> tuple[IntakeState, MeasuredFrame | MeasuredDarkFrame]:
         """Return the state after the next frame, and the frame as measured.
 
         Parameters
@@ -201,7 +204,7 @@ class Intake:
             return self.with_dark_frame(measured, state), measured
         return self.with_frame(measured, state), measured
 
-    def with_frame(self, measured: MeasuredFrame, state: TakenIn) -> TakenIn:
+    def with_frame(self, measured: MeasuredFrame, state: IntakeState) -> IntakeState:
         """Return the state after a light or white frame."""
         return replace(
             state,
@@ -210,7 +213,7 @@ class Intake:
             saturation=min(state.saturation, measured.saturation),
         )
 
-    def with_dark_frame(self, measured: MeasuredDarkFrame, state: TakenIn) -> TakenIn:
+    def with_dark_frame(self, measured: MeasuredDarkFrame, state: IntakeState) -> IntakeState:
         """Return the state after a dark frame."""
         state = replace(
             state,
@@ -219,25 +222,25 @@ class Intake:
         )
         if not self.subtracts_dark:
             return state
-        subtraction = deepcopy(state.subtraction)
-        return replace(state, subtraction=subtraction, dark=self._learn(subtraction, measured))
+        estimator = deepcopy(state.estimator)
+        return replace(state, estimator=estimator, dark=self._learn(estimator, measured))
 
-    def _register_again(self, record: FrameRecord, state: TakenIn) -> tuple[TakenIn, MeasuredFrame]:
+    def _register_again(self, record: FrameRecord, state: IntakeState) -> tuple[IntakeState, MeasuredFrame]:
         """Return the state with the chart registered in this frame, and what the frame shows."""
         decoded = decode_frame(self.session, record)
         registered = self.baseline.register(decoded)
         shift = movement_of(self.baseline, state.registered, registered)
-        subtraction = deepcopy(state.subtraction)
-        subtraction.restart()
+        estimator = deepcopy(state.estimator)
+        estimator.restart()
         even = self.selected.is_even(record)
         measured = measure_registered_frame(self.baseline, decoded, registered, shift, even, state.dark)
-        return replace(state, registered=registered, subtraction=subtraction), measured
+        return replace(state, registered=registered, estimator=estimator), measured
 
-    def _learn(self, subtraction: DarkLightEstimator, measured: MeasuredDarkFrame) -> DarkLight:
-        """Take a dark frame into a subtraction and return what is subtracted from the frames after it."""
+    def _learn(self, estimator: DarkLightEstimator, measured: MeasuredDarkFrame) -> DarkLight:
+        """Take a dark frame into the estimate and return what is subtracted from the frames after it."""
         points, reader = self.baseline.points, self.baseline.paper
         means = measured.means[len(points.cells_mm) :][: len(points.whites_mm)]
         inside = measured.registered.references.inside[: len(points.whites_mm), None]
         paper, shape = reader.read(np.where(inside, means, np.nan), measured.figures.record.file)
         field = np.concatenate([shape, paper.field.at(points.references_mm)])
-        return subtraction.add(measured.means, measured.figures.noise, paper, field)
+        return estimator.add(measured.means, measured.figures.noise, paper, field)

@@ -7,7 +7,7 @@ rise by one and the same factor, and a factor that depends on the level is the s
 cannot be seen so, a power of the light, and for it the exposure times are needed: stated to some per cent only, as
 cameras write 0.3 s for 0.315 s, they enter all together.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The series is no part of a table: no sample depends on it, and its figures are in the report alone.
 - A frame that is not of the series (another camera, ISO speed or aperture, the chart elsewhere) is refused by name.
@@ -20,13 +20,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.planes import CLIPPING_SHARE, frame_black
+from acquisition.framing.planes import CLIPPING_SHARE, frame_black, strongest_channel
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.fitting.least_squares import least_squares
 from calibration.pipeline.baseline import Baseline
-from calibration.pipeline.frames import strongest_channel
 from calibration.radiometry.sensor_range import saturation
-from calibration.registration.movement import BUMP_PX, Shift
+from calibration.registration.movement import REREGISTER_PX, Shift
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import FormatError, InputError
 
@@ -125,8 +124,8 @@ def _exposure_s(mosaic: Mosaic, path: Path) -> float:
 
 
 def _require_in_place(shift: Shift, path: Path) -> None:
-    if shift.gauges == 0 or shift.largest_px > BUMP_PX:
-        moved = f"it has moved by {shift.largest_px:.2f} px, {BUMP_PX:g} allowed"
+    if shift.gauges == 0 or shift.largest_px > REREGISTER_PX:
+        moved = f"it has moved by {shift.largest_px:.2f} px, {REREGISTER_PX:g} allowed"
         if shift.gauges == 0:
             moved = "its tags, or the outline of its field, are not seen"
         raise FormatError(

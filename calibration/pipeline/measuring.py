@@ -1,6 +1,6 @@
 """What one frame shows: how the chart has moved, its paper and greys, its samples.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A frame is measured with the baseline, the frame registered last, and the dark light, and with nothing else, so that
   frames can be measured in any order and by any thread.
@@ -24,7 +24,7 @@ from calibration.radiometry.dark_frames import DarkFrameFigures, measure_dark_fr
 from calibration.radiometry.dark_subtraction import DarkLight, winsorised_means
 from calibration.radiometry.paper import Paper
 from calibration.radiometry.primaries import Primaries
-from calibration.registration.movement import BUMP_PX, STILL_PX, Shift, shift_between
+from calibration.registration.movement import REREGISTER_PX, STILL_PX, Shift, shift_between
 from calibration.sampling.patch_statistics import patch_means, sample_noise
 from calibration.sampling.samples import Sites, gather, gather_values, table_values
 from drivers.raw.rawfile import Mosaic
@@ -129,7 +129,7 @@ def measure_frame(
     shift = shift_between(registered.gauges[channel], framing, gauges)
     # A turn or a change of distance moves the tags differently; moving the grid along would not mend it.
     turned = shift.largest_px > shift.length_px + STILL_PX
-    if shift.gauges == 0 or shift.length_px > BUMP_PX or turned:
+    if shift.gauges == 0 or shift.length_px > REREGISTER_PX or turned:
         return shift
     cells, references = registered.cells, registered.references
     if shift.length_px > STILL_PX:
@@ -148,9 +148,9 @@ def measure_registered_frame(
     keep_samples: bool,
     dark: DarkLight | None = None,
 ) -> MeasuredFrame:
-    """Return what the frame itself shows in which the chart was registered, `shift` after the one before.
+    """Return what a frame shows in which the chart was registered, `shift` px from the frame registered before.
 
-    Parameters and errors are else those of `measure_frame`.
+    Parameters and errors are otherwise those of `measure_frame`.
     """
     reregistered = registered is not baseline.first
     grid = _Grid(registered.cells, registered.references, shift, reregistered)
@@ -158,7 +158,7 @@ def measure_registered_frame(
 
 
 def sample_dark_frame(baseline: Baseline, decoded: DecodedFrame, registered: RegisteredFrame) -> MeasuredDarkFrame:
-    """Return what a dark frame shows; no tag is seen in it, so the chart is taken to lie where it did.
+    """Return what a dark frame shows; no tag is seen in it, so the chart is assumed to lie where it did.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def sample_dark_frame(baseline: Baseline, decoded: DecodedFrame, registered: Reg
 def measure_primaries(baseline: Baseline, frames: Iterable[DecodedFrame]) -> Primaries | None:
     """Return what the frames of red, green and blue alone show; None where there are none or one cannot be used.
 
-    Wherever the chart lay in them; `frames` are gone through once, one at a time.
+    The chart may lie elsewhere in them; `frames` are read once, one at a time.
 
     Raises
     ------
@@ -239,7 +239,7 @@ def _measured(
     else:
         values, highest = gather_values(decoded.mosaic, decoded.black, grid.cells, shape, dark_cells)
         kept = noise = None
-    mean = patch_means(values[baseline.expectation.cells])
+    mean = patch_means(values[baseline.consistency_check.cells])
     variance = baseline.transfer.variance(mean) / baseline.options.samples
     figures = FrameFigures(
         record=decoded.record,
@@ -248,7 +248,7 @@ def _measured(
         shift=grid.shift,
         reregistered=grid.reregistered,
         paper=paper,
-        consistency=baseline.expectation.compare(mean, variance),
+        consistency=baseline.consistency_check.compare(mean, variance),
         greys=grey_values,
         grey_errors=grey_errors,
         dark=np.zeros(3) if dark is None else dark.paper,

@@ -13,7 +13,7 @@ from foundation.errors import InputError
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """How a table is built; as it stands, as in the paper: 25 samples, nothing subtracted but black.
+    """How a table is built; the defaults are the paper's: 25 samples, nothing subtracted but black.
 
     Attributes
     ----------
@@ -52,5 +52,5 @@ class BuildOptions:
         return asdict(self) | {"corners": None if self.corners is None else [list(corner) for corner in self.corners]}
 
 
-AS_IN_THE_PAPER = BuildOptions()
-"""The options where none are given."""
+PAPER_OPTIONS = BuildOptions()
+"""The paper's options, which hold where none are given."""

@@ -1,4 +1,4 @@
-"""Work on frames by threads, some frames before their turn, and the results in the frames' order."""
+"""Frames worked on by threads, some before their turn, with the results in the frames' order."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_THREADS = 8
 _Result = TypeVar("_Result")
 
 
-def threads() -> int:
+def thread_count() -> int:
     """Return how many frames are read and measured at a time: one a processor, as far as memory allows."""
     return min(processor_count(), MOST_THREADS)
 
@@ -37,7 +37,7 @@ def prefetched(
     others_wait_for
         Whether work on those after a frame may begin only when the consumer asks for the next one.
     """
-    count = threads()
+    count = thread_count()
     with ThreadPoolExecutor(count) as pool:
         begun: deque[tuple[FrameRecord, Future[_Result]]] = deque()
         todo = deque(records)

@@ -1,6 +1,6 @@
 """Where the chart lies, from the frame in which it was registered until it moves too far from there.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Cells are in the order of colour indices, as in the table, and not in the chart's own order.
 - References follow the cells, the white ones before the grey ones.

@@ -39,7 +39,6 @@ _PAPER_WORTH = 10.0
 _ROUNDS = 5
 """Reweighted solutions in a row; Huber's weights, squared, have settled by then."""
 
-
 _Array = npt.NDArray[np.float64]
 
 
@@ -57,7 +56,7 @@ def field_of_cells(
     Parameters
     ----------
     rgb
-        (C, 3) printed codes, 0 … 255.
+        (C, 3) int printed codes, 0 … 255.
     cells_mm
         (C, 2) float64 mm, the cells' centres.
     level

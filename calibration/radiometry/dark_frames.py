@@ -1,10 +1,10 @@
 """Dark frames: the light that is there while the projector shows black, read noise, and hot photosites.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The projector's leak and ambient light cannot be separated and are one figure, read on bare paper.
 - They are part of every light: samples and ground truth contain them alike, so nothing is subtracted unless the user
-  wishes it (`calibration.radiometry.dark_subtraction`).
+  asks for it (`calibration.radiometry.dark_subtraction`).
 - A photosite is hot when it is an outlier in every dark frame; an outlier in a single one is a cosmic ray.
 """
 
@@ -85,7 +85,7 @@ class DarkFrameFigures:
     noise: _Array
 
     def to_json(self) -> dict[str, Any]:
-        """Return the figures as JSON holds them; `from_json` makes them again to the last bit."""
+        """Return the figures as JSON can hold them; `from_json` restores them to the last bit."""
         return {name: getattr(self, name).tolist() for name in ("black", "light", "error", "noise")}
 
     @staticmethod
@@ -175,7 +175,7 @@ class HotPixels:
         return {"dark_least": self._least, "dark_past": self._past}
 
     def restore(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `to_arrays` returned."""
+        """Go on from what `to_arrays` returned: int16 (C, S, 3) and float64 (C,) arrays by name."""
         self._least, self._past = arrays["dark_least"].copy(), arrays["dark_past"]
 
 

@@ -7,10 +7,11 @@ each channel (empirical Bayes; B. Efron and C. Morris, Journal of the American S
 
 Why so: `docs/decisions/0009-dark-light-is-predicted.md`.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A frame's dark light is that of the last dark frame taken before it, or of the first, for frames before that.
-- The estimate after a dark frame depends on those before it alone, so that a table may grow.
+- The estimate after a dark frame depends on those before it alone, so that a build that was stopped goes on to the same
+  bits.
 """
 
 from __future__ import annotations
@@ -150,7 +151,11 @@ class DarkLightEstimator:
         return self._current
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return all that is needed to go on: float arrays by name; none before the first frame."""
+        """Return all that is needed to go on: arrays by name; none before the first frame.
+
+        `dark_left` (P, 3) float64, `dark_noise` (3,) float64, `dark_frames` scalar int64, `dark_paper` (3,) float64,
+        `dark_patches` (P, 3) float32, `dark_share` (3,) float64.
+        """
         if self._current is None:
             return {}
         return {
@@ -163,7 +168,7 @@ class DarkLightEstimator:
         }
 
     def restore(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
-        """Go on from what `to_arrays` returned."""
+        """Go on from what `to_arrays` returned: (P, 3) and (3,) float arrays by name."""
         if "dark_left" not in arrays:
             return
         self._left, self._noise = arrays["dark_left"], arrays["dark_noise"]

@@ -1,6 +1,6 @@
-"""The grey references: what each printed level gives under each light, beside bare paper.
+"""The grey references: what each printed level gives under each light, compared with bare paper.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A level is the mean of its patches after the field is divided out, without outliers; its standard error is that of
   the mean.
@@ -23,6 +23,7 @@ from foundation.angles import angles_deg
 from foundation.robust import MAD_TO_SIGMA
 
 COLUMNS = ("light", "name", "r", "g", "b", "r_error", "g_error", "b_error")
+"""Columns of `references.csv` (docs/formats.md)."""
 
 _OUTLIER_SIGMAS = 6.0
 """Robust standard deviations from the median beyond which a patch is covered or dirty."""

@@ -37,9 +37,9 @@ def pure_lights(illuminations: Sequence[Illumination]) -> tuple[int, int, int] |
     for channel in range(3):
         alone: list[tuple[int, int]] = []
         for light in illuminations:
-            codes = light.colour.red, light.colour.green, light.colour.blue
-            if codes[channel] > 0 and sum(codes) == codes[channel]:
-                alone.append((codes[channel], -light.index))
+            code = light.codes[channel]
+            if code > 0 and sum(light.codes) == code:
+                alone.append((code, -light.index))
         if not alone:
             return None
         found.append(-max(alone)[1])

@@ -44,8 +44,7 @@ def additivity(
     """
     found: dict[tuple[int, int, int], _Array] = {}
     for light in lights:
-        code = (light.colour.red, light.colour.green, light.colour.blue)
-        found[code] = white[light.index] / gains[light.index]
+        found[light.codes] = white[light.index] / gains[light.index]
     total = full_white if full_white is not None else found.get((255, 255, 255))
     primaries = [found.get(code) for code in ((255, 0, 0), (0, 255, 0), (0, 0, 255))]
     red, green, blue = primaries

@@ -45,7 +45,7 @@ class Displacement:
         return cls(low_mm, (high_mm - low_mm) / spans, np.zeros((spans[1] + 3, spans[0] + 3, 2)))
 
     def basis(self, points_mm: npt.ArrayLike) -> sparse.csr_array:
-        """Return the splines (N, coefficients) at points (N, 2) mm; outside, the border's cubic goes on."""
+        """Return the splines (N, K) float64 at points (N, 2) float mm; outside, the border's cubic goes on."""
         rows, columns = self.coefficients.shape[:2]
         points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 2)
         at = (points - self.origin_mm) / self.knot_mm

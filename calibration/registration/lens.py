@@ -12,12 +12,17 @@ import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
-from acquisition.framing.homography import fit_homography, project
+from acquisition.framing.homography import fit_homography, on_one_line, project
 from foundation.errors import RegistrationError
 
 _PAIRS_FOR_ALL, _PAIRS_FOR_ONE = 48, 16
 """Pairs from which on all four coefficients are fitted, or the first: the corners of twelve tags and of four. Fewer do
 not determine them, and each would fit noise."""
+
+_ON_ONE_LINE = (
+    "the marks of the chart that were found lie on one line, and marks spread over the sheet are expected; bring all "
+    "of the chart into the frame, and uncover it"
+)
 
 _Array = npt.NDArray[np.float64]
 
@@ -87,11 +92,13 @@ def fit_lens(
     centre = (np.array(frame_size, dtype=np.float64) - 1) / 2
     radius = float(np.hypot(*frame_size)) / 2
     free = 4 if len(points_mm) >= _PAIRS_FOR_ALL else 1 if len(points_mm) >= _PAIRS_FOR_ONE else 0
+    if on_one_line(points_mm) or on_one_line(places_px):
+        raise RegistrationError(_ON_ONE_LINE)
     middle, spread = points_mm.mean(axis=0), points_mm.std(axis=0).max()
     normal = np.array([[1 / spread, 0, -middle[0] / spread], [0, 1 / spread, -middle[1] / spread], [0, 0, 1]])
     start = fit_homography((points_mm - middle) / spread, (places_px - centre) / radius)
     if start is None:
-        raise RegistrationError("the marks lie on one line; bring more of the chart into the frame")
+        raise RegistrationError(_ON_ONE_LINE)
     scale = np.array([[radius, 0, centre[0]], [0, radius, centre[1]], [0, 0, 1]])
 
     def lens(parameters: _Array) -> Lens:

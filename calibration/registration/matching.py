@@ -1,6 +1,6 @@
 """The map from print to frame moved until both coincide: what tags and lens leave is measured on the cells themselves.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The frame is rectified to the print, compared with the print's colours as the camera sees them (a colour model fitted
   on the frame itself), and a smooth displacement is fitted to what does not coincide.
@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, sparse
 
-from acquisition.chart.model import Chart
+from acquisition.chart.model import PAPER_WHITE, Chart
 from acquisition.framing.homography import rms
 from acquisition.framing.planes import Plane
 from calibration.registration.block_search import find_blocks
@@ -196,7 +196,7 @@ class Matcher:
 
     def _paper(self) -> _Array:
         """Return camera RGB (3,) of bare paper under even light."""
-        return self.colours.flat(np.array([[255, 255, 255]]))[0]
+        return self.colours.flat(np.array([PAPER_WHITE]))[0]
 
     def _fit_colours(self) -> ColourModel:
         seen = self._seen()
@@ -224,7 +224,7 @@ class Matcher:
 
     def _rectified(self, raster: Raster) -> tuple[_Float, _Mask]:
         """Return the frame as seen on the print's raster, (H, W, 3) float32, and where it exists, (H, W) bool."""
-        places = raster.spread(self.to_pixels)
+        places = raster.element_places(self.to_pixels)
         image = np.empty((*raster.shape, 3), dtype=np.float32)
         for channel, plane in enumerate(self._planes):
             image[..., channel] = cv2.remap(

@@ -24,8 +24,8 @@ MAX_SHIFT_PX = 3.0
 STILL_PX = 0.1
 """Half-size px that the chart may move before the sampling grid follows: a fifth of the rounding of samples' places."""
 
-BUMP_PX = 0.5
-"""Half-size px from which on the chart is registered again: camera or print was knocked, and may have turned too."""
+REREGISTER_PX = 0.5
+"""Half-size px of movement from which on the chart is registered again: it was knocked, and may have turned too."""
 
 _GAUGE_TAGS = 8
 """Tags that are measured: the median of eight has an error of 0.005 px where paper has 290 counts."""
@@ -136,7 +136,7 @@ def _gauge_tags(framing: Framing) -> list[FoundTag]:
 
 
 def _tag_shift(reference: Plane, plane: Plane, tag: FoundTag) -> _Points | None:
-    """Return the movement of one tag and its growth of blur, (3,) px, px, px², or None where it cannot be measured."""
+    """Return the movement of one tag and its growth of blur, (3,) px, px, px²; None where it cannot be measured."""
     margin = int(np.ceil(MAX_SHIFT_PX)) + 2
     height, width = reference.values.shape
     corners = tag.corners_px - reference.offset_px
@@ -240,7 +240,7 @@ def _field_shift(reference: Plane, plane: Plane, field: FoundField) -> Shift:
     known = 1 / np.asarray(np.linalg.inv(gram), dtype=np.float64)[:, 2, 2]
     weights = known * solution[:, 0] ** 2 / np.maximum((left**2).mean(axis=1), 1e-9)
     softer = 2 * float(np.median(solution[good, 3] / solution[good, 0]))
-    return _rigid(middles[good], normals[good], moved[good], weights[good], field, softer)
+    return _similarity(middles[good], normals[good], moved[good], weights[good], field, softer)
 
 
 def _sampled(plane: Plane, places: _Points) -> _Points:
@@ -250,10 +250,10 @@ def _sampled(plane: Plane, places: _Points) -> _Points:
     return (np.roll(found, 1, axis=1) + 2 * found + np.roll(found, -1, axis=1)) / 4
 
 
-def _rigid(
+def _similarity(
     middles: _Points, normals: _Points, moved: _Points, weights: _Points, field: FoundField, softer: float
 ) -> Shift:
-    """Return the robust fit of shift, turn and growth of the field to movements (K,) px across strips."""
+    """Return the similarity transform of the field (shift, turn, growth) that fits movements (K,) px across strips."""
     centre = field.corners_px.mean(axis=0)
     x, y = ((middles - centre) / np.abs(field.corners_px - centre).max()).T
     # A turn moves (x, y) by (−y, x), a growth by (x, y).

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from acquisition.chart.model import Tag
+from acquisition.chart.model import TAG_MODULES, Tag
 
 _Float = npt.NDArray[np.float32]
 _Array = npt.NDArray[np.float64]
@@ -46,7 +46,7 @@ class Raster:
 
     @classmethod
     def of(cls, low_mm: _Array, step_mm: _Array, size: _Array) -> Raster:
-        """Return the raster that begins at `low_mm` and has `size` (columns, rows) elements of `step_mm`."""
+        """Return the raster that begins at `low_mm` (2,) and has `size` (columns, rows) elements of `step_mm` (2,)."""
         return cls(low_mm, step_mm, (int(size[1]), int(size[0])))
 
     def point(self, column: float, row: float) -> _Array:
@@ -71,7 +71,7 @@ class Raster:
         points = self.low_mm + np.stack([x.ravel(), y.ravel()], axis=-1) * self.step_mm
         return to_pixels(points).reshape(rows, columns, 2), stride
 
-    def spread(self, to_pixels: ToPixels) -> _Float:
+    def element_places(self, to_pixels: ToPixels) -> _Float:
         """Return the places (H, W, 2) float32 px, x then y, of all elements; exact on a lattice, bilinear within."""
         lattice, stride = self._lattice(to_pixels)
         rows, columns = ((np.arange(length) + 0.5) / stride for length in self.shape)
@@ -139,7 +139,7 @@ class Raster:
         """Return which elements (H, W) bool lie clear of every tag and its white rim."""
         free = np.ones(self.shape, dtype=bool)
         for tag in tags:
-            rim = np.ptp(tag.corners_mm, axis=0).max() / 8 * 1.5
+            rim = np.ptp(tag.corners_mm, axis=0).max() / TAG_MODULES * 1.5
             low = np.floor((tag.corners_mm.min(axis=0) - rim - self.low_mm) / self.step_mm).astype(int)
             high = np.ceil((tag.corners_mm.max(axis=0) + rim - self.low_mm) / self.step_mm).astype(int)
             low = np.maximum(low, 0)
@@ -180,7 +180,7 @@ def to_pixel_units(sums: _Array, jacobians: _Array) -> tuple[_Array, _Array]:
     return information, -np.einsum("nji,nj->ni", inverse, sums[:, 3:])
 
 
-def box(image: npt.NDArray[np.floating], size: int) -> _Float:
+def box_mean(image: npt.NDArray[np.floating], size: int) -> _Float:
     """Return the mean (H, W) float32 over size × size elements around each of an image (H, W)."""
     return np.asarray(cv2.blur(image, (size, size)), dtype=np.float32)
 

@@ -1,6 +1,6 @@
 """Where every point of the print lies in a frame: tags or the field's outline first, then the cells themselves.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Tags give a homography and Brown's distortion and nothing finer: 35 of them cannot sample a wavy sheet. The local
   part is measured on the cells: the frame is rectified to the print, compared with the print's colours as the camera
@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from acquisition.chart.model import Chart
 from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.homography import rms
-from acquisition.framing.outline import refined
+from acquisition.framing.outline import refine_edges
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
 from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
 from acquisition.framing.tagless_field import FoundField
@@ -100,8 +100,8 @@ def register(
     what
         The frame's name for messages.
     corners
-        For a chart without tags: (4, 2) half-size px, the corners of the field of cells, clockwise from the printed
-        top-left, to some 20 px; found by themselves if not given.
+        For a chart without tags: (4, 2) float half-size px, the corners of the field of cells, clockwise from the
+        printed top-left, to some 20 px; found by themselves if not given.
     near
         An earlier registration of the same session: a chart without tags is then taken to hang the same way up.
 
@@ -162,7 +162,7 @@ def _outline(field: FoundField) -> Anchors:
 
 def _clear_edges(field: FoundField, planes: list[Plane], blur: float) -> FoundField:
     """Return the field with its outline measured finely, where it is clear enough for that."""
-    places, clear = refined(planes, field.outline_px, field.normals, blur)
+    places, clear = refine_edges(planes, field.outline_px, field.normals, blur)
     return replace(field, outline_mm=field.outline_mm[clear], outline_px=places[clear], normals=field.normals[clear])
 
 

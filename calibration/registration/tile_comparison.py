@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.registration.raster import Raster, ToPixels, box, jacobians, sums_of, tile_middles, to_pixel_units
+from calibration.registration.raster import Raster, ToPixels, box_mean, jacobians, sums_of, tile_middles, to_pixel_units
 from foundation.robust import sigma_of
 
 MIN_SCORE = 0.5
@@ -80,7 +80,7 @@ def compare_tiles(
     window
         Elements over which gain and offset are taken for constant.
     to_pixels
-        The map.
+        The map, from points (N, 2) mm to places (N, 2) px.
     cell_px
         Half-size pixels along a cell's side; a tile is taken to be as large, or finer.
     without_gradient
@@ -96,19 +96,20 @@ def compare_tiles(
         gy, gx = np.gradient(model)
         model = (model - mean(model)) * weight
         values = (values - mean(values)) * weight
-        power, common = box(model * model, window), box(model * values, window)
+        power, common = box_mean(model * model, window), box_mean(model * values, window)
         gain = common / np.maximum(power, np.float32(1e-6))
         error = values - gain * model
         magnitude = np.abs(error)
         noise = np.float32(sigma_of(magnitude[::3, ::3][weight[::3, ::3] > 0]) + 1e-3)
         agreeing += common / noise**2
         expected_power += power / noise**2
-        seen_power += box(values * values, window) / noise**2
+        seen_power += box_mean(values * values, window) / noise**2
         huber = weight / np.maximum(noise * noise, 0.5 * noise * magnitude)
         if without_gradient:
             gx, gy = ((slope - mean(slope)) * weight for slope in (gx, gy))
             gx, gy = (
-                slope - model * box(slope * model, window) / np.maximum(power, np.float32(1e-6)) for slope in (gx, gy)
+                slope - model * box_mean(slope * model, window) / np.maximum(power, np.float32(1e-6))
+                for slope in (gx, gy)
             )
         gx, gy = gx * gain, gy * gain
         for place, (one, other) in enumerate(((gx, gx), (gx, gy), (gy, gy), (gx, error), (gy, error))):
@@ -132,7 +133,7 @@ class _LocalMean:
 
     def __init__(self, weight: _Float, window: int, keep_gradient: bool) -> None:
         self._weight, self._window = weight, window
-        self.share = np.maximum(box(weight, window), np.float32(1e-3))
+        self.share = np.maximum(box_mean(weight, window), np.float32(1e-3))
         rows, columns = (np.flatnonzero(weight.any(axis=axis)) for axis in (1, 0))
         self._inner = None
         if keep_gradient and min(len(rows), len(columns)) > window:
@@ -141,9 +142,9 @@ class _LocalMean:
     def __call__(self, image: _Float) -> _Float:
         """Return the mean (H, W); an even gradient that is kept is its own mean up to the border of what counts."""
         if self._inner is None:
-            return np.asarray(box(image * self._weight, self._window) / self.share, dtype=np.float32)
+            return np.asarray(box_mean(image * self._weight, self._window) / self.share, dtype=np.float32)
         around = self._window // 2 + 1
         padded = np.pad(image[self._inner], around, mode="reflect", reflect_type="odd")
         mean = np.zeros_like(image)
-        mean[self._inner] = box(padded, self._window)[around:-around, around:-around]
+        mean[self._inner] = box_mean(padded, self._window)[around:-around, around:-around]
         return mean

@@ -355,7 +355,10 @@ def _draw_consistency(axes: Any, count: npt.NDArray[np.integer], figures: TableF
 
 
 def draw_worst_cells(figure: Any, picture: _Image, chart: Chart, registration: Registration, window: int) -> None:
-    """Draw the cells whose rim and middle differ most, magnified; parameters are those of `draw_registration`."""
+    """Draw the cells whose rim and middle differ most, magnified.
+
+    `picture` is (H, W, 3) float32 counts; all parameters are those of `draw_registration`.
+    """
     figure.set_size_inches(10, 3.1)
     height, width = picture.shape[:2]
     places = registration.to_pixels(chart.centres_mm)

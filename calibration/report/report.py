@@ -31,12 +31,10 @@ from calibration.report.plots import (
     png_of,
 )
 from calibration.report.report_json import report_json
+from calibration.table.file_names import REPORT_JSON, REPORT_PAGE
 from calibration.verdict.result import BuildResult
 from drivers.raw.rawfile import read_raw
 from foundation.files import write_whole
-
-NAME = "report.html"
-JSON_NAME = "report.json"
 
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
@@ -51,14 +49,14 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
     folder
         Where the files are written.
     """
-    write_whole(folder / NAME, page(result, _pictures(result.figures, session)))
-    write_whole(folder / JSON_NAME, json.dumps(report_json(result), indent=2) + "\n")
+    write_whole(folder / REPORT_PAGE, page(result, _pictures(result.figures, session)))
+    write_whole(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
 
 
 def _pictures(figures: TableFigures, session: Session) -> list[Picture]:
     chart, registration, window = session.chart, figures.registration, figures.cells.window
     frame = half_size(read_raw(session.folder / figures.session.registered_file))
-    codes = np.array([[light.colour.red, light.colour.green, light.colour.blue] for light in session.illuminations])
+    codes = np.array([light.codes for light in session.illuminations])
     black_body = np.array([light.kind == "blackbody" for light in session.illuminations], dtype=np.bool_)
     seen = f"seen by the {figures.session.camera}"
     return [

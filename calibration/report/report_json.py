@@ -15,6 +15,7 @@ from calibration.verdict.values import judged_values
 
 FORMAT = "crop.report"
 VERSION = 1
+"""`format` and `version` of `report.json` (docs/formats.md)."""
 
 _Array = npt.NDArray[np.float64]
 

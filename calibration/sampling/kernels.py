@@ -113,7 +113,11 @@ def sample_to_table(
     values: _Count,
     peak: _Count,
 ) -> None:
-    """Do `sample` and `tabulate` in one pass, without the samples (N, window², 3) between them."""
+    """Do `sample` and `tabulate` in one pass, without the samples (N, window², 3) between them.
+
+    `values` (N, window², 3) uint16 and `peak` (N,) uint16 are filled; `dark` and `field` are (N, 3) float32, the rest
+    as for `sample`.
+    """
     red, green, other, blue = uint64(places[0]), uint64(places[1]), uint64(places[2]), uint64(places[3])
     for patch in order:
         highest = np.int32(0)

@@ -50,9 +50,9 @@ def rim_difference(
     Parameters
     ----------
     samples
-        (N, S, 3) counts above black, S = 9, 25, 49 or 81 row by row.
+        (N, S, 3) float32 or float64 counts above black, S = 9, 25, 49 or 81 row by row.
     noise
-        (N, 3) standard deviation of one of them, counts.
+        (N, 3) float32 or float64, standard deviation of one of them, counts.
 
     Returns
     -------
@@ -75,9 +75,9 @@ def unevenness(samples: npt.NDArray[np.floating], noise: npt.NDArray[np.floating
     Parameters
     ----------
     samples
-        (N, S, 3) counts above black, the mean of one or more frames of equal light.
+        (N, S, 3) float32 or float64 counts above black, the mean of one or more frames of equal light.
     noise
-        (N, 3) counts, standard deviation of one of these values.
+        (N, 3) float32 or float64 counts, standard deviation of one of these values.
 
     Returns
     -------

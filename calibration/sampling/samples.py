@@ -1,6 +1,6 @@
 """The samples of every cell, taken as the sensor gave them.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A cell's samples are the 5×5 half-size pixels around its rounded centre (paper, section 3.2), or another odd window.
   Pixels are taken whole; nothing is interpolated, which would alter the noise that the samples are for.
@@ -162,7 +162,7 @@ def gather_values(
 ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
     """Return `table_values` of what `gather` returns, (N, S, 3) uint16, and the highest counts (N,) uint16.
 
-    In a third of the time of both; parameters as theirs.
+    In a third of the time of both; parameters as theirs: `black` (2, 2), `field` and `dark` (N, 3).
     """
     from calibration.sampling import kernels
 

@@ -18,3 +18,9 @@ FRAMES: Final = "frames.csv"
 
 REFERENCES: Final = "references.csv"
 """The grey references under each light, where the chart has some."""
+
+REPORT_PAGE: Final = "report.html"
+"""The report for people."""
+
+REPORT_JSON: Final = "report.json"
+"""The report for programs."""

@@ -4,7 +4,7 @@ A LUT folder holds `samples.npy` (uint16 little-endian, C order, [light, colour,
 (the lights and their ground truth), `lut.json` (provenance), and `frames.csv` (the frames it was made from). The
 generator reads tables through this file, and nothing behind it.
 
-Every version of the format that was ever released is read for ever. Keys added since are optional.
+Every released version of the format stays readable. Keys added since are optional.
 """
 
 from __future__ import annotations

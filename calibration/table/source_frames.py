@@ -13,6 +13,7 @@ from typing import Final
 from foundation.errors import FormatError
 
 COLUMNS: Final = ("kind", "illumination", "file", "sha256")
+"""Columns of a table's `frames.csv` (docs/formats.md)."""
 
 
 @dataclass(frozen=True)

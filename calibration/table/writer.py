@@ -166,9 +166,7 @@ def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[
                 light.index,
                 light.kind,
                 "" if light.cct_k is None else f"{light.cct_k:g}",
-                light.colour.red,
-                light.colour.green,
-                light.colour.blue,
+                *light.codes,
                 *(f"{value:.6f}" for value in values),
             ]
         )

@@ -4,7 +4,7 @@ Zarr specification version 3 with the codec `sharding_indexed`: one light is a c
 Blosc (Zstandard after bit shuffle), about two thirds of `samples.npy`. The table's other files are attributes, word for
 word, so that a table that was fetched is the one that was published, hash by hash.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The attributes are completed last: an array without the attribute `whole` was never finished.
 - Nothing is overwritten but such an array.
@@ -25,7 +25,7 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, REFERENCES, SAMPLES
+from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, REFERENCES, REPORT_JSON, SAMPLES
 from calibration.table.lut import Lut, open_lut
 from calibration.table.sample_hashes import light_sha256
 from foundation.errors import CropError, FormatError, InputError, StorageError
@@ -39,13 +39,14 @@ VERSION: Final = 1
 SHARD_LIGHTS: Final = 32
 """Lights of one object of the store: 100 MB compressed of a full table, a size that stores and networks like."""
 
-_TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, "report.json", PROVENANCE)
+_TEXTS: Final = (ILLUMINATIONS, FRAMES, REFERENCES, REPORT_JSON, PROVENANCE)
 """Files that go along where the table has them, the one that makes a folder a table last."""
 
-Progress = Callable[[int, int], None]
+ReportLights = Callable[[int, int], None]
+"""Called with the number of lights copied, and the number of all."""
 
 
-def publish(lut: Lut, url: str, progress: Progress | None = None) -> None:
+def publish(lut: Lut, url: str, progress: ReportLights | None = None) -> None:
     """Write a table to a store.
 
     Parameters
@@ -98,7 +99,7 @@ def publish(lut: Lut, url: str, progress: Progress | None = None) -> None:
         ) from error
 
 
-def fetch(url: str, folder: Path, progress: Progress | None = None) -> Lut:
+def fetch(url: str, folder: Path, progress: ReportLights | None = None) -> Lut:
     """Copy a published table to a folder, where it is memory-mapped.
 
     Parameters
@@ -159,7 +160,7 @@ def _light(array: Any, light: int, url: str) -> npt.NDArray[np.uint16]:
 
 
 def _verify(lut: Lut, url: str) -> None:
-    """Refuse a table whose samples have not the hashes that it records; the first tables of version 1 recorded none."""
+    """Refuse a table whose samples do not have the recorded hashes; the first tables of version 1 have none."""
     known = lut.provenance
     for light, then in enumerate(known.lights_sha256):
         if light_sha256(lut.samples[light]) != then:

@@ -1,6 +1,6 @@
 """Every limit that a table is judged by, in one list, each with its reason and where the number comes from.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A value within `accept` is accepted; between `accept` and `refuse` it is remarked on; beyond `refuse` there is no
   table.

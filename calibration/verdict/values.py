@@ -55,7 +55,7 @@ def _cell_values(figures: TableFigures) -> dict[str, float]:
 
 
 def _frame_values(figures: TableFigures) -> dict[str, float]:
-    """Return the worst that happened between frames."""
+    """Return the worst values over all frames, and how frames differ from each other."""
     frames, registration = figures.frames, figures.registration
     used = min((frame.paper.references for frame in frames), default=0)
     values = {

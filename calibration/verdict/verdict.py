@@ -1,6 +1,6 @@
 """Accept, accept with remarks, or refuse: values compared with `calibration.verdict.thresholds`.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Judging is a pure function of values: the same values give the same verdict, whoever measured them.
 - A value that could not be measured is not judged; one that is not a number is refused.

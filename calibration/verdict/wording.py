@@ -29,15 +29,15 @@ def refusal(verdict: Verdict, figures: TableFigures) -> str:
     if worst.threshold.name == "unfit_share":
         cause, count = Counter(cell.cause.split(":")[0] for cell in figures.cells.unfit).most_common(1)[0]
         detail, remedy = f", {count} of them {cause}", _REMEDIES.get(cause, "look at the report")
-    return f"{row_with_place(worst, figures)}{detail}{more}; {remedy}, and take the session anew"
+    return f"{_with_place(worst, figures)}{detail}{more}; {remedy}, and take the session anew"
 
 
 def remark(row: JudgedValue, figures: TableFigures) -> str:
     """Return a row that is remarked on: value, expectation, place and remedy, in a line."""
-    return f"{row_with_place(row, figures)}; {row.threshold.remedy}"
+    return f"{_with_place(row, figures)}; {row.threshold.remedy}"
 
 
-def row_with_place(row: JudgedValue, figures: TableFigures) -> str:
+def _with_place(row: JudgedValue, figures: TableFigures) -> str:
     """Return a value against its limit, and where the worst of it is."""
     place = _place(row, figures)
     return f"{row.text()}, {place}" if place else row.text()

@@ -4,7 +4,7 @@ A code counts eighths of a stop. What the camera shows, and what people write, i
 1/64 s, f/3.5 for f/3.564. Third stops and half stops share some nominal values (1/10 s is 0x53 and 0x54); a body
 works in one or the other, so that its own list of available codes decides.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A value is found by its nominal number within 1 %, or not at all: nothing is rounded to a neighbour. The error lists
   what is near.
@@ -25,6 +25,7 @@ from foundation.errors import InputError, ProtocolError
 TOLERANCE = 0.01
 """How far, of one, a wanted value may lie from a nominal one; neighbouring nominal values are 5 % apart or more."""
 _HIGHEST_CODE = 0xFF
+"""Codes are one byte: the law of stops has no meaning beyond."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ class Scale:
 
 
 def _number(wanted: float | str) -> float | None:
-    """Return the positive number that `wanted` is or says, or None."""
+    """Return the positive number that `wanted` is or spells, or None."""
     if isinstance(wanted, str):
         over, slash, under = wanted.strip().lower().removesuffix("s").removeprefix("f/").partition("/")
         try:

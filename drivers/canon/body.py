@@ -1,6 +1,6 @@
 """An EOS body in one session: from the connection to the last byte of a frame.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Every step is one that the recorded conversations have, or one that libgphoto2 takes; an operation that the body does
   not list is never sent.
@@ -35,21 +35,31 @@ PIECE_BYTES = 1 << 20
 MAX_FRAME_BYTES = 256 << 20
 """No raw file of an EOS body comes near it."""
 MAX_POLLS = 64
-"""GetEvent answers that one drain takes, at most."""
+"""GetEvent answers that one drain takes, at most: a few empty the queue, and some firmware repeats itself."""
 KEEP_ALIVE_S = 10.0
-"""After this long a body is asked to stay awake."""
+"""After this long a body is asked to stay awake, as libgphoto2 asks it."""
 SETTLE_LIMIT_S = 5.0
 """How long a body may take to report a value that it was given, or room for a frame."""
 RELEASE_TRIES = 5
+"""Presses in all, spread over `PASSING_LIMIT_S`: what keeps a body busy ends by itself or by what is fetched
+between."""
 CAPTURE_TIMEOUT_S = 100.0
-"""Wait for the answer to a release; some bodies expose before they answer."""
+"""Wait for the answer to a release; some bodies expose before they answer. libgphoto2 waits as long."""
 
 _REMOTE_ON, _REMOTE_OFF = 1, 0
+"""Parameter of SetRemoteMode, as the recorded conversations and libgphoto2 send it."""
 _WITHOUT_AF = 1
+"""Second parameter of RemoteReleaseOn: a release without autofocus."""
 _HOST_CLUSTERS, _HOST_CLUSTER_BYTES = 0x04FFFFFF, 0x1000
+"""Room announced to the body: so many clusters of so many bytes, 320 GiB, more than a session takes."""
 _PAUSES_S = (0.05, 0.1, 0.15, 0.2)
+"""Pauses between questions to the body, seconds; short at first, for most answers come at once (as libgphoto2
+waits)."""
 _PIECE_TRIES = 5
+"""Requests of one piece in all, with the longest pause between: a second for a fault that passes, then the frame is
+retaken."""
 _FREE_TRIES = 3
+"""Few, as the next `make_ready` tries again."""
 _LASTING = (ResponseCode.INVALID_OBJECT_HANDLE, ResponseCode.SESSION_NOT_OPEN, ResponseCode.DEVICE_BUSY)
 """Responses to a request for a piece that asking again does not change."""
 _RELEASE_RESULTS = {
@@ -86,7 +96,7 @@ class EosBody:
         return self._session.label
 
     def identity(self) -> CameraIdentity:
-        """Return what the body says of itself; the serial number is the engraved one, where it sends that."""
+        """Return maker, model, serial number and firmware; the serial number is the engraved one where it is sent."""
         serial = self.state.text(Property.EOS_SERIAL_NUMBER) or self._info.serial_number
         return CameraIdentity(self._info.manufacturer, self._info.model, serial, self._info.device_version)
 
@@ -96,7 +106,7 @@ class EosBody:
         Raises
         ------
         DeviceRefused
-            It is no EOS body, or offers no way to send frames to the host.
+            It is no EOS body, or cannot send frames to the host.
         LinkError, ProtocolError
             From the cable.
         """
@@ -169,7 +179,7 @@ class EosBody:
         """
         self.drain()
         self.free_waiting()
-        # A body whose "idle" was lost would seem busy for ever; it says itself whether it takes the release.
+        # A body whose "idle" was lost would seem busy for ever; its answer shows whether it takes the release.
         self._settled(lambda: not self.state.busy)
         self.free_waiting()
         if not self._settled(lambda: self.state.number(Property.EOS_AVAILABLE_SHOTS) != 0):

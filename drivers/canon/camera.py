@@ -1,6 +1,6 @@
 """A Canon EOS body as the suite's `Camera`: one raw frame after another, for hours, without a human.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A connection that fails is renewed, a limited number of times for one call and a limited time for each: reset, closed,
   opened again wherever the body is now, and given the settings again. `drivers.canon.body` is one connection.
@@ -29,11 +29,11 @@ from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
 RECOVERIES = 3
-"""How often one call renews the connection."""
+"""How often one call renews the connection: a fault that comes back more often lasts."""
 RECOVERY_LIMIT_S = 60.0
 """How long each renewal may take; a body that was switched off and on is back well within it."""
 FRAME_LIMIT_S = 90.0
-"""How long after its exposure a frame may be announced."""
+"""How long after its exposure a frame may be announced; libgphoto2 waits as long."""
 REDISCOVERY_S = 10.0
 """The same on a new connection, on which the body sends its whole state at once."""
 
@@ -41,6 +41,8 @@ _SYSTEM_CLOCK = SystemClock()
 _CERTAIN_SHARE = 0.9
 """Share of the nominal shutter time that passes at least: 1/6 s is really 0.149 s."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 5.0
+"""Pauses between attempts to find the camera again, doubled from one to the other: soon for a cable put back, seldom
+enough that a body which starts is left alone."""
 _STUCK = (
     *PASSING,
     ResponseCode.UNDEFINED,
@@ -102,7 +104,7 @@ class CanonEos:
         Raises
         ------
         DeviceRefused
-            The body does not offer a value, or is set up in a way that spoils a series; all of it in one message.
+            The body does not offer a value, or has a setting that spoils a series; all of it in one message.
         DeviceError
             It cannot be reached.
         """
@@ -193,7 +195,7 @@ class CanonEos:
 
         def released(body: EosBody) -> _Shot:
             body.make_ready()
-            _apply(body, settings)  # says nothing on the wire unless a dial was turned
+            _apply(body, settings)  # sends nothing unless a dial was turned
             now = self._clock.monotonic()
             exposed = now + _CERTAIN_SHARE * settings.shutter_s
             until = now + settings.shutter_s + FRAME_LIMIT_S

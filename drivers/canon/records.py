@@ -3,7 +3,7 @@
 GetEvent answers a chain of records: size (32 bits, these included), type (32), body; a record of size 8 and type 0
 ends it. The first answer after SetEventMode holds the camera's whole state, later ones what has changed since.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - ``decode`` and ``encode`` undo each other on well-formed bytes. A record whose type or inner form is not known stays
   as it came, in `OtherRecord`, and is skipped by its size; a record that contradicts itself raises `ProtocolError`.
@@ -180,7 +180,7 @@ def decode_events(data: bytes) -> tuple[Record, ...]:
 
 
 def encode_events(records: Iterable[Record] = ()) -> bytes:
-    """Return the answer to GetEvent, closed; without records the answer that says there is nothing new."""
+    """Return the answer to GetEvent, closed; without records the answer for nothing new."""
     chain = bytearray()
     for record in records:
         kind, body = _encode_record(record)

@@ -1,8 +1,8 @@
 """What an EOS body has reported of itself, and what follows from it for a series of raw frames.
 
-Laws that hold inside:
+Rules that hold inside:
 
-- `EosState` is fed the records of GetEvent in their order and knows nothing that was not reported.
+- `EosState` takes the records of GetEvent in their order and holds nothing that was not reported.
 - What a body does not report is no problem: properties come and go between bodies, and only what is known to spoil a
   series is named.
 - Nothing is taken for settable that the body does not list.
@@ -51,6 +51,7 @@ _NOT_RAW = (ObjectFormat.EXIF_JPEG, ObjectFormat.JFIF, ObjectFormat.MOV, ObjectF
 _NOT_RAW_SUFFIXES = (".jpg", ".jpeg", ".hif", ".mov", ".mp4")
 _SILENT_OR_PLAIN = (DriveMode.SINGLE, DriveMode.SINGLE_SILENT)
 _BATTERY_LOW = 0
+"""Of EOS_BATTERY_POWER: 0 is low, as libgphoto2 reads it."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,9 @@ class EosState:
     functions
         The custom functions: number to first value.
     busy
-        Whether the body said that it is exposing or writing.
+        Whether the body reported that it is exposing or writing.
     shutting_down
-        Whether it said that it will soon switch itself off.
+        Whether it reported that it will soon switch itself off.
     waiting
         By handle, in the order of their announcement.
     """
@@ -97,7 +98,7 @@ class EosState:
     waiting: dict[int, WaitingObject] = field(default_factory=dict[int, WaitingObject])
 
     def take(self, records: Iterable[Record]) -> None:
-        """Learn from the records of one answer."""
+        """Update the state from the records of one answer."""
         for record in records:
             match record:
                 case PropertyChanged(Property.EOS_CUSTOM_FUNCTIONS, value):
@@ -194,7 +195,7 @@ def plan(state: EosState, settings: ExposureSettings) -> dict[int, bytes]:
     Raises
     ------
     DeviceRefused
-        The body does not offer a value, or is set up in a way that spoils a series; all of it in one message.
+        The body does not offer a value, or has a setting that spoils a series; all of it in one message.
     """
     refused = problems(state)
     wanted: dict[int, bytes] = {}

@@ -1,6 +1,6 @@
 """The values of a Canon body's properties as they travel: numbers, text, image formats, and how one is set.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - ``decode`` and ``encode`` undo each other on well-formed bytes.
 - Properties travel as bytes: 32 bits for every number, text with a closing NUL, structures for a few. Nothing here
@@ -19,8 +19,9 @@ from drivers.ptp.cursor import Cursor
 from drivers.ptp.datasets import MAX_DATASET, encode_integer
 
 _RAW: Final = 6
+"""Kind of a raw file, see `ImageFile`."""
 _LOSSLESS: Final = 4
-"""Kind and compression of a raw file, see `ImageFile`."""
+"""Compression of a raw file, see `ImageFile`."""
 
 _JPEG_SIZES: Final = {0: "L", 1: "M", 2: "S", 5: "M1", 6: "M2", 14: "S1", 15: "S2", 16: "S3"}
 

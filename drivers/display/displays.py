@@ -1,4 +1,4 @@
-"""The displays of the desktop, by GLFW: which there are, and which one is meant.
+"""The displays of the desktop, by GLFW: the list of them, and the choice of one.
 
 On Linux GLFW speaks X; under Wayland that is XWayland.
 
@@ -105,7 +105,7 @@ def choose_display(displays: tuple[Display, ...], wanted: str | int | None = Non
 
 @contextlib.contextmanager
 def running_glfw() -> Generator[ModuleType]:
-    """Give GLFW's module, running; it ends when the last who needs it has left.
+    """Yield GLFW's module, running; it is terminated when the last block that needs it ends.
 
     Raises
     ------

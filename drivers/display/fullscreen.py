@@ -1,6 +1,6 @@
-"""Plain colours on a real display: exact codes, looked at where they arrive before anybody takes a picture.
+"""Plain colours on a real display: exact codes, read back from the screen before a frame is taken.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The picture fills one whole display in the mode that the desktop set: no scaling, no cursor, no frame.
 - `show` returns when the drawn frame and what the display's server shows are exactly the colour, in every pixel: on X,
@@ -10,8 +10,8 @@ Laws that hold inside:
 - GLFW and OpenGL are used in this folder and nowhere else; GLFW runs while anything here is open.
 
 On Linux the window is an X window. Under Wayland that is XWayland, whose compositor may scale and tint behind our back:
-`FullScreen.warnings` says so. Gamma ramps, which night light and colour management load, lie behind everything that can
-be read back; `warnings` looks at them, too.
+`FullScreen.warnings` reports it. Gamma ramps, which night light and colour management load, lie behind everything that
+can be read back; `warnings` looks at them, too.
 
 Sources: GLFW 3.4 reference; OpenGL 2.1, clauses 4.2.3 (Clear) and 4.3.2 (ReadPixels); ICC Profiles in X
 Specification 0.4.
@@ -59,7 +59,7 @@ _SYSTEM_CLOCK = SystemClock()
 class FullScreen:
     """A `drivers.presenter.Presenter` on a display; black from the moment it opens.
 
-    Use it from the thread that opened it. It takes no keys: the way out is `close`, or the end of the process.
+    Use it from the thread that opened it. It takes no keys: it ends by `close`, or with the process.
 
     Parameters
     ----------

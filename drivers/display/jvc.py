@@ -1,10 +1,10 @@
 """Plain colours from a JVC D-ILA projector's own flat field, over its network port.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The projector makes the colour itself, 0 … 255 a channel, so no desktop, cable or scaler can change it.
 - A command is ``!``, the unit, text and LF; the projector acknowledges with 06, the unit, the text's first two letters
-  and LF. `show` returns when the raster and all three levels have been acknowledged: the projector says that it obeyed,
+  and LF. `show` returns when the raster and all three levels have been acknowledged: the projector confirms commands,
   not what it shows.
 - The projector greets with PJ_OK, wants PJREQ within 5 s and answers PJACK; it serves one controller at a time. A
   command that meets a connection lost meanwhile is sent once more over a new one.
@@ -29,12 +29,15 @@ from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
 PORT = 20554
+"""TCP port of the external control (JVC external control specification)."""
 TIMEOUT_S = 5.0
+"""As long as the projector itself waits for PJREQ."""
 GREETING, REQUEST, ACCEPTED, BUSY, REFUSED = b"PJ_OK", b"PJREQ", b"PJACK", b"PJ_NG", b"PJNAK"
 UNIT = b"\x89\x01"
 FLAT_FIELD = b"SSTP02"
 LEVELS = {"red": b"SSFR", "green": b"SSFG", "blue": b"SSFB"}
 MAX_COMMAND = 64
+"""Bytes read at once; more than a greeting or an answer has, which are 5 and 6."""
 
 _OPERATION, _ACKNOWLEDGED, _END = b"!", b"\x06", b"\n"
 _SYSTEM_CLOCK = SystemClock()

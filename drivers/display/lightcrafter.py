@@ -1,10 +1,10 @@
 """Plain colours from the test pattern generator of a TI LightCrafter 4500 (DLPC350), 6500 or 9000 (DLPC900).
 
-Laws that hold inside:
+Rules that hold inside:
 
 - The controller makes the colour itself, so no desktop, cable or scaler can change it. It takes 10 bits a channel;
   an 8-bit code c becomes round(c · 1023 / 255).
-- `show` returns when the controller gives back the colour, and says that it shows it.
+- `show` returns when the controller reports the colour, and that it is shown.
 - After a fault of cable or protocol the connection is dropped; the next `show` makes a new one and sets everything up
   again. An answer that comes late never meets a later question: every one carries its question's number.
 
@@ -33,7 +33,7 @@ from drivers.display.lightcrafter_wire import (
     parse_colour,
     parse_reply,
 )
-from drivers.links.hid import Reports, open_hid
+from drivers.links.hid import HidReports, open_hid
 from drivers.presenter import BLACK, Colour
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
@@ -42,14 +42,18 @@ if TYPE_CHECKING:
     from usb.backend import IBackend
 
 VENDOR = 0x0451
+"""USB vendor number of Texas Instruments."""
 PRODUCTS = {"DLPC350": 0x6401, "DLPC900": 0xC900}
 """USB product numbers by controller."""
 TIMEOUT_S = 2.0
+"""For one report: chosen long beside what 64 bytes take on USB; not tried on hardware."""
 SWITCHING_S = 3.0
 """How long the controller may take to change its mode; DLPC900 takes about 0.3 s."""
 
 _LOOK_AGAIN_S = 0.05
+"""Between questions whether a mode has been taken: some six of them in the 0.3 s that it takes."""
 _STALE_REPLIES = 8
+"""Replies to earlier questions that are skipped; more than a lost exchange leaves, and an end to reading."""
 _SETTLED = (
     # What is set, to what, and which bits of the answer say so (the rest means other things).
     (LightCrafterCommand.TEST_PATTERN, PATTERN_SOLID, 0x0F),
@@ -59,7 +63,7 @@ _SETTLED = (
 _SYSTEM_CLOCK = SystemClock()
 
 
-def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = None) -> Reports:
+def find_lightcrafter(serial: str | None = None, *, backend: IBackend | None = None) -> HidReports:
     """Open the one LightCrafter on USB, of whatever kind; `serial` names one of several.
 
     Raises
@@ -97,10 +101,10 @@ class LightCrafter:
         The controller cannot be reached, or does not do what it was sent.
     """
 
-    def __init__(self, connect: Callable[[], Reports], clock: Clock = _SYSTEM_CLOCK) -> None:
+    def __init__(self, connect: Callable[[], HidReports], clock: Clock = _SYSTEM_CLOCK) -> None:
         self._connect = connect
         self._clock = clock
-        self._reports: Reports | None = None
+        self._reports: HidReports | None = None
         self._sequence = 0
         self._open = True
         self.show(BLACK)

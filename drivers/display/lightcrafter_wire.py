@@ -17,15 +17,18 @@ from drivers.presenter import Colour
 from foundation.errors import ProtocolError
 
 REPORT = 64
+"""Bytes of a report, whatever it says (DLPU010, DLPU018: USB transactions)."""
 MAX_DATA = REPORT - 6
+"""What flags, sequence number, length and command leave of a report."""
 FULL = 1023
 """The highest of the 10-bit codes of the test pattern."""
 
 _READ, _REPLY, _ERROR = 0x80, 0x40, 0x20
+"""Bits of the flags of a report: it reads, it is answered or is an answer, it is refused (same sources)."""
 
 
 class LightCrafterCommand(IntEnum):
-    """What of the controller is set and read here."""
+    """The commands that are used here."""
 
     TEST_PATTERN = 0x1203
     PATTERN_COLOUR = 0x1204
@@ -34,8 +37,11 @@ class LightCrafterCommand(IntEnum):
 
 
 SOURCE_TEST_PATTERN = 1
+"""Value of INPUT_SOURCE: the internal test pattern (DLPU010, DLPU018: input source selection)."""
 PATTERN_SOLID = 0
+"""Value of TEST_PATTERN: a solid field (same sources: test pattern selection)."""
 MODE_VIDEO = 0
+"""Value of DISPLAY_MODE: the input is shown as it comes, not as a sequence of patterns (display mode selection)."""
 
 
 @dataclass(frozen=True)

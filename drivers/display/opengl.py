@@ -15,15 +15,15 @@ from foundation.errors import DeviceError
 if TYPE_CHECKING:
     from types import ModuleType
 
+# Numbers from gl.h: the two buffers of a window, the bit of Clear, and what would change a plain colour or its area.
 FRONT: Final = 0x0404
 BACK: Final = 0x0405
-"""The buffers of a window."""
-
 COLOUR_BIT: Final = 0x4000
 DITHER: Final = 0x0BD0
 SCISSOR: Final = 0x0C11
 
 BGRA: Final = 0x80E1
+"""The order of channels that the next number is read with (gl.h)."""
 UNSIGNED_INT_8_8_8_8_REVERSED: Final = 0x8367
 """Read so, a pixel is the number 0xAARRGGBB, which is how drivers keep it: nothing needs converting."""
 

@@ -1,6 +1,6 @@
 """What an X server has on its screen, read as a screenshot program reads it; a hold on its screen saver; its end.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A connection of its own, beside that of the window: what it reads is what the server shows, whoever drew it.
 - Through libxcb, which returns errors to its caller. Xlib, which the window needs, ends the process when its server
@@ -22,12 +22,15 @@ import numpy.typing as npt
 from foundation.errors import DeviceError
 
 _Z_PIXMAP = 2
+"""Format of GetImage: whole pixels one after the other (X protocol, GetImage; XYPixmap is 1)."""
 _ALL_PLANES = 0xFFFFFFFF
+"""Plane mask of GetImage: every bit of a pixel."""
 _REPLY_PRESENT = 8
 """Offset of `present` in a QueryExtension reply."""
 _REPLY_ATOM = 8
 """Offset of `atom` in an InternAtom reply."""
 _ANY_TYPE = 0
+"""AnyPropertyType of GetProperty: the value is wanted whatever its type."""
 
 
 _lost: set[int] = set()
@@ -137,7 +140,7 @@ class XScreen:
             self._libc.free(reply)
 
     def has_extension(self, name: str) -> bool:
-        """Return whether the server knows the extension `name`."""
+        """Return whether the server has the extension `name`."""
         if self._connection is None:
             return False
         cookie = self._xcb.xcb_query_extension(self._connection, len(name), name.encode("ascii"))

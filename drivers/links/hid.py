@@ -1,6 +1,6 @@
 """USB cables to devices of the HID class, which speak in reports of 64 bytes.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Only the interrupt pipes are used, one report a transfer; a report is never cut and never joined.
 - The system's errors are translated here and nowhere else: ETIMEDOUT is `LinkTimeout`; EBUSY and EACCES are
@@ -37,7 +37,7 @@ _INTERRUPT: Final = 3
 """Transfer type in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
 
 
-class Reports(Protocol):
+class HidReports(Protocol):
     """An open cable that carries reports of `REPORT` bytes."""
 
     @property
@@ -100,7 +100,7 @@ def open_hid(
 
 
 class HidDevice:
-    """The `Reports` of a device that `open_hid` found."""
+    """The `HidReports` of a device that `open_hid` found."""
 
     def __init__(self, device: usb.core.Device, label: str) -> None:
         self._device = device

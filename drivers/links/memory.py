@@ -20,7 +20,7 @@ class Peer(Protocol):
     """The far side of a connection as a pure machine: bytes in, bytes out."""
 
     def connect(self) -> bytes:
-        """Begin a new connection, forgetting any other, and return what the far side says first."""
+        """Begin a new connection, forgetting any other, and return what the far side sends first."""
         ...
 
     def receive(self, data: bytes) -> bytes:

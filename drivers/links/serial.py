@@ -100,22 +100,22 @@ class SerialLink:
 
 def _unopened(error: OSError, device: str) -> LinkError | DeviceRefused:
     # On Windows pyserial hides the number of the system's error and gives its name only.
-    said = str(error)
-    if error.errno in (errno.EACCES, errno.EPERM) or "PermissionError" in said:
+    reason = str(error)
+    if error.errno in (errno.EACCES, errno.EPERM) or "PermissionError" in reason:
         return DeviceRefused(
             f"{device} may not be opened by this user, or another program has it; on Linux run "
             f"sudo usermod -aG dialout $USER (on Arch: uucp) and log in again"
         )
     if error.errno in (errno.EBUSY, errno.EAGAIN):
         return DeviceRefused(f"{device} is in use by another program; close it and try again")
-    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in said:
+    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in reason:
         found = ", ".join(sorted(port.device for port in list_ports.comports())) or "none at all"
         return LinkClosed(
             f"there is no serial port {device}; found: {found}: plug the adapter in, or name one of these"
         )
-    return LinkClosed(f"{device} cannot be opened: {said}; check that it is a serial port")
+    return LinkClosed(f"{device} cannot be opened: {reason}; check that it is a serial port")
 
 
 def list_serial_ports() -> tuple[str, ...]:
-    """Return the machine's serial ports with what the system says of them, sorted by name."""
+    """Return the machine's serial ports with what the system reports of them, sorted by name."""
     return tuple(f"{port.device} ({port.description})" for port in sorted(list_ports.comports()))

@@ -17,6 +17,7 @@ from foundation.errors import LinkClosed, LinkTimeout
 ANY_HOST = "0.0.0.0"
 BROADCAST = "255.255.255.255"
 MAX_DATAGRAM = 65535
+"""The length field of UDP has 16 bits (RFC 768), so that no datagram is cut off."""
 
 Address = tuple[str, int]
 

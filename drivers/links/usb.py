@@ -1,6 +1,6 @@
 """USB cables: finding still image devices on the bus and opening their pipes.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Devices are distinguished by vendor, product and serial number, or by the port they are plugged into: the address
   changes whenever a device restarts.
@@ -34,12 +34,14 @@ UDEV_RULE = "70-crop-cameras.rules"
 """The file in `drivers/data` that lets users of a Linux machine open cameras."""
 
 _CLASS_OUT: Final = 0x21
+"""bmRequestType of requests of the class to the interface (USB 2.0, 9.3)."""
 _CLASS_IN: Final = 0xA1
-"""bmRequestType of requests of the class to the interface, and from it (USB 2.0, 9.3)."""
+"""bmRequestType of requests of the class from the interface."""
 
 _BULK: Final = 2
+"""Transfer type in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
 _INTERRUPT: Final = 3
-"""Transfer types in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
+"""Transfer type, as above."""
 
 _MAX_POLLING_S: Final = 0.05
 """Longest interval that is believed: a wrong descriptor must not slow the events down to seconds."""
@@ -239,7 +241,7 @@ class _StillImageInterface:
 
 
 def _pipes_of(interface: usb.core.Interface, label: str) -> _StillImageInterface:
-    """Return what the endpoints of an interface say; `label` names the device.
+    """Return the pipes that the endpoints of an interface describe; `label` names the device.
 
     Raises
     ------
@@ -293,7 +295,7 @@ def _found(backend: IBackend | None) -> Iterator[tuple[usb.core.Device, UsbDevic
             serial = usb.util.get_string(device, device.iSerialNumber)
             name = usb.util.get_string(device, device.iProduct) or ""
         except (usb.core.USBError, ValueError, NotImplementedError):
-            # pyusb says ValueError, with no reason, when it cannot read the list of languages either.
+            # pyusb raises ValueError, with no reason, when it cannot read the list of languages either.
             refusal = DeviceRefused(_forbidden(f"the camera {device.idVendor:04x}:{device.idProduct:04x} at {port}"))
         finally:
             usb.util.dispose_resources(device)

@@ -23,7 +23,7 @@ from foundation.errors import ProtocolError
 
 SEARCH = b"%2SRCH\r"
 COLLECT_S = 30.0
-"""So long a controller collects answers."""
+"""So long a controller collects answers, which projectors delay by up to 10 s."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class InputChanged:
     code: str
 
 
-Notice = LinkUp | FaultsChanged | PowerChanged | InputChanged
+PjLinkNotice = LinkUp | FaultsChanged | PowerChanged | InputChanged
 
 
 def is_search(datagram: bytes) -> bool:
@@ -69,7 +69,7 @@ def is_search(datagram: bytes) -> bool:
     return datagram.strip(b"\0\r\n ").upper() == b"%2SRCH"
 
 
-def encode(message: Found | Notice) -> bytes:
+def encode(message: Found | PjLinkNotice) -> bytes:
     """Return the datagram of an answer or a notice."""
     match message:
         case Found(mac):
@@ -85,7 +85,7 @@ def encode(message: Found | Notice) -> bytes:
     return f"%2{text}\r".encode("ascii")
 
 
-def decode(datagram: bytes) -> tuple[Found | Notice, ...]:
+def decode(datagram: bytes) -> tuple[Found | PjLinkNotice, ...]:
     """Return the answers and notices in a datagram, in their order; what is neither is passed over."""
     messages = (_message(line) for line in re.split(rb"[\r\n\0]+", datagram))
     return tuple(message for message in messages if message is not None)
@@ -96,7 +96,7 @@ def is_notice_of_start(line: bytes) -> bool:
     return isinstance(_message(line), LinkUp)
 
 
-def _message(line: bytes) -> Found | Notice | None:
+def _message(line: bytes) -> Found | PjLinkNotice | None:
     try:
         reply = wire.parse_reply(line.strip())
         if not isinstance(reply, wire.PjLinkReply) or reply.level != 2:

@@ -6,7 +6,7 @@ Rules that hold inside:
 - Projectors hang up on an idle connection after about 30 s. A command that meets a connection so lost is sent once
   more over a new one; every command here may be repeated without harm.
 - After a fault of cable or protocol the connection is dropped, so that a late answer never meets a later question.
-- Class 2 is asked for only where the projector says that it speaks it: others may never answer.
+- Class 2 is used only where the projector reports that it has it: others may never answer.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class PjLinkProjector:
     sha256
         Offer the password by SHA-256 (PJLink 2.10) first, and by MD5 only where the projector does not take that up.
         Off unless asked for: it is tried against the standard's example and our simulated projector alone, and a
-        projector that knows only MD5 may take the offer for a wrong password and count it.
+        projector with MD5 alone may take the offer for a wrong password and count it.
     nonce
         Gives the 16 random bytes that SHA-256 needs.
     """
@@ -271,7 +271,7 @@ class PjLinkProjector:
         return self._ask(command, level=2)
 
     def _ask_for_part(self, command: str) -> str | None:
-        """Return what a projector says of a part, None where it does not know the question for want of the part."""
+        """Return what a projector reports of a part, None where it does not know the question for want of the part."""
         self._require_class_2(command)
         reply = self._exchange(PjLinkRequest(command, level=2))
         return None if reply.error is ErrorCode.UNDEFINED else self._value(reply)
@@ -354,7 +354,7 @@ class PjLinkProjector:
             connection = self._greeted_once(sha256=True)
             if connection is not None:
                 return connection
-            # 2.10, 5.1: who does not take it up is to be met again, in the old way.
+            # 2.10, 5.1: a projector that does not take it up is connected to again, with MD5.
             self._sha256 = False
         connection = self._greeted_once(sha256=False)
         assert connection is not None

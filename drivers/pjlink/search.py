@@ -18,19 +18,20 @@ from typing import Protocol
 
 from drivers.links.udp import ANY_HOST, BROADCAST, Address, UdpSocket
 from drivers.pjlink import notices, wire
-from drivers.pjlink.notices import COLLECT_S, Found, Notice
+from drivers.pjlink.notices import COLLECT_S, Found, PjLinkNotice
 from foundation.clock import Clock, SystemClock
 from foundation.errors import LinkTimeout
 
 ASKED = 3
 """A datagram may be lost, so the search is sent so often, a second apart; a projector may answer each."""
 ASK_EVERY_S = 1.0
+"""Far enough apart that one disturbance of the network does not swallow two."""
 
 _SYSTEM_CLOCK = SystemClock()
 
 
 class Datagrams(Protocol):
-    """What is asked of `drivers.links.udp.UdpSocket`."""
+    """The part of `drivers.links.udp.UdpSocket` that is used here."""
 
     def send(self, data: bytes, address: Address) -> None:
         """Send one datagram to host and port."""
@@ -130,7 +131,7 @@ class NoticePort:
     def __init__(self, port: int = wire.PORT, host: str = ANY_HOST, clock: Clock = _SYSTEM_CLOCK) -> None:
         self._socket = UdpSocket(port, host)
         self._clock = clock
-        self._waiting: list[tuple[str, Notice]] = []
+        self._waiting: list[tuple[str, PjLinkNotice]] = []
         self.address = self._socket.address
         """Host and port at which it listens."""
 
@@ -142,7 +143,7 @@ class NoticePort:
     ) -> None:
         self.close()
 
-    def receive(self, timeout: float) -> tuple[str, Notice]:
+    def receive(self, timeout: float) -> tuple[str, PjLinkNotice]:
         """Return the next notice and the address of the projector that sent it.
 
         Raises

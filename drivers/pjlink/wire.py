@@ -7,7 +7,7 @@ Rules that hold inside:
 - What we send follows the standard to the letter; what we accept is wider: any case, LF after or instead of CR, empty
   lines, NUL between lines (some projectors fill their packets up with it).
 - Bytes that do not fit raise `ProtocolError`, which quotes them.
-- What class 2 says over UDP is in `drivers.pjlink.notices`.
+- What class 2 sends over UDP is in `drivers.pjlink.notices`.
 
 Source: JBMIA, PJLink Specifications 1.04 (class 1), 2.00 (class 2: same lines, digit 2), 2.10 (SHA-256).
 """
@@ -24,11 +24,13 @@ from drivers.projector import Fault, Lamp, Power, Severity
 from foundation.errors import ProtocolError
 
 PORT = 4352
+"""TCP and UDP port of PJLink (PJLink Specifications 1.04 and 2.00)."""
 MAX_LINE = 136
 """Bytes of a command or reply, its CR included."""
 MAX_DIGEST = 96
 """Characters before the first command: 32 with MD5, 32 of random number and 64 of digest with SHA-256."""
 MAX_PASSWORD = 32
+"""Characters of a password (PJLink Specifications 1.04, authentication)."""
 IDLE_LIMIT_S = 30.0
 """Projectors hang up after about this long without a command."""
 
@@ -36,7 +38,7 @@ QUERY = "?"
 OK = "OK"
 RAISE = "1"
 LOWER = "0"
-"""SVOL and MVOL move by one step; there is no way to ask where they stand."""
+"""SVOL and MVOL move by one step; their level cannot be read."""
 MUTE_ON = "31"
 MUTE_OFF = "30"
 
@@ -91,7 +93,7 @@ class PjLinkReply:
 
 
 class LineCutter:
-    """Cuts a stream into lines, however it was split on its way."""
+    """Cuts a stream into lines, however it was split in transit."""
 
     def __init__(self, limit: int = MAX_LINE) -> None:
         self._limit = limit
@@ -118,7 +120,7 @@ class LineCutter:
 
 
 def authentication_digest(seed: str, password: str) -> str:
-    """Return what proves the password: MD5 of seed and password, 32 lowercase hex digits (1.04, 5.1)."""
+    """Return the digest that proves the password: MD5 of seed and password, 32 lowercase hex digits (1.04, 5.1)."""
     return hashlib.md5((seed + password).encode(), usedforsecurity=False).hexdigest()
 
 
@@ -138,13 +140,13 @@ def encode_challenge(challenge: bytes) -> bytes:
 
 
 def parse_challenge(line: bytes) -> bytes | None:
-    """Return the projector's 16 random bytes, or None where the line says anything else: it knows no SHA-256."""
+    """Return the projector's 16 random bytes, or None where the line is anything else: it has no SHA-256."""
     found = re.fullmatch(rb"PJLINK 2 ([0-9A-F]{32})", line.strip().upper())
     return bytes.fromhex(found[1].decode("ascii")) if found else None
 
 
 def sha256_digest(challenge: bytes, nonce: bytes, password: str) -> str:
-    """Return what proves the password to a projector that knows SHA-256 (2.10, 5.1).
+    """Return the digest that proves the password to a projector with SHA-256 (2.10, 5.1).
 
     Parameters
     ----------
@@ -168,7 +170,7 @@ def encode_greeting(greeting: Greeting) -> bytes:
 
 
 def parse_greeting(line: bytes) -> Greeting | Refused:
-    """Return what the projector's first line says."""
+    """Return the greeting in the projector's first line."""
     text = line.decode("ascii", "replace").strip()
     words = text.split()
     match [words[0].upper(), *words[1:]] if words else []:
@@ -261,7 +263,7 @@ def format_mute(muted: bool) -> str:
 
 
 def parse_mute(value: str) -> bool:
-    """Return whether AVMT's code says that the picture is muted; 21 mutes the sound alone."""
+    """Return whether AVMT's code means that the picture is muted; 21 mutes the sound alone."""
     if not re.fullmatch("[123][01]", value):
         raise _unexpected("AVMT", value, "11, 21, 31 or 30")
     return value in ("11", "31")
@@ -387,7 +389,7 @@ def format_freeze(frozen: bool) -> str:
 
 
 def parse_freeze(value: str) -> bool:
-    """Return whether FREZ says that the picture is frozen."""
+    """Return whether FREZ reports a frozen picture."""
     if value not in ("0", "1"):
         raise _unexpected("FREZ", value, "0 moving or 1 frozen")
     return value == "1"

@@ -3,7 +3,7 @@
 A container is its length (32 bits, header included), its type (16), a code (16), the transaction (32), then up to
 five parameters of 32 bits, or a payload.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - `ContainerReader` takes a stream in any pieces and keeps nothing but an unfinished header: the payload of a data
   phase is handed on as it comes, so that no object ever lies here in full.
@@ -27,6 +27,7 @@ from drivers.ptp.messages import MAX_PARAMETERS, PtpEvent, PtpRequest, PtpRespon
 from foundation.errors import ProtocolError
 
 HEADER_LENGTH = 12
+"""Bytes of length, type, code and transaction (clause 7)."""
 UNKNOWN_LENGTH = 0xFFFFFFFF
 """A container's length where the payload goes on until a short packet: more than 4 GiB, or not known."""
 HIGH_SPEED_PACKET = 512
@@ -63,7 +64,7 @@ Message = PtpRequest | PtpResponse | PtpEvent | DataStart | DataPiece
 
 
 class ContainerReader:
-    """Cuts what comes out of a pipe into messages, however it was split on its way.
+    """Cuts the bytes from a pipe into messages, however the transfers split them.
 
     One for each pipe. `packet_size` is the pipe's wMaxPacketSize; it matters only to data phases of unknown length.
     """
@@ -200,7 +201,7 @@ def encode_data(code: int, transaction: int, payload: bytes) -> bytes:
 def ends_with_empty_packet(total: int, packet_size: int) -> bool:
     """Return whether a transfer of `total` bytes, header included, must be closed by a zero-length packet.
 
-    A receiver knows the end of a transfer by a packet that is not full; where all are full, an empty one is due.
+    A receiver detects the end of a transfer by a packet that is not full; where all are full, an empty one is due.
     """
     return total % packet_size == 0
 
@@ -237,6 +238,7 @@ class ControlRequest(IntEnum):
 
 
 _CANCELLATION = 0x4001
+"""Cancellation code in the data of a CANCEL request (clause 5)."""
 MAX_DEVICE_STATUS = 0x14
 """Bytes that GET_DEVICE_STATUS is asked for: a header of 4, and parameters that name stalled pipes."""
 

@@ -1,6 +1,6 @@
 """A place in bytes that a device sent, which never reads past their end.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Whatever the bytes are, the only error is `ProtocolError`; it names the dataset, the field, the place, what was
   expected and what came.
@@ -30,7 +30,7 @@ class Cursor:
         return len(self._data) - self.at
 
     def fault(self, field: str, expected: str, came: object, at: int | None = None) -> ProtocolError:
-        """Return the error that says what is wrong with the field that was read last, or with the one at `at`."""
+        """Return the error that states what is wrong with the field that was read last, or with the one at `at`."""
         place = self._before if at is None else at
         return ProtocolError(f"{self.what}: {field} at byte {place} is {came}; expected {expected}")
 

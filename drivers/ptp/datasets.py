@@ -1,6 +1,6 @@
 """The datasets of PTP as bytes and as values: device, object, storage, property.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - ``decode`` and ``encode`` undo each other on well-formed bytes, so that both ends of the cable share one type.
 - A device's counts and lengths are not trusted: malformed bytes raise `ProtocolError`, and a dataset of more than
@@ -32,6 +32,7 @@ Value = int | str | tuple[int, ...]
 """A property's value: an integer, a string, or an array of integers."""
 
 _ARRAY = 0x4000
+"""Bit that makes an array of a type of integers (ISO 15740, table of data type codes)."""
 _INTEGERS: dict[int, tuple[int, bool]] = {
     DataType.INT8: (1, True),
     DataType.UINT8: (1, False),
@@ -336,7 +337,7 @@ class RangeForm:
 class EnumerationForm:
     """A property takes the values of a list.
 
-    `widened` says that a device sends values of one byte as two, as the EOS 60D does for the battery's level
+    `widened`: the device sends values of one byte as two, as the EOS 60D does for the battery's level
     (0x5001: 100, 75, 50, 25, 0); the standard does not allow it, but the bytes that are left show it.
     """
 

@@ -1,6 +1,6 @@
 """The two TCP connections of PTP/IP, from the greetings on: packets, events and pings, but no transactions.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Whoever waits for the device also answers its pings, at least once a second; nothing here has a thread.
 - Events are kept until asked for, the newest `MAX_EVENTS` of them.

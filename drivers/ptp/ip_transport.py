@@ -1,6 +1,6 @@
 """PTP over a network: transactions on one TCP connection, events on a second one.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A transaction that is called off is awaited to its response.
 - The connections themselves, their greetings and pings are in `drivers.ptp.ip_connection`.
@@ -31,7 +31,7 @@ from drivers.ptp.ptpip import (
     encode,
     encode_data,
 )
-from drivers.ptp.reception import Reception, Turns
+from drivers.ptp.reception import Reception, TransactionState
 from drivers.ptp.transport import Transaction
 from foundation.clock import Clock
 from foundation.errors import DeviceRefused, LinkClosed, LinkError, ProtocolError
@@ -86,7 +86,7 @@ class IpTransport:
         self._clock = clock
         self._place = label
         self._connection = self._connect()
-        self._turns = Turns()
+        self._state = TransactionState()
 
     @classmethod
     def connect(
@@ -123,7 +123,7 @@ class IpTransport:
             self._send(request, send, timeout)
             return self._receive(reception, timeout)
 
-        return self._turns.take(Reception(request, receive, self.label), exchange, self._call_off)
+        return self._state.take(Reception(request, receive, self.label), exchange, self._call_off)
 
     def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come since the last call, and answer pings; never waits.
@@ -157,12 +157,12 @@ class IpTransport:
                     raise
                 self._clock.sleep(RETRY_S)
             else:
-                self._turns = Turns()
+                self._state = TransactionState()
                 return
 
     def close(self) -> None:
         """Hang up both connections; a second call does nothing."""
-        self._turns.closed = True
+        self._state.closed = True
         self._connection.close()
 
     def _connect(self) -> IpConnection:

@@ -1,14 +1,14 @@
 """PTP over TCP as bytes: every packet of both channels, and a cutter for the stream.
 
-A packet is its length (32 bits, these included), its type (32), then what the type says. The initiator opens the
+A packet is its length (32 bits, these included), its type (32), then the fields of that type. The initiator opens the
 command channel and sends `InitCommandRequest`, the responder answers `InitCommandAck` with a number; the initiator
 opens the event channel and sends that number in `InitEventRequest`, the responder answers `InitEventAck`. `InitFail`
 may stand for either answer. Transactions run on the command channel; events, `Ping` and `Pong` on the other.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - `PacketCutter` takes a stream in any pieces. Data packets may be of any length, whatever comes of them is handed on
-  as `Data` at once and only their last bytes as `EndData`, which says the same; every other packet is at most
+  as `Data` at once and only their last bytes as `EndData`, which means the same; every other packet is at most
   `MAX_PACKET` bytes.
 - Whatever arrives, the only error is `ProtocolError`; after it the stream has lost its place and every further
   `feed` raises too.
@@ -28,15 +28,19 @@ from drivers.ptp.messages import MAX_PARAMETERS, PtpEvent, PtpRequest, PtpRespon
 from foundation.errors import ProtocolError
 
 PORT = 15740
+"""TCP port of PTP-IP (CIPA DC-005-2005)."""
 VERSION = 0x00010000
 """PTP/IP 1.0."""
 HEADER_LENGTH = 8
+"""Bytes of length and type."""
 MAX_PACKET = 4096
 """Bytes of the longest packet that is no data; the longest real one carries a name of 40 characters."""
 MAX_NAME_UNITS = 255
 """UTF-16 units of the longest name; the standard allows 39."""
 UNKNOWN_TOTAL = 0xFFFFFFFFFFFFFFFF
+"""Total length of a data phase whose sender does not know it yet."""
 GUID_LENGTH = 16
+"""Bytes of a GUID."""
 
 
 class PacketType(IntEnum):
@@ -87,7 +91,7 @@ class InitCommandAck:
 
 @dataclass(frozen=True)
 class InitEventRequest:
-    """The initiator says which connection the event channel belongs to."""
+    """The initiator names the connection that the event channel belongs to."""
 
     connection: int
 
@@ -172,7 +176,9 @@ Packet = (
 
 _DATA_TYPES = (PacketType.DATA, PacketType.END_DATA)
 _NO_DATA_OR_IN = 1
+"""Data phase information of an operation without data, or whose data come to the initiator."""
 _DATA_OUT = 2
+"""Data phase information of an operation whose data go to the responder."""
 
 
 def encode(packet: Packet) -> bytes:
@@ -239,7 +245,7 @@ def decode(data: bytes) -> Packet:
 
 
 class PacketCutter:
-    """Cuts a channel's stream into packets, however it was split on its way. One for each channel."""
+    """Cuts a channel's stream into packets, however it was split in transit. One for each channel."""
 
     def __init__(self) -> None:
         self._waiting: bytes = b""

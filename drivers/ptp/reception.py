@@ -1,6 +1,6 @@
 """The part of a transaction that comes from the device, the same on every cable: checked, and handed on.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Nothing is kept of a data phase that the caller takes piece by piece; otherwise at most `MAX_COLLECTED` bytes are.
 - Data and response must carry the request's transaction number, and a data phase the length that it announced.
@@ -20,12 +20,12 @@ from drivers.ptp.transport import MAX_COLLECTED, Transaction
 from foundation.errors import LinkClosed, LinkError, ProtocolError
 
 
-class Turns:
-    """Whether a cable is open, and between two transactions."""
+class TransactionState:
+    """State of a cable: whether it is closed, and whether it is between two transactions."""
 
     def __init__(self) -> None:
         self.closed = False
-        self.in_step = True
+        self.between_transactions = True
 
     def take(
         self,
@@ -50,11 +50,11 @@ class Turns:
             The transaction before did not end.
         """
         self.check_open(reception.label)
-        if not self.in_step:
+        if not self.between_transactions:
             raise ProtocolError(
                 f"{reception.label}: the transaction before {reception.request} did not end; reset the connection"
             )
-        self.in_step = False
+        self.between_transactions = False
         try:
             transaction = exchange(reception)
         except LinkClosed:
@@ -63,9 +63,9 @@ class Turns:
         except (LinkError, ProtocolError):
             raise
         except BaseException:
-            self.in_step = call_off(reception.request.transaction)
+            self.between_transactions = call_off(reception.request.transaction)
             raise
-        self.in_step = True
+        self.between_transactions = True
         return transaction
 
     def check_open(self, label: str) -> None:
@@ -134,7 +134,7 @@ class Reception:
             It is another transaction's, or reports success although data are missing.
         """
         self._check_transaction("a response", response.transaction)
-        # A device that gives up in the middle says so by its response: then the response is what counts.
+        # A device that gives up in the middle reports that by its response: then the response is what counts.
         if response.ok and self._announced is not None and self._taken != self._announced:
             raise ProtocolError(
                 f"{self.label} announced {self._announced} bytes with {self.request}, sent {self._taken}, "

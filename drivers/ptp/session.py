@@ -1,6 +1,6 @@
 """A PTP session: numbered transactions between its opening and its closing, over any cable.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A response other than OK raises `OperationDeclined`, which has its code by number and by name; what a device declines
   for the moment only (`PASSING`) is asked again, for a limited time.
@@ -24,18 +24,21 @@ from foundation.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolE
 START_TIMEOUT_S = 1.5
 """Wait for the answer to OpenSession: a body that a killed host left behind never answers before a reset."""
 TIMEOUT_S = 20.0
-"""Wait for every other answer, unless the caller sets another."""
+"""Wait for every other answer, unless the caller sets another; libgphoto2 waits as long."""
 PASSING_LIMIT_S = 10.0
 """How long an operation is asked again when a device declines it for the moment."""
 OPEN_TRIES = 3
-"""Tries at OpenSession with a reset between them."""
+"""Tries at OpenSession with a reset between them, as many as libgphoto2 makes."""
 
 PASSING = (ResponseCode.DEVICE_BUSY, ResponseCode.EOS_OBJECT_NOT_READY, ResponseCode.EOS_MEMORY_STATUS_NOT_READY)
 """Responses that mean: not now."""
 
 _FIRST_PAUSE_S = 0.05
+"""Before the first repetition: short to an operator, long beside the milliseconds of an operation."""
 _LONGEST_PAUSE_S = 1.0
+"""Pauses double up to here, so that a device that is free again waits for a second at most."""
 _LAST_SESSION = 8
+"""Session numbers tried where a device declines the transaction number, as libgphoto2 does; a few, then no more."""
 
 
 class OperationDeclined(DeviceRefused):

@@ -1,7 +1,7 @@
-"""What PTP asks of a cable to a device: one transaction at a time, and the events beside it.
+"""The interface of a PTP cable to a device: one transaction at a time, and the events beside it.
 
 The contract of `drivers.ptp.usb_transport` and `drivers.ptp.ip_transport`; the simulated lab has one in memory.
-A transport knows bytes, pipes and time limits; it knows neither sessions nor what an operation means.
+A transport deals with bytes, pipes and time limits, not with sessions or the meaning of operations.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """PTP over USB: commands, data and responses as containers on the bulk pipes, events on the interrupt pipe.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - What is read is never less than a packet nor more than 512 KiB, and always whole packets. A device may cut its
   containers as it likes: header alone, data and response in one transfer, a zero-length packet or none.
@@ -29,7 +29,7 @@ from drivers.ptp.container import (
     ends_with_empty_packet,
 )
 from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
-from drivers.ptp.reception import Reception, Turns
+from drivers.ptp.reception import Reception, TransactionState
 from drivers.ptp.transport import Transaction
 from foundation.clock import Clock
 from foundation.errors import LinkError, LinkTimeout, ProtocolError
@@ -40,11 +40,17 @@ MAX_EVENTS = 4096
 """Events returned at once from a device that never stops raising them."""
 
 _CONTROL_S = 1.0
+"""For a control request, which a device answers in milliseconds if at all."""
 _READY_TRIES = 40
+"""Two seconds in all for a device to be ready after a cancellation or reset."""
 _READY_EVERY_S = 0.05
+"""Between two questions for the status: little beside what a reset takes."""
 _DRAIN_S = 0.05
+"""A device that has been silent for so long has sent all that it had."""
 _DRAIN_READS = 256
+"""Pieces thrown away, 128 MiB at most: more than a raw frame, and an end to a device that never stops."""
 _EMPTY_READS = 16
+"""Empty packets in a row that are skipped: one may follow a full packet, so many mean a fault."""
 
 
 class UsbTransport:
@@ -53,7 +59,7 @@ class UsbTransport:
     def __init__(self, pipes: UsbPipes, clock: Clock) -> None:
         self._pipes = pipes
         self._clock = clock
-        self._turns = Turns()
+        self._state = TransactionState()
         self._stalls = 0
         self._reader = ContainerReader(pipes.packet_size)
         self._events_reader = ContainerReader(pipes.packet_size)
@@ -79,7 +85,7 @@ class UsbTransport:
             self._send(request, send, timeout)
             return self._receive(reception, timeout)
 
-        return self._turns.take(Reception(request, receive, self.label), exchange, self._cancel)
+        return self._state.take(Reception(request, receive, self.label), exchange, self._cancel)
 
     def events(self) -> tuple[PtpEvent, ...]:
         """Return the events that have come since the last call.
@@ -93,7 +99,7 @@ class UsbTransport:
         ProtocolError
             It sends what is no event; what follows will be read again.
         """
-        self._turns.check_open(self.label)
+        self._state.check_open(self.label)
         events: list[PtpEvent] = []
         while len(events) < MAX_EVENTS:
             try:
@@ -123,7 +129,7 @@ class UsbTransport:
         LinkTimeout
             It does not come back.
         """
-        self._turns.check_open(self.label)
+        self._state.check_open(self.label)
         try:
             self._pipes.control_out(ControlRequest.RESET_DEVICE, b"", _CONTROL_S)
             self._await_ready()
@@ -131,11 +137,11 @@ class UsbTransport:
             self._pipes.reset_port()
         self._clean()
         self._events_reader = ContainerReader(self._pipes.packet_size)
-        self._turns.in_step = True
+        self._state.between_transactions = True
 
     def close(self) -> None:
         """Release the device; a second call does nothing."""
-        self._turns.closed = True
+        self._state.closed = True
         self._pipes.close()
 
     def _send(self, request: PtpRequest, send: bytes | None, timeout: float) -> None:

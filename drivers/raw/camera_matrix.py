@@ -1,4 +1,4 @@
-"""The colour matrix of a camera that LibRaw knows by name.
+"""The colour matrix of a camera, as LibRaw has it by name.
 
 LibRaw holds a table of matrices and gives the entry of whatever raw file it opens, so a raw file of nothing but a
 name, made here, is opened and its entry read. No matrix is copied into the suite.
@@ -10,7 +10,7 @@ import io
 from functools import lru_cache
 
 from drivers.tiff.tags import CFA, TiffTag
-from drivers.tiff.writing import Kind, Tags, head, text
+from drivers.tiff.writing import Tags, ValueType, head, text
 
 Matrix = tuple[tuple[float, float, float], ...]
 """Three rows R, G, B of three numbers: from CIE XYZ (D65, Y = 1) to linear camera RGB."""
@@ -28,18 +28,18 @@ def camera_matrix(camera: str) -> Matrix | None:
     import rawpy
 
     tags: Tags = {
-        TiffTag.IMAGE_WIDTH: (Kind.LONG, [_SIDE]),
-        TiffTag.IMAGE_LENGTH: (Kind.LONG, [_SIDE]),
-        TiffTag.BITS_PER_SAMPLE: (Kind.SHORT, [16]),
-        TiffTag.COMPRESSION: (Kind.SHORT, [1]),  # none
-        TiffTag.PHOTOMETRIC_INTERPRETATION: (Kind.SHORT, [CFA]),
+        TiffTag.IMAGE_WIDTH: (ValueType.LONG, [_SIDE]),
+        TiffTag.IMAGE_LENGTH: (ValueType.LONG, [_SIDE]),
+        TiffTag.BITS_PER_SAMPLE: (ValueType.SHORT, [16]),
+        TiffTag.COMPRESSION: (ValueType.SHORT, [1]),  # none
+        TiffTag.PHOTOMETRIC_INTERPRETATION: (ValueType.SHORT, [CFA]),
         TiffTag.MAKE: text(maker),
         TiffTag.MODEL: text(camera),
-        TiffTag.SAMPLES_PER_PIXEL: (Kind.SHORT, [1]),
-        TiffTag.ROWS_PER_STRIP: (Kind.LONG, [_SIDE]),
-        TiffTag.CFA_REPEAT_PATTERN_DIM: (Kind.SHORT, [2, 2]),
-        TiffTag.CFA_PATTERN: (Kind.BYTE, [0, 1, 1, 2]),
-        TiffTag.DNG_VERSION: (Kind.BYTE, [1, 4, 0, 0]),
+        TiffTag.SAMPLES_PER_PIXEL: (ValueType.SHORT, [1]),
+        TiffTag.ROWS_PER_STRIP: (ValueType.LONG, [_SIDE]),
+        TiffTag.CFA_REPEAT_PATTERN_DIM: (ValueType.SHORT, [2, 2]),
+        TiffTag.CFA_PATTERN: (ValueType.BYTE, [0, 1, 1, 2]),
+        TiffTag.DNG_VERSION: (ValueType.BYTE, [1, 4, 0, 0]),
         TiffTag.UNIQUE_CAMERA_MODEL: text(camera),
     }
     pixels = bytes(2 * _SIDE * _SIDE)

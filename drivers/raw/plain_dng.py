@@ -140,7 +140,7 @@ def raw_pixels(directories: Sequence[Directory]) -> Directory | None:
 
 
 def stated_black(pixels: Directory | None) -> NDArray[np.float64] | None:
-    """Return DNG's BlackLevel for the visible block, (2, 2) float64; None where LibRaw has to say it.
+    """Return DNG's BlackLevel for the visible block, (2, 2) float64; None where LibRaw is needed for it.
 
     LibRaw cuts the level to an integer. The rows and columns of BlackLevel count from the active area's corner
     (DNG 1.7, BlackLevel); deltas per row and column enter by their mean, as in LibRaw.

@@ -49,7 +49,7 @@ _SKIPPED_COLUMNS = 4
 """The first columns of a masked area are disturbed by the readout of the row (seen on the 550D)."""
 
 _LEAST_MASKED = 256
-"""Photosites per phase below which a masked mean says less than the metadata."""
+"""Photosites per phase below which a masked mean is less certain than the metadata."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ class Mosaic:
         for row in range(2):
             for column in range(2):
                 found = [self._masked_phase(area, row, column) for area in self.masked]
-                # Counts are few different numbers, so a histogram says all, and fast.
+                # Counts are few different numbers, so a histogram is enough, and fast.
                 numbers = np.bincount(np.concatenate(found)) if found else np.zeros(0, dtype=np.int64)
                 if numbers.sum() < _LEAST_MASKED:
                     return None
@@ -144,7 +144,7 @@ class Mosaic:
 
 
 def _median(values: NDArray[np.float64], numbers: NDArray[np.int64]) -> float:
-    """Return the median of `values`, each there as often as `numbers` says."""
+    """Return the median of `values`, each repeated as often as `numbers` has it."""
     order = np.argsort(values)
     upto = np.cumsum(numbers[order])
     middle = np.searchsorted(upto, ((upto[-1] - 1) // 2, upto[-1] // 2), side="right")
@@ -174,7 +174,7 @@ _MASKED = {
 
 
 def read_raw(path: Path) -> Mosaic:
-    """Read a camera's raw file: CR2, CRW, DNG or whatever else LibRaw knows with a Bayer sensor.
+    """Read a camera's raw file: CR2, CRW, DNG or whatever else LibRaw reads, with a Bayer sensor.
 
     Raises
     ------

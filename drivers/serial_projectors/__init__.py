@@ -1,7 +1,7 @@
 """Projectors on a serial cable: which languages are spoken, and how fast.
 
 Each maker has a file of its own: a wire, which is pure functions of bytes for both ends, and a driver that keeps the
-contract of `drivers.projector.Projector`. Where a language cannot say something, the driver's docstring does.
+contract of `drivers.projector.Projector`. What a language cannot express is stated in the driver's docstring.
 """
 
 from __future__ import annotations

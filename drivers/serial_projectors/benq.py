@@ -5,8 +5,8 @@ Rules that hold inside:
 - ``*pow=?#`` asks, ``*pow=on#`` sets; the answer repeats the name, ``*POW=ON#``. Between them may stand an echo of
   what was sent and the prompt ``>``; projectors on a network send neither.
 - A command that changes nothing may be answered as wrong, so that none is sent.
-- The language knows power on and off only. `BenqProjector.power` takes ``Block item`` for warm-up or cooling, by the
-  state seen last. A projector that says on while its lamp still warms up is taken at its word.
+- The language has power on and off only. `BenqProjector.power` takes ``Block item`` for warm-up or cooling, by the
+  state seen last. A projector that reports on while its lamp still warms up counts as on.
 - It has no question about faults, and `BenqProjector.faults` is always empty.
 
 Source: BenQ, RS232 Command Control (command table, baud rates, the three refusals, echo). Not confirmed by a manual:
@@ -26,14 +26,16 @@ from drivers.serial_projectors.exchange import (
     DEFAULT_TIMEOUT_S,
     SYSTEM_CLOCK,
     Exchange,
-    Taker,
+    MessageParser,
     text_of,
 )
 from foundation.clock import Clock
 from foundation.errors import DeviceRefused, ProtocolError
 
 BAUD = 115200
+"""The highest of the speeds that the menu offers, 2400 to 115200 (RS232 Command Control)."""
 TCP_PORT = 8000
+"""Where a projector on a network takes the same text (not confirmed by a manual)."""
 PROMPT = b">"
 QUERY = "?"
 ILLEGAL = "Illegal format"
@@ -63,7 +65,7 @@ def take_command(data: bytes) -> tuple[str, int] | None:
     return None if end < 0 else (data[:end].decode("ascii", "replace").strip(), end + 1)
 
 
-def reply_taker(command: bytes) -> Taker[str]:
+def reply_parser(command: bytes) -> MessageParser[str]:
     """Return what takes the answer to `command` off the front of the bytes, past echo and prompts.
 
     Where the answer and the echo look the same and only one comes, the prompt after it shows that it was the answer.
@@ -120,7 +122,7 @@ def value_of(name: str, reply: str) -> str:
 
 
 def on_or_off(name: str, value: str) -> bool:
-    """Return whether `value` says on."""
+    """Return whether `value` is on, not off."""
     if value.upper() not in ("ON", "OFF"):
         raise ProtocolError(f"the projector answers {name}={value}; expected ON or OFF")
     return value.upper() == "ON"
@@ -214,7 +216,7 @@ class BenqProjector:
 
     def _command(self, name: str, value: str = QUERY) -> str:
         command = encode_command(name, value)
-        reply = self._exchange.ask(command, reply_taker(command))
+        reply = self._exchange.ask(command, reply_parser(command))
         try:
             return value_of(name, reply)
         except ProtocolError:

@@ -6,7 +6,7 @@ Rules that hold inside:
   by the colon alone.
 - One command at a time. ``PWR ON`` and ``PWR OFF`` are answered only when they are done, after up to 130 s: until then
   nothing else is asked, and `EpsonProjector.power` says what is under way.
-- The wire knows no model: `EpsonProjector.identity` gives the serial number as the name.
+- The language has no question for the model: `EpsonProjector.identity` gives the serial number as the name.
 
 Source: Epson, ESC/VP21 Command User's Guide (PWR, SOURCE, MSEL, times, ERR). Not confirmed by a manual: the state 09,
 the codes of ERR? (as other drivers have them), the events that newer projectors send unasked, the handshake's states.
@@ -24,13 +24,16 @@ from foundation.clock import Clock
 from foundation.errors import DeviceFault, DeviceRefused, LinkTimeout, ProtocolError
 
 BAUD = 9600
+"""With 8 data bits, no parity, 1 stop bit (ESC/VP21)."""
 TCP_PORT = 3629
+"""Port of ESC/VP.net (not confirmed by a manual: as other drivers have it)."""
 SWITCHING_LIMIT_S = 130.0
 """Three attempts to strike the lamp, and the time for which an abnormal state lasts."""
 
 HELLO = b"ESC/VP.net\x10\x03\x00\x00\x00\x00"
 """What opens a connection over TCP: name, version 1.0, the request to connect, no password."""
 WELCOME = 0x20
+"""State in the answer to `HELLO`: connected."""
 _HELLO_STATES = {
     0x40: "a bad request",
     0x41: "a password is wanted; switch the password for network control off in its menu",
@@ -139,7 +142,7 @@ def parse_power(code: str) -> Power:
     Raises
     ------
     DeviceFault
-        The code says that the projector is in an abnormal state.
+        The code means that the projector is in an abnormal state.
     """
     if code == _ABNORMAL:
         raise DeviceFault("the projector answers PWR=05: it stopped itself; look at its indicators, unplug and plug it")
@@ -149,7 +152,7 @@ def parse_power(code: str) -> Power:
 
 
 def format_fault(part: str) -> str:
-    """Return ERR's code for a faulty part; the language knows neither warnings nor two faults at once."""
+    """Return ERR's code for a faulty part; the language has neither warnings nor two faults at once."""
     return _FAULT_CODES[part]
 
 
@@ -263,7 +266,7 @@ class EpsonProjector:
         self._give_up_at = self._clock.monotonic() + SWITCHING_LIMIT_S
 
     def _meet_late_answer(self) -> None:
-        """See whether the command under way has been carried out."""
+        """Check whether the command under way has been carried out."""
         if self._under_way is None:
             return
         command = "PWR ON" if self._under_way is Power.WARMING else "PWR OFF"
@@ -299,7 +302,7 @@ class EpsonProjector:
             raise
 
     def _greet(self, exchange: Exchange) -> None:
-        # The colon shows that it listens, and ends whatever stood half-said on the line.
+        # The colon shows that it listens, and ends an incomplete command on the line.
         try:
             exchange.open_with(b"\r", take_reply)
         except LinkTimeout as error:

@@ -2,7 +2,8 @@
 
 Rules that hold inside:
 
-- What a message is, the caller says: a `Taker` looks at the bytes so far and takes one whole message off their front.
+- The caller defines what a message is: a `MessageParser` looks at the bytes so far and returns the first whole message
+  and its length.
 - One connection, opened when first needed. After a fault of cable or protocol it is dropped, so that a late answer
   never meets a later question; what waits unread when a question is asked answers none of ours, and is thrown away.
 - A question that meets a connection the other side has dropped meanwhile is asked once more over a new one; every
@@ -30,7 +31,7 @@ MAX_MESSAGE = 512
 """Bytes; no message of any language here comes near it."""
 
 _T = TypeVar("_T")
-Taker = Callable[[bytes], tuple[_T, int] | None]
+MessageParser = Callable[[bytes], tuple[_T, int] | None]
 """Returns the message at the front of the bytes and how many of them it took, or None while it is not whole."""
 
 
@@ -67,7 +68,7 @@ class Exchange:
         self._link: Link | None = None
         self._rest = b""
 
-    def ask(self, question: bytes, take: Taker[_T], overheard: Callable[[_T], bool] | None = None) -> _T:
+    def ask(self, question: bytes, take: MessageParser[_T], overheard: Callable[[_T], bool] | None = None) -> _T:
         """Send `question` and return the first message that `overheard` does not claim.
 
         Raises
@@ -87,7 +88,7 @@ class Exchange:
                 raise
             return self._ask_once(question, take, overheard)
 
-    def open_with(self, question: bytes, take: Taker[_T]) -> _T:
+    def open_with(self, question: bytes, take: MessageParser[_T]) -> _T:
         """Send `question` over the connection just opened and return its answer; only for `greet`."""
         return self._ask_once(question, take, None)
 
@@ -101,7 +102,7 @@ class Exchange:
                 raise
             self._send_once(command)
 
-    def glance(self, take: Taker[_T], wait: float = GLANCE_S) -> _T | None:
+    def glance(self, take: MessageParser[_T], wait: float = GLANCE_S) -> _T | None:
         """Return the next message if it comes within `wait` seconds; None without one, or without a connection."""
         if self._link is None:
             return None
@@ -120,7 +121,7 @@ class Exchange:
         if link is not None:
             link.close()
 
-    def _ask_once(self, question: bytes, take: Taker[_T], overheard: Callable[[_T], bool] | None) -> _T:
+    def _ask_once(self, question: bytes, take: MessageParser[_T], overheard: Callable[[_T], bool] | None) -> _T:
         link = self._send_once(question)
         try:
             while True:
@@ -145,7 +146,7 @@ class Exchange:
             raise
         return link
 
-    def _next(self, link: Link, take: Taker[_T], wait: float) -> _T:
+    def _next(self, link: Link, take: MessageParser[_T], wait: float) -> _T:
         deadline = self._clock.monotonic() + wait
         remaining = wait
         while (taken := take(self._rest)) is None:

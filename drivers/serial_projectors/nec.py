@@ -10,7 +10,7 @@ Rules that hold inside:
 
 Source: NEC, Projector Control Command Reference Manual, revision 6.1 (037, 078-2 to 078-5), and Control Commands
 (Basic), revision 5.16 (009, 015, table of error codes). Not confirmed by a manual: the bytes of 016 power off, 020 and
-021 picture mute (as other drivers have them), 02h 0Eh, and what the running status says during warm-up.
+021 picture mute (as other drivers have them), 02h 0Eh, and the running status during warm-up.
 """
 
 from __future__ import annotations
@@ -25,13 +25,16 @@ from foundation.clock import Clock
 from foundation.errors import DeviceFault, DeviceRefused, ProtocolError
 
 BAUD = 38400
+"""One of the speeds that the menu offers, 4800 to 115200; set it so."""
 TCP_PORT = 7142
+"""Where a projector on a network takes the same frames (as other drivers have it)."""
 _HEADER = 5
+"""Bytes before the data: kind, code, two numbers, length."""
 
 
 @dataclass(frozen=True)
 class NecCommand:
-    """What we say."""
+    """A command, as the controller sends it."""
 
     kind: int
     code: int
@@ -40,7 +43,7 @@ class NecCommand:
 
 @dataclass(frozen=True)
 class NecReply:
-    """What the projector says; `failed` holds the two bytes that give the reason why it did not do it."""
+    """An answer; `failed` holds the two bytes that give the reason why it did not do it."""
 
     kind: int
     code: int
@@ -61,8 +64,11 @@ MODEL = NecCommand(0, 0x85, b"\x04")
 INFORMATION = NecCommand(3, 0x8A)
 
 UNKNOWN_COMMAND = (0, 0)
+"""The two bytes with which a command is refused (table of error codes)."""
 POWER_IS_OFF = (2, 0x0D)
+"""Not possible in standby (same table)."""
 EXECUTION_FAILED = (2, 0x0E)
+"""Not confirmed by a manual."""
 _FAILURES = {
     (0, 0): "it does not know this command",
     (0, 1): "its model cannot do this",
@@ -91,6 +97,7 @@ _ERROR_BITS: Mapping[tuple[int, int], tuple[str, Severity]] = {
     (3, 2): ("temperature", Severity.WARNING),
 }
 _ERRORS_LENGTH = 12
+"""Bytes of data in the answer to 009, error status."""
 
 
 def checksum(data: bytes) -> int:

@@ -25,9 +25,11 @@ from foundation.clock import Clock
 from foundation.errors import DeviceRefused, ProtocolError
 
 BAUD = 9600
+"""With 8 data bits, no parity, 1 stop bit (RS232 Protocol Function List)."""
 EVERYBODY = 0
 """The number that every projector listens to."""
 
+# Numbers of commands and questions, as the RS232 Protocol Function List has them; 355 is not confirmed by it.
 POWER = 0
 AV_MUTE = 2
 LAMP_HOURS = 108
@@ -43,13 +45,13 @@ _PART_NUMBERS = {part: number for number, part in _PARTS.items()}
 
 @dataclass(frozen=True)
 class PassFail:
-    """The answer to a command: whether it was passed."""
+    """The answer to a command: whether it was carried out."""
 
     passed: bool
 
 
 @dataclass(frozen=True)
-class Value:
+class AnswerText:
     """The answer to a question."""
 
     text: str
@@ -57,12 +59,12 @@ class Value:
 
 @dataclass(frozen=True)
 class Info:
-    """What a projector says unasked."""
+    """What a projector sends unasked: the number of its new state or fault."""
 
     number: int
 
 
-Message = PassFail | Value | Info
+Message = PassFail | AnswerText | Info
 
 
 @dataclass(frozen=True)
@@ -94,11 +96,11 @@ def take_command(data: bytes) -> tuple[OptomaCommand | None, int] | None:
 
 
 def encode_message(message: Message) -> bytes:
-    """Return what the projector says."""
+    """Return the projector's line."""
     match message:
         case PassFail(passed):
             return b"P\r" if passed else b"F\r"
-        case Value(text):
+        case AnswerText(text):
             return f"OK{text}\r".encode("ascii")
         case Info(number):
             return f"INFO{number}\r".encode("ascii")
@@ -115,18 +117,18 @@ def take_message(data: bytes) -> tuple[Message, int] | None:
     if done is not None:
         return PassFail(done == b"P"), found.end()
     if value is not None:
-        return Value(text_of(value).strip()), found.end()
+        return AnswerText(text_of(value).strip()), found.end()
     return Info(int(info)), found.end()
 
 
 def info_of_power(power: Power) -> Info | None:
-    """Return what is said when a power state begins; nothing when the projector has warmed up."""
+    """Return what is sent when a power state begins; nothing when the projector has warmed up."""
     number = _POWER_NUMBERS.get(power)
     return None if number is None else Info(number)
 
 
 def info_of_fault(part: str) -> Info | None:
-    """Return what is said when a part fails, if there is a number for it."""
+    """Return what is sent when a part fails, None if there is no number for it."""
     number = _PART_NUMBERS.get(part)
     return None if number is None else Info(number)
 
@@ -191,7 +193,7 @@ class OptomaProjector:
                 pass
 
     def muted(self) -> bool:
-        """Return whether the picture is blanked; refused where neither the projector nor this driver knows."""
+        """Return whether the picture is blanked; refused where it cannot be read and was not set by this driver."""
         try:
             return self._get(AV_MUTE_STATE) == "1"
         except DeviceRefused:
@@ -228,7 +230,7 @@ class OptomaProjector:
 
     def _get(self, number: int) -> str:
         match self._ask(OptomaCommand(number, "1")):
-            case Value(text):
+            case AnswerText(text):
                 return text
             case PassFail(passed=False):
                 raise DeviceRefused(f"{self._label} answers F to question {number}: its model does not know it, or now")

@@ -1,4 +1,4 @@
-"""Reads the directories of a TIFF file: what camera makers and DNG say about the pixels, never the pixels themselves.
+"""Reads the directories of a TIFF file: the description of the pixels, never the pixels themselves.
 
 Rules that hold inside:
 

@@ -17,7 +17,7 @@ from typing import Final
 from drivers.tiff.tags import TiffTag
 
 
-class Kind(IntEnum):
+class ValueType(IntEnum):
     """The types of a tag's values that are written (TIFF 6.0, section 2)."""
 
     BYTE = 1
@@ -29,7 +29,7 @@ class Kind(IntEnum):
     SRATIONAL = 10
 
 
-Value = tuple[Kind, Sequence[int]]
+Value = tuple[ValueType, Sequence[int]]
 """A tag's type and its numbers; a rational is two of them, numerator first."""
 
 Tags = dict[TiffTag, Value]
@@ -39,27 +39,28 @@ LARGEST_FILE: Final = (1 << 32) - 1
 """Bytes that the 32-bit offsets of TIFF reach."""
 
 _LETTERS: Final = {
-    Kind.BYTE: "B",
-    Kind.ASCII: "B",
-    Kind.SHORT: "H",
-    Kind.LONG: "I",
-    Kind.RATIONAL: "II",
-    Kind.UNDEFINED: "B",
-    Kind.SRATIONAL: "ii",
+    ValueType.BYTE: "B",
+    ValueType.ASCII: "B",
+    ValueType.SHORT: "H",
+    ValueType.LONG: "I",
+    ValueType.RATIONAL: "II",
+    ValueType.UNDEFINED: "B",
+    ValueType.SRATIONAL: "ii",
 }
 _HEADER: Final = struct.pack("<2sHI", b"II", 42, 8)
 _ALIGNMENT: Final = 16
+"""Bytes on whose multiple the pixels begin, so that samples of any type are aligned."""
 
 
 def text(value: str) -> Value:
     """Return the value of an ASCII tag; what ASCII cannot write becomes a question mark."""
-    return Kind.ASCII, value.encode("ascii", "replace") + b"\0"
+    return ValueType.ASCII, value.encode("ascii", "replace") + b"\0"
 
 
 def rationals(*values: float | Fraction) -> Value:
     """Return numbers ≥ 0 as the nearest fractions of denominators up to 100 000."""
     near = (Fraction(value).limit_denominator(100_000) for value in values)
-    return Kind.RATIONAL, [part for value in near for part in value.as_integer_ratio()]
+    return ValueType.RATIONAL, [part for value in near for part in value.as_integer_ratio()]
 
 
 def head(main: Tags, strip: int, exif: Tags | None = None) -> bytes:
@@ -86,20 +87,20 @@ def head(main: Tags, strip: int, exif: Tags | None = None) -> bytes:
     """
     tags: Tags = {
         **main,
-        TiffTag.STRIP_OFFSETS: (Kind.LONG, [0]),
-        TiffTag.STRIP_BYTE_COUNTS: (Kind.LONG, [min(strip, LARGEST_FILE)]),
+        TiffTag.STRIP_OFFSETS: (ValueType.LONG, [0]),
+        TiffTag.STRIP_BYTE_COUNTS: (ValueType.LONG, [min(strip, LARGEST_FILE)]),
     }
     if exif is not None:
-        tags[TiffTag.EXIF_IFD_POINTER] = (Kind.LONG, [0])
+        tags[TiffTag.EXIF_IFD_POINTER] = (ValueType.LONG, [0])
     exif_at = len(_HEADER) + len(_directory(tags, 0))
     end = exif_at
     if exif is not None:
-        tags[TiffTag.EXIF_IFD_POINTER] = (Kind.LONG, [exif_at])
+        tags[TiffTag.EXIF_IFD_POINTER] = (ValueType.LONG, [exif_at])
         end += len(_directory(exif, 0))
     strip_at = end + -end % _ALIGNMENT
     if strip_at + strip > LARGEST_FILE:
         raise ValueError(f"{strip} bytes of pixels are more than the 4 GiB of a TIFF file")
-    tags[TiffTag.STRIP_OFFSETS] = (Kind.LONG, [strip_at])
+    tags[TiffTag.STRIP_OFFSETS] = (ValueType.LONG, [strip_at])
     directories = _directory(tags, len(_HEADER)) + (b"" if exif is None else _directory(exif, exif_at))
     return _HEADER + directories + bytes(strip_at - end)
 

@@ -1,7 +1,7 @@
 """Methods that estimate the light of an image from its statistics, one file a method.
 
 Every method is a value with a name and `estimate(image, saturation, mask)`, see `method.Method`; `standard_methods`
-lists them by the names that the command line knows.
+lists them by their names on the command line.
 """
 
 from evaluation.methods.gray_edge import GrayEdge

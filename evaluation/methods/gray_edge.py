@@ -119,7 +119,7 @@ def differentiate(image: npt.NDArray[np.float32], order: int, sigma: float) -> n
 
 
 def gaussian_kernel(sigma: float, order: int) -> npt.NDArray[np.float64]:
-    """Return the kernel (2⌊3σ + ½⌋ + 1,) float64 of a Gaussian's derivative, to be correlated with.
+    """Return the kernel (N,) float64 of a Gaussian's derivative, to be correlated with; N = 2⌊3σ + ½⌋ + 1.
 
     Normalised on the grid of pixels: order 0 sums to 1; order 1 gives 1 for the ramp x; order 2 gives 1 for x²/2 and 0
     for a constant.

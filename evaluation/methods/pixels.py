@@ -29,7 +29,7 @@ def usable(
     Parameters
     ----------
     image
-        (H, W, 3) of any type, linear camera RGB.
+        (H, W, 3) of any integer or float dtype, linear camera RGB.
     saturation
         Value from which a channel is saturated; None if none is.
     mask

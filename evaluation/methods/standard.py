@@ -1,4 +1,6 @@
-"""The methods that the command knows, with the constants that are usual in the field.
+"""The methods that the command offers, with the constants that are usual in the field.
+
+Where they come from::
 
 Where they come from::
 
@@ -30,7 +32,7 @@ from evaluation.methods.pca import BrightDark
 
 
 def standard_methods() -> Mapping[str, Method]:
-    """Return the methods by the short names that the command line knows; the paper's three first.
+    """Return the methods by their short names on the command line; the paper's three first.
 
     Examples
     --------

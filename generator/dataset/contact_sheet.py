@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_ROWS: Final = 12
+"""Sources of a sheet: what is still recognised where the page fills a screen."""
 MAX_COLUMNS: Final = 8
-"""Sources and lights of a sheet: what is still recognised where the page fills a screen."""
+"""Lights of a sheet, for the same reason."""
 _PAPER: Final = "#16171a"
 _INK: Final = "#e8e6e1"
 _FAINT: Final = "#8d8f96"

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from drivers.raw.camera_matrix import Matrix, camera_matrix
 from drivers.tiff.tags import CFA, D65, TiffTag
-from drivers.tiff.writing import Kind, Tags, head, rationals, text
+from drivers.tiff.writing import Tags, ValueType, head, rationals, text
 from foundation.errors import InputError
 from generator.files.metadata import ImageMetadata
 
@@ -48,34 +48,34 @@ def encode_dng(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes:
     matrix = camera_matrix(metadata.camera) or _SRGB
     model = f"{metadata.camera} generated".strip()
     tags: Tags = {
-        TiffTag.NEW_SUBFILE_TYPE: (Kind.LONG, [0]),  # the picture itself
-        TiffTag.IMAGE_WIDTH: (Kind.LONG, [width]),
-        TiffTag.IMAGE_LENGTH: (Kind.LONG, [height]),
-        TiffTag.BITS_PER_SAMPLE: (Kind.SHORT, [16]),
-        TiffTag.COMPRESSION: (Kind.SHORT, [1]),  # none
-        TiffTag.PHOTOMETRIC_INTERPRETATION: (Kind.SHORT, [CFA]),
+        TiffTag.NEW_SUBFILE_TYPE: (ValueType.LONG, [0]),  # the picture itself
+        TiffTag.IMAGE_WIDTH: (ValueType.LONG, [width]),
+        TiffTag.IMAGE_LENGTH: (ValueType.LONG, [height]),
+        TiffTag.BITS_PER_SAMPLE: (ValueType.SHORT, [16]),
+        TiffTag.COMPRESSION: (ValueType.SHORT, [1]),  # none
+        TiffTag.PHOTOMETRIC_INTERPRETATION: (ValueType.SHORT, [CFA]),
         TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
         TiffTag.MAKE: text("CroP"),
         TiffTag.MODEL: text(model),
-        TiffTag.ORIENTATION: (Kind.SHORT, [1]),  # as it lies
-        TiffTag.SAMPLES_PER_PIXEL: (Kind.SHORT, [1]),
-        TiffTag.ROWS_PER_STRIP: (Kind.LONG, [height]),
-        TiffTag.PLANAR_CONFIGURATION: (Kind.SHORT, [1]),
-        TiffTag.CFA_REPEAT_PATTERN_DIM: (Kind.SHORT, [2, 2]),
-        TiffTag.CFA_PATTERN: (Kind.BYTE, [0, 1, 1, 2]),  # red, green, green, blue
-        TiffTag.DNG_VERSION: (Kind.BYTE, [1, 4, 0, 0]),
-        TiffTag.DNG_BACKWARD_VERSION: (Kind.BYTE, [1, 1, 0, 0]),
+        TiffTag.ORIENTATION: (ValueType.SHORT, [1]),  # as it lies
+        TiffTag.SAMPLES_PER_PIXEL: (ValueType.SHORT, [1]),
+        TiffTag.ROWS_PER_STRIP: (ValueType.LONG, [height]),
+        TiffTag.PLANAR_CONFIGURATION: (ValueType.SHORT, [1]),
+        TiffTag.CFA_REPEAT_PATTERN_DIM: (ValueType.SHORT, [2, 2]),
+        TiffTag.CFA_PATTERN: (ValueType.BYTE, [0, 1, 1, 2]),  # red, green, green, blue
+        TiffTag.DNG_VERSION: (ValueType.BYTE, [1, 4, 0, 0]),
+        TiffTag.DNG_BACKWARD_VERSION: (ValueType.BYTE, [1, 1, 0, 0]),
         TiffTag.UNIQUE_CAMERA_MODEL: text(f"CroP {model}"),
-        TiffTag.CFA_PLANE_COLOR: (Kind.BYTE, [0, 1, 2]),
-        TiffTag.CFA_LAYOUT: (Kind.SHORT, [1]),  # rectangular
-        TiffTag.BLACK_LEVEL: (Kind.SHORT, [0]),
-        TiffTag.WHITE_LEVEL: (Kind.SHORT, [metadata.white_level]),
+        TiffTag.CFA_PLANE_COLOR: (ValueType.BYTE, [0, 1, 2]),
+        TiffTag.CFA_LAYOUT: (ValueType.SHORT, [1]),  # rectangular
+        TiffTag.BLACK_LEVEL: (ValueType.SHORT, [0]),
+        TiffTag.WHITE_LEVEL: (ValueType.SHORT, [metadata.white_level]),
         TiffTag.COLOR_MATRIX_1: (
-            Kind.SRATIONAL,
+            ValueType.SRATIONAL,
             [part for row in matrix for entry in row for part in (round(10000 * entry), 10000)],
         ),
         TiffTag.AS_SHOT_NEUTRAL: rationals(*neutral),
-        TiffTag.CALIBRATION_ILLUMINANT_1: (Kind.SHORT, [D65]),
+        TiffTag.CALIBRATION_ILLUMINANT_1: (ValueType.SHORT, [D65]),
     }
     try:
         start = head(tags, 2 * height * width)

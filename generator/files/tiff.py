@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.tiff.tags import RGB, TiffTag
-from drivers.tiff.writing import Kind, Tags, head, text
+from drivers.tiff.writing import Tags, ValueType, head, text
 from foundation.errors import InputError
 from generator.files.metadata import ImageMetadata
 
@@ -25,17 +25,17 @@ def encode_tiff(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes
     """
     height, width, channels = image.shape
     tags: Tags = {
-        TiffTag.NEW_SUBFILE_TYPE: (Kind.LONG, [0]),  # the picture itself
-        TiffTag.IMAGE_WIDTH: (Kind.LONG, [width]),
-        TiffTag.IMAGE_LENGTH: (Kind.LONG, [height]),
-        TiffTag.BITS_PER_SAMPLE: (Kind.SHORT, [16] * channels),
-        TiffTag.COMPRESSION: (Kind.SHORT, [1]),  # none
-        TiffTag.PHOTOMETRIC_INTERPRETATION: (Kind.SHORT, [RGB]),
+        TiffTag.NEW_SUBFILE_TYPE: (ValueType.LONG, [0]),  # the picture itself
+        TiffTag.IMAGE_WIDTH: (ValueType.LONG, [width]),
+        TiffTag.IMAGE_LENGTH: (ValueType.LONG, [height]),
+        TiffTag.BITS_PER_SAMPLE: (ValueType.SHORT, [16] * channels),
+        TiffTag.COMPRESSION: (ValueType.SHORT, [1]),  # none
+        TiffTag.PHOTOMETRIC_INTERPRETATION: (ValueType.SHORT, [RGB]),
         TiffTag.IMAGE_DESCRIPTION: text(metadata.to_json()),
-        TiffTag.SAMPLES_PER_PIXEL: (Kind.SHORT, [channels]),
-        TiffTag.ROWS_PER_STRIP: (Kind.LONG, [height]),
-        TiffTag.PLANAR_CONFIGURATION: (Kind.SHORT, [1]),  # pixel by pixel
-        TiffTag.SAMPLE_FORMAT: (Kind.SHORT, [1] * channels),  # unsigned integers
+        TiffTag.SAMPLES_PER_PIXEL: (ValueType.SHORT, [channels]),
+        TiffTag.ROWS_PER_STRIP: (ValueType.LONG, [height]),
+        TiffTag.PLANAR_CONFIGURATION: (ValueType.SHORT, [1]),  # pixel by pixel
+        TiffTag.SAMPLE_FORMAT: (ValueType.SHORT, [1] * channels),  # unsigned integers
     }
     try:
         start = head(tags, image.nbytes)

@@ -113,7 +113,7 @@ def check_white_level(white_level: int) -> None:
 
 
 def check_weights(weights: npt.ArrayLike, lights: int) -> npt.NDArray[np.float64]:
-    """Return the weights of `lights` lights as (K,) float64.
+    """Return the weights (K,) of `lights` lights as (K,) float64.
 
     Raises
     ------

@@ -77,7 +77,7 @@ def mixed_table(
     tables
         (K, 8**bits, S, 3) uint16 or a sequence of K (8**bits, S, 3), linear camera RGB of the lights.
     weights
-        (K,) ≥ 0, what each light contributes; 1 is the light as it was photographed.
+        (K,) float ≥ 0, what each light contributes; 1 is the light as it was photographed.
     white_level
         Saturation of the sensor, 1 … 65535: larger values are cut to it.
     seed

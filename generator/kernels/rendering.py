@@ -254,7 +254,9 @@ def draw_mosaic(
     pattern
         Channels of the picture's first 2x2 block in reading order: RGGB, BGGR, GRBG or GBRG. It belongs to the whole
         picture: with an odd `first_row` the first row is the pattern's second.
-    samples, picture, seed, image, first_row, threads
+    samples, picture
+        (8**bits, S, 3) uint16 and (H, W, 3) uint8, as for `draw_samples`.
+    seed, image, first_row, threads
         As for `draw_samples`.
     out
         (H, W) uint16 to fill instead of a new array.

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from foundation.errors import InputError
 from generator import philox
 from generator.lights.distributions import Distribution
-from generator.lights.gamut import Gamut, Match, Outside, OutsideGamutError, black_body, rgb_of
+from generator.lights.gamut import Gamut, Match, OutsideGamut, OutsideGamutError, black_body, rgb_of
 from generator.lights.ground_truths import load_ground_truths
 from generator.lights.lighting import LightChoice, Lighting, Mixture, parse_mixture, plain
 from generator.masks.weights import MaskPlan
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DrawnLights",
-    "FollowedLights",
     "LightChoice",
     "ListedLights",
     "RandomLights",
-    "TogetherLights",
+    "SequentialLights",
+    "SimultaneousLights",
     "load_ground_truths",
     "matched_lights",
     "nearest_lights",
@@ -103,7 +103,7 @@ class RandomLights:
 
 
 @dataclass(frozen=True)
-class FollowedLights:
+class SequentialLights:
     """The lights of a list of ground truths one after another, `each` for a picture, starting over when it ends.
 
     Attributes
@@ -202,7 +202,7 @@ class DrawnLights:
 
 
 @dataclass(frozen=True)
-class TogetherLights:
+class SimultaneousLights:
     """`together` lights of another choice at a time on one image, each where the masks let it fall.
 
     Image i of a picture gets the lights i · together … of the other choice, and the masks of number
@@ -281,7 +281,7 @@ def parse_lights(text: str, total: int) -> ListedLights:
     return ListedLights(tuple(lights))
 
 
-def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outside = "refuse") -> Mixture:
+def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: OutsideGamut = "refuse") -> Mixture:
     """Return the light that a text names.
 
     ``12`` and ``12:0.25+40:0.75`` are lights of the table, ``cct=4500`` or ``4500K`` a black body in kelvin
@@ -320,7 +320,7 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
     return (gamut or Gamut.of(lut)).match(rgb_of([numbers["r"], numbers["b"]]), outside).mixture
 
 
-def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", each: int = 1) -> FollowedLights:
+def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", each: int = 1) -> SequentialLights:
     """Return for each ground truth the table's light at the smallest angle; of several the lowest number.
 
     Parameters
@@ -340,7 +340,7 @@ def nearest_lights(lut: Lut, truths: npt.NDArray[np.float64], file: str = "", ea
     lights = cosine.argmax(axis=1)
     angles = np.degrees(np.arccos(cosine[np.arange(len(lights)), lights]))
     matches = (Match(plain(int(light)), float(angle)) for light, angle in zip(lights, angles, strict=True))
-    return FollowedLights("nearest", tuple(matches), file, each)
+    return SequentialLights("nearest", tuple(matches), file, each)
 
 
 def matched_lights(
@@ -348,8 +348,8 @@ def matched_lights(
     truths: npt.NDArray[np.float64],
     file: str = "",
     each: int = 1,
-    outside: Outside = "refuse",
-) -> FollowedLights:
+    outside: OutsideGamut = "refuse",
+) -> SequentialLights:
     """Return for each ground truth the mixture of the table's lights that has it; see `gamut.Gamut.match`.
 
     Parameters
@@ -383,4 +383,4 @@ def matched_lights(
             f"{len(outside_gamut)} of {len(truths)} ground truths{f' of {file}' if file else ''} cannot be made; "
             f"the farthest is number {number + 1}: {worst}"
         ) from worst
-    return FollowedLights("match", tuple(matches), file, each)
+    return SequentialLights("match", tuple(matches), file, each)

@@ -28,7 +28,7 @@ class Distribution(Protocol):
     """Chromaticities r and b as a function of random words."""
 
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
-        """Return (N, 2) float64, r and b, from four arrays of N random words; some may be no chromaticities at all."""
+        """Return (N, 2) float64, r and b, from four (N,) uint32 random words; some may be no chromaticities at all."""
         ...
 
     def describe(self) -> dict[str, Any]:

@@ -34,7 +34,7 @@ TOLERANCE_DEG: Final = 0.01
 """Angle to a wanted light within which one light, or two, are taken instead of three, degrees: about a table's own
 error."""
 
-Outside = Literal["refuse", "nearest"]
+OutsideGamut = Literal["refuse", "nearest"]
 """What to do about a light that the table cannot make: refuse it, or take the nearest that it can."""
 
 _Array = npt.NDArray[np.float64]
@@ -121,7 +121,7 @@ class Gamut:
         shares = (self._inverses.reshape(-1, 3) @ rgb.T).reshape(-1, 3, len(rgb))
         return (shares.min(axis=1) >= 0).any(axis=0)
 
-    def match(self, wanted: npt.ArrayLike, outside: Outside = "refuse") -> Match:
+    def match(self, wanted: npt.ArrayLike, outside: OutsideGamut = "refuse") -> Match:
         """Return the mixture of the fewest near lights for a wanted light, by the rule at the head of this file.
 
         Parameters

@@ -69,7 +69,7 @@ class Mixture:
 
     @property
     def label(self) -> str:
-        """Return what the column `illumination` of `ground_truth.csv` says: ``12``, or ``12:0.25+40:0.75``."""
+        """Return the text of the column `illumination` of `ground_truth.csv`: ``12``, or ``12:0.25+40:0.75``."""
         if len(self.lights) == 1:
             return str(self.lights[0])
         pairs = zip(self.lights, self.weights, strict=True)

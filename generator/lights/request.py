@@ -11,14 +11,14 @@ from generator.lights.choices import (
     DrawnLights,
     ListedLights,
     RandomLights,
-    TogetherLights,
+    SimultaneousLights,
     matched_lights,
     nearest_lights,
     parse_light,
     parse_lights,
 )
 from generator.lights.distributions import parse_distribution
-from generator.lights.gamut import Gamut, Outside
+from generator.lights.gamut import Gamut, OutsideGamut
 from generator.lights.ground_truths import load_ground_truths
 from generator.lights.lighting import LightChoice
 from generator.masks.request import parse_masks
@@ -60,7 +60,7 @@ class LightRequest:
     distribution: str | None = None
     nearest: Path | None = None
     match: Path | None = None
-    outside: Outside = "refuse"
+    outside: OutsideGamut = "refuse"
     lights_per_image: int | None = None
     masks: str | None = None
 
@@ -83,7 +83,7 @@ class LightRequest:
         choice = self._lights(lut, seed, together)
         if together == 1:
             return choice
-        return TogetherLights(choice, together, parse_masks(self.masks or MASKS, together, seed))
+        return SimultaneousLights(choice, together, parse_masks(self.masks or MASKS, together, seed))
 
     def _lights(self, lut: Lut, seed: int, together: int) -> LightChoice:
         """Return the choice of lights with as many for each picture as its images have together."""

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from generator.masks.shapes import Dice, Shape
+from generator.masks.shapes import RandomStreams, Shape
 from generator.masks.weights import MaskMaker, Weights, quantise_shares
 
 _PIXELS: Final = 1 << 15
@@ -30,14 +30,14 @@ class MadeMasks:
     """The masks of one image; a `MaskMaker`."""
 
     shape: Shape
-    dice: Dice
+    streams: RandomStreams
 
     def weights(self, height: int, width: int, lights: int) -> Weights:
         """Return (height, width, lights) float32 from 0 to 1 in whole 65535ths that sum to 1 in every pixel."""
         longer = max(height, width)
         u = ((np.arange(width) - (width - 1) / 2) / longer).astype(np.float32)[None, :]
         v = ((np.arange(height) - (height - 1) / 2) / longer).astype(np.float32)[:, None]
-        shares = self.shape.shares(self.dice, (width / longer / 2, height / longer / 2), lights, 1 / longer, u)
+        shares = self.shape.shares(self.streams, (width / longer / 2, height / longer / 2), lights, 1 / longer, u)
         out = np.empty((height, width, lights), np.float32)
         rows = max(1, _PIXELS // width)
         for top in range(0, height, rows):
@@ -54,7 +54,7 @@ class MadeMaskPlan:
 
     def maker(self, number: int) -> MaskMaker:
         """Return the masks of image `number`."""
-        return MadeMasks(self.shape, Dice(self.seed, number))
+        return MadeMasks(self.shape, RandomStreams(self.seed, number))
 
     def describe(self) -> dict[str, Any]:
         """Return the plan as plain values."""

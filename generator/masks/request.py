@@ -13,6 +13,7 @@ from generator.masks.weights import MaskPlan
 from generator.named_numbers import Range, parse_numbers
 
 _SHARE: Range = (0.0, 1.0)
+"""Least and most of a share."""
 _OPTIONS: Final[dict[str, dict[str, Range]]] = {
     "half-plane": {"angle": (-360.0, 360.0), "width": _SHARE},
     "soft-edge": {"angle": (-360.0, 360.0), "width": _SHARE},

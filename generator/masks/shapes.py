@@ -1,6 +1,6 @@
 """Kinds of masks: half planes and soft edges, spots, random smooth fields, windows.
 
-A shape draws its places from an image's dice, and gives a function from places in the picture to the lights' shares.
+A shape draws its places from an image's streams, and gives a function from places in the picture to the lights' shares.
 Pixels are computed with +, −, ×, ÷ and √ alone; see `making`.
 """
 
@@ -34,7 +34,7 @@ Shares = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
-class Dice:
+class RandomStreams:
     """Uniform random numbers of one image; each `stream` of them is independent of the others."""
 
     seed: int
@@ -47,14 +47,14 @@ class Dice:
 
 
 class Shape(Protocol):
-    """A kind of masks: from the dice of an image to where its lights fall."""
+    """A kind of masks: from the streams of an image to where its lights fall."""
 
-    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
+    def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to the lights' shares (K, h, W) float32 of their pixels.
 
         Parameters
         ----------
-        dice
+        streams
             Of this image.
         half
             Half the picture's width and height, shares of the longer side.
@@ -94,9 +94,9 @@ class HalfPlanes:
     angle: float | None = None
     width: float | None = 0.0
 
-    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
+    def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
-        drawn: list[float] = dice.uniform(0).tolist()
+        drawn: list[float] = streams.uniform(0).tolist()
         angle = math.radians(360 * drawn[0] if self.angle is None else self.angle)
         width = max(0.1 + 0.5 * drawn[1] if self.width is None else self.width, pixel)
         reach = abs(math.cos(angle)) * half[0] + abs(math.sin(angle)) * half[1]
@@ -135,11 +135,11 @@ class Spots:
     radius: float | None = None
     softness: float = 0.8
 
-    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
+    def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
         discs: list[list[tuple[float, float, float, float]]] = []
         for light in range(1, lights):
-            drawn = dice.uniform(light)
+            drawn = streams.uniform(light)
             count = 1 + int(4 * drawn[0]) if self.count is None else self.count
             discs.append([])
             for x, y, size in drawn[1 : 1 + 3 * count].reshape(-1, 3).tolist():
@@ -178,13 +178,13 @@ class SmoothFields:
     scale: float = 0.5
     contrast: float = 2.0
 
-    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
+    def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
         del half, pixel
         knots = math.ceil(2 / self.scale) + 4
         fields: list[Array] = []
         for light in range(lights):
-            drawn = dice.uniform(light, knots * knots).reshape(knots, knots)
+            drawn = streams.uniform(light, knots * knots).reshape(knots, knots)
             # The spline leaves 0.479 of the knots' variance in each direction, on the average.
             field = (self.contrast / 0.479 * math.sqrt(12) * (drawn - 0.5)).astype(np.float32)
             fields.append(np.ascontiguousarray(self._splined(np.ascontiguousarray(field.T), u[0]).T))
@@ -232,9 +232,9 @@ class Windows:
     rows: int | None = None
     softness: float | None = None
 
-    def shares(self, dice: Dice, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
+    def shares(self, streams: RandomStreams, half: tuple[float, float], lights: int, pixel: float, u: Array) -> Shares:
         """Return the function from rows v (h, 1) to shares (K, h, W) float32; see `Shape.shares`."""
-        windows = [self._window(dice.uniform(light), half, pixel) for light in range(1, lights)]
+        windows = [self._window(streams.uniform(light), half, pixel) for light in range(1, lights)]
 
         def fill(v: Array) -> Array:
             shares = np.ones((lights, len(v), u.shape[1]), np.float32)

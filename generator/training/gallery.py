@@ -23,6 +23,7 @@ from generator.pictures.sources import Source
 
 FORMAT: Final = "crop.gallery"
 VERSION: Final = 1
+"""The only version so far."""
 
 
 class _Entry(BaseModel):

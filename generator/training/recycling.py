@@ -37,7 +37,7 @@ class Recycled:
         Returns
         -------
         ndarray
-            float32, C order.
+            (...) float32, C order.
         """
         size = 4 * int(np.prod(shape))
         memory = self._memory(size)

@@ -1,8 +1,8 @@
-"""Trouble with cameras and cables, each as a wrapper around something good; nothing good knows of it.
+"""Faults of cameras and cables, each as a wrapper around a device or cable that works.
 
 Three places can be troubled: the device, as a `sim.buses.responder.Responder`; its pipes, as
 `drivers.links.pipes.UsbPipes`; the whole cable, as a `drivers.ptp.transport.Transport`. A wrapper keeps the contract of
-what it wraps and may be wrapped again. What happens and when is said on construction; nothing is random.
+what it wraps and may be wrapped again. What happens and when is set on construction; nothing is random.
 
 A device that restarts in the middle of an operation is `Interrupting` with the simulated bus's ``replug``, one that is
 pulled out the same with ``unplug``.
@@ -84,7 +84,7 @@ class Declining(TroubledResponder):
 
 
 class Hanging(TroubledResponder):
-    """Says nothing on an occasion; `obeys` whether it carries the operation out all the same."""
+    """Does not answer on an occasion; `obeys`: whether it carries the operation out all the same."""
 
     def __init__(self, good: Responder, occasion: Occasion, *, obeys: bool = False) -> None:
         super().__init__(good)
@@ -166,7 +166,7 @@ class RepeatingEvents(TroubledResponder):
 
 
 class UnknownEvents(TroubledResponder):
-    """Sends `unknown`, an event of a code that nobody knows, before each real one."""
+    """Sends `unknown`, an event of an undefined code, before each real one."""
 
     def __init__(self, good: Responder, unknown: PtpEvent) -> None:
         super().__init__(good)

@@ -1,4 +1,4 @@
-"""A PTP device on no cable at all: the whole way through the containers, without a bus, a thread or a wait."""
+"""A PTP device without a cable: in memory, through the containers, without a bus, a thread or a wait."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ADDRESSES = {Pipe.BULK_OUT: BULK_OUT, Pipe.BULK_IN: BULK_IN, Pipe.INTERRUPT_IN:
 
 
 class MemoryPipes:
-    """The `drivers.links.pipes.UsbPipes` of a device in the same thread; what it has not said yet, it will not say."""
+    """The `drivers.links.pipes.UsbPipes` of a device in the same thread; what it has not sent yet, it will not send."""
 
     def __init__(self, device: PtpUsbDevice) -> None:
         self._device = device

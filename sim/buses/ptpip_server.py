@@ -1,6 +1,6 @@
 """A simulated device on the network: PTP/IP on a TCP port, for any initiator.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - One initiator at a time, known by the number that joins its two connections; a second one hears that the device is
   busy.
@@ -50,8 +50,11 @@ DATA_PIECE = 256 * 1024
 """Bytes of data in a packet to the initiator; what fits goes out in one EndData."""
 
 _READ = 256 * 1024
+"""Bytes read at once; as large as a piece of data, which makes few calls of a long transfer."""
 _TICK_S = 0.05
+"""Between two looks for events while no command comes: soon enough for a host, and hardly any load."""
 _PATIENCE_S = 10.0
+"""For the first packet, a data phase under way, and a host that reads slowly; long beside a transfer on one machine."""
 
 
 def serve_ptpip(

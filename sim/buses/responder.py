@@ -1,7 +1,7 @@
-"""The other end of PTP: what a simulated device asks to be, whatever cable serves it.
+"""The other end of PTP: the interface of a simulated device, whatever the cable.
 
 `sim.camera.eos` is one; `sim.buses.usb`, `sim.buses.ptpip_server` and `sim.buses.usbip` put it on a cable. A responder
-knows operations and state; it knows neither containers nor packets.
+deals with operations and state, not with containers or packets.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Hand a `SimulatedBus` to `drivers.links.usb` as its backend.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A device that is plugged in gets an address that none had before, as on a real bus; its port stays.
 - Nothing waits: a pipe that says nothing is a timeout at once.
@@ -37,6 +37,7 @@ _ERRORS = {
     errno.EPIPE: (-9, "Pipe error"),
 }
 _HIGH_SPEED = 3
+"""LIBUSB_SPEED_HIGH, 480 Mbit/s, as the real bodies."""
 _DEVICE_FIELDS = (
     "bLength",
     "bDescriptorType",

@@ -1,6 +1,6 @@
 """The device's side of a USB cable as a pure machine: descriptors, control requests, and PTP on the bulk pipes.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - Packets count, as on a wire: a transfer from the host has ended only with a packet that is not full, and one to the
   host is closed by a zero-length packet when it fills its last one.
@@ -41,14 +41,20 @@ from sim.buses.responder import NoAnswer, Responder
 
 PACKET = HIGH_SPEED_PACKET
 INTERRUPT_PACKET = 8
+"""wMaxPacketSize of the interrupt pipe: an EOS splits its events over packets of 8 bytes."""
 BULK_IN = 0x81
+"""Endpoint address of a real EOS; bit 7 is the direction, to the host (USB 2.0, 9.6.6)."""
 BULK_OUT = 0x02
+"""Endpoint address of a real EOS."""
 INTERRUPT_IN = 0x83
-"""The endpoints' addresses, those of a real EOS."""
+"""Endpoint address of a real EOS; bit 7 as in `BULK_IN`."""
 
 _BULK, _INTERRUPT = 2, 3
+"""Transfer types in an endpoint's bmAttributes (USB 2.0, 9.6.6)."""
 _DEVICE, _CONFIGURATION, _STRING = 1, 2, 3
+"""Types of descriptors (USB 2.0, 9.4, table 9-5)."""
 _LANGUAGE_ENGLISH = 0x0409
+"""The one language of the string descriptors: LANGID of English, United States (USB 2.0, 9.6.7)."""
 
 
 class Stalled(Exception):
@@ -60,8 +66,8 @@ class Overflowed(Exception):
 
 
 @dataclass(frozen=True)
-class Identity:
-    """What a device says about itself before PTP begins; the default is an EOS 550D's. `serial` None: it has none."""
+class UsbIdentity:
+    """How a device identifies itself before PTP begins; the default is an EOS 550D's. `serial` None: it has none."""
 
     vendor: int = VENDOR_CANON_USB
     product: int = 0x31EA
@@ -113,8 +119,8 @@ class _Exchange:
 class PtpUsbDevice:
     """A still image device of one configuration and one interface, at high speed."""
 
-    def __init__(self, responder: Responder, identity: Identity | None = None) -> None:
-        self.identity = identity or Identity()
+    def __init__(self, responder: Responder, identity: UsbIdentity | None = None) -> None:
+        self.identity = identity or UsbIdentity()
         self._responder = responder
         self._halted: set[int] = set()
         self._configuration = 1

@@ -2,7 +2,7 @@
 
 On Linux, as root: ``modprobe vhci-hcd``, then ``usbip attach -r 127.0.0.1 -b 1-1``.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - A device is lent to one client at a time, and only the thread of its connection uses it.
 - A transfer in that finds nothing waits, in order, until the device has something to say or the client unlinks it;
@@ -40,8 +40,11 @@ from sim.buses.usbip_wire import (
 )
 
 _READ = 256 * 1024
+"""Bytes read at once; large beside a request, so that a long transfer out takes few calls."""
 _TICK_S = 0.02
+"""Between two looks at transfers that wait for data: short beside the times a host waits."""
 _PATIENCE_S = 10.0
+"""For a host that is slow to read or write; an idle one is listened to again."""
 _EREMOTEIO = 121
 """Linux's number for a transfer that was short although that was not allowed; not every system has it in errno."""
 

@@ -3,7 +3,7 @@
 A connection begins with one operation: to list the devices, or to import one. Once a device is imported, the same
 connection carries its transfers, each with a number under which its result comes back, in any order.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - `RequestReader` takes a stream in any pieces. Whatever arrives, the only error is `ProtocolError`; after it the stream
   has lost its place.
@@ -21,8 +21,11 @@ from foundation.errors import ProtocolError
 from sim.buses.usb_device import PtpUsbDevice
 
 PORT = 3240
+"""TCP port of a USB/IP server (usb/usbip_protocol)."""
 VERSION = 0x0111
+"""Version 1.1.1 of the protocol, one hexadecimal digit each."""
 HIGH_SPEED = 3
+"""Linux's USB_SPEED_HIGH (enum usb_device_speed)."""
 SHORT_NOT_OK = 0x0001
 """Flag of a transfer in that is to fail if less comes than was asked for."""
 ZERO_PACKET = 0x0040
@@ -30,11 +33,13 @@ ZERO_PACKET = 0x0040
 MAX_TRANSFER = 64 * 1024 * 1024
 """Bytes of the longest transfer that is taken."""
 
+# Codes of the operations before a device is imported, and of the messages after (usb/usbip_protocol).
 _LIST, _IMPORT = 0x8005, 0x8003
 _LIST_REPLY, _IMPORT_REPLY = 0x0005, 0x0003
 _SUBMIT, _UNLINK, _SUBMITTED, _UNLINKED = 1, 2, 3, 4
 _OPERATION = struct.Struct(">HHI")
 _BUS_ID = 32
+"""Bytes of a bus id, filled up with zeros."""
 _URB = struct.Struct(">IIIIIIiiii8s")
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
 from drivers.tiff.tags import CFA, D65, TiffTag
-from drivers.tiff.writing import Kind, Tags, head, rationals, text
+from drivers.tiff.writing import Tags, ValueType, head, rationals, text
 from sim.world.sensors import Body
 
 SOFTWARE = "CroP simulated camera"
@@ -73,43 +73,43 @@ def write_dng(
     exif: Tags = {
         TiffTag.EXPOSURE_TIME: rationals(settings.shutter_s),
         TiffTag.F_NUMBER: rationals(settings.aperture),
-        TiffTag.PHOTOGRAPHIC_SENSITIVITY: (Kind.SHORT, [settings.iso]),
-        TiffTag.EXIF_VERSION: (Kind.UNDEFINED, b"0232"),
+        TiffTag.PHOTOGRAPHIC_SENSITIVITY: (ValueType.SHORT, [settings.iso]),
+        TiffTag.EXIF_VERSION: (ValueType.UNDEFINED, b"0232"),
         TiffTag.DATE_TIME_ORIGINAL: stamp,
         TiffTag.OFFSET_TIME_ORIGINAL: text("+00:00"),
         TiffTag.BODY_SERIAL_NUMBER: text(serial),
     }
     matrix = _COLOUR_MATRICES[body.sensitivities]
     main: Tags = {
-        TiffTag.NEW_SUBFILE_TYPE: (Kind.LONG, [0]),  # the picture itself
-        TiffTag.IMAGE_WIDTH: (Kind.LONG, [columns]),
-        TiffTag.IMAGE_LENGTH: (Kind.LONG, [rows]),
-        TiffTag.BITS_PER_SAMPLE: (Kind.SHORT, [16]),
-        TiffTag.COMPRESSION: (Kind.SHORT, [1]),  # none
-        TiffTag.PHOTOMETRIC_INTERPRETATION: (Kind.SHORT, [CFA]),
+        TiffTag.NEW_SUBFILE_TYPE: (ValueType.LONG, [0]),  # the picture itself
+        TiffTag.IMAGE_WIDTH: (ValueType.LONG, [columns]),
+        TiffTag.IMAGE_LENGTH: (ValueType.LONG, [rows]),
+        TiffTag.BITS_PER_SAMPLE: (ValueType.SHORT, [16]),
+        TiffTag.COMPRESSION: (ValueType.SHORT, [1]),  # none
+        TiffTag.PHOTOMETRIC_INTERPRETATION: (ValueType.SHORT, [CFA]),
         TiffTag.MAKE: text(body.maker),
         TiffTag.MODEL: text(body.model),
-        TiffTag.ORIENTATION: (Kind.SHORT, [1]),  # as it lies
-        TiffTag.SAMPLES_PER_PIXEL: (Kind.SHORT, [1]),
-        TiffTag.ROWS_PER_STRIP: (Kind.LONG, [rows]),
-        TiffTag.PLANAR_CONFIGURATION: (Kind.SHORT, [1]),
+        TiffTag.ORIENTATION: (ValueType.SHORT, [1]),  # as it lies
+        TiffTag.SAMPLES_PER_PIXEL: (ValueType.SHORT, [1]),
+        TiffTag.ROWS_PER_STRIP: (ValueType.LONG, [rows]),
+        TiffTag.PLANAR_CONFIGURATION: (ValueType.SHORT, [1]),
         TiffTag.SOFTWARE: text(SOFTWARE),
         TiffTag.DATE_TIME: stamp,
-        TiffTag.CFA_REPEAT_PATTERN_DIM: (Kind.SHORT, [2, 2]),
-        TiffTag.CFA_PATTERN: (Kind.BYTE, ["RGB".index(letter) for letter in body.pattern]),
-        TiffTag.DNG_VERSION: (Kind.BYTE, [1, 4, 0, 0]),
-        TiffTag.DNG_BACKWARD_VERSION: (Kind.BYTE, [1, 1, 0, 0]),
+        TiffTag.CFA_REPEAT_PATTERN_DIM: (ValueType.SHORT, [2, 2]),
+        TiffTag.CFA_PATTERN: (ValueType.BYTE, ["RGB".index(letter) for letter in body.pattern]),
+        TiffTag.DNG_VERSION: (ValueType.BYTE, [1, 4, 0, 0]),
+        TiffTag.DNG_BACKWARD_VERSION: (ValueType.BYTE, [1, 1, 0, 0]),
         TiffTag.UNIQUE_CAMERA_MODEL: text(body.model),
-        TiffTag.CFA_PLANE_COLOR: (Kind.BYTE, [0, 1, 2]),
-        TiffTag.CFA_LAYOUT: (Kind.SHORT, [1]),  # rectangular
-        TiffTag.BLACK_LEVEL: (Kind.SHORT, [body.black]),
-        TiffTag.WHITE_LEVEL: (Kind.SHORT, [body.saturation]),
-        TiffTag.COLOR_MATRIX_1: (Kind.SRATIONAL, [part for entry in matrix for part in (entry, 10000)]),
+        TiffTag.CFA_PLANE_COLOR: (ValueType.BYTE, [0, 1, 2]),
+        TiffTag.CFA_LAYOUT: (ValueType.SHORT, [1]),  # rectangular
+        TiffTag.BLACK_LEVEL: (ValueType.SHORT, [body.black]),
+        TiffTag.WHITE_LEVEL: (ValueType.SHORT, [body.saturation]),
+        TiffTag.COLOR_MATRIX_1: (ValueType.SRATIONAL, [part for entry in matrix for part in (entry, 10000)]),
         TiffTag.AS_SHOT_NEUTRAL: rationals(*_neutral(matrix)),
         TiffTag.CAMERA_SERIAL_NUMBER: text(serial),
-        TiffTag.CALIBRATION_ILLUMINANT_1: (Kind.SHORT, [D65]),
-        TiffTag.ACTIVE_AREA: (Kind.LONG, _edges(*body.visible)),
-        TiffTag.MASKED_AREAS: (Kind.LONG, [edge for area in body.masked for edge in _edges(*area)]),
+        TiffTag.CALIBRATION_ILLUMINANT_1: (ValueType.SHORT, [D65]),
+        TiffTag.ACTIVE_AREA: (ValueType.LONG, _edges(*body.visible)),
+        TiffTag.MASKED_AREAS: (ValueType.LONG, [edge for area in body.masked for edge in _edges(*area)]),
     }
     stream.write(head(main, counts.nbytes, exif))
     stream.write(np.ascontiguousarray(counts, dtype="<u2").data)

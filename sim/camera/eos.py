@@ -260,7 +260,7 @@ class SimulatedEos(EosSettings, EosRelease):
         return operation(Arguments(one, two, three, data))
 
     def _check_transaction(self, transaction: int) -> None:
-        """Refuse a number that is none or was used: one may be skipped, for a request can be lost on its way."""
+        """Refuse a number that is none or was used: one may be skipped, for a request can be lost in transit."""
         advance = (transaction - self._last_transaction) & 0xFFFFFFFF
         if transaction in (0, 0xFFFFFFFF) or not 0 < advance < 1 << 31:
             raise OperationRefusal(ResponseCode.INVALID_TRANSACTION_ID)

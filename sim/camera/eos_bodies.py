@@ -1,7 +1,7 @@
-"""The EOS bodies that the simulated camera can be: what each says of itself, its properties, its lists.
+"""The EOS bodies that the simulated camera can be: how each identifies itself, its properties, its lists.
 
 A body is a table of facts, without behaviour. Nobody has published a recording of an EOS 550D or a 6D Mark II on the
-wire, so that much is borrowed from the one body that was recorded, an EOS 60D; each table says what. The laws:
+wire, so that much is borrowed from the one body that was recorded, an EOS 60D; each table says what. The rules:
 
 - Properties stand in the order in which the 60D sends them; one whose value is None has a list record, but its value
   is sent on request only, as by the 60D.
@@ -194,7 +194,9 @@ _COMMON_WHITE = (
     WhiteBalance.MANUAL,
 )
 _STYLES = (0x81, 0x82, 0x83, 0x84, 0x85, 0x86, 0x21, 0x22, 0x23)
+"""Codes of the picture styles: standard to monochrome, then the user's three (as libgphoto2 names them)."""
 _BULB = 0x0C
+"""Code of the shutter time that has no number: B."""
 
 _CHOICES_550D = _Choices(
     model_id=0x80000270,

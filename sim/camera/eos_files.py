@@ -20,7 +20,9 @@ from sim.camera.eos_state import (
 )
 
 _ROOT = 0xFFFFFFFF
+"""Parent in GetObjectHandles: only what lies in the root (ISO 15740, GetObjectHandles)."""
 _ANY_STORE = _ANY_FORMAT = 0xFFFFFFFF
+"""Store or format in GetObjectHandles: all of them."""
 
 
 class EosFiles(SimulatedEosState):

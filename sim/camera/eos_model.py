@@ -1,4 +1,4 @@
-"""What a simulated EOS body is made of: the form of its table of facts, what all of them know, and Canon's structures.
+"""What a simulated EOS body is made of: the form of its table of facts, what all of them share, and Canon's structures.
 
 - `OPERATIONS` are those that `sim.camera.eos` answers, in the 60D's order, and no others: a real body has more
   (uploads, live view, formatting).
@@ -53,7 +53,7 @@ class PropertySpec:
 
 @dataclass(frozen=True)
 class EosModel:
-    """An EOS body as the wire knows it.
+    """An EOS body as the wire shows it.
 
     Attributes
     ----------
@@ -203,7 +203,9 @@ def custom_functions(group: int, functions: Mapping[int, int]) -> bytes:
 
 
 FOCUS_POINTS = 9
+"""As the 60D has them, in a cross."""
 FOCUS_CENTRE = 4
+"""Number of the one in the middle, of 0 to 8."""
 
 
 def focus_points(found: Iterable[int]) -> bytes:

@@ -1,4 +1,4 @@
-"""The simulated EOS's release: focus, the press, drive modes and brackets, and the frame on its way to a file.
+"""The simulated EOS's release: focus, the press, drive modes and brackets, and the frame until it is a file.
 
 The rules stand in `sim.camera.eos`.
 """
@@ -51,6 +51,7 @@ _METERED_APERTURE = 5.6
 """Aperture where the body may choose (assumed; there is no meter)."""
 _FORMATS_BY_SUFFIX = {".crw": ObjectFormat.CRW, ".cr3": ObjectFormat.CR3}
 _JPEG_SIZE = (160, 240)
+"""Height and width, px: enough for the file's name, and next to nothing to encode."""
 
 
 class _Refusal(Enum):

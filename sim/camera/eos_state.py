@@ -30,6 +30,7 @@ CARD = 0x00020001
 EMPTY_SLOT = 0x00020000
 """The storage id while there is no card."""
 DCIM = 0x90000000
+"""Handle of the folder DCIM in the root of the card."""
 FOLDER = 0x91900000
 """Handle of the folder 100CANON; files on the card are numbered from it, 16 apart."""
 BULB = 0x0C
@@ -39,6 +40,7 @@ U32 = 0xFFFFFFFF
 _MEMORY = 0xA0000000
 """Handles of objects in the camera's memory are numbered from here (assumed)."""
 _MOST_SHOTS = 0x7FFFFFFF
+"""Highest number of free shots that is reported: what a signed number of 32 bits holds."""
 _TEXTS = (Property.EOS_OWNER, Property.EOS_ARTIST, Property.EOS_COPYRIGHT)
 
 

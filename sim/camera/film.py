@@ -1,6 +1,6 @@
 """What is on a simulated camera's pictures, apart from how its body behaves.
 
-`sim.camera.eos` knows settings, names and time; a `Film` knows the picture: the `World` as it is lit now (`WorldFilm`),
+`sim.camera.eos` has settings, names and time; a `Film` makes the picture: the `World` as it is lit now (`WorldFilm`),
 or the frames of a recorded session (`sim.camera.replay`). Nothing here draws a picture.
 """
 
@@ -42,7 +42,7 @@ class WorldFilm:
     Parameters
     ----------
     look
-        Tells the colour that stands on the screen now.
+        Holds the colour that is shown now.
     light
         Tells the share of its light that leaves the projector now, 0 … 1.
     exposed

@@ -36,7 +36,7 @@ class ReplayFilm:
     frames
         The recording in the order in which it was taken; at least one.
     look
-        Tells the colour that stands on the screen now.
+        Holds the colour that is shown now.
     exposed
         How many frames of each colour have been handed out before.
     """

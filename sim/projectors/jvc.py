@@ -1,6 +1,6 @@
 """The simulated JVC projector's network port: bytes in, bytes out, and a flat field on the simulated screen.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - It knows the raster and the three levels; anything else gets no answer, as from the real one.
 - Until the flat field is chosen its video input is seen, which is white.
@@ -17,14 +17,15 @@ from foundation.errors import LinkTimeout, ProtocolError
 from sim.projectors.screen import Screen
 
 _PATIENCE_S = 5.0
+"""For one read or write; a silent client is listened to again."""
 _CHANNELS = {text: channel for channel, text in jvc.LEVELS.items()}
 
 
 @dataclass
 class _Connection:
-    """One connection: what was heard of a command that is not whole yet, whether it was let in, whether it is over."""
+    """One connection: the bytes of an incomplete command, whether it was let in, whether it is over."""
 
-    heard: bytes = b""
+    received: bytes = b""
     admitted: bool = False
     closed: bool = False
 
@@ -56,19 +57,19 @@ class JvcPeer:
     def receive(self, data: bytes) -> bytes:
         """Take the next bytes and return the answers to the commands that they complete."""
         connection = self._connection
-        connection.heard += data
+        connection.received += data
         answer = b""
         if not connection.admitted:
-            if len(connection.heard) < len(jvc.REQUEST):
+            if len(connection.received) < len(jvc.REQUEST):
                 return b""
-            if not connection.heard.startswith(jvc.REQUEST):
+            if not connection.received.startswith(jvc.REQUEST):
                 connection.closed = True
                 return jvc.REFUSED
-            connection.heard = connection.heard[len(jvc.REQUEST) :]
+            connection.received = connection.received[len(jvc.REQUEST) :]
             connection.admitted = True
             answer = jvc.ACCEPTED
-        while b"\n" in connection.heard:
-            line, _, connection.heard = connection.heard.partition(b"\n")
+        while b"\n" in connection.received:
+            line, _, connection.received = connection.received.partition(b"\n")
             answer += self._obey(line + b"\n")
         return answer
 

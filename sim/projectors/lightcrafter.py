@@ -1,6 +1,6 @@
 """The simulated LightCrafter: a controller that shows its test pattern, and its HID interface on the simulated bus.
 
-Laws that hold inside:
+Rules that hold inside:
 
 - `Controller` is the device: registers, and what they put on the screen. `LightCrafterUsb` speaks reports for it.
 - Found as it is switched on: showing its video input, which is white.

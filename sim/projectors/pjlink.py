@@ -1,6 +1,6 @@
 """PJLink for the simulated projector: the far side of a connection, and a TCP port that speaks for it.
 
-Rules that hold inside: a peer is bytes and knows no physics; what they do happens in
+Rules that hold inside: a peer deals with bytes alone; what they do happens in
 `sim.projectors.projector.SimulatedProjector`.
 """
 
@@ -104,7 +104,7 @@ class PjLinkPeer:
 
     def _security_answer(self) -> bytes:
         if not self._projector.traits.sha256:
-            # Whoever knows MD5 only takes this for a digest, and a wrong one.
+            # A projector with MD5 alone takes this for a digest, and a wrong one.
             self._connection.closed = True
             return wire.encode_reply(Refused.WRONG_PASSWORD)
         self._connection.challenge = secrets.token_bytes(16)

@@ -9,7 +9,7 @@ from types import TracebackType
 from drivers.links.tcp import LOOPBACK
 from drivers.links.udp import Address, UdpSocket
 from drivers.pjlink import notices, wire
-from drivers.pjlink.notices import FaultsChanged, Found, InputChanged, LinkUp, Notice, PowerChanged
+from drivers.pjlink.notices import FaultsChanged, Found, InputChanged, LinkUp, PjLinkNotice, PowerChanged
 from foundation.errors import DeviceRefused, LinkClosed, LinkTimeout
 from sim.projectors.projector import SimulatedProjector
 
@@ -22,10 +22,10 @@ class Announcer:
 
     def __init__(self, projector: SimulatedProjector) -> None:
         self._projector = projector
-        self._sent: dict[type[Notice], Notice] = self._state()
+        self._sent: dict[type[PjLinkNotice], PjLinkNotice] = self._state()
         self._begun = False
 
-    def news(self) -> tuple[Notice, ...]:
+    def news(self) -> tuple[PjLinkNotice, ...]:
         """Return the notices that are due now."""
         if self._projector.traits.pjlink_class < 2:
             return ()
@@ -37,9 +37,9 @@ class Announcer:
         self._sent |= state
         return news
 
-    def _state(self) -> dict[type[Notice], Notice]:
+    def _state(self) -> dict[type[PjLinkNotice], PjLinkNotice]:
         projector = self._projector
-        state: list[Notice] = [FaultsChanged(projector.faults()), PowerChanged(projector.power())]
+        state: list[PjLinkNotice] = [FaultsChanged(projector.faults()), PowerChanged(projector.power())]
         # In standby there is no input.
         with contextlib.suppress(DeviceRefused):
             state.append(InputChanged(projector.input()))

@@ -2,7 +2,7 @@
 
 Rules that hold inside:
 
-- It is physics and knows no bytes; `sim.projectors.pjlink` and `sim.projectors.serial` speak for it.
+- It has states and no bytes; `sim.projectors.pjlink` and `sim.projectors.serial` translate for it.
 - State moves with the time that is handed in, and only when somebody looks.
 - What the world needs is `light`: how much of the full light reaches the screen now.
 """
@@ -18,7 +18,9 @@ from foundation.clock import Clock
 from foundation.errors import DeviceFault, DeviceRefused
 
 WARM_UP_S = 30.0
+"""A little less than the 40 s typical of PWR ON (Epson, ESC/VP21 Command User's Guide)."""
 COOL_DOWN_S = 60.0
+"""A little more than the 10 to 50 s of PWR OFF (same source): drivers must wait for it."""
 IDENTITY = ProjectorIdentity("CroP", "Simulated Projector", "dark room")
 INPUTS = (
     Input("11", "Computer"),
@@ -29,6 +31,7 @@ INPUTS = (
 )
 PANEL = Resolution(1920, 1080)
 MAX_VOLUME = 20
+"""Steps of the volume; of no consequence here."""
 
 
 @dataclass(frozen=True)

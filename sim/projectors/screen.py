@@ -9,11 +9,12 @@ from foundation.clock import Clock
 from foundation.errors import DeviceError
 
 REFRESH_S = 1 / 60
+"""60 Hz, the usual picture rate."""
 
 
 @dataclass
 class Screen:
-    """What stands on the screen now; shared by the presenter, who writes, and the camera, who looks."""
+    """The colour shown now; shared by the presenter, who writes, and the camera, who looks."""
 
     colour: Colour = BLACK
 

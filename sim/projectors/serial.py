@@ -2,7 +2,7 @@
 
 Rules that hold inside:
 
-- A peer knows bytes and no physics; what they do happens in `sim.projectors.projector.SimulatedProjector`.
+- A peer deals with bytes alone; what they do happens in `sim.projectors.projector.SimulatedProjector`.
 - A serial cable has no connections: a peer goes on where it was when its cable is opened again, and forgets only a
   half-heard command.
 - `receive` with no bytes asks what a peer has to say by now: a late answer, or news. Whoever joins a peer to a cable
@@ -237,13 +237,13 @@ class OptomaPeer(_Listener):
             case optoma.AV_MUTE, "0" | "1" | "2":
                 projector.set_muted(command.value == "1")
             case optoma.LAMP_HOURS, "1":
-                return optoma.Value(f"{projector.lamps()[0].hours:04d}")
+                return optoma.AnswerText(f"{projector.lamps()[0].hours:04d}")
             case optoma.POWER_STATE, "1":
-                return optoma.Value("1" if projector.power() is Power.ON else "0")
+                return optoma.AnswerText("1" if projector.power() is Power.ON else "0")
             case optoma.MODEL, "1":
-                return optoma.Value(self.MODEL)
+                return optoma.AnswerText(self.MODEL)
             case optoma.AV_MUTE_STATE, "1" if self._answers_mute:
-                return optoma.Value("1" if projector.muted() else "0")
+                return optoma.AnswerText("1" if projector.muted() else "0")
             case _:
                 raise ValueError(command)
         return optoma.PassFail(True)

@@ -22,6 +22,7 @@ REACH = 4.0
 """Standard deviations after which the blur's tail (3·10⁻⁵) is dropped."""
 
 _PHI_STEPS = 1024
+"""Entries per standard deviation: the error of linear interpolation stays below 2·10⁻⁷."""
 _PHI: NDArray[np.float32] = np.array(
     [0.5 * (1 + math.erf((i / _PHI_STEPS) / math.sqrt(2))) for i in range(int(REACH * _PHI_STEPS) + 2)],
     dtype=np.float32,
@@ -116,9 +117,9 @@ def light(
     sigma_px
         Blur and aperture, photosites.
     x_lines, y_lines
-        Every x and every y, ascending, at which the drawing changes, mm.
+        (A,) and (B,) float64, every x and every y, ascending, at which the drawing changes, mm.
     labels
-        (len(y_lines) + 1, len(x_lines) + 1) int32, row of `signals` between the lines.
+        (B + 1, A + 1) int32, row of `signals` between the lines.
     signals
         (n, 3, 3) float32, signal of a colour [label, camera channel, primary] in full light, DN.
     channels

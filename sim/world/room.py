@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from drivers.camera import ExposureSettings
-from sim.world.spectra import Lamp
+from sim.world.spectra import LampSpectrum
 
 REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 """The exposure at which `Room.white_level_share` holds."""
@@ -82,7 +82,7 @@ class Room:
     vignetting: float = 0.25
     projector_falloff: float = 0.15
     primary_difference: float = 0.1
-    lamp_spectrum: Lamp = "uhp"
+    lamp_spectrum: LampSpectrum = "uhp"
     transfer: Literal["srgb"] | float = "srgb"
     black_leak: float = 1 / 1500
     ambient: float = 0.0

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 5.0)
 """(81,) float64, the wavelengths of every spectrum here."""
 
-Lamp = Literal["uhp", "led"]
+LampSpectrum = Literal["uhp", "led"]
 
 SURFACE_REFLECTANCE = 0.03
 """Light that matte paper returns before it meets ink (share of the incident)."""
@@ -41,7 +41,11 @@ DOT_GAIN = 0.14
 """Mechanical dot gain: how much a coverage of one half grows."""
 
 _BLACK_GENERATION = 0.9
+"""Coverage of black where all three inks are full; below 1, so that black never hides them wholly (chosen, not
+measured)."""
 _UNDERCOLOUR_REMOVAL = 0.4
+"""Share of the black by which each of the three inks is reduced; partial, so that dark cells keep their inks
+(chosen)."""
 
 
 def _gauss(centre_nm: float, left_nm: float, right_nm: float | None = None) -> NDArray[np.float64]:
@@ -56,7 +60,7 @@ def _rise(centre_nm: float, width_nm: float) -> NDArray[np.float64]:
     return 1 / (1 + np.exp(-(WAVELENGTHS_NM - centre_nm) / width_nm))
 
 
-def projector_primaries(lamp: Lamp = "uhp") -> NDArray[np.float64]:
+def projector_primaries(lamp: LampSpectrum = "uhp") -> NDArray[np.float64]:
     """Return the light of each primary at full drive.
 
     Parameters
@@ -105,7 +109,7 @@ def ink_coverage(rgb: ArrayLike) -> NDArray[np.float64]:
     Parameters
     ----------
     rgb
-        (..., 3) codes 0 … 255.
+        (..., 3) float or int codes 0 … 255.
 
     Returns
     -------
@@ -124,7 +128,7 @@ def print_reflectance(rgb: ArrayLike) -> NDArray[np.float64]:
     Parameters
     ----------
     rgb
-        (N, 3) codes 0 … 255.
+        (N, 3) float or int codes 0 … 255.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """A lit print in front of a camera. What is shown decides what is photographed.
 
 Light adds. The signal of a photosite is linear in the drives of the projector's three primaries, so the room is
-rendered once for each primary alone (`_render`), and a frame is their weighted sum, its noise, and black. The laws:
+rendered once for each primary alone (`_render`), and a frame is their weighted sum, its noise, and black. The rules:
 
 - the same print, body, room, colour, settings and key give the same counts, on any number of threads;
 - every frame's noise depends on the room's seed and the key alone;
@@ -51,7 +51,7 @@ _SLANT: Final = 0.36
 
 
 class World:
-    """A print, a body and a room; see the module's laws.
+    """A print, a body and a room; the rules stand at the head of this file.
 
     The first frame takes a few seconds for the rendering, which is kept: 12 bytes a photosite. Any thread may ask.
     """
@@ -156,7 +156,7 @@ class World:
         Parameters
         ----------
         rgb
-            (N, 3) codes 0 … 255.
+            (N, 3) float or int codes 0 … 255.
         colour, settings, lamp
             As for `expose`.
 
@@ -180,7 +180,7 @@ class World:
         Parameters
         ----------
         rgb
-            (N, 3) codes 0 … 255.
+            (N, 3) float or int codes 0 … 255.
         points_mm
             (N, 2) float64.
         colour, settings, lamp

@@ -96,13 +96,13 @@ class CameraContract:
         if bench.keeps_names:
             assert names == ["IMG_0001.CR2", "IMG_0002.CR2", "IMG_0003.CR2", "IMG_0004.CR2"]
 
-    def test_exposes_as_it_was_told(self, bench: Bench) -> None:
-        told = [SETTINGS, replace(SETTINGS, iso=200), replace(SETTINGS, aperture=11.0, shutter_s=1 / 125), SETTINGS]
-        for settings in told:
+    def test_exposes_as_configured(self, bench: Bench) -> None:
+        applied = [SETTINGS, replace(SETTINGS, iso=200), replace(SETTINGS, aperture=11.0, shutter_s=1 / 125), SETTINGS]
+        for settings in applied:
             bench.camera.configure(settings)
             bench.camera.capture(io.BytesIO())
         bench.develop()
-        assert bench.film.settings == told
+        assert bench.film.settings == applied
 
     def test_lists_the_shutter_times_that_it_takes(self, bench: Bench) -> None:
         bench.camera.configure(SETTINGS)

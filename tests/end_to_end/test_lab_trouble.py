@@ -28,7 +28,7 @@ from foundation.errors import DeviceRefused
 from sim.buses.ptpip_server import serve_ptpip
 from sim.buses.pty import PseudoTerminal
 from sim.buses.usb import SimulatedBus
-from sim.buses.usb_device import Identity, PtpUsbDevice
+from sim.buses.usb_device import PtpUsbDevice, UsbIdentity
 from sim.camera.eos import SimulatedEos
 from sim.camera.eos_bodies import EOS_BODIES
 from sim.projectors.pjlink import serve_pjlink
@@ -55,7 +55,7 @@ class Bench:
     def plug(self, serial: str = "1") -> PtpUsbDevice:
         """Put a camera on the bus."""
         eos = SimulatedEos(EOS_BODIES["EOS 550D"], SeededFilm(1000), SystemClock(), serial=serial)
-        device = PtpUsbDevice(eos, Identity(*eos.body.usb, serial=serial))
+        device = PtpUsbDevice(eos, UsbIdentity(*eos.body.usb, serial=serial))
         self.bus.plug(device)
         return device
 

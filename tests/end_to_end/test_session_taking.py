@@ -307,3 +307,12 @@ def test_following_what_a_look_recommends_leads_to_a_good_exposure(
     lab.write_text(f"{text}{shutter_s}\n")
     assert run("check", lab) == 0
     assert "wanted" not in capsys.readouterr().out
+
+
+def test_what_is_recommended_holds_whole_turns_of_the_simulated_room_s_wheel(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = "[limits]\nclipped_percent = 100\n[simulated.room]\nwheel_hz = 50\nwhite_level_share = 6\n"
+    lab.write_text(f"{lab.read_text()}{room}[camera]\nshutter_s = 0.1\n")
+    assert run("check", lab) == 0
+    assert "try camera.shutter_s = 0.04\n" in capsys.readouterr().out

@@ -16,7 +16,7 @@ import pytest
 
 from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep
-from benchmarks.accuracy import Held, beyond_noise, hold, repeated_variance
+from benchmarks.accuracy import TableErrors, beyond_noise, repeated_variance, table_errors
 from benchmarks.rooms import random_case
 from calibration.pipeline.build import build
 from calibration.table.lut import open_lut
@@ -38,21 +38,21 @@ def lab() -> Lab:
     return hang()
 
 
-def compared_with_truth(lab: Lab, session: Session, folder: Path) -> tuple[BuildResult, Held]:
+def compared_with_truth(lab: Lab, session: Session, folder: Path) -> tuple[BuildResult, TableErrors]:
     """Return the result of building a session's table, and the table compared with the room."""
     result = build(session, folder / "lut")
     table = open_lut(folder / "lut")
     cells = lab.chart.centres_mm[lab.chart.cell_of_colour]
     frames = {frame.record.illumination: frame for frame in result.figures.frames if frame.record.kind == "light"}
     fields = [frames[number].paper.field.at(cells) for number in range(len(table.illuminations))]
-    return result, hold(table, lab.world, lab.chart, fields, SETTINGS)
+    return result, table_errors(table, lab.world, lab.chart, fields, SETTINGS)
 
 
-def wrong(held: Held) -> float:
+def wrong(errors: TableErrors) -> float:
     """Return the RMS relative error of fit cells from 100 counts on, noise taken out, of the worst light."""
-    chosen = held.where(100, np.inf)
-    one = range(len(held.error))
-    return max(beyond_noise(held.error[[n]], held.noise[[n]], chosen[[n]])[2] for n in one if chosen[n].any())
+    chosen = errors.where(100, np.inf)
+    one = range(len(errors.error))
+    return max(beyond_noise(errors.error[[n]], errors.noise[[n]], chosen[[n]])[2] for n in one if chosen[n].any())
 
 
 def session_of(lab: Lab, folder: Path, frame: Callable[[SessionStep], bytes]) -> Session:
@@ -98,9 +98,9 @@ def shaded(lab: Lab, left: float, when: Callable[[SessionStep], bool]) -> Callab
 def test_cells_have_no_error_but_noise_s(lab: Lab, tmp_path: Path) -> None:
     """3 700 means above 300 counts; beyond 0.3 % of field, response and bleed, chance adds 0.1 % in 10⁴ runs."""
     with take(lab, tmp_path / "session", LIGHTS, every=6) as session:
-        _, held = compared_with_truth(lab, session, tmp_path)
+        _, errors = compared_with_truth(lab, session, tmp_path)
         table = open_lut(tmp_path / "lut")
-    total, alone, systematic, _ = beyond_noise(held.error, held.noise, held.where(300, np.inf))
+    total, alone, systematic, _ = beyond_noise(errors.error, errors.noise, errors.where(300, np.inf))
     assert systematic < 0.004, f"{total:.4f} in all, {alone:.4f} of noise"
     truth = np.array([lab.world.white(light.colour, SETTINGS) for light in LIGHTS])
     degrees = angles_deg(truth, table.white)
@@ -108,7 +108,7 @@ def test_cells_have_no_error_but_noise_s(lab: Lab, tmp_path: Path) -> None:
     assert degrees.max() < 0.25
     for low, high in ((100, 300), (300, 1000), (1000, 3000)):
         # A thousand variances of 25 values: their mean has a standard error of 1 %, five of them are allowed.
-        scatter = held.scatter[held.where(low, high)]
+        scatter = errors.scatter[errors.where(low, high)]
         assert len(scatter) > 1000
         assert scatter.mean() == pytest.approx(1, abs=0.05)
 
@@ -116,12 +116,14 @@ def test_cells_have_no_error_but_noise_s(lab: Lab, tmp_path: Path) -> None:
 def test_two_frames_of_a_light_differ_by_photons_and_read_noise(lab: Lab, tmp_path: Path) -> None:
     """Within 5 %: some 600 variances of 25 values have a mean good to 1.2 %, so chance fails once in 10⁴."""
     with take(lab, tmp_path / "session", renumbered([LIGHTS[5], LIGHTS[5]])) as session:
-        _, held = compared_with_truth(lab, session, tmp_path)
+        _, errors = compared_with_truth(lab, session, tmp_path)
         result = open_lut(tmp_path / "lut")
-        field = held.level[0] * 0 + 1
-    ratio = repeated_variance(result.samples[0], result.samples[1], held.level[0], field, lab.world.body, SETTINGS.iso)
+        field = errors.level[0] * 0 + 1
+    ratio = repeated_variance(
+        result.samples[0], result.samples[1], errors.level[0], field, lab.world.body, SETTINGS.iso
+    )
     for low, high in ((100, 1000), (1000, 10000)):
-        chosen = (held.level[0] >= low) & (held.level[0] < high)
+        chosen = (errors.level[0] >= low) & (errors.level[0] < high)
         assert chosen.sum() > 300
         assert ratio[chosen].mean() == pytest.approx(1, abs=0.08)
 
@@ -145,12 +147,12 @@ def test_a_random_room_is_refused_or_right(seed: int, tmp_path: Path) -> None:
     hung = hang(room=room, seed=seed)
     with take(hung, tmp_path / "session", FEW, every=2) as session:
         try:
-            result, held = compared_with_truth(hung, session, tmp_path)
+            result, errors = compared_with_truth(hung, session, tmp_path)
         except QualityError:
             return
     offset = result.figures.registration.to_pixels(hung.chart.centres_mm) - hung.world.project(hung.chart.centres_mm)
     assert np.linalg.norm(offset, axis=1).max() < 0.7
-    assert wrong(held) < WRONG
+    assert wrong(errors) < WRONG
 
 
 @pytest.mark.parametrize("when", [later, once])
@@ -178,11 +180,11 @@ def test_a_chart_moved_by_a_cell_is_followed(lab: Lab, tmp_path: Path) -> None:
         return lab.dng(step.colour, step.number, paint=move)
 
     with session_of(lab, tmp_path, frame) as session:
-        result, held = compared_with_truth(lab, session, tmp_path)
+        result, errors = compared_with_truth(lab, session, tmp_path)
     assert sum(figures.reregistered for figures in result.figures.frames) == 1
     assert "moved_anew" in {row.threshold.name for row in result.verdict.remarks}
     # The light moves with the picture here, so its field fits the moved frames less well.
-    assert wrong(held) < 0.05
+    assert wrong(errors) < 0.05
 
 
 @pytest.mark.parametrize(("left", "when"), [(0.05, later), (0.05, once), (0.7, once), (0.85, once)])
@@ -212,8 +214,8 @@ def test_a_lamp_that_flickers_is_reported_and_harms_no_colour(lab: Lab, tmp_path
     bright = {step: ExposureSettings(100, 8.0, 0.5 * (0.94 if step % 2 else 1.0)) for step in range(20)}
     frame = exposed(lab, lambda step: bright[step.number])
     with take(lab, tmp_path / "session", FEW, every=1, frame=frame) as session:
-        result, held = compared_with_truth(lab, session, tmp_path)
-    assert wrong(held) < WRONG
+        result, errors = compared_with_truth(lab, session, tmp_path)
+    assert wrong(errors) < WRONG
     assert result.verdict.outcome != "refuse"
 
 
@@ -240,10 +242,10 @@ def test_an_exposure_changed_midway_is_reported_or_harms_nothing(lab: Lab, tmp_p
     frame = exposed(lab, lambda step: changed if later(step) else SETTINGS)
     with session_of(lab, tmp_path, frame) as session:
         try:
-            _, held = compared_with_truth(lab, session, tmp_path)
+            _, errors = compared_with_truth(lab, session, tmp_path)
         except CropError:
             return
-    assert wrong(held) < WRONG
+    assert wrong(errors) < WRONG
 
 
 def test_frames_that_clip_list_their_cells(lab: Lab, tmp_path: Path) -> None:
@@ -253,21 +255,21 @@ def test_frames_that_clip_list_their_cells(lab: Lab, tmp_path: Path) -> None:
     frame = exposed(lab, lambda step: long if step.colour == WHITE else SETTINGS)
     with take(lab, tmp_path / "session", lights, frame=frame) as session:
         try:
-            result, held = compared_with_truth(lab, session, tmp_path)
+            result, errors = compared_with_truth(lab, session, tmp_path)
         except QualityError as refused:
             assert "saturation" in str(refused)  # noqa: PT017
             return
     table = open_lut(tmp_path / "lut")
-    fit = table.samples[:, held.clean]
+    fit = table.samples[:, errors.clean]
     assert fit.max() < 1.2 * result.figures.sensor.white_level
-    assert wrong(held) < WRONG
+    assert wrong(errors) < WRONG
 
 
 def test_a_softer_picture_is_registered_as_well(tmp_path: Path) -> None:
     """0.8 px of the lens's blur: whether samples suffer depends on the cells' size, their places do not."""
     soft = hang(room=Room(waviness_mm=0.5, blur_px=0.8))
     with take(soft, tmp_path / "session", FEW) as session:
-        result, held = compared_with_truth(soft, session, tmp_path)
+        result, errors = compared_with_truth(soft, session, tmp_path)
     offset = result.figures.registration.to_pixels(soft.chart.centres_mm) - soft.world.project(soft.chart.centres_mm)
     assert np.sqrt((offset**2).sum(axis=1).mean()) < 0.05
-    assert wrong(held) < WRONG
+    assert wrong(errors) < WRONG

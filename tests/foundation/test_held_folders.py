@@ -216,3 +216,13 @@ def test_a_path_below_a_file_cannot_be_held(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="is a file"), held_folder(tmp_path / "file" / "folder", BUSY):
         pytest.fail("held")
+
+
+def test_messages_name_what_is_made_there_rather_than_the_hidden_folder(tmp_path: Path) -> None:
+    table = tmp_path / "file" / "table"
+    table.parent.touch()
+    with (
+        pytest.raises(InputError, match=f"cannot write {table}: a part of that path is a file"),
+        held_folder(table.with_name(".table.partial"), BUSY, of=table),
+    ):
+        pytest.fail("held")

@@ -1,1 +1,1 @@
-"""What a session is taken with: real devices, the simulated lab, or a recorded session; alone in opening any."""
+"""What a session is taken with: real devices, the simulated lab, or a recorded session; opened here only."""

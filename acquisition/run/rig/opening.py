@@ -1,4 +1,4 @@
-"""The door of the rig: opens what the settings name, and closes it whatever happens.
+"""Open the rig that the settings name, and close it whatever happens.
 
 `rig = "lab"` opens the devices that LAB.toml names, `rig = "simulated"` builds the simulated lab, `rig = "replay"` puts
 a recorded session into the same simulated camera.
@@ -31,7 +31,7 @@ def open_rig(
     chart
         What hangs on the wall, for the simulated lab.
     session
-        The session that is taken up; None for a look that records nothing.
+        The session that is taken up; None for a check that records nothing.
 
     Raises
     ------

@@ -52,7 +52,7 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     chart
         What hangs on the wall.
     session
-        The session that is taken up; None for a look that records nothing.
+        The session that is taken up; None for a check that records nothing.
     opened
         Closes what was opened, in the opposite order.
 
@@ -66,11 +66,11 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     exposed = _exposed(session)
     clock = SimulatedClock(_last_moment(session) if session is not None else OPENING)
     screen = Screen()
-    beamer = SimulatedProjector(clock, power=Power.ON if exposed else Power.STANDBY)
+    simulated = SimulatedProjector(clock, power=Power.ON if exposed else Power.STANDBY)
     sensor = simulated_body(settings)
     if settings.rig == "simulated":
         world = World(sheet(chart), sensor, simulated_room(settings))
-        film: Film = WorldFilm(world, lambda: screen.colour, beamer.light, SERIAL, exposed)
+        film: Film = WorldFilm(world, lambda: screen.colour, simulated.light, SERIAL, exposed)
     else:
         assert settings.replay is not None
         film = ReplayFilm(_recording(settings.replay.session), lambda: screen.colour, exposed)
@@ -78,7 +78,7 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     # On mains power, as a camera that takes 707 frames is.
     body = replace(EOS_BODIES[settings.simulated.body], shots_per_charge=10**9)
     eos = SimulatedEos(body, film, clock, serial=SERIAL, auto_power_off_s=0)
-    peer = PjLinkPeer(beamer)
+    peer = PjLinkPeer(simulated)
     projector = PjLinkProjector(lambda: memory_link(peer))
     opened.callback(projector.close)
     presenter = SimulatedPresenter(screen, clock)

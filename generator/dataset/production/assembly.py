@@ -46,7 +46,7 @@ class NothingMadeError(FormatError):
 
 
 class _ListedFile:
-    """A text file of the dataset that is written in order and hashed on the way."""
+    """A text file of the dataset that is written in order and hashed while it is written."""
 
     def __init__(self, stack: ExitStack, store: Store, name: str) -> None:
         self.name = name

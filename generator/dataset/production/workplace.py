@@ -37,7 +37,7 @@ from generator.stores.store import LocalStore, RemoteStore, Store, open_store
 PLAN: Final = "plan.json"
 RECORDS: Final = "shards"
 _NOTES: Final = ".plan"
-Identity = Mapping[str, Any]
+PlanIdentity = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class Workplace:
         return f"{RECORDS}/{shard_key(shard)}.{self.plan_id}.json"
 
 
-def finished(out: str | Path, identity: Identity) -> bool:
+def finished(out: str | Path, identity: PlanIdentity) -> bool:
     """Return whether the dataset of this plan is complete; notes that a killed program left are removed then."""
     notes = _notes(out)
     if not open_store(out).has(DESCRIPTION):
@@ -151,7 +151,7 @@ def require_free_place(out: str | Path) -> None:
 
 
 @contextmanager
-def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Generator[Workplace]:
+def workplace(out: str | Path, identity: PlanIdentity, alone: bool = True) -> Generator[Workplace]:
     """Open the place where the dataset `out` is being made, or begin one.
 
     Parameters
@@ -179,12 +179,13 @@ def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Genera
     folder = partial_path(path).absolute()
     busy = f"{path} is being made by another program; wait for it, or name another place"
     planned = None if alone else (folder / "plan" / PLAN).is_file
-    with held_folder(folder, busy, share_if=planned) as lock:
+    with held_folder(folder, busy, share_if=planned, of=path) as lock:
         notes = LocalStore(folder / "plan")
         plan_id = _plan_id(identity)
         place = Workplace(LocalStore(folder / f"dataset-{plan_id}"), notes, str(path), plan_id)
         try:
             if not notes.has(PLAN):
+                _require_still_free(path, folder)
                 _begin(folder, plan_id)
                 notes.put(PLAN, _text(identity))
                 notes.sync([PLAN])
@@ -198,7 +199,7 @@ def workplace(out: str | Path, identity: Identity, alone: bool = True) -> Genera
             raise
 
 
-def stored_identity(out: str | Path) -> Identity:
+def stored_identity(out: str | Path) -> PlanIdentity:
     """Return the identity of the plan of a dataset that is being made.
 
     Raises
@@ -218,7 +219,7 @@ def _notes(out: str | Path) -> Store:
     return LocalStore(partial_path(local_path(out)) / "plan")
 
 
-def _remote(out: str, identity: Identity) -> Generator[Workplace]:
+def _remote(out: str, identity: PlanIdentity) -> Generator[Workplace]:
     files, notes = RemoteStore(out), RemoteStore(f"{out.rstrip('/')}/{_NOTES}")
     place = Workplace(files, notes, out, _plan_id(identity))
     if files.has(DESCRIPTION):
@@ -238,6 +239,21 @@ def _remote(out: str, identity: Identity) -> Generator[Workplace]:
         raise
 
 
+def _require_still_free(path: Path, folder: Path) -> None:
+    """Refuse when another program finished the dataset while its hold was waited for; `folder` is new and empty then.
+
+    Raises
+    ------
+    InputError
+        The dataset is there.
+    """
+    try:
+        require_free(path, "the dataset")
+    except InputError:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
 def _begin(folder: Path, plan_id: str) -> None:
     """Make the folders inside; files that are there without a plan are left from before the plan was written."""
     try:
@@ -254,16 +270,16 @@ def _begin(folder: Path, plan_id: str) -> None:
         raise storage_error(folder, error) from error
 
 
-def _text(identity: Identity) -> bytes:
+def _text(identity: PlanIdentity) -> bytes:
     return (json.dumps(identity, indent=1) + "\n").encode()
 
 
-def _plan_id(identity: Identity) -> str:
+def _plan_id(identity: PlanIdentity) -> str:
     """Return the first 16 hexadecimal digits of the SHA-256 of the plan's identity."""
     return hashlib.sha256(json.dumps(_plain(identity), sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _plain(identity: Identity) -> Any:
+def _plain(identity: PlanIdentity) -> Any:
     """Return an identity as it is read back."""
     return json.loads(_text(identity))
 
@@ -276,7 +292,7 @@ def _load(notes: Store) -> dict[str, Any]:
     return dict(loaded)
 
 
-def _require_same(notes: Store, identity: Identity, out: str | Path, remedy: str) -> None:
+def _require_same(notes: Store, identity: PlanIdentity, out: str | Path, remedy: str) -> None:
     stored = _load(notes)
     differing = list(_differences(stored, _plain(identity)))
     if differing:

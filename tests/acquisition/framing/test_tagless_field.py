@@ -18,7 +18,7 @@ from acquisition.chart.layout import design_chart, paper_chart
 from acquisition.chart.model import Chart
 from acquisition.chart.printing import drawing
 from acquisition.framing.finding import find_chart
-from acquisition.framing.outline import refined
+from acquisition.framing.outline import refine_edges
 from acquisition.framing.planes import CHANNELS, Plane, plane_of
 from acquisition.framing.sharpness import blur_px
 from acquisition.framing.tagless_field import field_mm, find_field
@@ -207,7 +207,7 @@ def test_a_photograph_without_the_chart_has_no_chart(path: Path) -> None:
 
 def test_marks_in_the_margin_do_not_draw_the_refined_edge(white: Mosaic) -> None:
     field = find_field(planes_of(white), CHART, "the frame")
-    places, clear = refined(planes_of(white), field.outline_px, field.normals, 0.58)
+    places, clear = refine_edges(planes_of(white), field.outline_px, field.normals, 0.58)
     off = ((places - truth(UPRIGHT, white, field.outline_mm)) * field.normals).sum(axis=1)
     assert clear.mean() > 0.7
     for side in ((0, -1), (1, 0), (0, 1), (-1, 0)):
@@ -225,6 +225,6 @@ def test_an_edge_that_is_not_clear_is_not_refined(white: Mosaic) -> None:
         )
         for plane in planes_of(white)
     ]
-    places, clear = refined(faint, field.outline_px, field.normals, 0.58)
+    places, clear = refine_edges(faint, field.outline_px, field.normals, 0.58)
     assert not clear.any()
     assert (places == field.outline_px).all()

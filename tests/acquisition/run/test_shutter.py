@@ -100,6 +100,7 @@ def test_of_two_times_the_one_nearer_to_the_wanted_exposure_is_recommended() -> 
 def test_where_no_time_will_do_the_remedy_is_another(level: float, offered: tuple[float, ...], remedy: str) -> None:
     advice = exposure_advice(level, 0.5, offered, PERIOD_S)
     assert "no shutter time that the camera offers" in advice
+    assert "a whole multiple of 0.01667 s, after which the projector's light repeats" in advice
     assert advice.endswith(remedy)
 
 

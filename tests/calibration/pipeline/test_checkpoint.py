@@ -21,7 +21,7 @@ from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep
 from calibration.pipeline.build import TableProgress, append, build
 from calibration.pipeline.checkpoint import CHECKPOINT, Checkpoint, unfinished_table
-from calibration.pipeline.frames import lost_frames
+from calibration.pipeline.frames import frame_faults
 from calibration.table.lut import open_lut
 from calibration.table.verification import find_faults
 from calibration.verdict.result import BuildResult
@@ -237,13 +237,13 @@ def test_the_frames_of_a_table_are_found_again(session: Session, session_under_w
     build(session, tmp_path / "lut")
     lut = open_lut(tmp_path / "lut")
     assert find_faults(lut) == []
-    assert lost_frames(lut, session_under_way) == []
+    assert frame_faults(lut, session_under_way) == []
     first, second = (session_under_way.folder / frame.file for frame in lut.frames[1:3])
     first.unlink()
     data = bytearray(second.read_bytes())
     data[-1] ^= 1
     second.write_bytes(data)
-    gone, changed = lost_frames(lut, session_under_way)
+    gone, changed = frame_faults(lut, session_under_way)
     assert f"{first} cannot be read" in gone
     assert f"{second} has changed" in changed
     os.truncate(tmp_path / "lut" / "samples.npy", 1000)

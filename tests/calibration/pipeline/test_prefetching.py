@@ -27,7 +27,7 @@ def records(kinds: str) -> list[FrameRecord]:
 
 @pytest.fixture(params=[1, 2, 5])
 def threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(prefetching, "threads", lambda: request.param)
+    monkeypatch.setattr(prefetching, "thread_count", lambda: request.param)
     return request.param
 
 
@@ -67,7 +67,7 @@ def test_a_fault_comes_in_its_turn(threads: int) -> None:
 
 def test_no_byte_depends_on_the_threads(session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for count in (1, 4):
-        monkeypatch.setattr(prefetching, "threads", lambda count=count: count)
+        monkeypatch.setattr(prefetching, "thread_count", lambda count=count: count)
         build(session, tmp_path / str(count))
     names = sorted(path.name for path in (tmp_path / "1").iterdir())
     assert "samples.npy" in names

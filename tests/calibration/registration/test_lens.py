@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from calibration.registration.lens import fit_lens
+from foundation.errors import RegistrationError
 
 
 def test_the_lens_is_found_exactly_without_noise() -> None:
@@ -15,6 +17,34 @@ def test_the_lens_is_found_exactly_without_noise() -> None:
     radial = 1 - 0.04 * r2 + 0.02 * r2**2
     bent = np.stack([x * radial + 3e-4 * x * y, y * radial + 1.5e-4 * (r2 + 2 * y * y)], axis=-1)
     places = bent * 1500 + (1300, 866)
+    lens, residual = fit_lens(points, places, (2601, 1733))
+    assert np.abs(residual).max() < 0.02
+    assert lens.to_pixels(points) == pytest.approx(places, abs=0.02)
+
+
+LINES = {
+    "level": (np.linspace(0, 1000, 12), np.full(12, 300.0)),
+    "upright": (np.full(12, 300.0), np.linspace(0, 700, 12)),
+    "slanted": (np.linspace(0, 1000, 12), 100 + 0.37 * np.linspace(0, 1000, 12)),
+    "one point": (np.full(12, 300.0), np.full(12, 200.0)),
+}
+
+
+@pytest.mark.parametrize("line", LINES.values(), ids=LINES)
+def test_marks_on_one_line_are_refused(line: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]) -> None:
+    points = np.stack(line, axis=-1)
+    # Seen by a camera, the line's places are off it by the error of a measured corner.
+    places = 2 * points + (50, 80) + np.random.default_rng(1).normal(0, 0.1, points.shape)
+    with pytest.raises(RegistrationError, match="lie on one line"):
+        fit_lens(points, places, (2601, 1733))
+    with pytest.raises(RegistrationError, match="lie on one line"):
+        fit_lens(places, points, (2601, 1733))
+
+
+def test_two_small_tags_at_the_ends_of_a_sheet_are_not_on_one_line() -> None:
+    square = np.array([(0, 0), (6, 0), (6, 6), (0, 6)], dtype=np.float64)
+    points = np.concatenate([square + np.array([10, 10]), square + np.array([1170, 825])])
+    places = 2 * points + (50, 80)
     lens, residual = fit_lens(points, places, (2601, 1733))
     assert np.abs(residual).max() < 0.02
     assert lens.to_pixels(points) == pytest.approx(places, abs=0.02)

@@ -13,7 +13,7 @@ from drivers.ptp.messages import PtpRequest
 from drivers.ptp.usb_transport import UsbTransport
 from foundation.errors import DeviceRefused, InputError, LinkClosed, LinkTimeout
 from sim.buses.usb import SimulatedBus
-from sim.buses.usb_device import BULK_IN, Identity, PtpUsbDevice, Setup
+from sim.buses.usb_device import BULK_IN, PtpUsbDevice, Setup, UsbIdentity
 from sim.clock import SimulatedClock
 from tests.contracts.transport import ECHO, PATIENCE_S, Bench, Echo, TransportContract
 
@@ -30,7 +30,7 @@ class TestSimulatedBus(TransportContract):
 
 
 def camera(serial: str | None = "1234", product: int = 0x31EA) -> PtpUsbDevice:
-    return PtpUsbDevice(Echo(), Identity(product=product, serial=serial))
+    return PtpUsbDevice(Echo(), UsbIdentity(product=product, serial=serial))
 
 
 def bus_with(*devices: PtpUsbDevice) -> SimulatedBus:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivers.links.udp import Address, UdpSocket
 from drivers.pjlink import notices
-from drivers.pjlink.notices import FaultsChanged, Found, InputChanged, LinkUp, Notice, PowerChanged
+from drivers.pjlink.notices import FaultsChanged, Found, InputChanged, LinkUp, PjLinkNotice, PowerChanged
 from drivers.pjlink.search import FoundProjector, NoticePort, search
 from drivers.projector import Fault, Power, Severity
 from foundation.errors import LinkClosed, LinkTimeout
@@ -35,7 +35,7 @@ MAC = "00:11:22:aa:bb:cc"
         (b"%2INPT=3A\r", InputChanged("3A")),
     ],
 )
-def test_the_standards_datagrams(datagram: bytes, message: Found | Notice) -> None:
+def test_the_standards_datagrams(datagram: bytes, message: Found | PjLinkNotice) -> None:
     assert notices.decode(datagram) == (message,)
     assert notices.encode(message) == datagram
 
@@ -88,7 +88,7 @@ def test_any_datagram_is_decoded_without_complaint(datagram: bytes) -> None:
 
 
 @given(st.lists(st.sampled_from((Found(MAC), LinkUp(MAC), PowerChanged(Power.ON), InputChanged("6Z"))), max_size=6))
-def test_messages_come_back(messages: list[Found | Notice]) -> None:
+def test_messages_come_back(messages: list[Found | PjLinkNotice]) -> None:
     assert notices.decode(b"".join(map(notices.encode, messages))) == tuple(messages)
 
 

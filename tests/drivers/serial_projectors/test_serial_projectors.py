@@ -53,7 +53,7 @@ def _errors(faults: frozenset[Fault]) -> frozenset[Fault]:
     return frozenset(fault for fault in faults if fault.severity is Severity.ERROR)
 
 
-TOLD: dict[str, Callable[[frozenset[Fault]], frozenset[Fault]]] = {
+REPORTED: dict[str, Callable[[frozenset[Fault]], frozenset[Fault]]] = {
     "benq": lambda faults: frozenset(),
     "epson": _errors,
     "nec": lambda faults: faults,
@@ -83,7 +83,7 @@ def bench_of(name: str, device: SimulatedProjector, projector: Projector, catch_
 
     traits = device.traits
     return Bench(
-        projector, wait, break_part, repair, IDENTITIES[name], traits.warm_up_s, traits.cool_down_s, TOLD[name]
+        projector, wait, break_part, repair, IDENTITIES[name], traits.warm_up_s, traits.cool_down_s, REPORTED[name]
     )
 
 
@@ -594,7 +594,7 @@ def test_half_an_answer_is_no_answer(name: str, data: st.DataObject) -> None:
 
 
 TAKERS: list[Callable[[bytes], tuple[Any, int] | None]] = [
-    benq.reply_taker(b"\r*pow=?#\r"),
+    benq.reply_parser(b"\r*pow=?#\r"),
     epson.take_reply,
     epson.take_welcome,
     nec.take_reply,

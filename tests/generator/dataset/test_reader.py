@@ -10,7 +10,7 @@ import pytest
 from foundation.errors import FormatError
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.reader import open_dataset
-from generator.lights.choices import ListedLights, TogetherLights
+from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.request import parse_masks
 from generator.pictures.sources import random_scenes
 
@@ -108,7 +108,7 @@ def test_a_table_that_is_no_csv_is_named(small: Path) -> None:
 
 
 def test_the_mean_of_several_lights_lies_between_them(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
-    choice = TogetherLights(ListedLights((0, 3)), 2, parse_masks("half-plane", 2, 5))
+    choice = SimultaneousLights(ListedLights((0, 3)), 2, parse_masks("half-plane", 2, 5))
     out = tmp_path / "out"
     generate_dataset(make_lut(), out, random_scenes(2, 24, 16), choice, options=BARE)
     assert all(entry.truth not in entry.truths for entry in open_dataset(out).entries)

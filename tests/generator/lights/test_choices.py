@@ -14,7 +14,7 @@ from foundation.errors import InputError
 from generator.lights.choices import (
     ListedLights,
     RandomLights,
-    TogetherLights,
+    SimultaneousLights,
     matched_lights,
     nearest_lights,
     parse_light,
@@ -152,7 +152,7 @@ def test_a_bad_light_is_named(make_lut: Callable[..., Lut], text: str, message: 
 def test_lights_together_share_an_image() -> None:
     masks = parse_masks("spots", 2, seed=9)
     inner = RandomLights(4, 10, seed=1)
-    choice = TogetherLights(inner, 2, masks)
+    choice = SimultaneousLights(inner, 2, masks)
     assert isinstance(choice, LightChoice)
     assert choice.lights_each == 2
     lightings = choice.lightings_of(6)
@@ -169,4 +169,4 @@ def test_lights_that_cannot_be_shared_out_are_refused(count: int, together: int)
     with pytest.raises(
         InputError, match=f"{count} lights for each picture cannot be shared out {together} to an image"
     ):
-        TogetherLights(RandomLights(count, 10, 1), together, parse_masks("smooth", 2, 0))
+        SimultaneousLights(RandomLights(count, 10, 1), together, parse_masks("smooth", 2, 0))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import InputError
-from generator.lights.choices import DrawnLights, FollowedLights, ListedLights, RandomLights, TogetherLights
+from generator.lights.choices import DrawnLights, ListedLights, RandomLights, SequentialLights, SimultaneousLights
 from generator.lights.lighting import Mixture, plain
 from generator.lights.request import LightRequest
 
@@ -43,7 +43,7 @@ def test_ground_truths_of_a_file(make_lut: Callable[..., Lut], truths: Path) -> 
     lut = make_lut()
     for request in (LightRequest(nearest=truths), LightRequest(match=truths)):
         choice = request.choose(lut, 3)
-        assert isinstance(choice, FollowedLights)
+        assert isinstance(choice, SequentialLights)
         assert [choice.lightings_of(at)[0].mixtures[0] for at in range(4)] == [plain(2), plain(0), plain(1), plain(2)]
     both = LightRequest(match=truths, lights_per_image=2, masks="window").choose(lut, 3)
     assert both.lights_each == 1
@@ -56,7 +56,7 @@ def test_a_distribution_with_several_lights_an_image(make_lut: Callable[..., Lut
     lut.white[0] = [9000, 1000, 1000]
     request = LightRequest(distribution="uniform", random=3, lights_per_image=2, masks="spots:count=1")
     choice = request.choose(lut, 3)
-    assert isinstance(choice, TogetherLights)
+    assert isinstance(choice, SimultaneousLights)
     assert choice.lights_each == 3
     assert isinstance(choice.choice, DrawnLights)
     lightings = choice.lightings_of(0)
@@ -70,7 +70,7 @@ def test_masks_mean_two_lights_and_two_lights_mean_masks(make_lut: Callable[...,
     lut = make_lut()
     for request in (LightRequest(masks="smooth"), LightRequest(lights_per_image=2)):
         choice = request.choose(lut, 1)
-        assert isinstance(choice, TogetherLights)
+        assert isinstance(choice, SimultaneousLights)
         assert choice.together == 2
         assert choice.describe() == {
             "choice": "together",

@@ -23,7 +23,7 @@ from drivers.ptp.datasets import DeviceInfo
 from drivers.ptp.messages import PtpRequest, PtpResponse
 from drivers.ptp.usb_transport import UsbTransport
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
-from sim.buses.usb_device import BULK_IN, BULK_OUT, INTERRUPT_IN, Identity, PtpUsbDevice
+from sim.buses.usb_device import BULK_IN, BULK_OUT, INTERRUPT_IN, PtpUsbDevice, UsbIdentity
 from sim.buses.usbip import UsbIpService, serve_usbip
 from sim.buses.usbip_wire import ImportRequest, RequestReader, Submit, Unlink
 from sim.camera.eos import SimulatedEos
@@ -130,7 +130,10 @@ class TestLent(TransportContract):
 
 @pytest.fixture
 def lender() -> Iterator[TcpServer]:
-    devices = [PtpUsbDevice(Echo()), PtpUsbDevice(Echo(), Identity(product=0x32CA, serial="77", name="EOS 6D Mark II"))]
+    devices = [
+        PtpUsbDevice(Echo()),
+        PtpUsbDevice(Echo(), UsbIdentity(product=0x32CA, serial="77", name="EOS 6D Mark II")),
+    ]
     before = set(threading.enumerate())
     with serve_usbip(devices, 0) as server:
         yield server

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sim.world.spectra import (
     SURFACE_REFLECTANCE,
     WAVELENGTHS_NM,
-    Lamp,
+    LampSpectrum,
     ink_coverage,
     paper_white,
     print_reflectance,
@@ -25,7 +25,7 @@ from sim.world.spectra import (
 from tests.data_files import available
 
 CAMERAS = ("Canon_EOS_600D", "Canon_EOS_200D")
-LAMPS: tuple[Lamp, ...] = ("uhp", "led")
+LAMPS: tuple[LampSpectrum, ...] = ("uhp", "led")
 ALL_CODES = np.array(list(product(range(0, 256, 8), repeat=3)), dtype=np.uint8)
 
 
@@ -42,14 +42,14 @@ def interpolated(
     return np.asarray(np.interp(at, where, values), dtype=np.float64)
 
 
-def seen(camera: str, lamp: Lamp, codes: NDArray[np.uint8]) -> NDArray[np.float64]:
+def seen(camera: str, lamp: LampSpectrum, codes: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return (N, 3) camera RGB of printed codes under the projector's white, 1 for bare paper."""
     light = projector_primaries(lamp).sum(axis=0)[:, None] * sensitivities(camera)
     return (print_reflectance(codes) @ light) / (paper_white() @ light)
 
 
 @pytest.mark.parametrize("lamp", LAMPS)
-def test_the_projectors_white_is_near_d65(lamp: Lamp) -> None:
+def test_the_projectors_white_is_near_d65(lamp: LampSpectrum) -> None:
     # CIE 1931 2° observer, x̄ ȳ z̄ of CIE 018:2019 every 20 nm from 380; D65 is x 0.3127, y 0.3290.
     observer = np.array(
         [
@@ -99,7 +99,7 @@ def test_led_primaries_resemble_a_measured_led_projector(
 
 @pytest.mark.parametrize("lamp", LAMPS)
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_each_primary_is_seen_most_by_its_own_channel(lamp: Lamp, camera: str) -> None:
+def test_each_primary_is_seen_most_by_its_own_channel(lamp: LampSpectrum, camera: str) -> None:
     response = projector_primaries(lamp) @ sensitivities(camera)
     assert response.argmax(axis=1).tolist() == [0, 1, 2]
     # Canon raws under daylight white: R between a third and 0.7 of G, B between 0.5 and 0.9.

@@ -1,4 +1,4 @@
-"""The dark room keeps its laws: light adds, noise follows photon transfer, places are where `project` says.
+"""The simulated room keeps its rules: light adds, noise follows photon transfer, places are where `project` puts them.
 
 Probabilities of a false alarm are about one in a million for each statistical test; the seeds are fixed.
 """

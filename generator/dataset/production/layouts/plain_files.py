@@ -12,9 +12,9 @@ from generator.dataset.production.records import FileSum
 from generator.stores.store import Store
 
 _SYNCED_IMAGES: Final = 32
+"""Images from which files are synchronised while others are made: enough that one wait for the disk serves many."""
 _SYNCED_PIXELS: Final = 1 << 23
-"""Images, and pixels of them, from which files are synchronised while others are made: enough that one wait for the
-disk serves many files."""
+"""Pixels of such images, for the same reason where images are large."""
 
 
 class FolderWriter:

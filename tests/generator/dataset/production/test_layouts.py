@@ -25,7 +25,7 @@ from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.production.records import Layout
 from generator.dataset.reader import Dataset, open_dataset
 from generator.dataset.verification import file_faults
-from generator.lights.choices import ListedLights, TogetherLights
+from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.masks.request import parse_masks
 from generator.pictures.sources import SourcePicture, random_scenes
 from tests.generator.groups import grouped
@@ -182,7 +182,7 @@ def test_hugging_face_finds_the_parts_by_the_card(
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_several_lights_in_an_image(make: Make, make_lut: Callable[..., Lut], layout: Layout) -> None:
-    choice = TogetherLights(ListedLights((2, 0)), 2, parse_masks("half-plane", 2, 5))
+    choice = SimultaneousLights(ListedLights((2, 0)), 2, parse_masks("half-plane", 2, 5))
     made = make(layout, choice)
     entry = made.entries[3]
     assert entry.lights == ("2", "0")

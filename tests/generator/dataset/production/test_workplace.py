@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from foundation.errors import FormatError, InputError
+from foundation.held_folders import FolderLock, held_folder
 from generator.dataset.making import (
     DatasetOptions,
     Plan,
@@ -208,6 +209,23 @@ def test_shares_are_made_beside_each_other(make_lut: Callable[..., Lut], tmp_pat
         assert make_share(plan_of(lut), tmp_path / "out", (0, 1)) == (6, 6)
         with pytest.raises(InputError, match="is being made by another program"):
             finish_dataset(tmp_path / "out")
+
+
+def test_a_share_that_waited_for_the_whole_is_refused(
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its work could never become a dataset, and would stay under the hidden name."""
+    lut, out = make_lut(), tmp_path / "out"
+    make_dataset(plan_of(lut), tmp_path / "whole")
+
+    def finished_meanwhile(*arguments: Any, **named: Any) -> contextlib.AbstractContextManager[FolderLock]:
+        (tmp_path / "whole").rename(out)
+        return held_folder(*arguments, **named)
+
+    monkeypatch.setattr("generator.dataset.production.workplace.held_folder", finished_meanwhile)
+    with pytest.raises(InputError, match="already exists; name another place"):
+        make_share(plan_of(lut), out, (0, 2))
+    assert not (tmp_path / ".out.partial").exists()
 
 
 def test_a_damaged_record_and_a_changed_source_are_reported(make_lut: Callable[..., Lut], tmp_path: Path) -> None:
