@@ -60,12 +60,25 @@ SLOW = (
 """Folders and files, below this one, whose tests take more than their share of the minute."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of slow files and folders."""
+def pytest_configure() -> None:
+    """Refuse a list that names what is not there."""
     missing = [name for name in SLOW if not (TESTS / name).exists()]
     if missing:
         raise pytest.UsageError(f"{__file__}: SLOW names {', '.join(missing)}, which are not there; correct the list")
-    slow = [TESTS / name for name in SLOW]
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave slow files unread where they are not wanted: what they import takes seconds, too."""
+    return True if config.getoption("markexpr") == "not slow" and is_slow(collection_path) else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of slow files and folders."""
     for item in items:
-        if any(item.path == place or place in item.path.parents for place in slow):
+        if is_slow(item.path):
             item.add_marker(pytest.mark.slow)
+
+
+def is_slow(path: Path) -> bool:
+    """Return whether a file or folder is on the list, or below a folder on it."""
+    return any(path == place or place in path.parents for place in (TESTS / name for name in SLOW))
