@@ -2,8 +2,6 @@
 
 Where they come from::
 
-Where they come from::
-
     method              source                                                  n, p, σ of the Gray-Edge framework
     White-Patch         B. Funt, L. Shi, "The rehabilitation of MaxRGB", 2010   0, ∞, 0
     Gray-world          G. Buchsbaum, "A spatial processor model for object     0, 1, 0
