@@ -39,7 +39,7 @@ LINES_BEFORE = {
     "acquire run": 10694,
     "acquire run, without the simulated lab": 7321,
     "build-lut": 6290,
-    "generate": 7041,
+    "generate": 7428,
 }
 """Lines of those modules, at that commit."""
 
@@ -75,7 +75,7 @@ class Calls:
     def __init__(self) -> None:
         self.counts: Counter[Function] = Counter()
         self._functions: dict[CodeType, Function | None] = {}
-        self._compiled: dict[int, frozenset[Function]] = {}
+        self._compiled: dict[int, tuple[Function, ...]] = {}
 
     def on_event(self, frame: FrameType, event: str, _: object) -> None:
         """Count a call; what `sys.setprofile` wants."""
@@ -91,13 +91,13 @@ class Calls:
     def on_compiled(self, dispatcher: Any) -> None:
         """Count a call of a compiled function and of those compiled into it."""
         if id(dispatcher) not in self._compiled:
-            self._compiled[id(dispatcher)] = frozenset(compiled_into(dispatcher))
+            self._compiled[id(dispatcher)] = compiled_into(dispatcher)
         self.counts.update(self._compiled[id(dispatcher)])
 
 
-def compiled_into(dispatcher: Any) -> set[Function]:
-    """Return a compiled function and the compiled functions and intrinsics it names, and so on."""
-    found: set[Function] = set()
+def compiled_into(dispatcher: Any) -> tuple[Function, ...]:
+    """Return a compiled function and the compiled functions and intrinsics it names, and so on, each once."""
+    found: dict[Function, None] = {}
     waiting, seen = [dispatcher], set[int]()
     while waiting:
         one = waiting.pop()
@@ -108,9 +108,9 @@ def compiled_into(dispatcher: Any) -> set[Function]:
         seen.add(id(one))
         function = function_of(source.__code__)
         if function is not None:
-            found.add(function)
+            found[function] = None
         waiting.extend(source.__globals__.get(name) for name in names_in(source.__code__))
-    return found
+    return tuple(found)
 
 
 def names_in(code: CodeType) -> Iterable[str]:
@@ -190,7 +190,8 @@ def measure(folder: Path) -> dict[str, list[str]]:
         ("acquire", ("run", "{}.toml", "{}_session")),
         ("build-lut", ("{}_session", "{}_lut")),
         # The smaller run of each pair comes first, so that what is compiled and kept is not counted for the larger.
-        ("generate", ("more_lut", "{}_dataset", "--sources", "{}_pictures")),
+        # One thread, since with several it is chance who waits for whom.
+        ("generate", ("more_lut", "{}_dataset", "--sources", "{}_pictures", "--workers", "1")),
     ):
         fewer = called(folder, command, *(argument.format("fewer") for argument in arguments))
         more = called(folder, command, *(argument.format("more") for argument in arguments))
