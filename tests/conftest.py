@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 TESTS = Path(__file__).parent
 SLOW = (
@@ -27,6 +28,7 @@ SLOW = (
     "calibration/pipeline/test_linearity.py",
     "calibration/pipeline/test_options.py",
     "calibration/pipeline/test_plain_session.py",
+    "calibration/pipeline/test_prefetching.py",
     "calibration/pipeline/test_refused_table.py",
     "calibration/pipeline/test_small_charts.py",
     "calibration/radiometry/test_cell_field.py",
@@ -47,6 +49,7 @@ SLOW = (
     "generator/dataset/production/test_workplace.py",
     "generator/dataset/test_making.py",
     "generator/dataset/test_reader.py",
+    "generator/dataset/test_stores.py",
     "generator/kernels/test_choice_statistics.py",
     "generator/kernels/test_patches.py",
     "generator/test_cli.py",
@@ -60,8 +63,17 @@ SLOW = (
 """Folders and files, below this one, whose tests take more than their share of the minute."""
 
 
-def pytest_configure() -> None:
-    """Refuse a list that names what is not there."""
+QUICK_EXAMPLES = 20
+"""Examples of each property in `make quick`: a fifth of what `make test` tries, since
+the properties took a third of the minute."""
+
+settings.register_profile("quick", max_examples=QUICK_EXAMPLES)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Refuse a list that names what is not there; try fewer examples where slow tests are not wanted."""
+    if config.getoption("markexpr") == "not slow":
+        settings.load_profile("quick")
     missing = [name for name in SLOW if not (TESTS / name).exists()]
     if missing:
         raise pytest.UsageError(f"{__file__}: SLOW names {', '.join(missing)}, which are not there; correct the list")
