@@ -1,148 +1,47 @@
-"""The command `evaluate`: methods on datasets, in the format of the paper's tables."""
+"""The command `evaluate`: methods on data sets, and the paper's experiments."""
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+import sys
+from typing import TYPE_CHECKING
 
 import typer
 
+from evaluation.commands import run as run_command
 from foundation.console import EXIT_CODES, run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from evaluation.experiments import Result
-    from evaluation.methods.method import Method
-    from evaluation.metrics import ErrorKind
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help=f"""Evaluate methods of illumination estimation.
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-
-_CAUSES = "too small for it, clipped, black or even"
-"""Why an image has no usable pixel for a method."""
-
-_WIDE = 10_000
-"""Columns of a terminal that no table of methods fills: the table is measured as wide as it likes to be."""
-
-_HELP = f"""Estimate the light of every image of a dataset and sum up the errors.
-
-Reads DATASET, a folder or a URL (made by generate). Prints a table in the paper's order: mean, median, trimean, best
-25 %, worst 25 % and Avg., their geometric mean, all in degrees. Writes nothing unless asked with --csv or --images.
+`evaluate DATA` is short for `evaluate run DATA`.
 
 {EXIT_CODES}
-"""
+""",
+)
+app.command("run", help=run_command.HELP)(run_command.run)
 
 
-@app.command(help=_HELP)
-def evaluate(
-    dataset: Annotated[
-        str, typer.Argument(metavar="DATASET", help="Folder of the dataset, or its URL.", show_default=False)
-    ],
-    methods: Annotated[
-        str,
-        typer.Option(
-            metavar="LIST",
-            help="Methods between commas, or all: white-patch, gray-world, shades-of-gray, general-gray-world, "
-            "gray-edge-1, gray-edge-2, pca.",
-        ),
-    ] = "all",
-    error: Annotated[
-        Literal["reproduction", "recovery"], typer.Option(help="Angular error to sum up.")
-    ] = "reproduction",
-    csv: Annotated[
-        Path | None, typer.Option(metavar="OUT.csv", help="Write the table to this new file too.", show_default=False)
-    ] = None,
-    images: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="OUT.csv", help="Write each image's estimates and errors to this new file.", show_default=False
-        ),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False),
-    ] = None,
-) -> None:
-    """Evaluate methods."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    from evaluation import experiments
-    from evaluation.datasets import open_scenes
-    from foundation.files import write_whole
-    from foundation.processors import processor_count
-
-    chosen = _choose(methods)
-    _require_free(csv, images)
-    scenes = open_scenes(dataset)
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("images", total=len(scenes))
-        results = experiments.evaluate(scenes, chosen, workers or processor_count(), lambda: progress.advance(task))
-    print(f"{_name_of(dataset)}: {error} angular error of {len(scenes)} images, degrees")
-    _print_table(results, error)
-    for result in results:
-        if result.guessed.any():
-            counted = f"{result.guessed.sum()} of {len(scenes)} images"
-            print(f"{result.method}: no usable pixel in {counted} ({_CAUSES}); their light was taken to be grey")
-    if csv is not None:
-        write_whole(csv, experiments.table_csv(results, error))
-    if images is not None:
-        write_whole(images, experiments.images_csv(scenes, results))
-
-
-def _name_of(dataset: str) -> str:
-    """Return the name of a dataset: the last part of its URL, or of its folder's absolute path."""
-    return dataset.rstrip("/").rpartition("/")[2] if "://" in dataset else Path(dataset).resolve().name
-
-
-def _require_free(csv: Path | None, images: Path | None) -> None:
-    from foundation.errors import InputError
-    from foundation.files import require_free_file
-
-    for path, what in ((csv, "the table"), (images, "the images' errors")):
-        if path is not None:
-            require_free_file(path, what)
-    if csv is not None and images is not None and os.path.realpath(csv) == os.path.realpath(images):
-        raise InputError(f"--csv and --images are both {images}; give each a file of its own")
-
-
-def _print_table(results: Sequence[Result], error: ErrorKind) -> None:
-    """Print the summaries; in a narrow terminal names are folded, numbers never cut."""
-    from rich.console import Console
-    from rich.table import Table
-
-    longest_word = max(len(word) for result in results for word in result.method.split())
-    table = Table()
-    table.add_column("Algorithm", min_width=longest_word)
-    for column in ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg."):
-        table.add_column(column, justify="right", no_wrap=True, min_width=len(column))
-    for result in results:
-        table.add_row(result.method, *(f"{number:.2f}" for number in result.summary(error).as_tuple()))
-    console = Console()
-    needed = Console(width=_WIDE).measure(table)
-    # A file or pipe has no width, but rich would take that of the terminal on stdin or stderr.
-    console.width = max(console.width, needed.minimum) if console.is_terminal else needed.maximum
-    console.print(table)
-
-
-def _choose(text: str) -> list[Method]:
-    from evaluation.methods.standard import standard_methods
-    from foundation.errors import InputError
-
-    known = standard_methods()
-    if text.strip().lower() == "all":
-        return list(known.values())
-    names = [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in known:
-            raise InputError(f"{name!r} is no method; the methods are {', '.join(known)}, or all")
-    return [known[name] for name in dict.fromkeys(names)]
+@app.callback()
+def evaluate() -> None:
+    """Keep `run` a command of its own where it is the only one."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with `argv`, by default the process's own, and return one of `foundation.console.EXIT_CODES`."""
-    return run(lambda: app(None if argv is None else list(argv), prog_name="evaluate"))
+    given = list(sys.argv[1:] if argv is None else argv)
+    return run(lambda: app(_with_command(given), prog_name="evaluate"))
+
+
+def _with_command(given: Sequence[str]) -> list[str]:
+    """Return the arguments with the command that the short form leaves out."""
+    commands = {command.name for command in app.registered_commands} | {group.name for group in app.registered_groups}
+    short = bool(given) and given[0] not in commands and given[0] not in ("-h", "--help")
+    return [*(["run"] if short else []), *given]
 
 
 if __name__ == "__main__":

@@ -5,8 +5,8 @@ lists them by their names on the command line.
 """
 
 from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.method import Image, Method
+from evaluation.methods.method import Image, Learner, LocalMethod, Method
 from evaluation.methods.pca import BrightDark
 from evaluation.methods.standard import standard_methods
 
-__all__ = ["BrightDark", "GrayEdge", "Image", "Method", "standard_methods"]
+__all__ = ["BrightDark", "GrayEdge", "Image", "Learner", "LocalMethod", "Method", "standard_methods"]

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from fsspec.core import url_to_fs
 
-from evaluation import experiments
 from evaluation.cli import main
+from evaluation.experiments import running
 from evaluation.methods import standard_methods
 
 
@@ -118,7 +118,7 @@ def test_what_cannot_be_done_is_one_sentence(
         pytest.fail("the work must not begin")
 
     monkeypatch.chdir(dataset.parent)
-    monkeypatch.setattr(experiments, "evaluate", never)
+    monkeypatch.setattr(running, "evaluate", never)
     Path("empty").mkdir()
     before = {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")}
     assert main([*arguments]) == 2

@@ -11,13 +11,14 @@ import numpy.typing as npt
 import pytest
 
 from evaluation.datasets import open_scenes
-from evaluation.experiments import evaluate, images_csv, table_csv
+from evaluation.experiments import evaluate
 from evaluation.methods import GrayEdge
+from evaluation.results import images_csv, table_csv
 from foundation.errors import InputError
 
 
 def test_grey_on_average_is_what_gray_world_finds(dataset: Path) -> None:
-    scenes = open_scenes(dataset)
+    scenes = open_scenes(dataset).scenes
     assert [scene.name for scene in scenes] == [f"{number:06d}.png" for number in range(16)]
     assert {scene.saturation for scene in scenes} == {9000.0}
     methods = [GrayEdge("Gray-world", 0, 1, 0), GrayEdge("White-Patch", 0, np.inf, 0)]
@@ -31,7 +32,7 @@ def test_grey_on_average_is_what_gray_world_finds(dataset: Path) -> None:
 
 
 def test_the_tables_as_text(dataset: Path) -> None:
-    scenes = open_scenes(dataset)
+    scenes = open_scenes(dataset).scenes
     results = evaluate(scenes, [GrayEdge("Gray-world", 0, 1, 0)])
     rows = list(csv.DictReader(table_csv(results, "recovery").splitlines()))
     assert list(rows[0]) == ["method", "mean", "median", "trimean", "best25", "worst25", "avg"]
@@ -43,7 +44,7 @@ def test_the_tables_as_text(dataset: Path) -> None:
 
 def test_nothing_to_evaluate_is_said(dataset: Path) -> None:
     with pytest.raises(InputError, match="0 methods on 16 images"):
-        evaluate(open_scenes(dataset), [])
+        evaluate(open_scenes(dataset).scenes, [])
 
 
 @dataclass(frozen=True)

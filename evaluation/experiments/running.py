@@ -1,49 +1,19 @@
-"""Methods on datasets: the errors that the paper's tables sum up."""
+"""Run methods on the scenes of a data set."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.datasets import Scene
 from evaluation.methods.method import Method
 from evaluation.methods.pixels import GREY
-from evaluation.metrics import ErrorKind, Summary, recovery_error, reproduction_error, summarise
+from evaluation.metrics import recovery_error, reproduction_error
+from evaluation.results.result import Result
+from evaluation.scene import Scene
 from foundation.errors import InputError
-
-COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg")
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """Estimates and errors of one method on one dataset.
-
-    Attributes
-    ----------
-    method
-        The method's name.
-    estimates
-        (N, 3) float64, camera RGB of length 1, in the order of the scenes.
-    errors
-        Kind of error to (N,) float64, degrees.
-    guessed
-        (N,) bool, True where no pixel was usable and the estimate is therefore grey.
-    """
-
-    method: str
-    estimates: npt.NDArray[np.float64]
-    errors: Mapping[ErrorKind, npt.NDArray[np.float64]]
-    guessed: npt.NDArray[np.bool_]
-
-    def summary(self, kind: ErrorKind) -> Summary:
-        """Return the six numbers of the paper's tables for one kind of error."""
-        return summarise(self.errors[kind])
 
 
 def evaluate(
@@ -127,44 +97,3 @@ def _light(scene: Scene) -> npt.NDArray[np.float64]:
             "blue of a light: none below 0, not all 0; correct it"
         )
     return truth
-
-
-def table_csv(results: Sequence[Result], kind: ErrorKind) -> str:
-    """Return the table of one dataset as CSV text: `method,mean,median,trimean,best25,worst25,avg`, degrees.
-
-    Examples
-    --------
-    >>> errors = {"reproduction": np.array([1.0, 2.0, 3.0, 4.0])}
-    >>> print(table_csv([Result("Gray-world", np.ones((4, 3)), errors, np.zeros(4, bool))], "reproduction"), end="")
-    method,mean,median,trimean,best25,worst25,avg
-    Gray-world,2.500000,2.500000,2.500000,1.000000,4.000000,2.286525
-    """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for result in results:
-        writer.writerow([result.method, *(f"{number:.6f}" for number in result.summary(kind).as_tuple())])
-    return text.getvalue()
-
-
-def images_csv(scenes: Sequence[Scene], results: Sequence[Result]) -> str:
-    """Return every estimate and error as CSV text: `image,method,r,g,b,recovery,reproduction`.
-
-    Estimates are scaled to r + g + b = 1, errors are degrees.
-
-    Parameters
-    ----------
-    scenes
-        N scenes, as they were given to `evaluate`.
-    results
-        The results of `evaluate`.
-    """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("image", "method", "r", "g", "b", "recovery", "reproduction"))
-    for place, scene in enumerate(scenes):
-        for result in results:
-            light = result.estimates[place] / result.estimates[place].sum()
-            errors = (result.errors["recovery"][place], result.errors["reproduction"][place])
-            writer.writerow([scene.name, result.method, *(f"{part:.6f}" for part in (*light, *errors))])
-    return text.getvalue()

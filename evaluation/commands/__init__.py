@@ -1,0 +1,1 @@
+"""The commands under `evaluate`, one file each: parse, build, call, print."""

@@ -1,0 +1,94 @@
+"""Data sets made by `generate`, of every layout and in every store."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.scene import SceneSet
+from generator.dataset.reader import Dataset, Entry, open_dataset
+
+
+@dataclass(frozen=True)
+class GeneratedScene:
+    """An image of a dataset made by `generate`."""
+
+    dataset: Dataset
+    entry: Entry
+
+    @property
+    def name(self) -> str:
+        """The image's file name."""
+        return self.entry.image
+
+    @property
+    def truth(self) -> npt.NDArray[np.float64]:
+        """The light (3,) float64, linear camera RGB, r + g + b = 1."""
+        return np.array(self.entry.truth)
+
+    @property
+    def saturation(self) -> float:
+        """White level of the table that the image was made with, in the units of the image."""
+        return float(self.dataset.description.table.white_level)
+
+    def read(self) -> tuple[npt.NDArray[np.uint16], None]:
+        """Return the image (H, W, 3) uint16, linear camera RGB, and no mask."""
+        return self.dataset.read_image(self.entry), None
+
+
+@dataclass(frozen=True)
+class GeneratedMixedScene(GeneratedScene):
+    """An image of such a dataset that several lights fall on."""
+
+    @property
+    def lights(self) -> npt.NDArray[np.float64]:
+        """The lights (K, 3) float64, linear camera RGB, r + g + b = 1."""
+        return np.array(self.entry.truths)
+
+    def read_weights(self) -> npt.NDArray[np.float32]:
+        """Return the share of each light in each pixel: (H, W, K) float32, 0 … 1, sum 1."""
+        return self.dataset.read_weights(self.entry)
+
+    def read_truth_map(self) -> npt.NDArray[np.float32]:
+        """Return the light of each pixel: (H, W, 3) float32, r + g + b = 1."""
+        return self.dataset.read_ground_truth_map(self.entry)
+
+
+def open_generated(place: Path | str) -> SceneSet:
+    """Return a dataset made by `generate`; images are read when they are evaluated.
+
+    Parameters
+    ----------
+    place
+        The dataset's folder, or its URL on a store that fsspec knows.
+
+    Raises
+    ------
+    FormatError
+        There is no dataset in that place.
+    """
+    dataset = open_dataset(place)
+    white = dataset.description.table.white_level
+    return SceneSet(
+        name=_name_of(str(place)),
+        layout="generated",
+        place=str(place),
+        scenes=tuple(
+            (GeneratedScene if len(entry.lights) == 1 else GeneratedMixedScene)(dataset, entry)
+            for entry in dataset.entries
+        ),
+        treatment={
+            "black level": "subtracted when the table was made",
+            "saturation": f"from {white:g}, the white level of the table",
+            "mask": "none",
+            "ground truth": "white of the light as the table has it; of several lights their mean over the image",
+        },
+    )
+
+
+def _name_of(place: str) -> str:
+    """Return the name of a dataset: the last part of its URL, or of its folder's absolute path."""
+    return place.rstrip("/").rpartition("/")[2] if "://" in place else Path(place).resolve().name

@@ -1,0 +1,79 @@
+"""Thumbnails of a real data set in one NumPy archive, as networks for colour constancy exchange them.
+
+The archive (`.npz`) holds `images` (N, H, W, 3), float32 or uint16, linear camera RGB with black subtracted; `gt`
+(N, 3), the lights; and `names` (N,). Pixels of masked calibration targets are exactly zero.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.scene import SceneSet
+from foundation.errors import FormatError
+
+_EXPECTED = "expected images (N, H, W, 3), gt (N, 3) and names (N,), as numpy.savez writes them"
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """A thumbnail in memory.
+
+    Attributes
+    ----------
+    name
+        The image's name.
+    truth
+        (3,) float64, linear camera RGB of the light, of any length.
+    image
+        (H, W, 3) float32 or uint16, linear camera RGB, black at zero.
+    saturation
+        Always None: averaged pixels do not show what was clipped.
+    """
+
+    name: str
+    truth: npt.NDArray[np.float64]
+    image: npt.NDArray[np.float32] | npt.NDArray[np.uint16]
+    saturation: float | None = None
+
+    def read(self) -> tuple[npt.NDArray[np.float32] | npt.NDArray[np.uint16], npt.NDArray[np.bool_]]:
+        """Return the image and its mask, (H, W) bool: True where all channels are zero."""
+        return self.image, (self.image == 0).all(axis=2)
+
+
+def open_thumbnails(path: Path | str) -> SceneSet:
+    """Return the thumbnails of an archive; they are held in memory.
+
+    Raises
+    ------
+    FormatError
+        The file is no such archive.
+    """
+    try:
+        with np.load(path) as content:
+            images, truths, names = content["images"], content["gt"].astype(np.float64), content["names"]
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise FormatError(f"{path} is no archive of thumbnails: {error}; {_EXPECTED}") from error
+    count = len(images)
+    if images.ndim != 4 or images.shape[3] != 3 or truths.shape != (count, 3) or names.shape != (count,) or not count:
+        raise FormatError(
+            f"{path} has images {images.shape}, gt {truths.shape} and names {names.shape}; {_EXPECTED}, N from 1"
+        )
+    return SceneSet(
+        name=Path(path).stem,
+        layout="thumbnails",
+        place=str(path),
+        scenes=tuple(
+            Thumbnail(str(name), truth, image) for name, truth, image in zip(names, truths, images, strict=True)
+        ),
+        treatment={
+            "black level": "0: subtracted when the thumbnails were made",
+            "saturation": "none: averaged pixels do not show what was clipped",
+            "mask": "pixels that are zero in every channel",
+            "ground truth": "gt of the archive",
+        },
+    )

@@ -1,0 +1,1 @@
+"""Methods that learn from scenes with known lights, one file a method."""

@@ -1,0 +1,89 @@
+"""What an image of a data set is to everything that uses it: pixels, a mask, and the light that is to be estimated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+Image = npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64]
+"""(H, W, 3), linear camera RGB ≥ 0 with black subtracted, in any unit."""
+
+
+class Scene(Protocol):
+    """One image of a data set with its ground truth; the image is read from its file by `read`."""
+
+    @property
+    def name(self) -> str:
+        """The image's name, unique in its data set."""
+        ...
+
+    @property
+    def truth(self) -> npt.NDArray[np.float64]:
+        """The light (3,) float64, linear camera RGB of any length: the ground truth.
+
+        Where several lights fall on the image, the mean over its pixels, which single-light methods are held to.
+        """
+        ...
+
+    @property
+    def saturation(self) -> float | None:
+        """Value of the image from which a pixel is clipped; None if none is."""
+        ...
+
+    def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
+        """Return the image (H, W, 3), linear camera RGB with black subtracted, and its mask.
+
+        The mask is (H, W) bool, True where a pixel must not be used, or None if every pixel may be.
+        """
+        ...
+
+
+@runtime_checkable
+class MixedScene(Scene, Protocol):
+    """A scene that several lights fall on."""
+
+    @property
+    def lights(self) -> npt.NDArray[np.float64]:
+        """The lights (K, 3) float64, linear camera RGB of any length, K ≥ 2."""
+        ...
+
+    def read_weights(self) -> npt.NDArray[np.float32]:
+        """Return the share of each light in each pixel: (H, W, K) float32, 0 … 1, sum 1."""
+        ...
+
+    def read_truth_map(self) -> npt.NDArray[np.float32]:
+        """Return the light of each pixel: (H, W, 3) float32, r + g + b = 1; NaN where it is not known."""
+        ...
+
+
+@dataclass(frozen=True)
+class SceneSet:
+    """The images of a data set, and what was done to them before a method sees them.
+
+    Attributes
+    ----------
+    name
+        The data set's name as its authors write it, for the heads of tables: "Cube+".
+    layout
+        The name of the layout it was read by: "cube-plus".
+    place
+        Its folder, file or URL as it was given.
+    scenes
+        Its images, in the data set's own order; at least one.
+    treatment
+        Stated with every result: "black level", "saturation", "mask" and "ground truth", each with a sentence that
+        gives the value applied and its source.
+    folds
+        The fold of each scene, counted from 0, where the data set's authors divide it; else None.
+    """
+
+    name: str
+    layout: str
+    place: str
+    scenes: tuple[Scene, ...]
+    treatment: Mapping[str, str] = field(default_factory=dict[str, str])
+    folds: tuple[int, ...] | None = None
