@@ -93,9 +93,10 @@ def tables_to_latex(caption: str, tables: Sequence[Table]) -> str:
     ValueError
         There is no table, or they differ in the number of their columns.
     """
-    if not tables or len({len(table.columns) for table in tables}) > 1:
+    widths = sorted({len(table.columns) for table in tables})
+    if len(widths) != 1:
         raise ValueError(
-            f"{len(tables)} tables of {sorted({len(table.columns) for table in tables})} columns: no stack"
+            f"{len(tables)} tables of {widths} columns; expected at least one, and the same columns in each"
         )
     lines: list[str] = []
     for number, table in enumerate(tables):
