@@ -22,7 +22,8 @@ Reads one or two RESULTS: results folders, or the errors.csv in them. Of one, ev
 two, each method that both have. Images are matched by their names; images that one of them lacks are named and left
 out, and ground truths that differ are refused.
 
-Prints Wilcoxon's signed-rank test, and each statistic's difference and ratio with bootstrap intervals.
+Prints Wilcoxon's signed-rank test, and each statistic's difference and ratio with bootstrap intervals. Writes nothing
+unless asked with --out.
 
 {EXIT_CODES}
 """
@@ -31,7 +32,7 @@ Prints Wilcoxon's signed-rank test, and each statistic's difference and ratio wi
 def compare(
     results: Annotated[
         list[str],
-        typer.Argument(metavar="RESULTS [RESULTS]", help="Results folder, or its errors.csv.", show_default=False),
+        typer.Argument(metavar="RESULTS", help="Results folder, or its errors.csv.", show_default=False),
     ],
     method: Annotated[
         list[str] | None,
