@@ -152,9 +152,9 @@ def bits_removed(
 
     def estimate(scene: Scene) -> list[list[npt.NDArray[np.float64]]]:
         image, mask = scene.read()
-        # Clipped pixels are known before the reduction only.
+        # Clipped pixels are known before the reduction only; they have their say in the operator, as in a camera.
         left_out = ~usable(image, scene.saturation, mask, border=0)
-        versions: list[Image] = [image, *reduce_colours(image, bits, left_out)]
+        versions: list[Image] = [image, *reduce_colours(image, bits, mask)]
         return [[method.estimate(version, None, left_out) for method in methods] for version in versions]
 
     estimates: list[list[list[npt.NDArray[np.float64]]]] = []
