@@ -80,6 +80,14 @@ def table1(
     sizes: Annotated[
         str, typer.Option(metavar="LIST", help="Further sides, px, between commas, to show what they change.")
     ] = "",
+    hot: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST",
+            help="Hot photosites in a million that a table is taken to have, between commas, to show what they do to "
+            "White-Patch.",
+        ),
+    ] = "",
     error: Kind = "reproduction",
     seed: Seed = 0,
     out: Out = None,
@@ -90,13 +98,14 @@ def table1(
     Two sets of scenes, the pictures and as many of random codes, under two choices of lights, for each LUT. Nothing is
     written but the results: images are generated in memory.
     """
+    from evaluation.experiments.paper.hot import hot_rows
     from evaluation.experiments.paper.reporting import table1_report
     from evaluation.experiments.paper.table1 import settings, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
     from evaluation.experiments.paper.truths import read_truths
     from foundation.processors import processor_count
 
-    sides = _numbers(sizes)
+    sides, shares = [int(side) for side in _numbers(sizes, "side of an image, px", 65535)], _numbers(hot, "share", 1e6)
     _require_free(out)
     opened = _open(luts)
     scenes, says = _pictures(pictures, camera)
@@ -105,12 +114,13 @@ def table1(
     threads = workers or processor_count()
     with _progress(sum(len(part.scenes) for part in chosen)) as step:
         blocks = run(chosen, threads, step)
-    found = size_dependence(opened, scenes, truths.lights, sides, seed, threads) if sides else ()
+    found = size_dependence(opened, scenes, truths.lights, sides, seed, threads)
+    raised = hot_rows(chosen, shares, seed, threads)
     conditions = (
         f"Pictures: {says}. Images: longest side {side} px. Lights like those of {truths.name}. Seed {seed}.",
         f"Tables: {'; '.join(f'{lut.provenance.camera}, {len(lut.white)} lights, {lut.folder}' for lut in opened)}.",
     )
-    _finish(table1_report(blocks, found, opened, conditions, error), conditions, out)
+    _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out)
 
 
 @app.command("bits")
@@ -217,15 +227,15 @@ def _pictures(place: str, camera: str | None) -> tuple[Sequence[Source], str]:
     return developed(data, camera), f"{len(data.scenes)} of {data.name}, developed to sRGB {matrix}"
 
 
-def _numbers(text: str) -> list[int]:
-    """Return the sides between commas."""
+def _numbers(text: str, what: str, most: float) -> list[float]:
+    """Return the whole numbers from 1 to `most` between commas."""
     from foundation.errors import InputError
 
     parts = [part.strip() for part in text.split(",") if part.strip()]
     for part in parts:
-        if not part.isdigit() or not 1 <= int(part) <= 65535:
-            raise InputError(f"{part!r} is no side of an image; write numbers of px from 1 to 65535 between commas")
-    return [int(part) for part in parts]
+        if not part.isdigit() or not 1 <= int(part) <= most:
+            raise InputError(f"{part!r} is no {what}; write whole numbers from 1 to {most:g} between commas")
+    return [float(part) for part in parts]
 
 
 def _require_free(out: Path | None) -> None:

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 """Markers of series, so that they differ in print without colour."""
 
+_SEEN: Final = 3
+"""Decimals of a chromaticity that the eye can tell apart in the figure; points nearer than that are drawn once."""
+
 
 def bits_figure(found: BitsResult, kind: ErrorKind) -> bytes:
     """Return the paper's figure of bits removal: each method's median against the bits; the raw image's as a line."""
@@ -94,7 +97,8 @@ def _draw_chromaticities(
             axes.scatter(*uniform.T, s=7, color=FAINT, linewidths=0, label=f"uniform ({len(uniform)})", zorder=2)
         for number, (name, truths) in enumerate(sets.items()):
             style = series_style(number)
-            axes.scatter(*rb_of(truths).T, s=5, color=style["color"], linewidths=0, alpha=0.6, label=name, zorder=3)
+            seen = np.unique(rb_of(truths).round(_SEEN), axis=0)
+            axes.scatter(*seen.T, s=5, color=style["color"], linewidths=0, alpha=0.6, label=name, zorder=3)
         if len(bodies):
             axes.scatter(
                 *bodies.T,

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from evaluation.experiments.paper.bits import bits_table
 from evaluation.experiments.paper.chromaticities import chromaticity_rows, coverage_table, table_lights
 from evaluation.experiments.paper.drawing import bits_figure, chromaticities_figure, sizes_figure, standalone
+from evaluation.experiments.paper.hot import hot_table
 from evaluation.experiments.paper.reduction import reduction_strip, reduction_table
 from evaluation.experiments.paper.table1 import block_table, joint_table, noise_table, size_table, table_noise
 from evaluation.reports.latex import table_to_latex, tables_to_latex
@@ -22,6 +23,7 @@ from foundation.files import whole_folder
 
 if TYPE_CHECKING:
     from evaluation.experiments.paper.bits import BitsResult
+    from evaluation.experiments.paper.hot import HotRow
     from evaluation.experiments.paper.table1 import Block, SizeRow
     from evaluation.experiments.paper.truths import Truths
     from evaluation.metrics import ErrorKind
@@ -71,7 +73,12 @@ def write_report(report: PaperReport, folder: Path) -> None:
 
 
 def table1_report(
-    blocks: Sequence[Block], sizes: Sequence[SizeRow], luts: Sequence[Lut], conditions: Sequence[str], kind: ErrorKind
+    blocks: Sequence[Block],
+    luts: Sequence[Lut],
+    conditions: Sequence[str],
+    kind: ErrorKind,
+    sizes: Sequence[SizeRow] = (),
+    hot: Sequence[HotRow] = (),
 ) -> PaperReport:
     """Return the report of table 1, first with one kind of error, then with the other.
 
@@ -79,14 +86,16 @@ def table1_report(
     ----------
     blocks
         The data sets' results.
-    sizes
-        The errors for other sizes of images; may be empty.
     luts
         The tables.
     conditions
         Sentences that say what was given and chosen.
     kind
         The kind of error that is printed and stands first.
+    sizes
+        The errors for other sizes of images; may be empty.
+    hot
+        White-Patch's errors with hot photosites; may be empty.
     """
     other: ErrorKind = "recovery" if kind == "reproduction" else "reproduction"
     first = [block_table(block, kind) for block in blocks]
@@ -105,8 +114,15 @@ def table1_report(
         table = size_table(sizes)
         tables.append(table)
         files |= {"sizes.csv": table_to_csv(table).encode(), "sizes.svg": standalone(drawn)}
-        caption = "White-Patch takes the largest of all values: the larger the image, the larger its error."
+        caption = (
+            "White-Patch takes the largest of all values, of which a larger image has more: of noise, and of whites."
+        )
         parts += [heading("Images of other sizes"), figure_part(drawn, caption), table_part(table)]
+    if hot:
+        table = hot_table(hot, kind)
+        tables.append(table)
+        files |= {"hot.csv": table_to_csv(table).encode(), "hot.tex": table_to_latex(table).encode()}
+        parts += [heading("Hot photosites"), table_part(table)]
     parts += [heading("The tables"), table_part(noise)]
     parts += [heading(f"{other.capitalize()} error, degrees"), *map(table_part, second)]
     return PaperReport("Table 1: plain methods on generated data sets", tuple(tables), tuple(parts), files)
