@@ -1,0 +1,177 @@
+"""Find a method by what a user types: a name of this suite, a class of an installed module, or a class in a file.
+
+    gray-edge-1            a method of `standard.standard_methods`
+    package.module:Class   a class or value of a module that Python finds, also beside the working folder
+    path/file.py:Class     a class or value of a file; what stands beside the file can be imported by it
+
+A class is made without arguments; a value is taken as it is. A file of ten lines is enough::
+
+    import numpy as np
+
+    class Brightest:
+        name = "Brightest pixel"
+
+        def estimate(self, image, saturation=None, mask=None):
+            usable = np.ones(image.shape[:2], bool) if mask is None else ~mask
+            pixels = image[usable].astype(np.float64)
+            light = pixels[pixels.sum(axis=1).argmax()]
+            return light / np.linalg.norm(light)
+
+Python of the file and the module is run: name only what you trust.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+import traceback
+from hashlib import sha256
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, cast
+
+from evaluation.methods.standard import standard_methods
+from foundation.errors import InputError
+
+if TYPE_CHECKING:
+    from evaluation.methods.method import Learner, Method
+
+_FORMS = "a name of this suite, module:Class or path/file.py:Class"
+
+
+def find_method(text: str) -> Method | Learner:
+    """Return the method or learner that a text names.
+
+    Parameters
+    ----------
+    text
+        A name of `standard_methods`, "module:Class" or "path/file.py:Class".
+
+    Raises
+    ------
+    InputError
+        There is no such name, module, file or class; it fails while it is loaded or made; it has no `name`, or neither
+        `estimate` nor `fit`. The message says which, and in which line of the user's file.
+
+    Examples
+    --------
+    >>> find_method("gray-world").name
+    'Gray-world'
+    >>> find_method("evaluation.methods.pca:BrightDark").name
+    'PCA bright and dark'
+    """
+    wanted = text.strip()
+    place, colon, name = wanted.rpartition(":")
+    if not colon:
+        known = standard_methods()
+        if wanted in known:
+            return known[wanted]
+        raise InputError(f"{wanted!r} is no method; the methods are {', '.join(known)}, or give module:Class or a file")
+    if not place or not name:
+        raise InputError(f"{wanted!r} names no method; expected {_FORMS}")
+    is_file = place.endswith(".py")
+    module = _module_of_file(Path(place)) if is_file else _module_by_name(place)
+    found = getattr(module, name, None)
+    if found is None:
+        others = ", ".join(sorted(one for one in vars(module) if _looks_like_method(module, one))) or "none"
+        raise InputError(f"{place} has no {name!r}; its classes with estimate or fit: {others}")
+    if isinstance(found, type):
+        try:
+            found = cast("object", found())
+        except Exception as error:
+            raise InputError(
+                f"{wanted} cannot be made without arguments: {_told(error)}; give its parameters defaults, or name a "
+                "value of the file instead of the class"
+            ) from error
+    return checked_method(found, wanted)
+
+
+def checked_method(found: object, place: str) -> Method | Learner:
+    """Return an object that is a method or a learner.
+
+    Parameters
+    ----------
+    found
+        What may be one.
+    place
+        How messages call it.
+
+    Raises
+    ------
+    InputError
+        It has neither `estimate` nor `fit`, or no name.
+
+    Examples
+    --------
+    >>> class Nameless:
+    ...     def estimate(self, image, saturation=None, mask=None):
+    ...         return image.mean(axis=(0, 1))
+    >>> checked_method(Nameless(), "own.py:Nameless")
+    Traceback (most recent call last):
+        ...
+    foundation.errors.InputError: own.py:Nameless has no name; add name = "…", the text that stands in the tables
+    """
+    if not callable(getattr(found, "estimate", None)) and not callable(getattr(found, "fit", None)):
+        raise InputError(
+            f"{place} is no method: it has neither estimate(image, saturation, mask) nor fit(scenes, seed); add the "
+            "one that it is to have, see evaluation/methods/method.py"
+        )
+    if not isinstance(getattr(found, "name", None), str) or not getattr(found, "name", ""):
+        raise InputError(f'{place} has no name; add name = "…", the text that stands in the tables')
+    return cast("Method | Learner", found)
+
+
+def _looks_like_method(module: ModuleType, name: str) -> bool:
+    one = getattr(module, name)
+    return not name.startswith("_") and (hasattr(one, "estimate") or hasattr(one, "fit"))
+
+
+def _module_of_file(path: Path) -> ModuleType:
+    """Return the module of a Python file, run once a process: a second method of the file finds the same module."""
+    if not path.is_file():
+        raise InputError(f"{path} is not there; expected a Python file with the class of a method")
+    whole = path.resolve()
+    name = f"_method_file_{sha256(str(whole).encode()).hexdigest()[:16]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, whole)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # Data classes and pickles look their module up by its name.
+    sys.modules[name] = module
+    if str(whole.parent) not in sys.path:
+        sys.path.append(str(whole.parent))
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise InputError(f"{path} fails while it is loaded: {_told(error, whole)}; correct it") from error
+    return module
+
+
+def _module_by_name(name: str) -> ModuleType:
+    if str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        missing = str(error.name)
+        if name == missing or name.startswith(f"{missing}."):
+            raise InputError(
+                f"there is no module {name!r}; install it, or give the path of a file that ends in .py"
+            ) from error
+        raise InputError(f"module {name} needs {missing!r}, which is not installed; install it") from error
+    except Exception as error:
+        raise InputError(f"module {name} fails while it is loaded: {_told(error)}; correct it") from error
+
+
+def _told(error: Exception, file: Path | None = None) -> str:
+    """Return what went wrong, with the last line of `file` that it went through, or the last line at all."""
+    if isinstance(error, SyntaxError) and error.lineno:
+        return f"line {error.lineno}: {error.msg}"
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if file is None or frame.filename == str(file)]
+    place = f"line {own[-1].lineno}: " if own else ""
+    return f"{place}{type(error).__name__}: {error}"

@@ -1,0 +1,105 @@
+"""Methods by name, of modules and of a user's file, and what is said where one cannot be had."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.methods.method import Learner
+from evaluation.methods.naming import find_method
+from evaluation.methods.standard import standard_methods
+from foundation.errors import InputError
+
+TEN_LINES = """\
+import numpy as np
+
+class Brightest:
+    name = "Brightest pixel"
+
+    def estimate(self, image, saturation=None, mask=None):
+        usable = np.ones(image.shape[:2], bool) if mask is None else ~mask
+        pixels = image[usable].astype(np.float64)
+        light = pixels[pixels.sum(axis=1).argmax()]
+        return light / np.linalg.norm(light)
+"""
+
+
+@pytest.mark.parametrize("name", standard_methods())
+def test_names_of_the_suite(name: str) -> None:
+    assert find_method(f" {name} ") == standard_methods()[name]
+
+
+def test_a_file_of_ten_lines(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(TEN_LINES)
+    method = find_method(f"{tmp_path}/own.py:Brightest")
+    assert method.name == "Brightest pixel"
+    image = np.ones((3, 3, 3), np.uint16)
+    image[1, 1] = (30, 40, 0)
+    assert not isinstance(method, Learner)
+    np.testing.assert_allclose(method.estimate(image), [0.6, 0.8, 0])
+
+
+def test_a_value_a_learner_and_a_neighbour_of_the_file(tmp_path: Path) -> None:
+    (tmp_path / "beside_own.py").write_text("LABEL = 'from beside'\n")
+    (tmp_path / "own.py").write_text(
+        "from __future__ import annotations\nfrom dataclasses import dataclass\nfrom beside_own import LABEL\n"
+        "@dataclass(frozen=True)\nclass Own:\n    p: int\n    name: str = LABEL\n"
+        "    def fit(self, scenes, seed=0):\n        return self\n"
+        "five = Own(5)\n"
+    )
+    found = find_method(f"{tmp_path}/own.py:five")
+    assert isinstance(found, Learner)
+    assert found.name == "from beside"
+    assert type(find_method(f"{tmp_path}/own.py:five")) is type(found)
+    with pytest.raises(InputError, match=r"cannot be made without arguments: .*'p'.*name a value"):
+        find_method(f"{tmp_path}/own.py:Own")
+
+
+def test_a_class_of_a_module() -> None:
+    assert find_method("evaluation.methods.pca:BrightDark").name == "PCA bright and dark"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("gray-wurld", "'gray-wurld' is no method; the methods are white-patch, gray-world"),
+        ("", "is no method"),
+        (":Class", "names no method; expected"),
+        ("own.py:", "names no method; expected"),
+        ("nowhere/own.py:Own", "nowhere/own.py is not there"),
+        ("no_such_module:Own", "there is no module 'no_such_module'"),
+        ("evaluation.no_such:Own", "there is no module 'evaluation.no_such'"),
+        ("evaluation.methods.pca:Own", "has no 'Own'; its classes with estimate or fit: BrightDark"),
+    ],
+)
+def test_what_is_not_there(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        find_method(text)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("class Own:\n    name = 'own'\n", "is no method: it has neither estimate"),
+        ("class Own:\n    def estimate(self, image, saturation=None, mask=None): ...\n", 'has no name; add name = "…"'),
+        ("def f(:\n", "fails while it is loaded: line 1: "),
+        ("x = 1\nimport no_such_thing\n", "fails while it is loaded: line 2: ModuleNotFoundError: .*no_such_thing"),
+        ("x = 1\n\n1 / 0\n", "line 3: ZeroDivisionError"),
+        ("class Own:\n    def __init__(self):\n        raise OSError('no weights')\n", "line 3: OSError: no weights"),
+    ],
+)
+def test_what_is_wrong_with_a_file(tmp_path: Path, source: str, message: str) -> None:
+    (tmp_path / "own.py").write_text(source)
+    with pytest.raises(InputError, match=message):
+        find_method(f"{tmp_path}/own.py:Own")
+
+
+def test_a_file_that_was_corrected_loads(tmp_path: Path) -> None:
+    file = tmp_path / "own.py"
+    file.write_text("1 / 0\n")
+    with pytest.raises(InputError):
+        find_method(f"{file}:Brightest")
+    file.write_text(TEN_LINES)
+    assert find_method(f"{file}:Brightest").name == "Brightest pixel"
