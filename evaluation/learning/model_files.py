@@ -34,7 +34,7 @@ _ABOUT = "about"
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingRecord:
     """What a model was trained on, by what and when.
 
     Attributes
@@ -86,12 +86,12 @@ class StoredMethod(LearnedMethod):
         What it was trained on.
     """
 
-    provenance: Training | None = None
+    provenance: TrainingRecord | None = None
 
 
-def provenance_of(data: SceneSet, seed: int, clock: Clock, part: str = "all") -> Training:
+def provenance_of(data: SceneSet, seed: int, clock: Clock, part: str = "all") -> TrainingRecord:
     """Return the provenance of a model that is trained on a data set now."""
-    return Training(
+    return TrainingRecord(
         data_name=data.name,
         data_place=data.place,
         data_layout=data.layout,
@@ -118,7 +118,7 @@ def scenes_sha256(scenes: Sequence[Scene]) -> str:
     return sha256_of("\n".join(lines).encode())
 
 
-def save_model(path: Path, method: Method, provenance: Training) -> None:
+def save_model(path: Path, method: Method, provenance: TrainingRecord) -> None:
     """Write a learned method to a new model file.
 
     Raises
@@ -201,8 +201,8 @@ def _with_settings(learner: FeatureLearner, settings: Mapping[str, Any]) -> Feat
     return type(learner)(**settings)
 
 
-def _provenance(given: Mapping[str, Any]) -> Training:
-    expected = {each.name for each in dataclasses.fields(Training)}
+def _provenance(given: Mapping[str, Any]) -> TrainingRecord:
+    expected = {each.name for each in dataclasses.fields(TrainingRecord)}
     if set(given) != expected:
         raise ValueError(f"its provenance has {', '.join(sorted(given))}; expected {', '.join(sorted(expected))}")
-    return Training(**given)
+    return TrainingRecord(**given)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
-from evaluation.learning.model_files import Training, provenance_of
+from evaluation.learning.model_files import TrainingRecord, provenance_of
 from evaluation.scene import Scene, SceneSet
 
 
@@ -22,7 +22,7 @@ class Noon:
         raise AssertionError(seconds)
 
 
-def story(scenes: Sequence[Scene], name: str = "made up") -> Training:
+def story(scenes: Sequence[Scene], name: str = "made up") -> TrainingRecord:
     """Return the provenance of a model that was trained on scenes."""
     data = SceneSet(name, "memory", "nowhere", tuple(scenes), {"mask": "none"})
     return provenance_of(data, seed=3, clock=Noon())
