@@ -123,6 +123,59 @@ def table1(
     _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out)
 
 
+@app.command("table2")
+def table2(
+    data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set; the paper's is Cube+.")],
+    generated: Annotated[
+        str, typer.Option(metavar="PLACE", help="Data set made by generate, to train on.", show_default=False)
+    ],
+    methods: Annotated[
+        str, typer.Option(metavar="LIST", help="Learned methods, between commas.")
+    ] = "smart-color-cat,regression-trees,color-beaver",
+    folds: Annotated[str, typer.Option(metavar="N|FILE", help="Folds of the cross-validation, or their file.")] = "3",
+    layout: Layout = None,
+    error: Kind = "reproduction",
+    seed: Seed = 0,
+    out: Out = None,
+    workers: Workers = None,
+) -> None:
+    """Learned methods trained on real and on generated images (table 2).
+
+    The paper's numbers stand beside those of Cube+ only. `evaluate transfer` compares more trainings on any data set.
+    """
+    from evaluation.datasets import open_scenes
+    from evaluation.experiments.folds import draw_folds, read_folds
+    from evaluation.experiments.paper.reporting import table2_report
+    from evaluation.experiments.paper.table2 import table2 as run
+    from evaluation.experiments.paper.table2 import table2_tables
+    from evaluation.learning.standard import standard_learners
+    from foundation.errors import InputError
+    from foundation.processors import processor_count
+
+    _require_free(out)
+    names = [name.strip() for name in methods.split(",") if name.strip()]
+    known = standard_learners()
+    for name in names:
+        if name not in known:
+            raise InputError(f"{name!r} is no learned method; the methods are {', '.join(known)}")
+    learners = {name: known[name] for name in names}
+    real, made = open_scenes(data, layout), open_scenes(generated)
+    count = len(real.scenes)
+    if folds.isdigit():
+        drawn = draw_folds(count, int(folds), seed)
+    else:
+        drawn = read_folds(Path(folds), [scene.name for scene in real.scenes])
+    with _progress(2 * count) as step:
+        found = run(real.scenes, made.scenes, learners, drawn, seed, workers or processor_count(), step)
+    is_cube = real.layout == "cube-plus"
+    conditions = (
+        f"Real: {real.name}, {count} images, {int(drawn.max()) + 1} folds. Generated: {made.name}, {len(made.scenes)} "
+        f"images. Seed {seed}. {error.capitalize()} error, degrees.",
+        *(() if is_cube else ("The paper's table is of Cube+, so only its ratios stand beside these.",)),
+    )
+    _finish(table2_report(table2_tables(found, error, real.name, is_cube), conditions), conditions, out)
+
+
 @app.command("bits")
 def bits(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images; the paper's is NUS C1.")],
