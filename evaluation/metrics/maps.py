@@ -105,7 +105,7 @@ def measure_map(
     lights
         (K, 3) float, the lights, of any length above 0.
     image
-        (H, W, 3) of any number type, linear camera RGB ≥ 0, black subtracted.
+        (H, W, 3) of any dtype of numbers, linear camera RGB ≥ 0, black subtracted.
     saturation
         Value at which a corrected pixel is clipped; None if none is.
     mask
