@@ -23,7 +23,7 @@ import numpy.typing as npt
 from evaluation.methods.method import LocalMethod, Method
 from evaluation.methods.pixels import GREY
 from evaluation.metrics import MapError, measure_map
-from evaluation.results.answers import Answer, read_light, results_of
+from evaluation.results.answers import SceneAnswer, read_light, results_of
 from evaluation.results.result import Result
 from evaluation.scene import MixedScene, Scene
 from foundation.errors import CropError, FormatError, InputError
@@ -96,7 +96,7 @@ def evaluate(
     'Gray-world: 0.00 degrees'
     """
     truths = truths_of(scenes, methods)
-    answers: list[tuple[Answer, ...]] = []
+    answers: list[tuple[SceneAnswer, ...]] = []
     for given in answer_scenes(scenes, methods, workers):
         answers.append(given)
         if on_scene:
@@ -119,7 +119,7 @@ def truths_of(scenes: Sequence[Scene], methods: Sequence[object]) -> npt.NDArray
 
 def answer_scenes(
     scenes: Sequence[Scene], methods: Sequence[Method | SceneMethod], workers: int = 1
-) -> Iterator[tuple[Answer, ...]]:
+) -> Iterator[tuple[SceneAnswer, ...]]:
     """Yield what the methods answer for each scene, one answer a method, in the scenes' order.
 
     Methods of this suite are called by several threads at once. Others are called by one thread at a time and get a
@@ -192,12 +192,12 @@ def _runner_of(method: Method | SceneMethod) -> _Runner:
     return _Runner(method, None if type(method).__module__.startswith("evaluation.") else Lock())
 
 
-def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[Answer, ...]:
+def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[SceneAnswer, ...]:
     """Return the answers for one scene; its image is left unread where no method wants it and one light falls on it."""
     mixed = isinstance(scene, MixedScene)
     image, mask = (None, None) if blind and not mixed else scene.read()
     truth = (scene.read_truth_map(), scene.read_weights()) if isinstance(scene, MixedScene) else None
-    answers: list[Answer] = []
+    answers: list[SceneAnswer] = []
     for runner in runners:
         method = runner.method
         try:
@@ -208,7 +208,7 @@ def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[Answ
             field = None
             if mixed and isinstance(method, LocalMethod):
                 field, cause = _field(runner.call(method.estimate_map, image, scene.saturation, mask), image)
-                answer = Answer(answer.light, answer.cause or cause)
+                answer = SceneAnswer(answer.light, answer.cause or cause)
         except CropError:
             raise
         except Exception as error:
@@ -219,7 +219,7 @@ def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[Answ
                 f"{method.name} fails on {scene.name}: {_reason(error)}; correct it and run the same command again"
             ) from error
         if truth is not None and isinstance(scene, MixedScene) and image is not None:
-            answer = Answer(answer.light, answer.cause, _map_error(scene, answer, field, truth, image, mask))
+            answer = SceneAnswer(answer.light, answer.cause, _map_error(scene, answer, field, truth, image, mask))
         answers.append(answer)
     return tuple(answers)
 
@@ -245,7 +245,7 @@ def _field(given: object, image: Any) -> tuple[npt.NDArray[np.floating[Any]], st
 
 def _map_error(
     scene: MixedScene,
-    answer: Answer,
+    answer: SceneAnswer,
     field: npt.NDArray[np.floating[Any]] | None,
     truth: tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]],
     image: npt.NDArray[Any],

@@ -19,7 +19,7 @@ NO_PIXEL = "no usable pixel"
 
 
 @dataclass(frozen=True)
-class Answer:
+class SceneAnswer:
     """What one method answered for one image.
 
     Attributes
@@ -37,7 +37,7 @@ class Answer:
     by_pixel: MapError | None = None
 
 
-def read_light(given: object, grey: npt.NDArray[np.float64] = GREY) -> Answer:
+def read_light(given: object, grey: npt.NDArray[np.float64] = GREY) -> SceneAnswer:
     """Return the answer that a returned value is.
 
     Parameters
@@ -61,9 +61,9 @@ def read_light(given: object, grey: npt.NDArray[np.float64] = GREY) -> Answer:
     'returned 1 nan 1'
     """
     if given is grey:
-        return Answer(None, NO_PIXEL)
+        return SceneAnswer(None, NO_PIXEL)
     if given is None:
-        return Answer(None, "returned None")
+        return SceneAnswer(None, "returned None")
     try:
         light = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -72,13 +72,13 @@ def read_light(given: object, grey: npt.NDArray[np.float64] = GREY) -> Answer:
         raise ValueError(f"returned an array of shape {light.shape}, expected (3,): red, green, blue")
     length = math.hypot(*light)
     if not (math.isfinite(length) and length > 0 and light.min() >= 0):
-        return Answer(None, f"returned {' '.join(f'{part:g}' for part in light)}")
+        return SceneAnswer(None, f"returned {' '.join(f'{part:g}' for part in light)}")
     red, green, blue = (float(part) / length for part in light)
-    return Answer((red, green, blue))
+    return SceneAnswer((red, green, blue))
 
 
 def results_of(
-    methods: Sequence[str], truths: npt.NDArray[np.float64], answers: Sequence[Sequence[Answer]]
+    methods: Sequence[str], truths: npt.NDArray[np.float64], answers: Sequence[Sequence[SceneAnswer]]
 ) -> tuple[Result, ...]:
     """Return the results that answers make.
 
@@ -94,7 +94,7 @@ def results_of(
     return tuple(_result(method, truths, [given[number] for given in answers]) for number, method in enumerate(methods))
 
 
-def _result(method: str, truths: npt.NDArray[np.float64], answers: Sequence[Answer]) -> Result:
+def _result(method: str, truths: npt.NDArray[np.float64], answers: Sequence[SceneAnswer]) -> Result:
     estimates = np.array([GREY if answer.light is None else answer.light for answer in answers], dtype=np.float64)
     return Result(
         method,
@@ -106,7 +106,7 @@ def _result(method: str, truths: npt.NDArray[np.float64], answers: Sequence[Answ
     )
 
 
-def _maps(answers: Sequence[Answer]) -> MapErrors | None:
+def _maps(answers: Sequence[SceneAnswer]) -> MapErrors | None:
     measured = [(number, answer.by_pixel) for number, answer in enumerate(answers) if answer.by_pixel is not None]
     if not measured:
         return None
@@ -128,12 +128,12 @@ def _maps(answers: Sequence[Answer]) -> MapErrors | None:
     )
 
 
-def answer_to_json(answer: Answer) -> dict[str, Any]:
+def answer_to_json(answer: SceneAnswer) -> dict[str, Any]:
     """Return an answer as a JSON object, from which `answer_from_json` makes the same answer to the last bit."""
     return {key: value for key, value in asdict(answer).items() if value not in (None, "")}
 
 
-def answer_from_json(stored: dict[str, Any]) -> Answer:
+def answer_from_json(stored: dict[str, Any]) -> SceneAnswer:
     """Return the answer that a JSON object is.
 
     Raises
@@ -143,7 +143,7 @@ def answer_from_json(stored: dict[str, Any]) -> Answer:
 
     Examples
     --------
-    >>> answer = Answer((0.1, 0.2, 1 / 3), "", MapError(1.0, 2.0, 3.0, (RegionError(0, 0.5, 1.0, 2.0),)))
+    >>> answer = SceneAnswer((0.1, 0.2, 1 / 3), "", MapError(1.0, 2.0, 3.0, (RegionError(0, 0.5, 1.0, 2.0),)))
     >>> answer_from_json(answer_to_json(answer)) == answer
     True
     """
@@ -154,4 +154,4 @@ def answer_from_json(stored: dict[str, Any]) -> Answer:
     if by_pixel is not None:
         regions = tuple(RegionError(**region) for region in by_pixel["regions"])
         by_pixel = MapError(**(by_pixel | {"regions": regions}))
-    return Answer(light, str(stored.get("cause", "")), by_pixel)
+    return SceneAnswer(light, str(stored.get("cause", "")), by_pixel)
