@@ -46,7 +46,18 @@ Workers = Annotated[
 ]
 
 
-@app.command("table1")
+_TABLE1 = f"""Plain methods on eight generated data sets (table 1).
+
+Reads LUTs, the pictures and the ground truths. Generates, in memory, two sets of scenes, the pictures and as many of
+random codes, under two choices of lights for each LUT: the nearest to the ground truths, and lights drawn at random.
+Prints each method's six numbers for each of the data sets, the paper's below them. Writes nothing unless asked with
+--out.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("table1", help=_TABLE1)
 def table1(
     luts: Luts,
     pictures: Annotated[
@@ -93,11 +104,7 @@ def table1(
     out: Out = None,
     workers: Workers = None,
 ) -> None:
-    """Plain methods on eight generated data sets (table 1).
-
-    Two sets of scenes, the pictures and as many of random codes, under two choices of lights, for each LUT. Nothing is
-    written but the results: images are generated in memory.
-    """
+    """Run plain methods on eight generated data sets."""
     from evaluation.experiments.paper.hot import hot_rows
     from evaluation.experiments.paper.reporting import table1_report
     from evaluation.experiments.paper.table1 import settings, size_dependence
@@ -123,7 +130,17 @@ def table1(
     _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out)
 
 
-@app.command("table2")
+_TABLE2 = f"""Learned methods trained on real and on generated images (table 2).
+
+Reads the real DATA, in the paper Cube+, and a generated data set. Trains each method on both, by cross-validation on
+the real one, and tests on the real one. The paper's numbers stand beside those of Cube+ only; on any data set
+`evaluate transfer` compares more trainings. Writes nothing unless asked with --out.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("table2", help=_TABLE2)
 def table2(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set; the paper's is Cube+.")],
     generated: Annotated[
@@ -139,10 +156,7 @@ def table2(
     out: Out = None,
     workers: Workers = None,
 ) -> None:
-    """Learned methods trained on real and on generated images (table 2).
-
-    The paper's numbers stand beside those of Cube+ only. `evaluate transfer` compares more trainings on any data set.
-    """
+    """Train learned methods on real and on generated images."""
     from evaluation.datasets import open_scenes
     from evaluation.experiments.folds import draw_folds, read_folds
     from evaluation.experiments.paper.reporting import table2_report
@@ -176,7 +190,17 @@ def table2(
     _finish(table2_report(table2_tables(found, error, real.name, is_cube), conditions), conditions, out)
 
 
-@app.command("bits")
+_BITS = f"""Influence of colour reduction on methods (section 4.2).
+
+Reads DATA. Its linear images are tone mapped to 8 bits by the Flash operator, 0 to 7 bits of each code set to zero, and
+taken back to linear; each method's numbers are printed for every number of bits and for the images as they are. Writes
+nothing unless asked with --out.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("bits", help=_BITS)
 def bits(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images; the paper's is NUS C1.")],
     sigma: Annotated[
@@ -187,10 +211,7 @@ def bits(
     out: Out = None,
     workers: Workers = None,
 ) -> None:
-    """Influence of colour reduction on methods (section 4.2).
-
-    Linear images are tone mapped to 8 bits by the Flash operator, 0 to 7 bits of each code set to zero, and taken back.
-    """
+    """Run methods on images whose colours were reduced."""
     from evaluation.datasets import open_scenes
     from evaluation.experiments.paper.bits import bits_methods, bits_removed
     from evaluation.experiments.paper.reporting import bits_report
@@ -204,12 +225,21 @@ def bits(
     _finish(bits_report(found, error, opened.name, conditions), conditions, out)
 
 
-@app.command("reduction")
+_REDUCTION = f"""One picture with 0 to 7 bits of each code set to zero (a figure of section 4.2).
+
+Reads PICTURE. Prints how many colours are left and how far from the picture. Writes nothing unless asked with --out;
+the figure is there only.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("reduction", help=_REDUCTION)
 def reduction(
     picture: Annotated[Path, typer.Argument(metavar="PICTURE", help="Any picture file.", show_default=False)],
     out: Out = None,
 ) -> None:
-    """One picture with 0 to 7 bits of each code set to zero (figure of section 4.2)."""
+    """Show a picture with its colours reduced."""
     from evaluation.experiments.paper.reporting import reduction_report
     from generator import read_picture
 
@@ -217,7 +247,16 @@ def reduction(
     _finish(reduction_report(read_picture(picture), picture.name), (), out)
 
 
-@app.command("chromaticities")
+_CHROMATICITIES = f"""Chromaticities of tables' lights as their cameras see them (figures of section 3.3).
+
+Reads LUTs, and ground truths of real data sets. Prints how near the lights come to those. Writes nothing unless asked
+with --out; the figure is there only.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("chromaticities", help=_CHROMATICITIES)
 def chromaticities(
     luts: Luts,
     truths: Annotated[
@@ -230,7 +269,7 @@ def chromaticities(
     ] = None,
     out: Out = None,
 ) -> None:
-    """Chromaticities of tables' lights as their cameras see them (figures of section 3.3)."""
+    """Show the chromaticities of tables' lights."""
     from evaluation.experiments.paper.reporting import chromaticities_report
     from evaluation.experiments.paper.truths import read_truths
 

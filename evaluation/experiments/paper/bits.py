@@ -9,18 +9,19 @@ have no say in k and scale.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.experiments.running import ordered_map, truths_of
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.method import Method
-from evaluation.methods.pixels import GREY, usable
+from evaluation.methods.pixels import usable
 from evaluation.methods.standard import standard_methods
-from evaluation.metrics import ErrorKind, recovery_error, reproduction_error
+from evaluation.metrics import ErrorKind
+from evaluation.results.answers import SceneAnswer, read_light, results_of
 from evaluation.results.result import Result
 from evaluation.results.tables import Table
 from evaluation.scene import Image, Scene
@@ -147,37 +148,25 @@ def bits_removed(
     InputError
         There is no scene or no method.
     """
-    if not scenes or not methods:
-        raise InputError(f"{len(methods)} methods on {len(scenes)} images: name at least one of each")
+    truths = truths_of(scenes, methods)
 
-    def estimate(scene: Scene) -> list[list[npt.NDArray[np.float64]]]:
+    def answers_for(scene: Scene) -> list[list[SceneAnswer]]:
         image, mask = scene.read()
         # Clipped pixels are known before the reduction only; they have their say in the operator, as in a camera.
         left_out = ~usable(image, scene.saturation, mask, border=0)
         versions: list[Image] = [image, *reduce_colours(image, bits, mask)]
-        return [[method.estimate(version, None, left_out) for method in methods] for version in versions]
+        return [[read_light(method.estimate(version, None, left_out)) for method in methods] for version in versions]
 
-    estimates: list[list[list[npt.NDArray[np.float64]]]] = []
-    with ThreadPoolExecutor(max(1, workers)) as pool:
-        for answer in pool.map(estimate, scenes):
-            estimates.append(answer)
-            if on_scene:
-                on_scene()
-    truths = np.stack([scene.truth for scene in scenes])
-
-    def results(version: int) -> tuple[Result, ...]:
-        found: list[Result] = []
-        for place, method in enumerate(methods):
-            lights = np.stack([answer[version][place] for answer in estimates])
-            errors: dict[ErrorKind, npt.NDArray[np.float64]] = {
-                "recovery": recovery_error(lights, truths),
-                "reproduction": reproduction_error(lights, truths),
-            }
-            guessed = np.array([answer[version][place] is GREY for answer in estimates])
-            found.append(Result(method.name, lights, errors, guessed))
-        return tuple(found)
-
-    return BitsResult(results(0), {count: results(place) for place, count in enumerate(bits, start=1)})
+    answers: list[list[list[SceneAnswer]]] = []
+    for given in ordered_map(answers_for, scenes, workers):
+        answers.append(given)
+        if on_scene:
+            on_scene()
+    names = [method.name for method in methods]
+    raw, *reduced = (
+        results_of(names, truths, [given[version] for given in answers]) for version in range(1 + len(bits))
+    )
+    return BitsResult(raw, dict(zip(bits, reduced, strict=True)))
 
 
 def bits_table(found: BitsResult, kind: ErrorKind, name: str) -> Table:

@@ -26,7 +26,7 @@ from evaluation.experiments.paper.rendering import (
 )
 from evaluation.experiments.running import evaluate
 from evaluation.methods.standard import standard_methods
-from evaluation.metrics import ErrorKind, Summary
+from evaluation.metrics import ErrorKind
 from evaluation.results.tables import Table
 from foundation.errors import InputError
 from generator.pictures.sources import Source, random_scenes
@@ -191,10 +191,10 @@ def joint_table(blocks: Sequence[Block]) -> Table:
         published = TABLE1.get(block.cell, {})
         for result in block.results:
             head = (*block.cell, block.images, result.method)
-            given: dict[str, Summary] = {kind: result.summary(kind) for kind in kinds}
+            given = {str(kind): result.summary(kind).as_tuple() for kind in kinds}
             if result.method in published:
-                given["paper"] = published[result.method]
-            rows += [(*head, name, *summary.as_tuple()) for name, summary in given.items()]
+                given["paper"] = published[result.method].as_tuple()
+            rows += [(*head, name, *numbers) for name, numbers in given.items()]
     return Table(
         "Errors on generated data sets, degrees",
         (*_HEAD, "mean", "median", "trimean", "best25", "worst25", "avg"),

@@ -13,7 +13,8 @@ from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
 def test_they_are_the_lights_of_the_table(make_table: TableMaker) -> None:
     lut = make_table("Canon EOS 550D")
     found = table_lights(lut)
-    np.testing.assert_allclose(found.rb, [(r / (r + g + b), b / (r + g + b)) for r, g, b in LIGHTS], atol=1e-6)
+    for (r, b), (red, green, blue) in zip(found.rb.tolist(), LIGHTS.tolist(), strict=True):
+        assert (r, b) == pytest.approx((red / (red + green + blue), blue / (red + green + blue)), abs=1e-6)
     assert found.black_body.tolist() == [False, False, True, True]
     table = chromaticity_rows([lut])
     assert table.rows[2][:4] == ("Canon EOS 550D", 2, "blackbody", 3002.0)

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.experiments.paper.published import TABLE1, TABLE2
-from evaluation.metrics import Summary
+from evaluation.experiments.paper.published import TABLE1, TABLE2, PublishedRow
 
 PAPERS = [path for folder in Path(__file__).parents if (path := folder / "shared" / "paper.tex").is_file()]
 """The paper's source, where it lies beside a developer's checkout; it is not ours to ship."""
@@ -20,14 +19,14 @@ BLOCK = re.compile(r"\\multicolumn\{7\}\{\|c\|\}\{")
 ALL = [(f"{key}, {method}", row) for key, rows in [*TABLE1.items(), *TABLE2.items()] for method, row in rows.items()]
 
 
-def printed(text: str) -> list[tuple[str, dict[str, Summary]]]:
+def printed(text: str) -> list[tuple[str, dict[str, PublishedRow]]]:
     """Return the heads of the blocks of both tables and their rows."""
     _, *blocks = BLOCK.split(text)
     # The last block of the first table is followed by the text, where no row stands.
     return [
         (
             block.split("\\\\")[0].replace("\\makecell{", "").strip("}{ \n"),
-            {name: Summary(*map(float, numbers.split("&"))) for name, numbers in ROW.findall(block)},
+            {name: PublishedRow(*map(float, numbers.split("&"))) for name, numbers in ROW.findall(block)},
         )
         for block in blocks
     ]
@@ -51,7 +50,7 @@ def test_they_are_those_of_the_paper(path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "row"), ALL, ids=[name for name, _ in ALL])
-def test_the_last_number_is_the_geometric_mean_of_the_others(name: str, row: Summary) -> None:
+def test_the_last_number_is_the_geometric_mean_of_the_others(name: str, row: PublishedRow) -> None:
     *parts, average = row.as_tuple()
     low = math.prod(part - 0.005 for part in parts) ** 0.2
     high = math.prod(part + 0.005 for part in parts) ** 0.2
