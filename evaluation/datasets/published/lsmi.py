@@ -262,7 +262,7 @@ class _Camera:
             return given[0] or 0.0, given[1], "subtracted by 2_preprocess_data.py"
         if None not in given:
             return float(given[0] or 0), given[1], "the user"
-        if self.name.lower().startswith("sony"):
+        if "sony" in self.name.lower():
             black, white, source = *_SONY, "1_make_mixture_map.py"
         else:
             black, white, source = self._levels_of_raw()
