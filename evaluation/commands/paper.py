@@ -303,17 +303,23 @@ def _open(folders: Sequence[Path]) -> list[Lut]:
 
 def _pictures(place: str, camera: str | None) -> tuple[Sequence[Source], str]:
     """Return the source pictures at a place, and what was done to get them."""
-    from evaluation.datasets import LAYOUTS, open_scenes
+    from evaluation.datasets import open_scenes
+    from evaluation.datasets.opening import layout_of
     from evaluation.experiments.paper.developing import developed
-    from foundation.errors import InputError
+    from foundation.errors import FormatError, InputError
     from generator import find_pictures
 
-    layout = next(name for name, known in LAYOUTS.items() if known.matches(place))
-    if layout == "generated":
+    try:
+        layout = layout_of(place)
+    except FormatError:
+        layout = None
+    if layout is None:
         if camera is not None:
-            raise InputError(f"--camera {camera} is for a data set of raw images; {place} is a folder of pictures")
+            raise InputError(f"--camera {camera} is for a data set of raw images; {place} is none")
         found = find_pictures(place)
         return found, f"{len(found)} of {place}"
+    if layout == "generated":
+        raise InputError(f"{place} was made by generate; name photographs, or a data set of real raw images")
     data = open_scenes(place, layout)
     matrix = f"with the colour matrix of {camera}" if camera else "without a colour matrix"
     return developed(data, camera), f"{len(data.scenes)} of {data.name}, developed to sRGB {matrix}"

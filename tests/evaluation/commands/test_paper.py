@@ -154,7 +154,7 @@ def test_chromaticities(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("bits", "nowhere.npz"), "nowhere.npz is no archive of thumbnails"),
+        (("bits", "nowhere.npz"), "nowhere.npz is no dataset"),
         (("reduction", "nowhere.png"), "there is no such file"),
         (("chromaticities", "nowhere"), "nowhere is no table"),
         (
