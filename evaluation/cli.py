@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from evaluation.commands import run as run_command
+from evaluation.commands import transfer as transfer_command
 from foundation.console import EXIT_CODES, run
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ app = typer.Typer(
 """,
 )
 app.command("run", help=run_command.HELP)(run_command.run)
+app.command("transfer", help=transfer_command.HELP)(transfer_command.transfer)
 
 
 @app.callback()
