@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,8 +20,15 @@ class ConstantLight(FeatureLearner):
     does not beat it has learned the distribution of the lights, and nothing of how they show in an image.
     """
 
-    key: ClassVar[str] = "constant-light"
-    name: ClassVar[str] = "Constant light"
+    @property
+    def key(self) -> str:
+        """Its name on the command line and in model files."""
+        return "constant-light"
+
+    @property
+    def name(self) -> str:
+        """Its name in tables."""
+        return "Constant light"
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None

@@ -7,7 +7,6 @@ compared by name and by their pixels. A name is compared without folder and endi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -57,9 +56,10 @@ def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]
             "cross-validation: evaluate cv"
         )
     made = [isinstance(some.scenes[0], GeneratedScene) for some in (training, test)]
-    tests = _identities(test, pixels=not any(made))
+    how = _How(names=not all(made), pixels=not any(made))
+    tests = {key: name for name, keys in _keys(test, how) for key in keys}
     shared: list[SharedImage] = []
-    for position, (name, keys) in enumerate(_keys(training, pixels=not any(made))):
+    for position, (name, keys) in enumerate(_keys(training, how)):
         found = next(((tests[key], key[0]) for key in keys if key in tests), None)
         if found:
             shared.append(SharedImage(position, name, *found))
@@ -70,24 +70,31 @@ _Key = tuple[str, str]
 """How an image is known, "name" or "content", and by what."""
 
 
-def _identities(scenes: SceneSet, pixels: bool) -> Mapping[_Key, str]:
-    """Return names by all keys that a data set's images are known by."""
-    return {key: name for name, keys in _keys(scenes, pixels) for key in keys}
+@dataclass(frozen=True)
+class _How:
+    """By what images are compared besides the hashes of source pictures, which are always at hand."""
+
+    names: bool
+    pixels: bool
 
 
-def _keys(scenes: SceneSet, pixels: bool) -> list[tuple[str, tuple[_Key, ...]]]:
+def _keys(scenes: SceneSet, how: _How) -> list[tuple[str, tuple[_Key, ...]]]:
     """Return the name of each image, or of its source, and the keys that it is known by."""
     sources: dict[int, dict[str, _Key]] = {}
     listed: list[tuple[str, tuple[_Key, ...]]] = []
     for scene in scenes.scenes:
         if not isinstance(scene, GeneratedScene):
-            content = (("content", _pixels(scene)),) if pixels else ()
-            listed.append((scene.name, (*content, ("name", _bare(scene.name)))))
+            content = (("content", _pixels(scene)),) if how.pixels else ()
+            listed.append((scene.name, content + _name_key(scene.name, how)))
             continue
         known = sources.setdefault(id(scene.dataset), _sources(scene))
         source = scene.entry.source
-        listed.append((source, (known[source], ("name", _bare(source)))))
+        listed.append((source, (known[source], *_name_key(source, how))))
     return listed
+
+
+def _name_key(name: str, how: _How) -> tuple[_Key, ...]:
+    return (("name", PurePosixPath(name).stem.lower()),) if how.names else ()
 
 
 def _sources(scene: GeneratedScene) -> dict[str, _Key]:
@@ -101,10 +108,6 @@ def _sources(scene: GeneratedScene) -> dict[str, _Key]:
 def _pixels(scene: Scene) -> str:
     image, _ = scene.read()
     return sha256_of(np.ascontiguousarray(image, dtype=np.float32))
-
-
-def _bare(name: str) -> str:
-    return PurePosixPath(name).stem.lower()
 
 
 def _place(scenes: SceneSet) -> str:

@@ -125,9 +125,7 @@ def _with_naive(
     """Return a generated set's images and their naive counterparts, all of the pictures that were found."""
     made = [scene for scene in scenes if isinstance(scene, GeneratedScene)]
     if not made:
-        raise InputError(
-            f"{some.name} was not made by generate, so that it has no naive counterpart; leave out --naive"
-        )
+        raise InputError(f"{some.name} was not made by generate and has no naive counterpart; leave out --naive")
     dataset = made[0].dataset
     found, missing = find_sources(dataset, pictures)
     kept = tuple(scene for scene in made if scene.entry.source in found)
