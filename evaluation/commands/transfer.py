@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from evaluation.experiments.transfer.material import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
-    from evaluation.learning.feature_learner import FeatureLearner
-    from evaluation.methods.method import Learner, Method
+    from evaluation.methods.method import Method
     from evaluation.scene import Scene, SceneSet
 
 _FOLDS = "3"
@@ -121,7 +121,6 @@ def transfer(
     from evaluation.experiments.transfer.outcome import TransferOutcome, save_outcome
     from evaluation.experiments.transfer.plan import plan_transfer
     from evaluation.experiments.transfer.rows import transfer as run_transfer
-    from evaluation.learning.constant_light import ConstantLight
     from evaluation.reports.terminal import print_table
     from foundation.files import require_free
     from foundation.processors import processor_count
@@ -129,7 +128,7 @@ def transfer(
     if out is not None:
         require_free(out, "the results")
     threads = workers or processor_count()
-    learners = [*_learners(methods), ConstantLight()]
+    learners = _learners(methods)
     references = _references(statistics)
     tested = open_scenes(test, layout)
     plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared)
@@ -161,16 +160,37 @@ def transfer(
         save_outcome(outcome, out)
 
 
-def _learners(text: str) -> list[FeatureLearner | Learner]:
+def _learners(text: str) -> list[AnyLearner]:
+    """Return the learned methods of a list, built-in ones or classes of the user's own, and the constant light."""
+    from evaluation.learning.constant_light import ConstantLight
+    from evaluation.learning.feature_learner import FeatureLearner
     from evaluation.learning.standard import standard_learners
+    from evaluation.methods.method import Learner
+    from evaluation.methods.naming import find_method
     from foundation.errors import InputError
 
     known = standard_learners()
     names = list(known) if text.strip().lower() == "all" else [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in known:
-            raise InputError(f"{name!r} is no learned method; they are {', '.join(known)}, or all")
-    return [known[name] for name in dict.fromkeys(names) if name != "constant-light"]
+    found: list[AnyLearner] = []
+    for name in dict.fromkeys(names):
+        if name in known or name == ConstantLight().key:
+            found += [] if name == ConstantLight().key else [known[name]]
+            continue
+        if ":" not in name:
+            raise InputError(
+                f"{name!r} is no learned method; they are {', '.join(known)}, or all; one of your own is named as "
+                "module:Class or file.py:Class"
+            )
+        learner = find_method(name)
+        if not isinstance(learner, FeatureLearner | Learner):
+            raise InputError(f"{name} learns nothing: it has no fit(scenes, seed); evaluate run takes it")
+        found.append(learner)
+    found.append(ConstantLight())
+    titles = [learner.name for learner in found]
+    for title in titles:
+        if titles.count(title) > 1:
+            raise InputError(f"two methods are called {title}; give one another name: names head the rows")
+    return found
 
 
 def _references(text: str) -> list[Method]:

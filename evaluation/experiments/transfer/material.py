@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.experiments.running import answer_scenes
 from evaluation.learning.feature_learner import (
     FeatureLearner,
     Features,
@@ -17,10 +18,10 @@ from evaluation.learning.feature_learner import (
     truths_of,
 )
 from evaluation.methods.method import Learner, Method
-from evaluation.methods.pixels import GREY
-from evaluation.metrics import ErrorKind, recovery_error, reproduction_error
+from evaluation.results.answers import NO_PIXEL, SceneAnswer, read_light, results_of
 from evaluation.results.result import Result
 from evaluation.scene import Scene
+from foundation.errors import CropError, InputError
 
 Places = npt.NDArray[np.int64]
 """(P,) int64: which scenes of a data set, from 0."""
@@ -80,47 +81,50 @@ def gather(
 
 
 def fit_on(learner: AnyLearner, number: int, material: Material, places: Places, seed: int) -> Method:
-    """Return the learner fitted to the scenes at `places` (P,) int64; `number` is its place among the learners."""
+    """Return the learner fitted to the scenes at `places` (P,) int64; `number` is its place among the learners.
+
+    Raises
+    ------
+    InputError
+        No image has a usable pixel, or a class of the user's own fails.
+    """
     features = material.features[number]
     if isinstance(learner, FeatureLearner) and features is not None:
         return fit_extracted(learner, [features[place] for place in _list(places)], material.truths[places], seed)
-    return learner.fit([material.scenes[place] for place in _list(places)], seed)
+    scenes = [material.scenes[place] for place in _list(places)]
+    try:
+        return learner.fit(scenes, seed)
+    except CropError:
+        raise
+    except Exception as error:
+        raise InputError(
+            f"{learner.name} fails to learn from {len(scenes)} images: {type(error).__name__}: {error}; correct it and "
+            "run the same command again"
+        ) from error
 
 
-def estimate_on(
-    method: Method, number: int, material: Material, places: Places
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    """Return the lights (P, 3) float64 of the scenes at `places` (P,) int64, of length 1, and which were guessed.
+def estimate_on(method: Method, number: int, material: Material, places: Places) -> list[SceneAnswer]:
+    """Return what a fitted method answers for the scenes at `places` (P,) int64, P answers.
 
-    The second array, (P,) bool, is True where no pixel was usable and the light is `pixels.GREY`.
+    Raises
+    ------
+    InputError
+        A class of the user's own fails.
     """
     features = material.features[number]
-    if isinstance(method, LearnedMethod) and features is not None:
-        given = [features[place] for place in _list(places)]
-        guessed = np.array([one is None for one in given])
-        lights = np.tile(GREY, (len(given), 1))
-        seen = [one for one in given if one is not None]
-        if seen:
-            found = np.asarray(method.model.lights(np.stack(seen)), dtype=np.float64)
-            lights[~guessed] = found / np.linalg.norm(found, axis=1, keepdims=True)
-        return lights, guessed
-    estimates: list[npt.NDArray[np.float64]] = []
-    for place in _list(places):
-        scene = material.scenes[place]
-        image, mask = scene.read()
-        estimates.append(method.estimate(image, scene.saturation, mask))
-    return np.stack(estimates), np.array([light is GREY for light in estimates])
+    if not isinstance(method, LearnedMethod) or features is None:
+        scenes = [material.scenes[place] for place in _list(places)]
+        return [answer for (answer,) in answer_scenes(scenes, [method])]
+    given = [features[place] for place in _list(places)]
+    seen = [one for one in given if one is not None]
+    lights = iter(method.model.lights(np.stack(seen)) if seen else ())
+    return [SceneAnswer(None, NO_PIXEL) if one is None else read_light(next(lights)) for one in given]
 
 
-def result_of(
-    name: str, lights: npt.NDArray[np.float64], guessed: npt.NDArray[np.bool_], truths: npt.NDArray[np.float64]
-) -> Result:
-    """Return the result of estimated lights (N, 3), guessed ones (N,) bool, against truths (N, 3) float64."""
-    errors: dict[ErrorKind, npt.NDArray[np.float64]] = {
-        "recovery": recovery_error(lights, truths),
-        "reproduction": reproduction_error(lights, truths),
-    }
-    return Result(name, lights, errors, guessed)
+def result_of(name: str, answers: Sequence[SceneAnswer], truths: npt.NDArray[np.float64]) -> Result:
+    """Return the result that N answers make, held to truths (N, 3) float64."""
+    (result,) = results_of([name], truths, [[answer] for answer in answers])
+    return result
 
 
 def _list(places: Places) -> list[int]:

@@ -22,7 +22,7 @@ from evaluation.experiments.transfer.material import (
 )
 from evaluation.learning.constant_light import ConstantLight
 from evaluation.methods.method import Method
-from evaluation.methods.pixels import GREY
+from evaluation.results.answers import SceneAnswer
 from evaluation.results.result import Result
 from evaluation.scene import Scene
 from foundation.errors import InputError
@@ -94,7 +94,7 @@ class TransferRow:
 
 
 def draw_images(count: int, wanted: int, seed: int) -> Places:
-    """Return which of `count` images to train on, (wanted,) int64 in ascending order, drawn by a seed.
+    """Return which of `count` images to train on, (P,) int64 in ascending order, P = `wanted`, drawn by a seed.
 
     Data sets of equal counts get the same places, so that a generated set and its naive counterpart, or one under
     another table, are trained on the same pictures under the same lights.
@@ -165,13 +165,14 @@ def transfer(
         raise InputError(f"{len(learners)} learned methods and {len(folds)} seeds: expected at least one of each")
     for each in folds:
         require_apart(test, each)
+    # All that may be refused is, before the first image is read.
+    drawn = [[draw_images(len(some.scenes), images, seed) for seed in range(len(folds))] for some in training]
     trials = gather(test, learners, workers, on_scene)
     parts = [
         TransferRow(learner.name, "cross-validation", "", _least(folds), _crossed(learner, number, trials, folds))
         for number, learner in enumerate(learners)
     ]
-    for some in training:
-        wanted = [draw_images(len(some.scenes), images, seed) for seed in range(len(folds))]
+    for some, wanted in zip(training, drawn, strict=True):
         # Of a large set only what some seed wants is read.
         used = np.unique(np.concatenate(wanted))
         lessons = gather([some.scenes[int(place)] for place in used.tolist()], learners, workers, on_scene)
@@ -200,15 +201,15 @@ def _crossed(
 ) -> tuple[Result, ...]:
     results: list[Result] = []
     for seed, each in enumerate(folds):
-        lights, guessed = np.tile(GREY, (len(each), 1)), np.zeros(len(each), dtype=bool)
+        answers: dict[int, SceneAnswer] = {}
         for fold in np.unique(each):
             inside = np.flatnonzero(each == fold)
             method = fit_on(learner, number, trials, np.flatnonzero(each != fold), seed)
-            lights[inside], guessed[inside] = estimate_on(method, number, trials, inside)
-        results.append(result_of(learner.name, lights, guessed, trials.truths))
+            answers |= zip(inside.tolist(), estimate_on(method, number, trials, inside), strict=True)
+        results.append(result_of(learner.name, [answers[place] for place in range(len(each))], trials.truths))
     return tuple(results)
 
 
 def _tested(learner: AnyLearner, number: int, lessons: Material, places: Places, trials: Material, seed: int) -> Result:
     method = fit_on(learner, number, lessons, places.astype(np.int64), seed)
-    return result_of(learner.name, *estimate_on(method, number, trials, trials.everything), trials.truths)
+    return result_of(learner.name, estimate_on(method, number, trials, trials.everything), trials.truths)

@@ -27,6 +27,7 @@ from generator.pictures.sources import find_pictures
 LIGHTS = np.array([[4000.0, 8000, 3000], [3000, 8000, 6000]])
 """Counts of white under the two lights of the table."""
 WHITE_LEVEL = 9000
+BOTH = ListedLights((0, 1))
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Maker:
     def make(
         self,
         name: str = "made",
-        lights: LightChoice = ListedLights((0, 1)),
+        lights: LightChoice = BOTH,
         preparation: Preparation = UNPREPARED,
         split: tuple[float, float, float] | None = None,
         pictures: Path | None = None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -98,6 +98,8 @@ class Mean:
     def estimate(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float64]:
+        if not image.any():
+            raise ZeroDivisionError("black")
         return self.light
 
 
@@ -116,8 +118,33 @@ def test_a_learner_that_reads_scenes_itself() -> None:
     training = world(30, seed=2)
     rows = transfer(TEST, [TrainingSet("a", "generated", training)], [MeanLearner()], FOLDS, 30)
     assert [row.kind for row in rows] == ["cross-validation", "generated"]
-    expected = MeanLearner().fit(training).estimate(np.zeros((1, 1, 3)))
+    expected = MeanLearner().fit(training).estimate(np.ones((1, 1, 3)))
     np.testing.assert_allclose(rows[1].results[0].estimates, np.tile(expected, (120, 1)))
+
+
+@dataclass(frozen=True)
+class Stubborn:
+    """A user's class with a mistake in it."""
+
+    name: str = "Stubborn"
+
+    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Method:
+        raise KeyError("weights")
+
+
+def test_mistakes_of_a_users_class_are_named() -> None:
+    with pytest.raises(InputError, match="Stubborn fails to learn from 80 images: KeyError: 'weights'"):
+        transfer(TEST, [], [Stubborn()], FOLDS, 1)
+    black = (replace(TEST[0], cast=(0.0, 0.0, 0.0)), *TEST[1:])
+    with pytest.raises(InputError, match=r"Mean light fails on 1_000: ZeroDivisionError: black \(test_rows.py"):
+        transfer(black, [], [MeanLearner()], FOLDS, 1)
+
+
+def test_an_image_without_a_usable_pixel_is_guessed() -> None:
+    black = (replace(TEST[0], cast=(0.0, 0.0, 0.0)), *TEST[1:])
+    for row in transfer(black, [TrainingSet("a", "generated", world(40, seed=2))], [MeanColour()], FOLDS, 40):
+        assert row.results[0].guessed.nonzero()[0].tolist() == [0]
+        np.testing.assert_allclose(row.results[0].estimates[0], 3**-0.5)
 
 
 def test_images_are_drawn_without_repeats() -> None:
