@@ -7,17 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
-    from evaluation.experiments.describing import Description
+    from evaluation.experiments.describing import DataDescription
 
 HELP = f"""Describe the images and lights of a data set, and hold them beside another's: how real is what was generated.
 
 Reads DATA, a data set of any layout that evaluate run reads, or a STATS.json written by --out. Figures: luminance
 percentiles, exposure, clipping, chroma spread, near-grey share, grey-world offsets, edges, noise, and the distribution
 of the lights. Scenes are seen at 64 x 64 cells at most and with the light divided out, so sets of different sizes and
-units compare. Masked and clipped pixels are left out.
+units compare. Masked and clipped pixels are left out. The options of reading are DATA's: where the other set needs some
+too, write its STATS.json first and give that to --against.
 
 Prints tables, and with --against one sentence for each figure: within 25 % or not. Writes nothing unless asked with
 --out or --report.
@@ -26,6 +28,7 @@ Prints tables, and with --against one sentence for each figure: within 25 % or n
 """
 
 
+@with_data_options
 def describe(
     data: Annotated[
         str,
@@ -43,10 +46,6 @@ def describe(
         Path | None,
         typer.Option(metavar="PAGE.html", help="Write a page with figures to this new file.", show_default=False),
     ] = None,
-    layout: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Layout of DATA. \\[default: by what it looks like]", show_default=False),
-    ] = None,
     against_layout: Annotated[
         str | None, typer.Option(metavar="NAME", help="Layout of the data set beside it.", show_default=False)
     ] = None,
@@ -55,6 +54,8 @@ def describe(
     workers: Annotated[
         int | None, typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False)
     ] = None,
+    *,
+    reading: DataReading,
 ) -> None:
     """Describe a data set."""
     from evaluation.experiments.describing import report as reporting
@@ -68,8 +69,8 @@ def describe(
         if path is not None:
             require_free_file(path, what)
     threads = workers or processor_count()
-    one = _described(data, layout, cells, threads)
-    other = None if against is None else _described(against, against_layout, cells, threads)
+    one = _described(data, reading, cells, threads)
+    other = None if against is None else _described(against, DataReading(against_layout), cells, threads)
     if other is None:
         print_table(reporting.figures_table(one))
     print_table(reporting.lights_table([one] if other is None else [one, other]))
@@ -87,17 +88,16 @@ def describe(
         write_whole(report, reporting.describe_page(one, other, seed))
 
 
-def _described(place: str, layout: str | None, cells: int, workers: int) -> Description:
+def _described(place: str, reading: DataReading, cells: int, workers: int) -> DataDescription:
     from rich.console import Console
     from rich.progress import Progress
 
-    from evaluation.datasets import open_scenes
     from evaluation.experiments.describing import describe
     from evaluation.experiments.describing.statistics_json import read_statistics
 
-    if layout is None and place.endswith(".json") and Path(place).is_file():
+    if reading.layout is None and place.endswith(".json") and Path(place).is_file():
         return read_statistics(place)
-    data = open_scenes(place, layout)
+    data = reading.open(place)
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task(data.name, total=len(data.scenes))
         return describe(data, cells, workers, lambda: progress.advance(task))

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.experiments.bootstrap import independent
-from evaluation.experiments.describing.description import Description, known_values, summed
+from evaluation.experiments.describing.description import DataDescription, known_values, summed
 from evaluation.experiments.describing.quantities import QUANTITIES, Quantity
 
 TOLERANCE: Final = 0.25
@@ -59,7 +59,7 @@ class FigureCompared:
     verdict: Verdict | None
 
 
-def compare_figures(one: Description, other: Description, seed: int = 0) -> tuple[FigureCompared, ...]:
+def compare_figures(one: DataDescription, other: DataDescription, seed: int = 0) -> tuple[FigureCompared, ...]:
     """Return every figure that is known of both sets, of at least three images each.
 
     Parameters

@@ -13,14 +13,14 @@ import numpy.typing as npt
 
 from evaluation.experiments.describing.cells import CELLS
 from evaluation.experiments.describing.measuring import CHROMA_EDGES, LUMINANCE_EDGES, measure_scene
-from evaluation.experiments.describing.noise import PhotonTransfer, photon_transfer
+from evaluation.experiments.describing.noise import NoiseCurve, photon_transfer
 from evaluation.experiments.describing.quantities import QUANTITIES, Summed
 from evaluation.scene import MixedScene, SceneSet
 from foundation.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
-class Description:
+class DataDescription:
     """What is to be known of a data set.
 
     Attributes
@@ -65,12 +65,12 @@ class Description:
     luminance: npt.NDArray[np.float64]
     chroma: npt.NDArray[np.float64]
     noise_unit: str
-    noise: tuple[PhotonTransfer, ...]
+    noise: tuple[NoiseCurve, ...]
 
 
 def describe(
     data: SceneSet, side: int = CELLS, workers: int = 1, on_scene: Callable[[], None] | None = None
-) -> Description:
+) -> DataDescription:
     """Return the description of a data set; each image is read once and let go.
 
     Parameters
@@ -112,7 +112,7 @@ def describe(
             if on_scene:
                 on_scene()
     scaled = all(scene.saturation is not None for scene in data.scenes)
-    return Description(
+    return DataDescription(
         name=data.name,
         layout=data.layout,
         place=data.place,
@@ -131,7 +131,7 @@ def describe(
     )
 
 
-def known_values(description: Description, value: str) -> npt.NDArray[np.float64]:
+def known_values(description: DataDescription, value: str) -> npt.NDArray[np.float64]:
     """Return the numbers (M,) float64 that are known of the images, M ≤ N."""
     given = description.values[value]
     return given[np.isfinite(given)]
@@ -150,7 +150,7 @@ def summed(values: npt.NDArray[np.float64], how: Summed) -> float:
             return float(values.std())
 
 
-def figures(description: Description) -> dict[str, float]:
+def figures(description: DataDescription) -> dict[str, float]:
     """Return all figures of a data set by their names; NaN where one is not known."""
     return {
         quantity.name: summed(known_values(description, quantity.value), quantity.summed) for quantity in QUANTITIES

@@ -65,7 +65,7 @@ class NoiseLevel:
 
 
 @dataclass(frozen=True)
-class PhotonTransfer:
+class NoiseCurve:
     """Noise against signal of one channel: variance = read² + gain · signal.
 
     Attributes
@@ -145,7 +145,7 @@ def relative_noise(blocks: npt.NDArray[np.float64], least: float) -> float:
     return float(np.percentile(sigma[bright] / signal[bright], _FLATTEST)) / _OF_FLATTEST
 
 
-def photon_transfer(blocks: Sequence[npt.NDArray[np.float64]]) -> tuple[PhotonTransfer, ...]:
+def photon_transfer(blocks: Sequence[npt.NDArray[np.float64]]) -> tuple[NoiseCurve, ...]:
     """Return the photon-transfer curves of red, green and blue.
 
     Parameters
@@ -157,13 +157,13 @@ def photon_transfer(blocks: Sequence[npt.NDArray[np.float64]]) -> tuple[PhotonTr
     return tuple(_curve(together[:, 0, channel], together[:, 1, channel]) for channel in range(3))
 
 
-def _curve(signal: npt.NDArray[np.float64], sigma: npt.NDArray[np.float64]) -> PhotonTransfer:
+def _curve(signal: npt.NDArray[np.float64], sigma: npt.NDArray[np.float64]) -> NoiseCurve:
     from scipy.optimize import nnls
 
     lit = signal > 0
     signal, sigma = signal[lit], sigma[lit]
     if not signal.size:
-        return PhotonTransfer(())
+        return NoiseCurve(())
     low, high = np.percentile(signal, [0.5, 99.5])
     steps = np.log(signal / low) / max(np.log(high / low), 1e-9) * _LEVELS
     level = np.clip(steps.astype(np.int64), 0, _LEVELS - 1)
@@ -177,12 +177,12 @@ def _curve(signal: npt.NDArray[np.float64], sigma: npt.NDArray[np.float64]) -> P
             mean = float(signal[inside][sigma[inside] <= flattest].mean())
             levels.append(NoiseLevel(mean, float(flattest) / _OF_FLATTEST, count))
     if len(levels) < _LEAST_LEVELS or levels[-1].signal < _LEAST_SPAN * levels[0].signal:
-        return PhotonTransfer(tuple(levels))
+        return NoiseCurve(tuple(levels))
     means, sigmas = (np.array([getattr(level, name) for level in levels]) for name in ("signal", "sigma"))
     # Variances are known to a share of themselves, so each equation is divided by its own.
     solved = nnls(np.stack([np.ones_like(means), means], axis=1) / sigmas[:, None] ** 2, np.ones_like(means))[0]
     variance, gain = (float(number) for number in solved)
     misfit = float(np.sqrt(np.mean((np.log((variance + gain * means) / sigmas**2) / 2) ** 2)))
     if misfit > _FITS:
-        return PhotonTransfer(tuple(levels), misfit=misfit)
-    return PhotonTransfer(tuple(levels), variance**0.5, gain, misfit)
+        return NoiseCurve(tuple(levels), misfit=misfit)
+    return NoiseCurve(tuple(levels), variance**0.5, gain, misfit)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from evaluation.experiments.describing.against import TOLERANCE, FigureCompared, compare_figures, sentence
-from evaluation.experiments.describing.description import Description, figures, known_values
+from evaluation.experiments.describing.description import DataDescription, figures, known_values
 from evaluation.experiments.describing.lights import energy_distance, light_distribution, log_chroma
 from evaluation.experiments.describing.measuring import CHROMA_EDGES, LUMINANCE_EDGES
 from evaluation.experiments.describing.quantities import QUANTITIES
@@ -16,7 +16,7 @@ from evaluation.reports.page import Part, figure_part, heading, page, paragraph,
 from evaluation.results.tables import Table
 
 
-def figures_table(description: Description) -> Table:
+def figures_table(description: DataDescription) -> Table:
     """Return the figures of a data set, with the quartiles of the images' numbers that they are made of."""
     value = figures(description)
     rows: list[tuple[str | float | None, ...]] = []
@@ -40,7 +40,7 @@ def figures_table(description: Description) -> Table:
     )
 
 
-def lights_table(descriptions: Sequence[Description]) -> Table:
+def lights_table(descriptions: Sequence[DataDescription]) -> Table:
     """Return the distributions of the lights of one or two data sets."""
     rows = [
         (
@@ -96,7 +96,7 @@ def compared_tables(compared: Sequence[FigureCompared], names: tuple[str, str]) 
     return tables
 
 
-def noise_notes(description: Description) -> tuple[str, ...]:
+def noise_notes(description: DataDescription) -> tuple[str, ...]:
     """Return what is to be said of the noise of a data set."""
     green = description.noise[1]
     if green.gain is not None and green.read is not None:
@@ -110,7 +110,7 @@ def noise_notes(description: Description) -> tuple[str, ...]:
     return (told, *(("Noise of thumbnails is what averaging left, and their texture.",) if averaged else ()))
 
 
-def seen_notes(one: Description, other: Description) -> tuple[str, ...]:
+def seen_notes(one: DataDescription, other: DataDescription) -> tuple[str, ...]:
     """Return what makes two descriptions less comparable than they look."""
     notes: list[str] = []
     if one.side != other.side:
@@ -123,6 +123,12 @@ def seen_notes(one: Description, other: Description) -> tuple[str, ...]:
         for made in (one, other)
         if any(min(width, height) < made.side for width, height, _ in made.sizes)
     ]
+    notes += [
+        f"Images of {made.name} may be of one picture under several lights; they count as independent, and "
+        "intervals are too narrow."
+        for made in (one, other)
+        if made.layout == "generated"
+    ]
     unknown = {
         quantity.title for quantity in QUANTITIES if _is_known(one, quantity.value) != _is_known(other, quantity.value)
     }
@@ -131,7 +137,7 @@ def seen_notes(one: Description, other: Description) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def describe_page(one: Description, other: Description | None = None, seed: int = 0) -> str:
+def describe_page(one: DataDescription, other: DataDescription | None = None, seed: int = 0) -> str:
     """Return the HTML page of a data set, or of one beside another."""
     both = (one,) if other is None else (one, other)
     names = [made.name for made in both]
@@ -156,7 +162,7 @@ def describe_page(one: Description, other: Description | None = None, seed: int 
     return page(" beside ".join(names), parts)
 
 
-def sizes_table(description: Description, count: int = 6) -> Table:
+def sizes_table(description: DataDescription, count: int = 6) -> Table:
     """Return the most frequent sizes of the images."""
     rest = sum(number for _, _, number in description.sizes[count:])
     rows = [(f"{width} x {height}", number) for width, height, number in description.sizes[:count]]
@@ -174,7 +180,7 @@ def _definitions() -> Table:
     )
 
 
-def _luminance(both: Sequence[Description], names: Sequence[str]) -> Part:
+def _luminance(both: Sequence[DataDescription], names: Sequence[str]) -> Part:
     picture = luminance_figure(names, [made.luminance for made in both], LUMINANCE_EDGES)
     return figure_part(
         picture,
@@ -183,7 +189,7 @@ def _luminance(both: Sequence[Description], names: Sequence[str]) -> Part:
     )
 
 
-def _chroma(both: Sequence[Description], names: Sequence[str]) -> Part:
+def _chroma(both: Sequence[DataDescription], names: Sequence[str]) -> Part:
     picture = chroma_figure(names, [made.chroma for made in both], CHROMA_EDGES)
     return figure_part(
         picture,
@@ -192,11 +198,11 @@ def _chroma(both: Sequence[Description], names: Sequence[str]) -> Part:
     )
 
 
-def _lights(both: Sequence[Description], names: Sequence[str]) -> Part:
+def _lights(both: Sequence[DataDescription], names: Sequence[str]) -> Part:
     return figure_part(lights_figure(names, [made.lights for made in both]), "The lights; of mixtures, each light.")
 
 
-def _noise(both: Sequence[Description]) -> list[Part]:
+def _noise(both: Sequence[DataDescription]) -> list[Part]:
     unit = both[0].noise_unit
     shown = [made for made in both if made.noise_unit == unit and made.noise[1].levels]
     if not shown:
@@ -210,11 +216,11 @@ def _noise(both: Sequence[Description]) -> list[Part]:
     return [figure_part(noise_figure([made.name for made in shown], measured, curves, unit), caption)]
 
 
-def _seen_at(description: Description) -> str:
+def _seen_at(description: DataDescription) -> str:
     return f"{description.side} x {description.side} cells at most" if description.side else "full size"
 
 
-def _is_known(description: Description, value: str) -> bool:
+def _is_known(description: DataDescription, value: str) -> bool:
     return bool(known_values(description, value).size)
 
 

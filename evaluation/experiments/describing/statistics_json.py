@@ -16,10 +16,10 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.describing.description import Description, figures, known_values
+from evaluation.experiments.describing.description import DataDescription, figures, known_values
 from evaluation.experiments.describing.lights import light_distribution
 from evaluation.experiments.describing.measuring import CHROMA_EDGES, LUMINANCE_EDGES
-from evaluation.experiments.describing.noise import NoiseLevel, PhotonTransfer
+from evaluation.experiments.describing.noise import NoiseCurve, NoiseLevel
 from evaluation.experiments.describing.quantities import QUANTITIES
 from foundation.errors import FormatError
 from foundation.version import software
@@ -39,7 +39,7 @@ _DIGITS: Final = 6
 _CHANNELS: Final = ("red", "green", "blue")
 
 
-def statistics_to_json(description: Description) -> str:
+def statistics_to_json(description: DataDescription) -> str:
     """Return the text of a `STATS.json`; the same description gives the same text."""
     distribution = asdict(light_distribution(description.lights))
     content = {
@@ -83,7 +83,7 @@ def statistics_to_json(description: Description) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def read_statistics(path: Path | str) -> Description:
+def read_statistics(path: Path | str) -> DataDescription:
     """Return the description that a `STATS.json` holds.
 
     Raises
@@ -109,7 +109,7 @@ def read_statistics(path: Path | str) -> Description:
         ) from error
 
 
-def _description(content: Mapping[str, Any]) -> Description:
+def _description(content: Mapping[str, Any]) -> DataDescription:
     data, noise = content["data"], content["noise"]
     images = tuple(map(str, content["images"]))
     values = {name: _array(given) for name, given in content["values"].items()}
@@ -122,7 +122,7 @@ def _description(content: Mapping[str, Any]) -> Description:
     luminance, chroma = _array(content["luminance"]["shares"]), _array(content["chroma"]["shares"])
     if luminance.shape != (len(LUMINANCE_EDGES) - 1,) or chroma.shape != (len(CHROMA_EDGES) - 1,) * 2:
         raise ValueError(f"histograms of {luminance.shape} and {chroma.shape} bins")
-    return Description(
+    return DataDescription(
         name=data["name"],
         layout=data["layout"],
         place=data["place"],
@@ -141,9 +141,9 @@ def _description(content: Mapping[str, Any]) -> Description:
     )
 
 
-def _curve(given: Mapping[str, Any]) -> PhotonTransfer:
+def _curve(given: Mapping[str, Any]) -> NoiseCurve:
     levels = tuple(NoiseLevel(level["signal"], level["sigma"], level["blocks"]) for level in given["levels"])
-    return PhotonTransfer(levels, given["read"], given["gain"], given["misfit"])
+    return NoiseCurve(levels, given["read"], given["gain"], given["misfit"])
 
 
 def _array(given: Any) -> npt.NDArray[np.float64]:

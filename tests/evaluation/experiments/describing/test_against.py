@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from evaluation.experiments.describing import Description, describe, figures
+from evaluation.experiments.describing import DataDescription, describe, figures
 from evaluation.experiments.describing.against import FigureCompared, compare_figures, sentence
 from tests.evaluation.experiments.describing.scenes import random_set
 
 
-def compared(one: Description, other: Description) -> dict[str, FigureCompared]:
+def compared(one: DataDescription, other: DataDescription) -> dict[str, FigureCompared]:
     return {made.quantity.name: made for made in compare_figures(one, other)}
 
 

@@ -112,7 +112,7 @@ def test_figures_are_those_of_a_few_lines_of_numpy(thumbnails: Path) -> None:
         chroma = lit / lit.sum(axis=1)[:, None]
         spreads.append(float(np.sqrt(np.mean(np.std(chroma, axis=0) ** 2))))
         means: npt.NDArray[np.float64] = pixels.mean(axis=0)
-        offsets.append(np.log(means[[0, 2]] / means[1]))
+        offsets.append(np.log(np.array([means[0], means[2]]) / means[1]))
         grey = (pixels * light.mean()).mean(axis=1)
         middles.append(float(np.median(grey) / np.percentile(grey, 99, method="hazen")))
     value = figures(made)

@@ -39,7 +39,7 @@ def test_two_colours_by_hand() -> None:
 
 
 def test_luminance_percentiles_of_a_ramp() -> None:
-    ramp = np.linspace(0, 1, 4096, dtype=np.float64).reshape(64, 64, 1) * np.ones(3)
+    ramp = np.repeat(np.linspace(0, 1, 4096).astype(np.float64), 3).reshape(64, 64, 3)
     found = numbers(ramp)
     for percent in (1, 5, 25, 50, 75, 95):
         assert found[f"luminance_{percent}"] == pytest.approx(percent / 99, abs=0.001)
