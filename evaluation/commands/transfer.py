@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
@@ -40,18 +41,13 @@ Training sets that share pictures with the test set, by name or content, are ref
 """
 
 
+@with_data_options
 def transfer(
     train: Annotated[
         list[str],
         typer.Option(metavar="GENERATED", help="Data set to train on; may be repeated.", show_default=False),
     ],
     test: Annotated[str, typer.Option(metavar="REAL", help="Data set to test on.", show_default=False)],
-    layout: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="Layout of the test set. \\[default: by what it looks like]", show_default=False
-        ),
-    ] = None,
     methods: Annotated[str, typer.Option(metavar="LIST", help="Learned methods between commas, or all.")] = "all",
     statistics: Annotated[
         str, typer.Option(metavar="LIST", help="Statistics methods for reference between commas, all or none.")
@@ -114,9 +110,11 @@ def transfer(
         int | None,
         typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False),
     ] = None,
+    *,
+    reading: DataReading,
 ) -> None:
-    """Train on generated data, test on real data."""
-    from dataclasses import replace
+    """Train on generated data, test on real data; options of reading are those of the test set."""
+    from dataclasses import asdict, replace
 
     from evaluation.datasets import open_scenes
     from evaluation.experiments.transfer.figures import figures_of
@@ -132,7 +130,7 @@ def transfer(
     threads = workers or processor_count()
     learners = _learners(methods)
     references = _references(statistics)
-    tested = open_scenes(test, layout)
+    tested = reading.open(test)
     plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared)
     if told := _sizes(tested, plan, side):
         plan = replace(plan, notes=(*plan.notes, told))
@@ -152,6 +150,7 @@ def transfer(
         "side": side,
         "shared": shared,
         "error": error,
+        "reading": asdict(reading),
     }
     outcome = TransferOutcome(tested, plan, rows, figures, drawn, settings)
     for table in outcome.tables():
