@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from evaluation.commands.choosing import METHOD_HELP
+from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
@@ -29,16 +30,11 @@ A run with --out that was stopped goes on when the same command is given again.
 """
 
 
+@with_data_options
 def run(
     data: Annotated[
         str, typer.Argument(metavar="DATA", help="Folder or file of the data set, or its URL.", show_default=False)
     ],
-    layout: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="Layout of the data set. \\[default: by what it looks like]", show_default=False
-        ),
-    ] = None,
     method: Annotated[list[str] | None, typer.Option(metavar="METHOD", help=METHOD_HELP, show_default=False)] = None,
     methods: Annotated[
         str | None,
@@ -93,10 +89,11 @@ def run(
             show_default=False,
         ),
     ] = None,
+    *,
+    reading: DataReading,
 ) -> None:
     """Evaluate methods on a data set."""
     from evaluation.commands.choosing import choose_estimates, choose_methods
-    from evaluation.datasets import open_scenes
     from evaluation.experiments.run_folder import run_methods
     from evaluation.results.result import images_csv, table_csv
     from foundation.console import orderly_end, progress
@@ -108,7 +105,7 @@ def run(
         listed = ["all"]
     chosen = choose_methods([*listed, *(method or [])])
     _require_free(csv, images, out)
-    found = open_scenes(data, layout)
+    found = reading.open(data)
     given = choose_estimates(estimates or [], [scene.name for scene in found.scenes])
     with orderly_end(), progress("images") as advance:
         made = run_methods(found, [*chosen, *given], out, error, workers or processor_count(), advance)

@@ -25,7 +25,7 @@ from evaluation.reports.latex import table_to_latex
 from evaluation.reports.run_page import MOST_SHOWN, chosen_images, run_page
 from evaluation.results.answers import SceneAnswer, results_of
 from evaluation.results.errors_file import ERRORS_FILE
-from evaluation.results.journal import JOURNAL_FILE, Journal, read_journal
+from evaluation.results.journal import JOURNAL_FILE, AnswerJournal, read_journal
 from evaluation.results.method_records import describe_method
 from evaluation.results.result import Result
 from evaluation.results.run import Run
@@ -97,7 +97,9 @@ def run_methods(
         journal = partial / JOURNAL_FILE
         known = read_journal(journal, _identity(run))
         with journal.open("ab", buffering=0) as stream:
-            answers = _answers(data.scenes, methods, known, Journal(stream, len(known), folder), workers, on_scene)
+            answers = _answers(
+                data.scenes, methods, known, AnswerJournal(stream, len(known), folder), workers, on_scene
+            )
         run = finished(answers)
         _publish(run, data.scenes, folder, kind, workers)
     return run
@@ -199,7 +201,11 @@ def _run_of(
 def _identity(run: Run) -> dict[str, Any]:
     """Return what must be the same for a run to go on with what another has made; its keys stand in messages."""
     return {
-        "data set": {"images": len(run.subject.images), "sha256": run.data_sha256, "several lights": run.subject.mixed},
+        "data set": {
+            "images": len(run.subject.images),
+            "sha256": run.data_sha256,
+            "several lights": sum(run.subject.mixed),
+        },
         "treatment": dict(run.treatment),
         "methods": list(run.methods),
         "settings": dict(run.settings),
@@ -211,7 +217,7 @@ def _answers(
     scenes: Sequence[Scene],
     methods: Sequence[Method | SceneMethod],
     known: list[tuple[SceneAnswer, ...]],
-    journal: Journal | None,
+    journal: AnswerJournal | None,
     workers: int,
     on_scene: Callable[[int, int], None] | None,
 ) -> list[tuple[SceneAnswer, ...]]:

@@ -66,7 +66,7 @@ def read_journal(path: Path, identity: dict[str, Any]) -> list[tuple[SceneAnswer
     return answers
 
 
-class Journal:
+class AnswerJournal:
     """The file, open to be continued.
 
     Parameters

@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.metrics import MapError, RegionError
 from evaluation.results.answers import SceneAnswer
-from evaluation.results.journal import Journal, read_journal
+from evaluation.results.journal import AnswerJournal, read_journal
 from foundation.errors import InputError
 
 IDENTITY = {"methods": [{"name": "A", "settings": {"p": 1 / 3}}], "software": "x 1", "several lights": (False, True)}
@@ -24,7 +24,7 @@ def written(path: Path) -> bytes:
     """Return the bytes of the journal of all answers."""
     assert read_journal(path, IDENTITY) == []
     with path.open("ab", buffering=0) as stream:
-        journal = Journal(stream, 0, path.parent)
+        journal = AnswerJournal(stream, 0, path.parent)
         for answers in ANSWERS:
             journal.append(answers)
     return path.read_bytes()
@@ -48,7 +48,7 @@ def test_a_journal_cut_anywhere_goes_on_where_it_was_whole(tmp_path: Path) -> No
         known = read_journal(path, IDENTITY)
         assert known == ANSWERS[: max(0, sum(end <= cut for end in ends) - 1)]
         with path.open("ab", buffering=0) as stream:
-            journal = Journal(stream, len(known), tmp_path)
+            journal = AnswerJournal(stream, len(known), tmp_path)
             for answers in ANSWERS[len(known) :]:
                 journal.append(answers)
         assert path.read_bytes() == whole
