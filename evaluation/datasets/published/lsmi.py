@@ -47,7 +47,7 @@ _IMAGE = re.compile(r"(?P<place>.+)_(?P<lights>[123]{1,3})\.tiff?")
 _RAW = (".dng", ".nef", ".arw")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class LsmiScene(RawScene):
     """An image under one light.
 
@@ -79,7 +79,7 @@ class LsmiScene(RawScene):
         return mask
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class LsmiMixedScene(LsmiScene):
     """An image under two or three lights; `light` is not used.
 
@@ -147,7 +147,7 @@ def is_lsmi(folder: Folder) -> bool:
     return bool(_cameras(folder))
 
 
-def open_lsmi(place: str, options: DataOptions) -> SceneSet:
+def open_lsmi(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
     """Return the images of all cameras or of one, of all parts or of one; they are read when they are used.
 
     `options.subset` is a part, "train", "val" or "test", or a number of lights, "single" or "mixed", or both:
@@ -160,7 +160,7 @@ def open_lsmi(place: str, options: DataOptions) -> SceneSet:
     FormatError
         A file is missing, or meta.json or split.json is damaged.
     """
-    folder = Folder(Path(place))
+    folder = listed or Folder(Path(place))
     cameras = _cameras(folder)
     if not cameras:
         raise FormatError(f"{place} is no copy of LSMI: it has no meta.json beside split.json; name a camera's folder")

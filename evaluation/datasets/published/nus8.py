@@ -33,7 +33,7 @@ from foundation.errors import FormatError
 _ENDING = "_gt.mat"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ChartScene(RawScene):
     """An image with the box of its chart.
 
@@ -68,7 +68,7 @@ def is_nus8(folder: Folder) -> bool:
     return any(True for _ in _tables(folder))
 
 
-def open_nus8(place: str, options: DataOptions) -> SceneSet:
+def open_nus8(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
     """Return the images of all cameras in a folder, or of one; they are read when they are used.
 
     Raises
@@ -78,7 +78,7 @@ def open_nus8(place: str, options: DataOptions) -> SceneSet:
     FormatError
         A .mat file is missing or damaged, or images are missing or too many.
     """
-    folder = Folder(Path(place))
+    folder = listed or Folder(Path(place))
     tables = {path.name[: -len(_ENDING)]: path for path in _tables(folder)}
     if not tables:
         raise FormatError(f"{place} has no CAMERA{_ENDING}, expected one a camera; fetch GROUNDTRUTH from its page")
