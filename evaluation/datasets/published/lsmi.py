@@ -99,10 +99,11 @@ class LsmiMixedScene(LsmiScene):
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64, r + g + b = 1: the mean over the pixels whose lights are known; read once."""
+        """The light (3,) float64, r + g + b = 1: the mean of the pixels' lights, where they are known; read once."""
         if "" not in self._means:
-            lights = self.read_truth_map().reshape(-1, 3)
-            self._means[""] = lights[np.isfinite(lights[:, 0])].mean(axis=0, dtype=np.float64)
+            weights = self.read_weights().reshape(-1, len(self.several))
+            mean = weights[np.isfinite(weights[:, 0])].mean(axis=0, dtype=np.float64) @ self.lights
+            self._means[""] = mean / mean.sum()
         return self._means[""]
 
     @property
