@@ -45,6 +45,7 @@ SLOW = (
     "evaluation/datasets/test_generated.py",
     "evaluation/test_cli.py",
     "foundation/test_compiled.py",
+    "evaluation/experiments/test_run_folder.py",
     "generator/dataset/production/test_engines.py",
     "generator/dataset/production/test_layouts.py",
     "generator/dataset/production/test_workplace.py",
