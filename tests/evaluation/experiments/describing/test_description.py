@@ -110,7 +110,7 @@ def test_figures_are_those_of_a_few_lines_of_numpy(thumbnails: Path) -> None:
         pixels = pixels[pixels.any(axis=1)]
         lit = pixels[(pixels > 0).all(axis=1)]
         chroma = lit / lit.sum(axis=1)[:, None]
-        spreads.append(float(np.sqrt(np.mean(np.std(chroma, axis=0) ** 2))))
+        spreads.append(float(np.sqrt(np.mean(np.var(chroma, axis=0)))))
         means: npt.NDArray[np.float64] = pixels.mean(axis=0)
         offsets.append(np.log(np.array([means[0], means[2]]) / means[1]))
         grey = (pixels * light.mean()).mean(axis=1)
