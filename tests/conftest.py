@@ -42,6 +42,7 @@ SLOW = (
     "drivers/raw/test_rawfile.py",
     "drivers/test_gphoto2_camera.py",
     "end_to_end",
+    "evaluation/commands/test_transfer.py",
     "evaluation/datasets/test_generated.py",
     "evaluation/test_cli.py",
     "foundation/test_compiled.py",
