@@ -3,7 +3,8 @@
 The paper prints "the sRGB images of the Canon 1Ds Mark III" (section 4.3), which the camera or a program of its maker
 had developed; nobody has published how. Ours, with the ground truth at hand:
 
-1. the image is divided by its light, green kept;
+1. the image is divided by its light, green kept, and cut where the first channel clips, so that clipped skies become
+   white and not pink (dcraw's ``-H 0``); thumbnails do not show what was clipped, and keep a few pink ones;
 2. the camera's colour matrix takes it to linear sRGB (D. Coffin, dcraw: XYZ of D65 to camera RGB in ten-thousandths,
    Adobe's numbers; the matrix from sRGB has rows of sum 1, so that white stays white);
 3. it is scaled so that one in a hundred of the values of the channel that reaches highest lies above 1, dcraw's
@@ -71,6 +72,7 @@ def develop(
     light: npt.NDArray[np.float64],
     mask: npt.NDArray[np.bool_] | None = None,
     camera: str | None = None,
+    saturation: float | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Return the sRGB picture of a raw image; the steps stand at the head of this file.
 
@@ -84,6 +86,8 @@ def develop(
         (H, W) bool, True where a pixel has no say in the white level; None if all have.
     camera
         One of `CAMERAS`; None takes balanced camera RGB for linear sRGB.
+    saturation
+        Value of the image from which a channel is clipped; None if none is.
 
     Returns
     -------
@@ -110,6 +114,8 @@ def develop(
     if not (np.isfinite(light).all() and light.min() > 0):
         raise InputError(f"a picture cannot be balanced for the light {light.tolist()}; expected three numbers above 0")
     linear: npt.NDArray[np.float64] = np.asarray(image, dtype=np.float64) * (light[1] / light)
+    if saturation is not None:
+        linear = np.minimum(linear, saturation * float((light[1] / light).min()))
     if camera is not None:
         linear = linear @ np.linalg.inv(camera_from_srgb(camera)).T
     seen = linear.reshape(-1, 3) if mask is None else linear[~mask]
@@ -144,7 +150,7 @@ class DevelopedSource:
     def read(self) -> SourcePicture:
         """Return the picture, codes (H, W, 3) uint8; masked pixels are black."""
         image, mask = self.scene.read()
-        picture = develop(image, self.scene.truth, mask, self.camera)
+        picture = develop(image, self.scene.truth, mask, self.camera, self.scene.saturation)
         if mask is not None:
             picture[mask] = 0
         return SourcePicture(picture)

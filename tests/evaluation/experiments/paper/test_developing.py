@@ -11,7 +11,7 @@ import pytest
 from evaluation.experiments.paper.developing import DevelopedSource, camera_from_srgb, develop, developed
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
-from foundation.srgb import decode_srgb
+from foundation.srgb import decode_srgb, srgb_codes
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +59,16 @@ def test_one_in_a_hundred_is_clipped() -> None:
     alone = develop(bright[50:], np.array([0.3, 1.0, 0.4]))
     np.testing.assert_array_equal(develop(bright, np.array([0.3, 1.0, 0.4]), mask)[50:], alone)
     assert develop(bright, np.array([0.3, 1.0, 0.4]))[50:].max() < 128
+
+
+def test_a_clipped_sky_is_white() -> None:
+    light = np.array([0.5, 1.0, 0.7])
+    image = np.full((20, 20, 3), 200.0) * light
+    image[:10] = 1000.0  # all channels at saturation: under this light as red and blue as no sky is
+    pink, white = (develop(image, light, saturation=level)[0, 0].tolist() for level in (None, 1000.0))
+    assert pink == srgb_codes([1, 0.5, 0.5 / 0.7]).tolist()
+    assert white == [255, 255, 255]
+    np.testing.assert_array_equal(develop(image, light, saturation=5000.0), develop(image, light))
 
 
 def test_a_source_has_no_chart() -> None:
