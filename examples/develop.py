@@ -1,7 +1,7 @@
 """Develop the raw images of a real data set to sRGB pictures, to generate from: white balanced by their ground truths.
 
-Usage: python examples/develop.py DATA FOLDER [--camera NAME] [--side PX]. DATA is any data set that evaluate reads. How
-it is done says evaluation/experiments/paper/developing.py; the pictures are PNG of 8 bits, named after the images.
+Usage: python examples/develop.py DATA FOLDER [--matrix CAMERA] [--side PX]. DATA is any data set that evaluate reads.
+How it is done says evaluation/experiments/paper/developing.py; the pictures are PNG of 8 bits, named after the images.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from pathlib import Path, PurePosixPath
 import cv2
 
 from evaluation.datasets import open_scenes
-from evaluation.experiments.paper.developing import CAMERAS, developed
+from evaluation.experiments.paper.developing import developed
 from evaluation.experiments.paper.rendering import ScaledSource
+from evaluation.experiments.transfer.matrices import choose_matrix
 
 
 def main() -> None:
@@ -21,10 +22,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", help="data set")
     parser.add_argument("folder", type=Path, help="where the pictures go")
-    parser.add_argument("--camera", choices=CAMERAS, help="whose colour matrix is used; none by default")
+    parser.add_argument("--matrix", default="none", help="colour matrix: a camera, or a file of 3 x 3 numbers")
     parser.add_argument("--side", type=int, help="longest side, px; as it is by default")
     chosen = parser.parse_args()
-    sources = developed(open_scenes(chosen.data), chosen.camera)
+    sources = developed(open_scenes(chosen.data), choose_matrix(chosen.matrix))
     chosen.folder.mkdir(parents=True)
     for source in sources:
         picture = (ScaledSource(source, chosen.side) if chosen.side else source).read().picture
