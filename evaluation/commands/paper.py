@@ -106,9 +106,9 @@ def table1(
     """Run plain methods on eight generated data sets."""
     from evaluation.experiments.paper.hot import hot_rows
     from evaluation.experiments.paper.reporting import table1_report
+    from evaluation.experiments.paper.scenes.truths import read_truths
     from evaluation.experiments.paper.table1 import settings, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
-    from evaluation.experiments.paper.truths import read_truths
     from foundation.processors import processor_count
 
     sides, shares = [int(side) for side in _numbers(sizes, "side of an image, px", 65535)], _numbers(hot, "share", 1e6)
@@ -270,7 +270,7 @@ def chromaticities(
 ) -> None:
     """Show the chromaticities of tables' lights."""
     from evaluation.experiments.paper.reporting import chromaticities_report
-    from evaluation.experiments.paper.truths import read_truths
+    from evaluation.experiments.paper.scenes.truths import read_truths
 
     _require_free(out)
     report = chromaticities_report(_open(luts), [read_truths(place) for place in truths or ()])
@@ -304,7 +304,7 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str]:
     """Return the source pictures at a place, and what was done to get them."""
     from evaluation.datasets import open_scenes
     from evaluation.datasets.opening import layout_of
-    from evaluation.experiments.paper.developing import developed
+    from evaluation.experiments.paper.scenes.developing import developed
     from evaluation.experiments.transfer.matrices import choose_matrix
     from foundation.errors import FormatError, InputError
     from generator import find_pictures

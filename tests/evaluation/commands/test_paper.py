@@ -66,7 +66,7 @@ def test_table1(
     first = rows[0]
     assert re.search(rf"White-Patch +│ +{float(first['mean']):.2f} │ +{float(first['median']):.2f} │", printed)
     assert {path.name for path in out.iterdir()} == {
-        *("report.html", "table1.csv", "table1.tex", "table1_recovery.tex", "noise.csv"),
+        *("report.html", "table1.csv", "table1.tex", "table1_recovery.tex", "noise.csv", "print.csv"),
         *("sizes.csv", "sizes.svg", "hot.csv", "hot.tex"),
     }
     page = (out / "report.html").read_text()

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.paper.developing import DevelopedSource, develop, developed
+from evaluation.experiments.paper.scenes.developing import DevelopedSource, develop, developed
 from evaluation.experiments.transfer.matrices import camera_matrix
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
