@@ -1,7 +1,7 @@
 """Develop the raw images of a real data set to sRGB pictures, to generate from: white balanced by their ground truths.
 
 Usage: python examples/develop.py DATA FOLDER [--matrix CAMERA] [--side PX]. DATA is any data set that evaluate reads.
-How it is done says evaluation/experiments/paper/scenes/developing.py; the pictures are PNG of 8 bits, named after the images.
+How it is done says evaluation/experiments/paper/scenes/developing.py; the pictures are PNG, named after the images.
 """
 
 from __future__ import annotations
