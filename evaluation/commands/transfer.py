@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from evaluation.experiments.transfer.material import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
     from evaluation.methods.method import Method
-    from evaluation.scene import Scene, SceneSet
+    from evaluation.scene import SceneSet
 
 _FOLDS = "3"
 """Folds of the field's tables, on NUS and on Cube+."""
@@ -40,18 +41,13 @@ Training sets that share pictures with the test set, by name or content, are ref
 """
 
 
+@with_data_options
 def transfer(
     train: Annotated[
         list[str],
         typer.Option(metavar="GENERATED", help="Data set to train on; may be repeated.", show_default=False),
     ],
     test: Annotated[str, typer.Option(metavar="REAL", help="Data set to test on.", show_default=False)],
-    layout: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="Layout of the test set. \\[default: by what it looks like]", show_default=False
-        ),
-    ] = None,
     methods: Annotated[str, typer.Option(metavar="LIST", help="Learned methods between commas, or all.")] = "all",
     statistics: Annotated[
         str, typer.Option(metavar="LIST", help="Statistics methods for reference between commas, all or none.")
@@ -114,8 +110,12 @@ def transfer(
         int | None,
         typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False),
     ] = None,
+    *,
+    reading: DataReading,
 ) -> None:
-    """Train on generated data, test on real data."""
+    """Train on generated data, test on real data; options of reading are those of the test set."""
+    from dataclasses import asdict, replace
+
     from evaluation.datasets import open_scenes
     from evaluation.experiments.transfer.figures import figures_of
     from evaluation.experiments.transfer.outcome import TransferOutcome, save_outcome
@@ -130,14 +130,15 @@ def transfer(
     threads = workers or processor_count()
     learners = _learners(methods)
     references = _references(statistics)
-    tested = open_scenes(test, layout)
+    tested = reading.open(test)
     plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared)
+    if told := _sizes(tested, plan, side):
+        plan = replace(plan, notes=(*plan.notes, told))
     drawn = _folds(folds, tested, seeds)
     smallest = min(len(some.scenes) for some in plan.training)
     wanted = smallest if images is None else images
     with _progress() as step:
-        scenes, plan = _alike(tested, plan, side, threads, step)
-        rows = run_transfer(scenes, plan.training, learners, drawn, wanted, references, threads, step)
+        rows = run_transfer(tested.scenes, plan.training, learners, drawn, wanted, references, side, threads, step)
     figures = figures_of(rows, error)
     settings: dict[str, Any] = {
         "methods": [learner.name for learner in learners],
@@ -149,8 +150,9 @@ def transfer(
         "side": side,
         "shared": shared,
         "error": error,
+        "reading": asdict(reading),
     }
-    outcome = TransferOutcome(tested, scenes, plan, rows, figures, drawn, settings)
+    outcome = TransferOutcome(tested, plan, rows, figures, drawn, settings)
     for table in outcome.tables():
         print_table(table)
         print()
@@ -222,29 +224,17 @@ def _folds(text: str | None, test: SceneSet, seeds: int) -> tuple[npt.NDArray[np
     return (read_folds(Path(wanted), [scene.name for scene in test.scenes]),) * seeds
 
 
-def _alike(
-    test: SceneSet, plan: TransferPlan, side: int | None, workers: int, on_scene: Callable[[], None]
-) -> tuple[tuple[Scene, ...], TransferPlan]:
-    """Return test images and plan with all images made small, or with a word of caution where they are not alike."""
-    from dataclasses import replace
-
-    from evaluation.experiments.transfer.thumbnails import make_small
-
+def _sizes(test: SceneSet, plan: TransferPlan, side: int | None) -> str:
+    """Return what the reader is told of the sizes of images; nothing where they are alike."""
     if side is not None:
-        training = tuple(
-            replace(some, scenes=make_small(some.scenes, side, workers, on_scene)) for some in plan.training
-        )
-        note = f"All images were made small to at most {side} px by averaging areas without clipped and masked pixels"
-        small = make_small(test.scenes, side, workers, on_scene)
-        return small, replace(plan, training=training, notes=(*plan.notes, note))
+        return f"All images were made small to at most {side} px by averaging areas without clipped and masked pixels"
     sizes = [max(scenes[0].read()[0].shape) for scenes in (test.scenes, plan.training[0].scenes)]
     if max(sizes) <= _ALIKE * min(sizes):
-        return test.scenes, plan
-    note = (
+        return ""
+    return (
         f"Training images have sides of up to {sizes[1]} px and test images of up to {sizes[0]} px: methods see detail "
         f"and noise in one that the other lacks; --side {min(sizes)} makes them alike"
     )
-    return test.scenes, replace(plan, notes=(*plan.notes, note))
 
 
 @contextmanager

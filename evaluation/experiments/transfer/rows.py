@@ -121,6 +121,7 @@ def transfer(
     folds: Sequence[npt.NDArray[np.int64]],
     images: int,
     methods: Sequence[Method] = (),
+    side: int | None = None,
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[TransferRow, ...]:
@@ -143,6 +144,8 @@ def transfer(
         Training images of each training set, drawn anew by each seed.
     methods
         Methods that learn nothing, for reference.
+    side
+        Longest side that images are made small to first, px; None leaves all as they are.
     workers
         Threads that read images; no number depends on it.
     on_scene
@@ -167,7 +170,7 @@ def transfer(
         require_apart(test, each)
     # All that may be refused is, before the first image is read.
     drawn = [[draw_images(len(some.scenes), images, seed) for seed in range(len(folds))] for some in training]
-    trials = gather(test, learners, workers, on_scene)
+    trials = gather(test, learners, side, workers, on_scene)
     parts = [
         TransferRow(learner.name, "cross-validation", "", _least(folds), _crossed(learner, number, trials, folds))
         for number, learner in enumerate(learners)
@@ -175,7 +178,7 @@ def transfer(
     for some, wanted in zip(training, drawn, strict=True):
         # Of a large set only what some seed wants is read.
         used = np.unique(np.concatenate(wanted))
-        lessons = gather([some.scenes[int(place)] for place in used.tolist()], learners, workers, on_scene)
+        lessons = gather([some.scenes[int(place)] for place in used.tolist()], learners, side, workers, on_scene)
         for number, learner in enumerate(learners):
             if isinstance(learner, ConstantLight) and some.kind in NAIVE:
                 continue
@@ -186,7 +189,7 @@ def transfer(
             parts.append(TransferRow(learner.name, some.kind, some.data, images, results))
     rows = [part for learner in learners for part in parts if part.method == learner.name]
     if methods:
-        found = evaluate(test, methods, workers)
+        found = evaluate(trials.scenes, methods, workers)
         rows += [TransferRow(result.method, "none", "", 0, (result,)) for result in found]
     return tuple(rows)
 
