@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,8 +11,6 @@ from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
-
     import numpy as np
     import numpy.typing as npt
 
@@ -120,8 +117,11 @@ def transfer(
     from evaluation.experiments.transfer.figures import figures_of
     from evaluation.experiments.transfer.outcome import TransferOutcome, save_outcome
     from evaluation.experiments.transfer.plan import plan_transfer
+    from evaluation.experiments.transfer.rows import count_images
     from evaluation.experiments.transfer.rows import transfer as run_transfer
     from evaluation.reports.terminal import print_table
+    from evaluation.results.method_records import describe_method
+    from foundation.console import orderly_end, progress
     from foundation.files import require_free
     from foundation.processors import processor_count
 
@@ -137,12 +137,17 @@ def transfer(
     drawn = _folds(folds, tested, seeds)
     smallest = min(len(some.scenes) for some in plan.training)
     wanted = smallest if images is None else images
-    with _progress() as step:
-        rows = run_transfer(tested.scenes, plan.training, learners, drawn, wanted, references, side, threads, step)
+    count = count_images(tested.scenes, plan.training, len(drawn), wanted)
+    with orderly_end(), progress("images") as advance:
+        steps = iter(range(1, count + 1))
+        rows = run_transfer(
+            *(tested.scenes, plan.training, learners, drawn, wanted, references),
+            *(side, threads, lambda: advance(next(steps), count)),
+        )
     figures = figures_of(rows, error)
     settings: dict[str, Any] = {
-        "methods": [learner.name for learner in learners],
-        "statistics": [method.name for method in references],
+        "methods": [describe_method(learner) for learner in learners],
+        "statistics": [describe_method(method) for method in references],
         "folds": folds or ("the data set's own" if tested.folds is not None else _FOLDS),
         "matrix": matrix,
         "images": wanted,
@@ -164,49 +169,23 @@ def transfer(
 
 def _learners(text: str) -> list[AnyLearner]:
     """Return the learned methods of a list, built-in ones or classes of the user's own, and the constant light."""
+    from evaluation.commands.choosing import choose_learners
     from evaluation.learning.constant_light import ConstantLight
-    from evaluation.learning.feature_learner import FeatureLearner
-    from evaluation.learning.standard import standard_learners
-    from evaluation.methods.method import Learner
-    from evaluation.methods.naming import find_method
     from foundation.errors import InputError
 
-    known = standard_learners()
-    names = list(known) if text.strip().lower() == "all" else [name.strip() for name in text.split(",")]
-    found: list[AnyLearner] = []
-    for name in dict.fromkeys(names):
-        if name in known or name == ConstantLight().key:
-            found += [] if name == ConstantLight().key else [known[name]]
-            continue
-        if ":" not in name:
-            raise InputError(
-                f"{name!r} is no learned method; they are {', '.join(known)}, or all; one of your own is named as "
-                "module:Class or file.py:Class"
-            )
-        learner = find_method(name)
-        if not isinstance(learner, FeatureLearner | Learner):
-            raise InputError(f"{name} learns nothing: it has no fit(scenes, seed); evaluate run takes it")
-        found.append(learner)
-    found.append(ConstantLight())
-    titles = [learner.name for learner in found]
+    constant = ConstantLight()
+    chosen = [each for each in choose_learners(text.split(",")) if each.name != constant.name]
+    titles = [each.name for each in chosen]
     for title in titles:
         if titles.count(title) > 1:
             raise InputError(f"two methods are called {title}; give one another name: names head the rows")
-    return found
+    return [*chosen, constant]
 
 
 def _references(text: str) -> list[Method]:
-    from evaluation.methods.standard import standard_methods
-    from foundation.errors import InputError
+    from evaluation.commands.choosing import choose_methods
 
-    known = standard_methods()
-    if text.strip().lower() == "none":
-        return []
-    names = list(known) if text.strip().lower() == "all" else [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in known:
-            raise InputError(f"{name!r} is no statistics method; they are {', '.join(known)}, all or none")
-    return [known[name] for name in dict.fromkeys(names)]
+    return [] if text.strip().lower() == "none" else choose_methods(text.split(","))
 
 
 def _folds(text: str | None, test: SceneSet, seeds: int) -> tuple[npt.NDArray[np.int64], ...]:
@@ -235,15 +214,3 @@ def _sizes(test: SceneSet, plan: TransferPlan, side: int | None) -> str:
         f"Training images have sides of up to {sizes[1]} px and test images of up to {sizes[0]} px: methods see detail "
         f"and noise in one that the other lacks; --side {min(sizes)} makes them alike"
     )
-
-
-@contextmanager
-def _progress() -> Generator[Callable[[], None]]:
-    """Show how many images have been read; their number depends on what seeds draw."""
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.completed} images read"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("images", total=None)
-        yield lambda: progress.advance(task)

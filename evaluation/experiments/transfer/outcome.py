@@ -26,7 +26,8 @@ from evaluation.experiments.transfer.tables import (
 from evaluation.reports.latex import table_to_latex
 from evaluation.reports.page import figure_part, heading, page, paragraph, table_part
 from evaluation.reports.style import FAINT, INK, series_style, svg_of
-from evaluation.results.result import Result, images_csv
+from evaluation.results.result import Result
+from evaluation.results.run_files import errors_csv
 from evaluation.results.tables import Table, table_to_csv
 from evaluation.scene import SceneSet
 from foundation.files import whole_folder, write_whole
@@ -92,9 +93,10 @@ def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
         The disk is full, read-only or gone; nothing is left behind.
     """
     names = [scene.name for scene in outcome.test.scenes]
+    truths = np.stack([scene.truth for scene in outcome.test.scenes])
     with whole_folder(folder, "the results") as partial:
         write_whole(partial / "results.csv", table_to_csv(long_table(outcome.figures)))
-        write_whole(partial / "errors.csv", images_csv(outcome.test.scenes, labelled_results(outcome.rows)))
+        write_whole(partial / "errors.csv", errors_csv(names, truths, labelled_results(outcome.rows)))
         for seed, folds in enumerate(outcome.folds):
             write_whole(partial / f"folds_{seed}.csv", folds_to_csv(names, folds))
         write_whole(partial / "tables.tex", "\n".join(table_to_latex(table) for table in outcome.tables()))
