@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
@@ -37,10 +38,6 @@ Out = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Write page, tables and figures here.", show_default=False)
 ]
 Seed = Annotated[int, typer.Option(metavar="N", help="Of all that is drawn at random.", min=0)]
-Layout = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="Layout of DATA. \\[default: by what it looks like]", show_default=False),
-]
 Workers = Annotated[
     int | None, typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False)
 ]
@@ -140,6 +137,7 @@ the real one, and tests on the real one. The paper's numbers stand beside those 
 
 
 @app.command("table2", help=_TABLE2)
+@with_data_options
 def table2(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set; the paper's is Cube+.")],
     generated: Annotated[
@@ -149,11 +147,12 @@ def table2(
         str, typer.Option(metavar="LIST", help="Learned methods, between commas.")
     ] = "smart-color-cat,regression-trees,color-beaver",
     folds: Annotated[str, typer.Option(metavar="N|FILE", help="Folds of the cross-validation, or their file.")] = "3",
-    layout: Layout = None,
     error: Kind = "reproduction",
     seed: Seed = 0,
     out: Out = None,
     workers: Workers = None,
+    *,
+    reading: DataReading,
 ) -> None:
     """Train learned methods on real and on generated images."""
     from evaluation.datasets import open_scenes
@@ -172,7 +171,7 @@ def table2(
         if name not in known:
             raise InputError(f"{name!r} is no learned method; the methods are {', '.join(known)}")
     learners = {name: known[name] for name in names}
-    real, made = open_scenes(data, layout), open_scenes(generated)
+    real, made = reading.open(data), open_scenes(generated)
     count = len(real.scenes)
     if folds.isdigit():
         drawn = draw_folds(count, int(folds), seed)
@@ -200,24 +199,25 @@ nothing unless asked with --out.
 
 
 @app.command("bits", help=_BITS)
+@with_data_options
 def bits(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images; the paper's is NUS C1.")],
     sigma: Annotated[
         float, typer.Option(metavar="PX", help="Scale of Gray-Edge; 6 is usual for images of full size.", min=0.1)
     ] = 6.0,
-    layout: Layout = None,
     error: Kind = "reproduction",
     out: Out = None,
     workers: Workers = None,
+    *,
+    reading: DataReading,
 ) -> None:
     """Run methods on images whose colours were reduced."""
-    from evaluation.datasets import open_scenes
     from evaluation.experiments.paper.bits import bits_methods, bits_removed
     from evaluation.experiments.paper.reporting import bits_report
     from foundation.processors import processor_count
 
     _require_free(out)
-    opened = open_scenes(data, layout)
+    opened = reading.open(data)
     with _progress(len(opened.scenes)) as step:
         found = bits_removed(opened.scenes, bits_methods(sigma), workers=workers or processor_count(), on_scene=step)
     conditions = (f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px.",)
