@@ -1,16 +1,16 @@
 """Color Beaver: the estimates of another method, kept within a learned region of lights.
 
-K. Koščević, N. Banić, S. Lončarić, "Color Beaver: bounding illumination estimations for higher accuracy", VISAPP 2019. The
-estimate of an underlying method, in the paper's table Gray-world, is moved into a region of the chromaticity plane; the
-region is found by a genetic algorithm that minimises the median angular error on the training images.
+K. Koščević, N. Banić, S. Lončarić, "Color Beaver: bounding illumination estimations for higher accuracy", VISAPP 2019.
+The estimate of an underlying method, in the paper's table Gray-world, is moved into a region of the chromaticity
+plane; the region is found by a genetic algorithm that minimises the median angular error on the training images.
 
-*Reconstruction*, from the abstract and from what this house recollects of the paper: the plane is that of r and b of r +
-g + b = 1; the region is a polyline of `corners` points with a half-width at each end, that is a band along the locus of
-lights; an estimate outside it moves to its nearest point. A genome holds the corners, the two half-widths, and which
-of `bases` is used, so that the parameters of the underlying method are found with it. The first generation lies about the
-training lights' own axis; parents are chosen by tournaments of three, genes are crossed one by one between the parents
-(BLX-α, L. J. Eshelman, J. D. Schaffer 1993) and mutated by a normal step that shrinks over the generations; the best few
-survive unchanged. The error is the recovery error.
+*Reconstruction*, from the abstract and from what this house recollects of the paper: the plane is that of r and b of r
++ g + b = 1; the region is a polyline of `corners` points with a half-width at each end, that is a band along the locus
+of lights; an estimate outside it moves to its nearest point. A genome holds the corners, the two half-widths, and
+which of `bases` is used, so that the parameters of the underlying method are found with it. The first generation lies
+about the training lights' own axis; parents are chosen by tournaments of three, genes are crossed one by one between
+the parents (BLX-α, L. J. Eshelman, J. D. Schaffer 1993) and mutated by a normal step that shrinks over the
+generations; the best few survive unchanged. The error is the recovery error.
 """
 
 from __future__ import annotations
@@ -209,9 +209,7 @@ def _evolve(
     return LightBand(line[0], widths[0], np.array(used[winner], dtype=np.int64))
 
 
-def _decoded(
-    genomes: npt.NDArray[np.float64], corners: int
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _decoded(genomes: npt.NDArray[np.float64], corners: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return the polylines (P, K, 2) and half-widths (P, 2) ≥ 0 of genomes (P, 2 K + 2)."""
     return genomes[:, : 2 * corners].reshape(-1, corners, 2), np.maximum(genomes[:, 2 * corners :], 0)
 

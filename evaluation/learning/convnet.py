@@ -1,13 +1,13 @@
 """A small convolutional network that weighs local estimates by its confidence in them; needs PyTorch.
 
 After Y. Hu, B. Wang, S. Lin, "FC4: fully convolutional color constancy with confidence-weighted pooling", CVPR 2017: a
-fully convolutional network gives four channels, three of a local light and one of confidence; their product, summed over
-the image and scaled to length 1, is the light (equations 4 to 6), and the angular error is the loss (equation 7).
+fully convolutional network gives four channels, three of a local light and one of confidence; their product, summed
+over the image and scaled to length 1, is the light (equations 4 to 6), and the angular error is the loss (equation 7).
 
-*What is ours.* Three convolutions on thumbnails take the place of AlexNet or SqueezeNet pretrained on ImageNet, so that
-it trains on a processor in a minute; the network sees the square root of the image divided by its mean colour, and a
-channel that tells usable pixels; its local lights multiply that mean colour. Each image is flipped and lit anew at
-random in every epoch, as in the paper's section 5.1 (a gain of 0.6 to 1.4 on each channel).
+*What is ours.* Three convolutions on thumbnails take the place of AlexNet or SqueezeNet pretrained on ImageNet, so
+that it trains on a processor in a minute; the network sees the square root of the image divided by its mean colour,
+and a channel that tells usable pixels; its local lights multiply that mean colour. Each image is flipped and lit anew
+at random in every epoch, as in the paper's section 5.1 (a gain of 0.6 to 1.4 on each channel).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.learning.feature_learner import FeatureLearner, Features
+from evaluation.learning.feature_learner import FeatureLearner, Features, require_installed
 from evaluation.learning.working_size import reduce
 from evaluation.scene import Image
 from foundation.errors import InputError
@@ -68,6 +68,11 @@ class ConvNet(FeatureLearner):
         """Its name in tables."""
         return "Convolutional network"
 
+    @property
+    def needs(self) -> tuple[str, str]:
+        """What training needs: the module, and the command that installs it."""
+        return "torch", "pip install 'croplab[torch]'"
+
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float16] | None:
@@ -86,6 +91,7 @@ class ConvNet(FeatureLearner):
 
     def fit_features(self, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> ConvNetModel:
         """Return the network fitted to images (N, 64, 64, 4) float16 and lights (N, 3) float64."""
+        require_installed(self)
         torch = _torch()
         threads, generator = torch.get_num_threads(), torch.Generator().manual_seed(seed)
         # Sums of several threads depend on their number; the network is too small to gain by them.
@@ -167,7 +173,7 @@ def _shapes(width: int) -> dict[str, tuple[int, ...]]:
 
 
 def _initial(torch: Any, width: int, generator: Any) -> dict[str, Any]:
-    """Return weights as K. He et al. (ICCV 2015) draw them; the last layer begins with grey lights, equal everywhere."""
+    """Return weights as K. He et al. (ICCV 2015) draw them; those of the last layer begin at a tenth."""
     weights: dict[str, Any] = {}
     for name, shape in _shapes(width).items():
         inputs = int(np.prod(shape[1:]))

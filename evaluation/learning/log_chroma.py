@@ -46,8 +46,9 @@ _LARGEST = 256
 class LogChroma(FeatureLearner):
     """The method with its settings.
 
-    The weights are those that the authors' program publishes for thumbnails of the Gehler-Shi data set, except where
-    docs/reference/learned-methods.md says otherwise.
+    The weights are those that the authors' program publishes for thumbnails of the Gehler-Shi data set, except
+    `bias_smoothness` and the three sizes, which were chosen by cross-validation on thumbnails of a Canon 5DSR of
+    INTEL-TAU (docs/reference/learned-methods.md).
 
     Attributes
     ----------
@@ -75,10 +76,10 @@ class LogChroma(FeatureLearner):
     likelihood: float = 2.0**1.75
     pixel_smoothness: float = 2.0**-26.25
     edge_smoothness: float = 2.0**-23.5
-    bias_smoothness: float = 2.0**-23
-    pixel_size: float = 2.0**-60
-    edge_size: float = 2.0**-71.75
-    bias_size: float = 2.0**-93
+    bias_smoothness: float = 2.0**-17
+    pixel_size: float = 2.0**-33
+    edge_size: float = 2.0**-33
+    bias_size: float = 2.0**-25
     spread: float = 1.0
     pretraining: int = 16
     training: int = 64
@@ -126,8 +127,8 @@ class LogChroma(FeatureLearner):
         wide = span > _SPREAD * BINS * _FINE_SIZE
         if span > _SPREAD * _FINE_BINS * _FINE_SIZE:
             raise InputError(
-                f"the lights to learn from span {span:.2f} natural logarithms of green over red or blue; log-chroma tells "
-                f"{_SPREAD * _FINE_BINS * _FINE_SIZE:g}: leave out the most saturated lights, or use another method"
+                f"the lights to learn from span {span:.2f} natural logarithms of green over red or blue; log-chroma "
+                f"tells {_SPREAD * _FINE_BINS * _FINE_SIZE:g}: leave out the most saturated lights or take another method"
             )
         grid = (2 * _FINE_SIZE, _FINE_SIZE / 2) if wide else (_FINE_SIZE, 0.0)
         penalties = Penalties(
@@ -144,7 +145,7 @@ class LogChroma(FeatureLearner):
         return LogChromaModel(filters, bias, np.median(chromas, axis=0), np.array(grid))
 
     def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> LogChromaModel:
-        """Return the model whose arrays are given: of the shapes and dtypes of `LogChromaModel`."""
+        """Return the model whose arrays are given: filters (2, 64, 33) and so on, dtype by dtype as `LogChromaModel`."""
         shapes = {"filters": (_CHANNELS, BINS, BINS // 2 + 1), "bias": (BINS, BINS), "centre": (2,), "grid": (2,)}
         found: dict[str, Any] = {name: arrays[name] for name in shapes}
         for name, shape in shapes.items():
@@ -177,7 +178,7 @@ class LogChromaModel:
     grid: npt.NDArray[np.float64]
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
-        """Return the arrays by their names, of the shapes (2, 64, 33) and so on and the dtypes above."""
+        """Return the arrays by their names, filters (2, 64, 33) complex128 and so on as above."""
         return {"filters": self.filters, "bias": self.bias, "centre": self.centre, "grid": self.grid}
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:
@@ -202,7 +203,7 @@ def fold(features: Features, wide: bool) -> npt.NDArray[np.float64]:
     Parameters
     ----------
     features
-        The counts on the fine torus.
+        (N, 2, 128, 128) uint16, the counts on the fine torus.
     wide
         Whether neighbouring bins are joined, else bins that are half a turn apart.
     """
@@ -229,4 +230,4 @@ def _deviations(image: npt.NDArray[np.float32], used: npt.NDArray[np.bool_]) -> 
         near = (slice(down, down + height), slice(right, right + width))
         total += free[near][..., None] * np.abs(values[near] - image)
         count += free[near]
-    return total / np.maximum(count, 1)[..., None]
+    return (total / np.maximum(count, 1)[..., None]).astype(np.float32)

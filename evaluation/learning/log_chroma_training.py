@@ -1,11 +1,11 @@
 """Fit the filters and the bias of `log_chroma.py`.
 
-J. T. Barron, Y.-T. Tsai, "Fast Fourier color constancy", CVPR 2017, sections 3 and 4 and its supplement. The loss of the
-first iterations is convex, the cross-entropy between the softmax and the bin of the true light; that of the others is
-the negative log-likelihood of the true light under the fitted bivariate von Mises distribution, taken as a normal one
-on the unrolled torus (equations 9 to 13). The penalties, squares of the parameters and of their differences between
-neighbouring bins, are diagonal in Fourier space, where L-BFGS runs on parameters scaled so that the penalty is half
-their squared length (preconditioning, section 4.2).
+J. T. Barron, Y.-T. Tsai, "Fast Fourier color constancy", CVPR 2017, sections 3 and 4 and its supplement. The loss of
+the first iterations is convex, the cross-entropy between the softmax and the bin of the true light; that of the others
+is the negative log-likelihood of the true light under the fitted bivariate von Mises distribution, taken as a normal
+one on the unrolled torus (equations 9 to 13). The penalties, squares of the parameters and of their differences
+between neighbouring bins, are diagonal in Fourier space, where L-BFGS runs on parameters scaled so that the penalty is
+half their squared length (preconditioning, section 4.2).
 
 The Fourier transforms of real arrays are symmetric; instead of the paper's packing of their independent parts, the
 scaled parameters stay in the plane of bins and pass through Fourier space and back, a symmetric linear map. Gradients
@@ -139,7 +139,7 @@ def likelihood(
 def crossentropy(
     response: npt.NDArray[np.floating], likely: npt.NDArray[np.floating], places: npt.NDArray[np.floating]
 ) -> tuple[float, npt.NDArray[Any]]:
-    """Return the summed cross-entropy with the bins of true places (N, 2), and its derivative by the response.
+    """Return the summed cross-entropy with the bins of true places, and its derivative (N, 64, 64), a float dtype.
 
     Parameters
     ----------
@@ -177,8 +177,11 @@ def train(
     stages
         For each stage the iterations of L-BFGS and the weights of the cross-entropy and of the likelihood.
     """
-    from scipy import fft, optimize
+    import scipy.fft
+    import scipy.optimize
 
+    fft: Any = scipy.fft
+    minimize: Any = scipy.optimize.minimize
     whiten = np.stack([_scale(*weights) for weights in zip(penalties.smoothness, penalties.size, strict=True)])
     spectra: Any = fft.rfft2(histograms.astype(np.float32))
     wanted = places.astype(np.float32)
@@ -215,7 +218,7 @@ def train(
     scaled = np.zeros(3 * BINS * BINS)
     for iterations, *weights in stages:
         options = {"maxiter": iterations, "maxcor": iterations, "maxfun": 4 + 2 * iterations, "ftol": 0, "gtol": 0}
-        found: Any = optimize.minimize(loss, scaled, tuple(weights), "L-BFGS-B", jac=True, options=options)
+        found: Any = minimize(loss, scaled, tuple(weights), "L-BFGS-B", jac=True, options=options)
         scaled = found.x
     filters, bias = spread_out(scaled)
     return filters, bias

@@ -23,10 +23,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.learning.feature_learner import FeatureLearner, Features
+from evaluation.learning.feature_learner import FeatureLearner, Features, require_installed
 from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
 from evaluation.scene import Image
-from foundation.errors import InputError
 
 _FEATURES = 4
 """Mean, brightest, dominant and palette mode (section 3.1)."""
@@ -78,6 +77,11 @@ class RegressionTrees(FeatureLearner):
         """Its name in tables."""
         return "Regression trees (simple features)"
 
+    @property
+    def needs(self) -> tuple[str, str]:
+        """What training needs: the module, and the command that installs it."""
+        return "sklearn", "pip install 'croplab[learn]'; a model that is trained already does without"
+
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float32] | None:
@@ -99,13 +103,9 @@ class RegressionTrees(FeatureLearner):
 
     def fit_features(self, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> Forest:
         """Return the trees fitted to features (N, 8) float32 and lights (N, 3) float64; needs scikit-learn."""
-        try:
-            import sklearn.tree
-        except ImportError as error:
-            raise InputError(
-                "training regression trees needs scikit-learn: pip install 'croplab[learn]' (a model that is trained "
-                "already does without)"
-            ) from error
+        require_installed(self)
+        import sklearn.tree
+
         make: Any = sklearn.tree.DecisionTreeRegressor
         given = features.reshape(len(features), _FEATURES, 2)
         lights = truths[:, :_TARGETS]

@@ -1,12 +1,12 @@
 """Smart Color Cat: the light's place on a line of lights from the histogram of red chromaticities.
 
-N. Banić, S. Lončarić, "Using the red chromaticity for illumination estimation", ISPA 2015. Lights of real scenes lie near
-a line in the rb-chromaticity plane; the histogram of the image's red chromaticities, a few bins, is mapped linearly to
-the place on it.
+N. Banić, S. Lončarić, "Using the red chromaticity for illumination estimation", ISPA 2015. Lights of real scenes lie
+near a line in the rb-chromaticity plane; the histogram of the image's red chromaticities, a few bins, is mapped
+linearly to the place on it.
 
 *Reconstruction*, from the abstract and from what this house recollects of the paper: the line is the first principal
-axis of the training lights in the plane of r = R / (R + G + B) and b; the map is a least-squares fit of the place on it
-with the shares of the bins as inputs; the number of bins is chosen on the training images alone, by five-fold
+axis of the training lights in the plane of r = R / (R + G + B) and b; the map is a least-squares fit of the place on
+it with the shares of the bins as inputs; the number of bins is chosen on the training images alone, by five-fold
 cross-validation of the median recovery error among `CHOICES`; places beyond the training lights are moved to the
 outermost of them.
 """
@@ -137,8 +137,8 @@ def _fitted(features: Features, truths: npt.NDArray[np.float64], bins: int) -> L
     direction = axes[0] * (1 if axes[0, 0] >= 0 else -1)
     places = (red_blue - centre) @ direction
     # The shares sum to 1, so that their weights hold the constant too.
-    weights = np.linalg.lstsq(_joined(features, bins), places)[0]
-    return LightLine(weights, centre, direction, np.array([places.min(), places.max()]))
+    solved: Any = np.linalg.lstsq(_joined(features, bins), places)
+    return LightLine(solved[0], centre, direction, np.array([places.min(), places.max()]))
 
 
 def _chosen(features: Features, truths: npt.NDArray[np.float64], seed: int) -> int:
