@@ -44,6 +44,7 @@ SLOW = (
     "end_to_end",
     "evaluation/test_cli.py",
     "foundation/test_compiled.py",
+    "evaluation/experiments/test_run_folder.py",
     "generator/dataset/production/test_engines.py",
     "generator/dataset/production/test_layouts.py",
     "generator/dataset/production/test_workplace.py",
