@@ -8,9 +8,9 @@ deviations (section 4); a softmax turns the response plus a learned bias of each
 of the bivariate von Mises distribution that has their moments is the light (section 3.1).
 
 *What is ours.* The bias is learned and the gain map of equation 5 is not, as in the authors' published program. The
-torus is de-aliased by the lights themselves: of the chromas that fall on one bin, the one nearest to the median of the
-training lights is meant, where the paper has grey light or grey world (section 3.3). Training lights that spread over
-more than three quarters of the paper's torus of two natural logarithms get bins of twice the width. Training is
+torus is de-aliased by the lights themselves: of the chromas that fall on one bin, the one nearest to the middle of the
+training lights' range is meant, where the paper has grey light or grey world (section 3.3). Training lights that spread
+over more than three quarters of the paper's torus of two natural logarithms get bins of twice the width. Training is
 described in `log_chroma_training.py`.
 """
 
@@ -128,7 +128,7 @@ class LogChroma(FeatureLearner):
         if span > _SPREAD * _FINE_BINS * _FINE_SIZE:
             raise InputError(
                 f"the lights to learn from span {span:.2f} natural logarithms of green over red or blue; log-chroma "
-                f"tells {_SPREAD * _FINE_BINS * _FINE_SIZE:g}: leave out the most saturated lights or take another method"
+                f"tells {_SPREAD * _FINE_BINS * _FINE_SIZE:g}: leave out saturated lights, or take another method"
             )
         grid = (2 * _FINE_SIZE, _FINE_SIZE / 2) if wide else (_FINE_SIZE, 0.0)
         penalties = Penalties(
@@ -142,10 +142,13 @@ class LogChroma(FeatureLearner):
             penalties,
             ((self.pretraining, self.crossentropy, 0.0), (self.training, 0.0, self.likelihood)),
         )
-        return LogChromaModel(filters, bias, np.median(chromas, axis=0), np.array(grid))
+        # Half-way between the outermost lights: their median lies so near one end where tungsten is rare that the torus
+        # would be cut through the other.
+        centre = (chromas.min(axis=0) + chromas.max(axis=0)) / 2
+        return LogChromaModel(filters, bias, centre, np.array(grid))
 
     def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> LogChromaModel:
-        """Return the model whose arrays are given: filters (2, 64, 33) and so on, dtype by dtype as `LogChromaModel`."""
+        """Return the model whose arrays are given: filters (2, 64, 33) complex128 and the others float64."""
         shapes = {"filters": (_CHANNELS, BINS, BINS // 2 + 1), "bias": (BINS, BINS), "centre": (2,), "grid": (2,)}
         found: dict[str, Any] = {name: arrays[name] for name in shapes}
         for name, shape in shapes.items():
@@ -167,7 +170,7 @@ class LogChromaModel:
     bias
         (64, 64) float64.
     centre
-        (2,) float64, u and v about which the torus is cut: the median of the training lights.
+        (2,) float64, u and v about which the torus is cut: the middle of the training lights' range.
     grid
         (2,) float64, the width of a bin and the chroma of the first one's centre.
     """
@@ -178,7 +181,7 @@ class LogChromaModel:
     grid: npt.NDArray[np.float64]
 
     def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
-        """Return the arrays by their names, filters (2, 64, 33) complex128 and so on as above."""
+        """Return the arrays by their names, filters (2, 64, 33) complex128 and the others float64."""
         return {"filters": self.filters, "bias": self.bias, "centre": self.centre, "grid": self.grid}
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:

@@ -188,12 +188,11 @@ class Forest:
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:
         """Return the lights (N, 3) float64, r + g + b = 1, of features (N, 8) float32."""
-        given = features.reshape(len(features), _FEATURES, 2)
-        every = np.stack([self._estimates(one) for one in given])
-        return lights_from_chromaticities(np.stack([_consensus(one, self.agreement) for one in every]))
+        every = np.stack([self.estimates(one) for one in features])
+        return lights_from_chromaticities(np.stack([consensus(one, self.agreement) for one in every]))
 
-    def _estimates(self, feature: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-        """Return what each tree estimates, (windows, 4, 2) float64, from features (4, 2)."""
+    def estimates(self, feature: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+        """Return what each tree estimates, (windows, 4, 2) float64, r and g, from features (8,) float32."""
         windows, _, _, nodes = self.split.shape
         start: npt.NDArray[np.int64] = np.arange(windows * _FEATURES * _TARGETS, dtype=np.int64) * nodes
         which = np.tile(np.repeat(np.arange(_FEATURES), _TARGETS), windows)
@@ -201,7 +200,7 @@ class Forest:
         for _ in range(self.depth):
             place: npt.NDArray[np.int64] = start + at
             part = self.split.ravel()[place]
-            lower = feature[which, np.maximum(part, 0)] <= self.threshold.ravel()[place]
+            lower = feature[2 * which + np.maximum(part, 0)] <= self.threshold.ravel()[place]
             child = np.where(lower, self.left.ravel()[place], self.right.ravel()[place])
             at = np.where(part < 0, at, child)
         return self.value.ravel()[start + at].reshape(windows, _FEATURES, _TARGETS)
@@ -216,8 +215,23 @@ def _frequent_colours(pixels: npt.NDArray[np.float32], bins: int, most: int) -> 
     return sums[fullest] / counts[fullest, None]
 
 
-def _consensus(estimates: npt.NDArray[np.float64], agreement: float) -> npt.NDArray[np.float64]:
-    """Return the median (2,) float64 of the estimates, (windows, 4, 2) float64, on which three features agree."""
+def consensus(estimates: npt.NDArray[np.float64], agreement: float) -> npt.NDArray[np.float64]:
+    """Return the median (2,) float64 of the estimates on which three features agree; of all where none do.
+
+    Parameters
+    ----------
+    estimates
+        (windows, 4, 2) float64, r and g by each window's trees of each feature.
+    agreement
+        Distance in chromaticity within which two features agree.
+
+    Examples
+    --------
+    The fourth feature is outvoted:
+
+    >>> consensus(np.array([[[0.30, 0.4], [0.31, 0.4], [0.32, 0.4], [0.60, 0.2]]]), 0.025)
+    array([0.31, 0.4 ])
+    """
     apart = np.linalg.norm(estimates[:, :, None] - estimates[:, None], axis=-1) <= agreement
     agreed = np.zeros(estimates.shape[:2], dtype=bool)
     for members in itertools.combinations(range(_FEATURES), _AGREEING):

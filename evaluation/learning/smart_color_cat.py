@@ -137,8 +137,9 @@ def _fitted(features: Features, truths: npt.NDArray[np.float64], bins: int) -> L
     direction = axes[0] * (1 if axes[0, 0] >= 0 else -1)
     places = (red_blue - centre) @ direction
     # The shares sum to 1, so that their weights hold the constant too.
-    solved: Any = np.linalg.lstsq(_joined(features, bins), places)
-    return LightLine(solved[0], centre, direction, np.array([places.min(), places.max()]))
+    solve: Any = np.linalg.lstsq
+    weights: npt.NDArray[np.float64] = solve(_joined(features, bins), places)[0]
+    return LightLine(weights, centre, direction, np.array([places.min(), places.max()]))
 
 
 def _chosen(features: Features, truths: npt.NDArray[np.float64], seed: int) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from evaluation.learning.color_beaver import ColorBeaver
+from evaluation.learning.constant_light import ConstantLight
 from evaluation.learning.convnet import ConvNet
 from evaluation.learning.feature_learner import FeatureLearner
 from evaluation.learning.log_chroma import LogChroma
@@ -20,5 +21,12 @@ def standard_learners() -> Mapping[str, FeatureLearner]:
     >>> standard_learners()["regression-trees"].name
     'Regression trees (simple features)'
     """
-    learners: tuple[FeatureLearner, ...] = (RegressionTrees(), SmartColorCat(), ColorBeaver(), LogChroma(), ConvNet())
+    learners: tuple[FeatureLearner, ...] = (
+        RegressionTrees(),
+        SmartColorCat(),
+        ColorBeaver(),
+        LogChroma(),
+        ConvNet(),
+        ConstantLight(),
+    )
     return {learner.key: learner for learner in learners}
