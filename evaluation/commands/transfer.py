@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
-
     import numpy as np
     import numpy.typing as npt
 
     from evaluation.experiments.transfer.material import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
     from evaluation.methods.method import Method
-    from evaluation.scene import Scene, SceneSet
+    from evaluation.scene import SceneSet
 
 _FOLDS = "3"
 """Folds of the field's tables, on NUS and on Cube+."""
@@ -40,18 +38,13 @@ Training sets that share pictures with the test set, by name or content, are ref
 """
 
 
+@with_data_options
 def transfer(
     train: Annotated[
         list[str],
         typer.Option(metavar="GENERATED", help="Data set to train on; may be repeated.", show_default=False),
     ],
     test: Annotated[str, typer.Option(metavar="REAL", help="Data set to test on.", show_default=False)],
-    layout: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="Layout of the test set. \\[default: by what it looks like]", show_default=False
-        ),
-    ] = None,
     methods: Annotated[str, typer.Option(metavar="LIST", help="Learned methods between commas, or all.")] = "all",
     statistics: Annotated[
         str, typer.Option(metavar="LIST", help="Statistics methods for reference between commas, all or none.")
@@ -114,14 +107,21 @@ def transfer(
         int | None,
         typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False),
     ] = None,
+    *,
+    reading: DataReading,
 ) -> None:
-    """Train on generated data, test on real data."""
+    """Train on generated data, test on real data; options of reading are those of the test set."""
+    from dataclasses import asdict, replace
+
     from evaluation.datasets import open_scenes
     from evaluation.experiments.transfer.figures import figures_of
     from evaluation.experiments.transfer.outcome import TransferOutcome, save_outcome
     from evaluation.experiments.transfer.plan import plan_transfer
+    from evaluation.experiments.transfer.rows import count_images
     from evaluation.experiments.transfer.rows import transfer as run_transfer
     from evaluation.reports.terminal import print_table
+    from evaluation.results.method_records import describe_method
+    from foundation.console import orderly_end, progress
     from foundation.files import require_free
     from foundation.processors import processor_count
 
@@ -130,18 +130,24 @@ def transfer(
     threads = workers or processor_count()
     learners = _learners(methods)
     references = _references(statistics)
-    tested = open_scenes(test, layout)
+    tested = reading.open(test)
     plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared)
+    if told := _sizes(tested, plan, side):
+        plan = replace(plan, notes=(*plan.notes, told))
     drawn = _folds(folds, tested, seeds)
     smallest = min(len(some.scenes) for some in plan.training)
     wanted = smallest if images is None else images
-    with _progress() as step:
-        scenes, plan = _alike(tested, plan, side, threads, step)
-        rows = run_transfer(scenes, plan.training, learners, drawn, wanted, references, threads, step)
+    count = count_images(tested.scenes, plan.training, len(drawn), wanted)
+    with orderly_end(), progress("images") as advance:
+        steps = iter(range(1, count + 1))
+        rows = run_transfer(
+            *(tested.scenes, plan.training, learners, drawn, wanted, references),
+            *(side, threads, lambda: advance(next(steps), count)),
+        )
     figures = figures_of(rows, error)
     settings: dict[str, Any] = {
-        "methods": [learner.name for learner in learners],
-        "statistics": [method.name for method in references],
+        "methods": [describe_method(learner) for learner in learners],
+        "statistics": [describe_method(method) for method in references],
         "folds": folds or ("the data set's own" if tested.folds is not None else _FOLDS),
         "matrix": matrix,
         "images": wanted,
@@ -149,8 +155,9 @@ def transfer(
         "side": side,
         "shared": shared,
         "error": error,
+        "reading": asdict(reading),
     }
-    outcome = TransferOutcome(tested, scenes, plan, rows, figures, drawn, settings)
+    outcome = TransferOutcome(tested, plan, rows, figures, drawn, settings)
     for table in outcome.tables():
         print_table(table)
         print()
@@ -162,49 +169,23 @@ def transfer(
 
 def _learners(text: str) -> list[AnyLearner]:
     """Return the learned methods of a list, built-in ones or classes of the user's own, and the constant light."""
+    from evaluation.commands.choosing import choose_learners
     from evaluation.learning.constant_light import ConstantLight
-    from evaluation.learning.feature_learner import FeatureLearner
-    from evaluation.learning.standard import standard_learners
-    from evaluation.methods.method import Learner
-    from evaluation.methods.naming import find_method
     from foundation.errors import InputError
 
-    known = standard_learners()
-    names = list(known) if text.strip().lower() == "all" else [name.strip() for name in text.split(",")]
-    found: list[AnyLearner] = []
-    for name in dict.fromkeys(names):
-        if name in known or name == ConstantLight().key:
-            found += [] if name == ConstantLight().key else [known[name]]
-            continue
-        if ":" not in name:
-            raise InputError(
-                f"{name!r} is no learned method; they are {', '.join(known)}, or all; one of your own is named as "
-                "module:Class or file.py:Class"
-            )
-        learner = find_method(name)
-        if not isinstance(learner, FeatureLearner | Learner):
-            raise InputError(f"{name} learns nothing: it has no fit(scenes, seed); evaluate run takes it")
-        found.append(learner)
-    found.append(ConstantLight())
-    titles = [learner.name for learner in found]
+    constant = ConstantLight()
+    chosen = [each for each in choose_learners(text.split(",")) if each.name != constant.name]
+    titles = [each.name for each in chosen]
     for title in titles:
         if titles.count(title) > 1:
             raise InputError(f"two methods are called {title}; give one another name: names head the rows")
-    return found
+    return [*chosen, constant]
 
 
 def _references(text: str) -> list[Method]:
-    from evaluation.methods.standard import standard_methods
-    from foundation.errors import InputError
+    from evaluation.commands.choosing import choose_methods
 
-    known = standard_methods()
-    if text.strip().lower() == "none":
-        return []
-    names = list(known) if text.strip().lower() == "all" else [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in known:
-            raise InputError(f"{name!r} is no statistics method; they are {', '.join(known)}, all or none")
-    return [known[name] for name in dict.fromkeys(names)]
+    return [] if text.strip().lower() == "none" else choose_methods(text.split(","))
 
 
 def _folds(text: str | None, test: SceneSet, seeds: int) -> tuple[npt.NDArray[np.int64], ...]:
@@ -222,38 +203,14 @@ def _folds(text: str | None, test: SceneSet, seeds: int) -> tuple[npt.NDArray[np
     return (read_folds(Path(wanted), [scene.name for scene in test.scenes]),) * seeds
 
 
-def _alike(
-    test: SceneSet, plan: TransferPlan, side: int | None, workers: int, on_scene: Callable[[], None]
-) -> tuple[tuple[Scene, ...], TransferPlan]:
-    """Return test images and plan with all images made small, or with a word of caution where they are not alike."""
-    from dataclasses import replace
-
-    from evaluation.experiments.transfer.thumbnails import make_small
-
+def _sizes(test: SceneSet, plan: TransferPlan, side: int | None) -> str:
+    """Return what the reader is told of the sizes of images; nothing where they are alike."""
     if side is not None:
-        training = tuple(
-            replace(some, scenes=make_small(some.scenes, side, workers, on_scene)) for some in plan.training
-        )
-        note = f"All images were made small to at most {side} px by averaging areas without clipped and masked pixels"
-        small = make_small(test.scenes, side, workers, on_scene)
-        return small, replace(plan, training=training, notes=(*plan.notes, note))
+        return f"All images were made small to at most {side} px by averaging areas without clipped and masked pixels"
     sizes = [max(scenes[0].read()[0].shape) for scenes in (test.scenes, plan.training[0].scenes)]
     if max(sizes) <= _ALIKE * min(sizes):
-        return test.scenes, plan
-    note = (
+        return ""
+    return (
         f"Training images have sides of up to {sizes[1]} px and test images of up to {sizes[0]} px: methods see detail "
         f"and noise in one that the other lacks; --side {min(sizes)} makes them alike"
     )
-    return test.scenes, replace(plan, notes=(*plan.notes, note))
-
-
-@contextmanager
-def _progress() -> Generator[Callable[[], None]]:
-    """Show how many images have been read; their number depends on what seeds draw."""
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.completed} images read"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("images", total=None)
-        yield lambda: progress.advance(task)

@@ -51,7 +51,11 @@ def developed(scene: Scene, estimates: Sequence[npt.NDArray[np.float64]]) -> lis
         (3,) float64 each, camera RGB of any length.
     """
     image, mask = scene.read()
-    small = _resized(image.astype(np.float32))
+    linear = image.astype(np.float32)
+    if mask is not None:
+        # What is masked must not shine into its neighbours when the image is resized, nor set the exposure.
+        linear[mask] = 0
+    small = _resized(linear)
     truth: npt.NDArray[Any] = scene.truth
     if isinstance(scene, MixedScene):
         field = scene.read_truth_map()
@@ -62,10 +66,10 @@ def developed(scene: Scene, estimates: Sequence[npt.NDArray[np.float64]]) -> lis
     white = float(np.percentile(free.max(axis=1), _WHITE_PERCENTILE)) if len(free) else 0.0
 
     def seen(light: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
-        linear = small * _gains(light) / np.float32(white or 1.0)
+        lit = small * _gains(light) / np.float32(white or 1.0)
         if covered is not None:
-            linear[covered] = _MASKED
-        return srgb_codes(linear)
+            lit[covered] = _MASKED
+        return srgb_codes(lit)
 
     raw, right = seen(np.ones(3)), seen(truth)
     gap = np.full((len(small), _GAP, 3), 255, np.uint8)

@@ -65,6 +65,7 @@ def summary_table(subject: Subject, results: Sequence[Result], kind: ErrorKind, 
     """
     several = sum(subject.mixed)
     held = f" ({several} of them under several lights, held to the mean of these)" if several else ""
+    held = " under several lights, held to the mean of these" if several == len(subject.images) else held
     return Table(
         f"{subject.name}: {kind} angular error of {len(subject.images)} images{held}, degrees",
         (*PAPER_COLUMNS, *(FURTHER_COLUMNS if further else ())),
@@ -135,11 +136,11 @@ def _several(subject: Subject, results: Sequence[Result]) -> Table:
         f"{subject.name}: recovery angular error of the {sum(subject.mixed)} images under several lights, degrees",
         (
             "Algorithm",
-            *("MAE_illum mean", "MAE_illum med.", "MAE_rgb mean", "MAE_rgb med."),
-            *("By region mean", "By region med.", "Mean light mean", "Mean light med."),
+            *("MAE_illum", "med.", "MAE_rgb", "med.", "By region", "med.", "Mean light", "med."),
         ),
         tuple(rows),
         notes=(
+            "Each column is the mean over images, and beside it their median",
             "MAE_illum and MAE_rgb: by pixel, averaged over pixels and then over images, as LSMI defines them (Kim et "
             "al., ICCV 2021)",
             "By region: against the light that gives more than half of a pixel's light; every region counts the same",

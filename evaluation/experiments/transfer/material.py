@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.experiments.running import answer_scenes
+from evaluation.experiments.transfer.thumbnails import make_small
 from evaluation.learning.feature_learner import (
     FeatureLearner,
     Features,
@@ -58,10 +59,24 @@ class Material:
 def gather(
     scenes: Sequence[Scene],
     learners: Sequence[AnyLearner],
+    side: int | None = None,
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> Material:
     """Return the material of scenes for learners; each image is read once for all that extract features.
+
+    Parameters
+    ----------
+    scenes
+        The scenes, at least one.
+    learners
+        What learns from them, or is tested on them.
+    side
+        Longest side that images are made small to first, px, in memory; None leaves them as they are.
+    workers
+        Threads that read images; no number depends on it.
+    on_scene
+        Called after each scene that is read, from the calling thread.
 
     Raises
     ------
@@ -71,6 +86,8 @@ def gather(
         An image cannot be read.
     """
     truths = truths_of(scenes)
+    if side is not None:
+        scenes, on_scene = make_small(scenes, side, workers, on_scene), None
     extracting = [learner for learner in learners if isinstance(learner, FeatureLearner)]
     given = iter(extract(scenes, extracting, workers, on_scene) if extracting else ())
     features = tuple(next(given) if isinstance(learner, FeatureLearner) else None for learner in learners)

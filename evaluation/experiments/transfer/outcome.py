@@ -26,9 +26,10 @@ from evaluation.experiments.transfer.tables import (
 from evaluation.reports.latex import table_to_latex
 from evaluation.reports.page import figure_part, heading, page, paragraph, table_part
 from evaluation.reports.style import FAINT, INK, series_style, svg_of
-from evaluation.results.result import Result, images_csv
+from evaluation.results.result import Result
+from evaluation.results.run_files import errors_csv
 from evaluation.results.tables import Table, table_to_csv
-from evaluation.scene import Scene, SceneSet
+from evaluation.scene import SceneSet
 from foundation.files import whole_folder, write_whole
 from foundation.version import software
 
@@ -40,9 +41,7 @@ class TransferOutcome:
     Attributes
     ----------
     test
-        The test set as it was opened.
-    scenes
-        Its images as they were tested, N of them.
+        The test set as it was opened, N images.
     plan
         What was trained on.
     rows, figures
@@ -54,7 +53,6 @@ class TransferOutcome:
     """
 
     test: SceneSet
-    scenes: tuple[Scene, ...]
     plan: TransferPlan
     rows: tuple[TransferRow, ...]
     figures: TransferFigures
@@ -65,7 +63,7 @@ class TransferOutcome:
         """Return the tables in the order in which they are shown."""
         name = self.test.name
         made = (
-            errors_table(self.figures, name, len(self.scenes)),
+            errors_table(self.figures, name, len(self.test.scenes)),
             intervals_table(self.figures, name),
             real_ratios_table(self.figures, name),
             naive_ratios_table(self.figures, name),
@@ -94,10 +92,11 @@ def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
     StorageError
         The disk is full, read-only or gone; nothing is left behind.
     """
-    names = [scene.name for scene in outcome.scenes]
+    names = [scene.name for scene in outcome.test.scenes]
+    truths = np.stack([scene.truth for scene in outcome.test.scenes])
     with whole_folder(folder, "the results") as partial:
         write_whole(partial / "results.csv", table_to_csv(long_table(outcome.figures)))
-        write_whole(partial / "errors.csv", images_csv(outcome.scenes, labelled_results(outcome.rows)))
+        write_whole(partial / "errors.csv", errors_csv(names, truths, labelled_results(outcome.rows)))
         for seed, folds in enumerate(outcome.folds):
             write_whole(partial / f"folds_{seed}.csv", folds_to_csv(names, folds))
         write_whole(partial / "tables.tex", "\n".join(table_to_latex(table) for table in outcome.tables()))
@@ -110,7 +109,7 @@ def report_page(outcome: TransferOutcome) -> str:
     test = outcome.test
     parts = [
         paragraph(
-            f"Learned methods trained on generated images and tested on {len(outcome.scenes)} images of {test.name}, "
+            f"Learned methods trained on generated images and tested on {len(test.scenes)} images of {test.name}, "
             "beside the same methods cross-validated on these images and trained without a table. Each row "
             "was trained on as many images as its column says."
         ),
@@ -150,7 +149,8 @@ def _draw_ratios(figure: Any, found: TransferFigures) -> None:
 
 def _provenance(outcome: TransferOutcome) -> dict[str, Any]:
     return {
-        "command": "evaluate transfer",
+        "format": "crop.transfer",
+        "version": 1,
         "software": software(),
         "libraries": _libraries(),
         "settings": dict(outcome.settings),

@@ -114,6 +114,17 @@ def draw_images(count: int, wanted: int, seed: int) -> Places:
     return np.sort(np.random.default_rng(seed).permutation(count)[:wanted])
 
 
+def count_images(test: Sequence[Scene], training: Sequence[TrainingSet], seeds: int, images: int) -> int:
+    """Return how many images `transfer` reads for its learners, all seeds together: each image once.
+
+    Raises
+    ------
+    InputError
+        A training set has fewer images than are to be drawn.
+    """
+    return len(test) + sum(len(_used(_drawn(some, seeds, images))) for some in training)
+
+
 def transfer(
     test: Sequence[Scene],
     training: Sequence[TrainingSet],
@@ -121,6 +132,7 @@ def transfer(
     folds: Sequence[npt.NDArray[np.int64]],
     images: int,
     methods: Sequence[Method] = (),
+    side: int | None = None,
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[TransferRow, ...]:
@@ -143,6 +155,8 @@ def transfer(
         Training images of each training set, drawn anew by each seed.
     methods
         Methods that learn nothing, for reference.
+    side
+        Longest side that images are made small to first, px; None leaves all as they are.
     workers
         Threads that read images; no number depends on it.
     on_scene
@@ -166,16 +180,16 @@ def transfer(
     for each in folds:
         require_apart(test, each)
     # All that may be refused is, before the first image is read.
-    drawn = [[draw_images(len(some.scenes), images, seed) for seed in range(len(folds))] for some in training]
-    trials = gather(test, learners, workers, on_scene)
+    drawn = [_drawn(some, len(folds), images) for some in training]
+    trials = gather(test, learners, side, workers, on_scene)
     parts = [
         TransferRow(learner.name, "cross-validation", "", _least(folds), _crossed(learner, number, trials, folds))
         for number, learner in enumerate(learners)
     ]
     for some, wanted in zip(training, drawn, strict=True):
         # Of a large set only what some seed wants is read.
-        used = np.unique(np.concatenate(wanted))
-        lessons = gather([some.scenes[int(place)] for place in used.tolist()], learners, workers, on_scene)
+        used = _used(wanted)
+        lessons = gather([some.scenes[int(place)] for place in used.tolist()], learners, side, workers, on_scene)
         for number, learner in enumerate(learners):
             if isinstance(learner, ConstantLight) and some.kind in NAIVE:
                 continue
@@ -186,9 +200,17 @@ def transfer(
             parts.append(TransferRow(learner.name, some.kind, some.data, images, results))
     rows = [part for learner in learners for part in parts if part.method == learner.name]
     if methods:
-        found = evaluate(test, methods, workers)
+        found = evaluate(trials.scenes, methods, workers)
         rows += [TransferRow(result.method, "none", "", 0, (result,)) for result in found]
     return tuple(rows)
+
+
+def _drawn(some: TrainingSet, seeds: int, images: int) -> list[Places]:
+    return [draw_images(len(some.scenes), images, seed) for seed in range(seeds)]
+
+
+def _used(drawn: Sequence[Places]) -> Places:
+    return np.unique(np.concatenate(drawn))
 
 
 def _least(folds: Sequence[npt.NDArray[np.int64]]) -> int:

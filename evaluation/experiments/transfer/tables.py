@@ -23,17 +23,21 @@ _PAPER: Final = {
 
 def errors_table(found: TransferFigures, name: str, images: int) -> Table:
     """Return the statistics of every row; of several seeds their means."""
-    notes = ()
+    notes = [
+        f"{row.row.method}, {row.row.training}: no light in {guessed.sum()} images; grey stands in for it"
+        for row in found.rows
+        if (guessed := row.row.results[0].guessed).any()
+    ]
     if any(row.spread for row in found.rows):
         median = [row.spread[1] for row in found.rows if row.spread]
-        notes = (
-            f"Means over seeds; the standard deviation of a median over seeds is up to {max(median):.2f} degrees.",
+        notes.append(
+            f"Means over seeds; the standard deviation of a median over seeds is up to {max(median):.2f} degrees."
         )
     return Table(
         f"{name}: {found.error} angular error of {images} images, degrees",
         ("Method", "Trained on", "Images", *HEADS),
         tuple((*_heads(row.row), *(figure.value for figure in row.statistics)) for row in found.rows),
-        notes=notes,
+        notes=tuple(notes),
     )
 
 

@@ -111,7 +111,6 @@ def test_mistakes_are_named(
     arguments: list[str],
     why: str,
     data: Path,
-    tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -131,9 +131,9 @@ def test_images_made_small_are_alike(place: Path, capsys: pytest.CaptureFixture[
     ("arguments", "message"),
     [
         (("--test", "made"), "made is both training and test"),
-        (("--methods", "magic"), "'magic' is no learned method; they are regression-trees"),
+        (("--methods", "magic"), "'magic' is no method that learns; expected regression-trees"),
         (("--methods", "own.py:Nothing"), "Nothing"),
-        (("--statistics", "magic"), "'magic' is no statistics method"),
+        (("--statistics", "magic"), "'magic'"),
         (("--images", "13"), "13 training images of 12 were asked for"),
         (("--folds", "31"), "31 folds of 30 images"),
         (("--folds", "none.csv"), "cannot read folds from none.csv"),

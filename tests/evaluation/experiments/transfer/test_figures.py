@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.bootstrap import STATISTICS, interval, paired_ratio
+from evaluation.experiments.bootstrap import STATISTICS, intervals, paired
 from evaluation.experiments.transfer.figures import figures_of
 from evaluation.experiments.transfer.rows import Kind, TransferRow
 from evaluation.metrics import summarise
@@ -27,15 +27,14 @@ def _row(kind: Kind, *errors: npt.NDArray[np.float64], method: str = "Trees") ->
 def test_one_seed_is_what_the_bootstrap_gives() -> None:
     rows = [_row("cross-validation", REAL), _row("generated", OTHER), _row("naive", THIRD)]
     found = figures_of(rows, "recovery")
-    for place, statistic in enumerate(STATISTICS):
-        for row, errors in zip(found.rows, (REAL, OTHER, THIRD), strict=True):
-            figure = row.statistics[place]
-            assert figure.value == pytest.approx(summarise(errors).as_tuple()[place])
-            assert (figure.low, figure.high) == pytest.approx(interval(errors, statistic))
-        ratio = found.to_real[0].ratios[place]
-        assert (ratio.value, ratio.low, ratio.high) == pytest.approx(paired_ratio(OTHER, REAL, statistic))
-        ratio = found.to_naive[0].ratios[place]
-        assert (ratio.value, ratio.low, ratio.high) == pytest.approx(paired_ratio(OTHER, THIRD, statistic))
+    for row, errors in zip(found.rows, (REAL, OTHER, THIRD), strict=True):
+        np.testing.assert_allclose([figure.value for figure in row.statistics], summarise(errors).as_tuple()[:6])
+        expected = intervals(errors)
+        for statistic, figure in zip(STATISTICS, row.statistics, strict=True):
+            assert (figure.low, figure.high) == pytest.approx(expected[statistic])
+    for ratios, base in ((found.to_real[0], REAL), (found.to_naive[0], THIRD)):
+        for compared, figure in zip(paired(OTHER, base), ratios.ratios, strict=True):
+            assert (figure.value, figure.low, figure.high) == pytest.approx(compared.ratio)
     assert [(one.row.kind, one.base.kind) for one in found.to_real] == [
         ("generated", "cross-validation"),
         ("naive", "cross-validation"),
