@@ -16,6 +16,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.experiments.describing.cells import usable_pixels
+from evaluation.scene import Image
+
 BLOCK: Final = 8
 """Pixels a side of a block: flat places of that size are in most photographs, and 36 Laplacians tell noise to 20 %."""
 
@@ -86,8 +89,9 @@ class NoiseCurve:
 
 
 def measure_blocks(
-    image: npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64],
-    usable: npt.NDArray[np.bool_],
+    image: Image,
+    saturation: float | None = None,
+    mask: npt.NDArray[np.bool_] | None = None,
     limit: int = BLOCKS_AN_IMAGE,
 ) -> npt.NDArray[np.float64]:
     """Return mean and noise of blocks of an image whose pixels are all usable.
@@ -96,8 +100,10 @@ def measure_blocks(
     ----------
     image
         (H, W, 3), linear camera RGB with black subtracted.
-    usable
-        (H, W) bool.
+    saturation
+        Value from which a pixel is clipped; None if none is.
+    mask
+        (H, W) bool, True where a pixel must not be used; or None.
     limit
         Blocks looked at, at most; they lie on an even grid.
 
@@ -106,7 +112,7 @@ def measure_blocks(
     ndarray
         (M, 2, 3) float64: mean, and standard deviation by the Laplacian, of each channel. M may be 0.
     """
-    down, across = (size // BLOCK for size in usable.shape)
+    down, across = (size // BLOCK for size in image.shape[:2])
     step = max(1, int(np.ceil(np.sqrt(down * across / limit))))
     found: list[npt.NDArray[np.float64]] = []
     for row in range(step // 2 if down > step // 2 else 0, down, step):
@@ -114,7 +120,8 @@ def measure_blocks(
         for column in range(step // 2 if across > step // 2 else 0, across, step):
             left = column * BLOCK
             place = (slice(top, top + BLOCK), slice(left, left + BLOCK))
-            if usable[place].all():
+            usable, _ = usable_pixels(image[place], saturation, None if mask is None else mask[place])
+            if usable.all():
                 found.append(image[place].astype(np.float64))
     if not found:
         return np.empty((0, 2, 3))

@@ -9,8 +9,8 @@ import pytest
 from evaluation.experiments.describing.noise import measure_blocks, photon_transfer, relative_noise
 
 
-def blocks_of(image: npt.NDArray[np.float64], usable: npt.NDArray[np.bool_] | None = None) -> npt.NDArray[np.float64]:
-    return measure_blocks(image, np.ones(image.shape[:2], bool) if usable is None else usable, 10_000)
+def blocks_of(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return measure_blocks(image, limit=10_000)
 
 
 def test_white_noise_on_a_plane() -> None:
@@ -45,16 +45,17 @@ def test_texture_all_over_overstates_and_averaging_understates() -> None:
 
 def test_blocks_hold_usable_pixels_only_and_lie_all_over() -> None:
     image = np.ones((64, 96, 3)) * np.arange(96)[None, :, None]
-    usable = np.ones((64, 96), bool)
-    usable[20, 30] = False
-    blocks = measure_blocks(image, usable)
+    mask = np.zeros((64, 96), bool)
+    mask[20, 30] = True
+    blocks = measure_blocks(image, None, mask)
     assert len(blocks) == 8 * 12 - 1
     # The block with that pixel is in columns 24 to 31, whose mean is 27.5: one of eight is missing.
     assert [(blocks[:, 0, 0] == 8 * column + 3.5).sum() for column in range(12)] == [8, 8, 8, 7, *[8] * 8]
-    few = measure_blocks(np.ones((800, 800, 3)), np.ones((800, 800), bool), 256)
+    assert len(measure_blocks(image, 88.0)) == 8 * 11
+    few = measure_blocks(np.ones((800, 800, 3)), limit=256)
     assert 150 < len(few) <= 256
-    assert measure_blocks(image, np.zeros_like(usable)).shape == (0, 2, 3)
-    assert measure_blocks(image[:7], usable[:7]).shape == (0, 2, 3)
+    assert measure_blocks(image, None, np.ones_like(mask)).shape == (0, 2, 3)
+    assert measure_blocks(image[:7]).shape == (0, 2, 3)
     assert np.isnan(relative_noise(few[:9], 0))
     assert np.isnan(relative_noise(few, 2))
 
