@@ -40,7 +40,7 @@ def read_journal(path: Path, identity: dict[str, Any]) -> list[tuple[SceneAnswer
     try:
         content = path.read_bytes() if path.exists() else b""
         whole, lines = _whole_lines(content)
-        head = json.loads(lines[0]) if lines else None
+        head: dict[str, Any] = json.loads(lines[0]) if lines else {}
         same = head == json.loads(json.dumps(identity))
         if not same and len(lines) <= 1:
             # Nothing was answered, so nothing is lost: a method that failed on the first image was corrected, say.
