@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from evaluation.methods.method import Method
 from evaluation.methods.pixels import GREY
+from evaluation.methods.prepared import estimate_all
 from evaluation.metrics import recovery_error, reproduction_error
 from evaluation.results.result import Result
 from evaluation.scene import Scene
@@ -68,7 +69,7 @@ def evaluate(
 
     def estimate(scene: Scene) -> list[npt.NDArray[np.float64]]:
         image, mask = scene.read()
-        return [method.estimate(image, scene.saturation, mask) for method in methods]
+        return estimate_all(methods, image, scene.saturation, mask)
 
     estimates: list[list[npt.NDArray[np.float64]]] = []
     with ThreadPoolExecutor(max(1, workers)) as pool:

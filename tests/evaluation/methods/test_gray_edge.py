@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evaluation.methods import GrayEdge
-from evaluation.methods.gray_edge import differentiate, gaussian_kernel
+from evaluation.methods.gaussian import differentiate, gaussian_kernel
 from evaluation.metrics import recovery_error
 
 if TYPE_CHECKING:
