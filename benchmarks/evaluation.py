@@ -1,9 +1,9 @@
 """How fast methods estimate: `python -m benchmarks.evaluation` prints one JSON object a line.
 
 Each method stands beside the NumPy and OpenCV that one would write for it in a few lines, on one thread, in turns with
-it; the fastest turn of each counts, by the processor's clock. The peers do the same work with the same exclusions: pixels
-saturated in a channel are left out with their neighbours (0.1 % of the image are saturated). In float32, as OpenCV is
-fastest; sums by `cv2.mean`, which is faster than NumPy's.
+it; the fastest turn of each counts, by the processor's clock. The peers do the same work with the same exclusions:
+pixels saturated in a channel are left out with their neighbours (0.1 % of the image are saturated). In float32, as
+OpenCV is fastest; sums by `cv2.mean`, which is faster than NumPy's.
 
 From files to results is the mean rate of `evaluate` over PNG files of a generated dataset, in as many threads as there
 are processors, over that of reading the same files the same way and nothing else; again in turns.
@@ -27,6 +27,7 @@ from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.method import Method
 from evaluation.methods.pca import BrightDark
 from evaluation.methods.standard import standard_methods
+from evaluation.scene import Scene
 
 SIZES = {"512 x 512": (512, 512), "18 Mpx": (5184, 3456)}
 SATURATION = 12000.0
@@ -36,20 +37,24 @@ Image = npt.NDArray[np.uint16]
 def main() -> None:
     cv2.setNumThreads(1)
     for size, (width, height) in SIZES.items():
-        image = test_image(width, height)
-        pixels = width * height / 1e6
-        for name, method in standard_methods().items():
-            peer = peer_of(method)
-            if peer is None:
-                continue
-            ours, theirs = in_turns(
-                lambda method=method: method.estimate(image, SATURATION), peer_call(peer, image), 9 if pixels < 1 else 3
-            )
-            report(f"{name}, {size}, one thread", pixels / ours, "Mpx/s", f"{theirs / ours:.2f} x NumPy and OpenCV")
-        several = [method for method in standard_methods().values() if peer_of(method)]
-        ours, apart = in_turns(lambda: together(several, image), lambda: one_by_one(several, image), 3)
-        report(f"all of these, {size}, one thread", pixels / ours, "Mpx/s", f"{apart / ours:.2f} x one by one")
+        report_methods(size, test_image(width, height))
     files_to_results()
+
+
+def report_methods(size: str, image: Image) -> None:
+    """Report each method beside its peer, and what it saves that methods share an image's parts."""
+    pixels = image.size / 3e6
+    turns = 15 if pixels < 1 else 3
+    several: list[Method] = []
+    for name, method in standard_methods().items():
+        peer = peer_of(method)
+        if peer is None:
+            continue
+        several.append(method)
+        ours, theirs = in_turns(lambda method=method: method.estimate(image, SATURATION), peer_call(peer, image), turns)
+        report(f"{name}, {size}, one thread", pixels / ours, "Mpx/s", f"{theirs / ours:.2f} x NumPy and OpenCV")
+    ours, apart = in_turns(lambda: together(several, image), lambda: one_by_one(several, image), turns)
+    report(f"all of these, {size}, one thread", pixels / ours, "Mpx/s", f"{apart / ours:.2f} x one by one")
 
 
 def test_image(width: int, height: int) -> Image:
@@ -76,8 +81,9 @@ def peer_call(
     peer: Callable[[Image, npt.NDArray[np.uint8]], npt.NDArray[np.float64]], image: Image
 ) -> Callable[[], object]:
     def call() -> npt.NDArray[np.float64]:
-        clipped = cv2.dilate((image >= SATURATION).any(axis=2).astype(np.uint8), np.ones((3, 3), np.uint8))
-        return peer(image, 1 - clipped)
+        clipped = np.asarray((image >= SATURATION).any(axis=2), dtype=np.uint8)
+        dilated = np.asarray(cv2.dilate(clipped, np.ones((3, 3), np.uint8)), dtype=np.uint8)
+        return peer(image, 1 - dilated)
 
     return call
 
@@ -149,7 +155,7 @@ def files_to_results() -> None:
 
         def decode() -> None:
             with ThreadPoolExecutor(workers) as pool:
-                list(pool.map(lambda scene: scene.read()[0].shape, scenes))
+                list(pool.map(_read, scenes))
 
         for title, names in chosen.items():
             methods = [standard_methods()[name] for name in names]
@@ -157,6 +163,10 @@ def files_to_results() -> None:
                 lambda methods=methods: evaluate(scenes, methods, workers), decode, 5, time.perf_counter
             )
             report(f"files to results, {title}, {workers} threads", bare / ours, "of decoding alone", "0.9")
+
+
+def _read(scene: Scene) -> int:
+    return scene.read()[0].size
 
 
 def make_dataset(folder: Path) -> Path:

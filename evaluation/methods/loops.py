@@ -39,9 +39,10 @@ def mark_clipped(image: Image, saturation: Any, clipped: npt.NDArray[np.uint8]) 
     flat = image.reshape(-1)
     length = 3 * image.shape[1]
     for y in range(image.shape[0]):
+        row = flat[y * length : (y + 1) * length]
         over = 0
-        for at in range(y * length, (y + 1) * length):
-            over += flat[at] >= saturation
+        for at in range(row.size):
+            over |= row[at] >= saturation
         if not over:
             continue
         for x in range(image.shape[1]):
@@ -53,20 +54,27 @@ def mark_clipped(image: Image, saturation: Any, clipped: npt.NDArray[np.uint8]) 
 
 @compiled
 def _add_span(
-    flat: npt.NDArray[np.uint16],
-    start: int,
+    span: npt.NDArray[np.uint16],
     sums: npt.NDArray[np.uint32],
     squares: npt.NDArray[np.uint64],
     highs: npt.NDArray[np.uint16],
 ) -> None:
-    """Add a span of a flat image to sums a place; the loops are such as LLVM makes vectors of."""
+    """Add the values of a span to sums a place; the loops are such as LLVM makes vectors of."""
     for j in range(3 * SPAN):
-        value = flat[start + j]
+        value = span[j]
         sums[j] += uint32(value)
         highs[j] = max(highs[j], value)
     for j in range(3 * SPAN):
-        wide = uint32(flat[start + j])
+        wide = uint32(span[j])
         squares[j] += uint64(uint32(wide * wide))
+
+
+@compiled
+def _count(free: npt.NDArray[np.bool_]) -> int:
+    usable = 0
+    for x in range(free.size):
+        usable += free[x]
+    return usable
 
 
 @compiled
@@ -89,12 +97,11 @@ def whole_moments(
             right = min(width - border, left + SPAN)
             usable = right - left
             if free.size:
-                usable = 0
-                for x in range(left, right):
-                    usable += free[y, x]
+                usable = _count(free[y, left:right])
             count += usable
             if usable == SPAN:
-                _add_span(flat, 3 * (y * width + left), sums, squares, highs)
+                begin = 3 * (y * width + left)
+                _add_span(flat[begin : begin + 3 * SPAN], sums, squares, highs)
                 since += 1
                 continue
             for x in range(left, right):
@@ -204,9 +211,9 @@ def sum_powers(
         part = np.zeros(3, np.float64)
         for left in range(border, width - border, CHUNK):
             length = min(CHUNK, width - border - left)
-            begin = 3 * left
-            for j in range(3 * length):
-                factors[j] = values[row, begin + j] * scale
+            span = values[row, 3 * left : 3 * (left + length)]
+            for j in range(span.size):
+                factors[j] = span[j] * scale
             if not np.isinf(p):
                 _raise(factors, powers, 3 * length, p)
             for x in range(length):

@@ -65,16 +65,22 @@ def usable(
 def dilate_clipped(
     image: npt.NDArray[np.integer[Any]] | npt.NDArray[np.floating[Any]], saturation: float
 ) -> npt.NDArray[np.bool_]:
-    """Return (H, W) bool, True where a channel is saturated or a neighbour's is; the image is (H, W, 3) of any dtype."""
+    """Return (H, W) bool, True where a channel is saturated or a neighbour's is.
+
+    The image is (H, W, 3) of any dtype.
+    """
     import cv2
 
     from evaluation.methods.loops import mark_clipped
 
     clipped = np.zeros(image.shape[:2], dtype=np.uint8)
-    whole = np.issubdtype(image.dtype, np.integer)
-    if whole and saturation > np.iinfo(image.dtype).max:
-        return clipped.view(np.bool_)
-    limit = image.dtype.type(max(0, math.ceil(saturation)) if whole else saturation)
+    kind: Any = image.dtype
+    if kind.kind in "iu":
+        if saturation > np.iinfo(kind).max:
+            return clipped.view(np.bool_)
+        limit = kind.type(max(0, math.ceil(saturation)))
+    else:
+        limit = kind.type(saturation)
     if mark_clipped(cast("Any", np.ascontiguousarray(image)), limit, clipped):
         clipped = cv2.dilate(clipped, np.ones((3, 3), np.uint8))
     return np.asarray(clipped).view(np.bool_)
