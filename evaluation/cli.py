@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from evaluation.commands import compare as compare_command
 from evaluation.commands import run as run_command
 from foundation.console import EXIT_CODES, run
 
@@ -24,6 +25,7 @@ app = typer.Typer(
 """,
 )
 app.command("run", help=run_command.HELP)(run_command.run)
+app.command("compare", help=compare_command.HELP)(compare_command.compare)
 
 
 @app.callback()

@@ -1,5 +1,6 @@
 """Readers of data sets, one file a layout, behind one door: `open_scenes`."""
 
-from evaluation.datasets.opening import LAYOUTS, open_scenes
+from evaluation.datasets.opening import LAYOUTS, layout_of, open_scenes
+from evaluation.datasets.options import DataOptions
 
-__all__ = ["LAYOUTS", "open_scenes"]
+__all__ = ["LAYOUTS", "DataOptions", "layout_of", "open_scenes"]

@@ -6,10 +6,27 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from evaluation.datasets.ffcc import is_ffcc, open_ffcc
 from evaluation.datasets.generated import open_generated
+from evaluation.datasets.names import Folder
+from evaluation.datasets.options import DataOptions
+from evaluation.datasets.plain_folder import is_plain_folder, open_plain_folder
+from evaluation.datasets.published.cube_plus import is_cube_plus, open_cube_plus
+from evaluation.datasets.published.cube_plus_plus import (
+    is_cube_plus_plus,
+    is_simple_cube,
+    open_cube_plus_plus,
+    open_simple_cube,
+)
+from evaluation.datasets.published.gehler_shi import is_gehler_shi, open_gehler_shi
+from evaluation.datasets.published.intel_tau import is_intel_tau, open_intel_tau
+from evaluation.datasets.published.lsmi import is_lsmi, open_lsmi
+from evaluation.datasets.published.nus8 import is_nus8, open_nus8
 from evaluation.datasets.thumbnails import open_thumbnails
 from evaluation.scene import SceneSet
-from foundation.errors import InputError
+from foundation.errors import FormatError, InputError
+
+_LEVELS = ("black", "saturation")
 
 
 @dataclass(frozen=True)
@@ -20,44 +37,150 @@ class Layout:
     ----------
     title
         What lies so, for help and messages: "a dataset made by generate".
+    signs
+        What a place is told by: "cube+_gt.txt".
     matches
-        Whether a path or URL looks like it; reads names at most.
+        Whether a folder looks like it; reads names, and the first lines of tables, at most.
     open
         Returns the data set at a path or URL.
+    options
+        The fields of `DataOptions` that have a meaning for it.
+    general
+        Whether it is no particular data set's, and asked only where no other matches.
     """
 
     title: str
-    matches: Callable[[str], bool]
-    open: Callable[[str], SceneSet]
+    signs: str
+    matches: Callable[[Folder], bool]
+    open: Callable[[str, DataOptions], SceneSet]
+    options: tuple[str, ...] = ()
+    general: bool = False
 
 
 LAYOUTS: Mapping[str, Layout] = {
-    "thumbnails": Layout(
-        "thumbnails in a NumPy archive", lambda place: "://" not in place and place.endswith(".npz"), open_thumbnails
+    "generated": Layout(
+        "a dataset made by generate",
+        "dataset.json",
+        lambda folder: folder.has("dataset.json"),
+        lambda place, _: open_generated(place),
     ),
-    "generated": Layout("a dataset made by generate", lambda _: True, open_generated),
+    "thumbnails": Layout(
+        "thumbnails in a NumPy archive", "a file .npz", lambda _: False, lambda place, _: open_thumbnails(place)
+    ),
+    "cube-plus": Layout("Cube+, or Cube", "cube+_gt.txt", is_cube_plus, open_cube_plus, ("truth", *_LEVELS, "partial")),
+    "cube++": Layout(
+        "Cube++",
+        "gt.csv with left_r",
+        is_cube_plus_plus,
+        open_cube_plus_plus,
+        ("truth", *_LEVELS, "partial"),
+    ),
+    "simple-cube++": Layout(
+        "SimpleCube++",
+        "gt.csv beside PNG, or those in train and test",
+        is_simple_cube,
+        open_simple_cube,
+        ("subset", *_LEVELS, "partial"),
+    ),
+    "nus8": Layout(
+        "NUS 8 cameras, or one of them", "CAMERA_gt.mat", is_nus8, open_nus8, ("camera", *_LEVELS, "partial")
+    ),
+    "gehler-shi": Layout(
+        "Gehler's ColorChecker data set as Shi and Funt processed it",
+        "ColorCheckerData.mat, real_illum_568..mat or coordinates",
+        is_gehler_shi,
+        open_gehler_shi,
+        ("camera", "truth", *_LEVELS, "partial"),
+    ),
+    "intel-tau": Layout(
+        "INTEL-TAU, processed to 1080p",
+        "folders field_1_cameras, field_3_cameras, lab_printouts or lab_realscene",
+        is_intel_tau,
+        open_intel_tau,
+        ("camera", "subset", *_LEVELS, "partial"),
+    ),
+    "lsmi": Layout(
+        "LSMI, several lights",
+        "meta.json beside split.json",
+        is_lsmi,
+        open_lsmi,
+        ("camera", "subset", *_LEVELS, "partial"),
+    ),
+    "ffcc": Layout(
+        "FFCC's thumbnails", "NAME.png beside NAME.txt", is_ffcc, open_ffcc, (*_LEVELS, "partial"), general=True
+    ),
+    "folder": Layout(
+        "images of your own",
+        "a .csv with image,r,g,b",
+        is_plain_folder,
+        open_plain_folder,
+        (*_LEVELS, "partial"),
+        general=True,
+    ),
 }
-"""By the names that the command takes; the first that matches a place is its layout."""
+"""By the names that the command takes."""
 
 
-def open_scenes(place: Path | str, layout: str | None = None) -> SceneSet:
+def open_scenes(place: Path | str, layout: str | None = None, options: DataOptions | None = None) -> SceneSet:
     """Return the data set at a place; images are read when they are used.
 
     Parameters
     ----------
     place
-        Folder, file or URL.
+        Folder, file or URL; URLs are those of datasets made by `generate`.
     layout
-        A name of `LAYOUTS`; by default the first that matches.
+        A name of `LAYOUTS`; by default the one that the place looks like.
+    options
+        What to take of it, and levels that replace those of the layout.
 
     Raises
     ------
     InputError
-        There is no layout of that name.
+        There is no layout of that name, the place looks like several, or an option has no meaning for its layout.
     FormatError
-        The data set is not there, or not as its layout has it; the message says what is missing.
+        The place looks like no layout; or the data set is not as its layout has it: the message says what is missing.
     """
-    if layout is not None and layout not in LAYOUTS:
-        raise InputError(f"{layout!r} is no layout; the layouts are {', '.join(LAYOUTS)}")
-    name = layout or next(name for name, known in LAYOUTS.items() if known.matches(str(place)))
-    return LAYOUTS[name].open(str(place))
+    chosen = DataOptions() if options is None else options
+    text = str(place)
+    name = layout_of(text) if layout is None else layout
+    if name not in LAYOUTS:
+        raise InputError(f"{name!r} is no layout; the layouts are {', '.join(LAYOUTS)}")
+    known = LAYOUTS[name]
+    idle = [option for option in chosen.given if option not in known.options]
+    if idle:
+        able = [other for other, it in LAYOUTS.items() if idle[0] in it.options]
+        raise InputError(
+            f"--{idle[0]} has no meaning for {text}, {known.title} ({name}); it has one for {', '.join(able)}"
+        )
+    return known.open(text, chosen)
+
+
+def layout_of(place: str) -> str:
+    """Return the name of the layout that a place looks like.
+
+    Raises
+    ------
+    InputError
+        It looks like several.
+    FormatError
+        It looks like none, or is not there.
+    """
+    if "://" in place:
+        return "generated"
+    path = Path(place)
+    if path.is_file():
+        by_ending = {".npz": "thumbnails", ".csv": "folder"}
+        if path.suffix.lower() in by_ending:
+            return by_ending[path.suffix.lower()]
+        raise FormatError(f"{place} is a file, expected a folder, an archive .npz or a table .csv; name one of these")
+    if not path.is_dir():
+        raise FormatError(f"{place} is no dataset: it does not exist; name its folder, file or URL")
+    folder = Folder(path)
+    found = [name for name, known in LAYOUTS.items() if not known.general and known.matches(folder)]
+    found = found or [name for name, known in LAYOUTS.items() if known.general and known.matches(folder)]
+    if not found:
+        signs = "; ".join(f"{known.signs} ({name})" for name, known in LAYOUTS.items())
+        raise FormatError(f"{place} is no dataset of a layout that is known. Looked for: {signs}. Name its folder")
+    if len(found) > 1:
+        raise InputError(f"{place} looks like {' and '.join(found)}; say which it is with --layout")
+    return found[0]

@@ -1,25 +1,58 @@
-"""Run methods on the scenes of a data set."""
+"""Run methods on the scenes of a data set: each image is decoded once, whatever the number of methods.
+
+What a method may do wrong is dealt with here. A value that is no light (None, a channel that is NaN, infinite or below
+0, or nothing but zeros) is no estimate for that image: it is counted and named, and grey stands in for it, so that a
+method gains nothing by leaving out what it finds hard. An exception, or a value that is not three numbers, ends the
+run with the name of the method and the image, and the line of the method's file.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.method import Method
+from evaluation.methods.method import LocalMethod, Method
 from evaluation.methods.pixels import GREY
-from evaluation.methods.prepared import estimate_all
-from evaluation.metrics import recovery_error, reproduction_error
+from evaluation.methods.prepared import PreparedImage, PreparedMethod
+from evaluation.metrics import MapError, measure_map
+from evaluation.results.answers import SceneAnswer, read_light, results_of
 from evaluation.results.result import Result
-from evaluation.scene import Scene
-from foundation.errors import InputError
+from evaluation.scene import MixedScene, Scene
+from foundation.errors import CropError, FormatError, InputError
+
+_HOUSE = Path(__file__).parents[1]
+"""This package's folder: what lies outside of it, and is no installed library, is the user's."""
+
+_In = TypeVar("_In")
+_Out = TypeVar("_Out")
+
+
+@runtime_checkable
+class SceneMethod(Protocol):
+    """What knows a scene's light without its pixels, such as estimates that another program has made."""
+
+    @property
+    def name(self) -> str:
+        """Its name in tables."""
+        ...
+
+    def estimate_scene(self, scene: Scene) -> npt.NDArray[np.float64] | None:
+        """Return the estimated light (3,) float64 of a scene, camera RGB of any length; None if there is none."""
+        ...
 
 
 def evaluate(
     scenes: Sequence[Scene],
-    methods: Sequence[Method],
+    methods: Sequence[Method | SceneMethod],
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
 ) -> tuple[Result, ...]:
@@ -32,7 +65,7 @@ def evaluate(
     methods
         At least one.
     workers
-        Threads, one image each; no number depends on it.
+        Threads, one image each; no number depends on it. See `answer_scenes`.
     on_scene
         Called after each scene, from the calling thread.
 
@@ -44,7 +77,7 @@ def evaluate(
     Raises
     ------
     InputError
-        There is no scene or no method, or the ground truth of a scene is no light.
+        There is no scene or no method, the ground truth of a scene is no light, or a method fails.
     FormatError
         An image cannot be read.
 
@@ -63,31 +96,183 @@ def evaluate(
     >>> f"{result.method}: {result.summary('reproduction').mean:.2f} degrees"
     'Gray-world: 0.00 degrees'
     """
+    truths = truths_of(scenes, methods)
+    answers: list[tuple[SceneAnswer, ...]] = []
+    for given in answer_scenes(scenes, methods, workers):
+        answers.append(given)
+        if on_scene:
+            on_scene()
+    return results_of([method.name for method in methods], truths, answers)
+
+
+def truths_of(scenes: Sequence[Scene], methods: Sequence[object]) -> npt.NDArray[np.float64]:
+    """Return the ground truths (N, 3) float64 of scenes, camera RGB of any length.
+
+    Raises
+    ------
+    InputError
+        There is no scene or no method, or a ground truth is no light.
+    """
     if not scenes or not methods:
         raise InputError(f"{len(methods)} methods on {len(scenes)} images: name at least one of each")
-    truths = np.stack([_light(scene) for scene in scenes])
+    return np.stack([_light(scene) for scene in scenes])
 
-    def estimate(scene: Scene) -> list[npt.NDArray[np.float64]]:
-        image, mask = scene.read()
-        return estimate_all(methods, image, scene.saturation, mask)
 
-    estimates: list[list[npt.NDArray[np.float64]]] = []
-    with ThreadPoolExecutor(max(1, workers)) as pool:
-        for answer in pool.map(estimate, scenes):
-            estimates.append(answer)
-            if on_scene:
-                on_scene()
-    lights = np.stack([np.stack(given) for given in estimates], axis=1)
-    guessed = np.array([[light is GREY for light in given] for given in estimates]).T
-    return tuple(
-        Result(
-            method.name,
-            given,
-            {"recovery": recovery_error(given, truths), "reproduction": reproduction_error(given, truths)},
-            blind,
+def answer_scenes(
+    scenes: Sequence[Scene], methods: Sequence[Method | SceneMethod], workers: int = 1
+) -> Iterator[tuple[SceneAnswer, ...]]:
+    """Yield what the methods answer for each scene, one answer a method, in the scenes' order.
+
+    Methods of this suite are called by several threads at once. Others are called by one thread at a time and get a
+    copy of the image, which they may change; with one worker everything runs in the calling thread.
+
+    Parameters
+    ----------
+    scenes
+        The images.
+    methods
+        The methods, of which no answer may depend on the images before.
+    workers
+        Threads, one image each; as many images are held in memory.
+
+    Raises
+    ------
+    InputError
+        A method fails; the message names it, the image and the line.
+    FormatError
+        An image cannot be read.
+    """
+    runners = [_runner_of(method) for method in methods]
+    blind = all(isinstance(method, SceneMethod) for method in methods)
+    yield from ordered_map(lambda scene: _answer(scene, runners, blind), scenes, workers)
+
+
+def ordered_map(function: Callable[[_In], _Out], things: Iterable[_In], workers: int) -> Iterator[_Out]:
+    """Yield the function's values in the order of the things; with one worker in the calling thread.
+
+    Two things a worker are taken in advance, no more, so that neither things nor values pile up. What has begun is
+    waited for when the caller stops, what has not is dropped.
+
+    Examples
+    --------
+    >>> list(ordered_map(abs, [-3, 2, -1], workers=2))
+    [3, 2, 1]
+    """
+    if workers <= 1:
+        yield from map(function, things)
+        return
+    waiting: deque[Future[_Out]] = deque()
+    pool = ThreadPoolExecutor(workers)
+    try:
+        for thing in things:
+            waiting.append(pool.submit(function, thing))
+            if len(waiting) >= 2 * workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@dataclass(frozen=True)
+class _Runner:
+    """A method, and how it is called: `lock` where it is one of the user's."""
+
+    method: Method | SceneMethod
+    lock: Any | None
+
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function of the method; a method of the user's one at a time, with its own copies of arrays."""
+        if self.lock is None:
+            return function(*arguments)
+        with self.lock:
+            return function(*(one.copy() if isinstance(one, np.ndarray) else one for one in arguments))
+
+
+def _runner_of(method: Method | SceneMethod) -> _Runner:
+    return _Runner(method, None if type(method).__module__.startswith("evaluation.") else Lock())
+
+
+def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[SceneAnswer, ...]:
+    """Return the answers for one scene; its image is left unread where no method wants it and one light falls on it."""
+    mixed = isinstance(scene, MixedScene)
+    image, mask = (None, None) if blind and not mixed else scene.read()
+    truth = (scene.read_truth_map(), scene.read_weights()) if isinstance(scene, MixedScene) else None
+    prepared = None if image is None else PreparedImage(image, scene.saturation, mask)
+    answers: list[SceneAnswer] = []
+    for runner in runners:
+        method = runner.method
+        try:
+            if isinstance(method, SceneMethod):
+                answer = read_light(runner.call(method.estimate_scene, scene))
+            elif runner.lock is None and prepared is not None and isinstance(method, PreparedMethod):
+                answer = read_light(method.estimate_prepared(prepared))
+            else:
+                answer = read_light(runner.call(method.estimate, image, scene.saturation, mask))
+            field = None
+            if mixed and isinstance(method, LocalMethod):
+                field, cause = _field(runner.call(method.estimate_map, image, scene.saturation, mask), image)
+                answer = SceneAnswer(answer.light, answer.cause or cause)
+        except CropError:
+            raise
+        except Exception as error:
+            if runner.lock is None:
+                error.add_note(f"while {method.name} was on {scene.name}")
+                raise
+            raise InputError(
+                f"{method.name} fails on {scene.name}: {_reason(error)}; correct it and run the same command again"
+            ) from error
+        if truth is not None and isinstance(scene, MixedScene) and image is not None:
+            answer = SceneAnswer(answer.light, answer.cause, _map_error(scene, answer, field, truth, image, mask))
+        answers.append(answer)
+    return tuple(answers)
+
+
+def _field(given: object, image: Any) -> tuple[npt.NDArray[np.floating[Any]], str]:
+    """Return a map of lights (H, W, 3) float with grey where a pixel has none, and how many pixels those are in words.
+
+    Raises
+    ------
+    ValueError
+        It is no such map.
+    """
+    field = np.asarray(given)
+    if field.shape != image.shape or not np.issubdtype(field.dtype, np.floating):
+        raise ValueError(
+            f"estimate_map returned {field.dtype} of shape {field.shape}, expected floats {tuple(image.shape)}"
         )
-        for method, given, blind in zip(methods, lights, guessed, strict=True)
-    )
+    bad = np.asarray(~(np.isfinite(field).all(axis=2) & (field >= 0).all(axis=2) & field.any(axis=2)))
+    if not bad.any():
+        return field, ""
+    return np.where(bad[..., None], GREY, field), f"no light in {int(bad.sum())} of {bad.size} pixels of its map"
+
+
+def _map_error(
+    scene: MixedScene,
+    answer: SceneAnswer,
+    field: npt.NDArray[np.floating[Any]] | None,
+    truth: tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]],
+    image: npt.NDArray[Any],
+    mask: npt.NDArray[np.bool_] | None,
+) -> MapError:
+    lights, weights = truth
+    if lights.shape != image.shape or weights.shape[:2] != image.shape[:2]:
+        raise FormatError(
+            f"{scene.name} is {image.shape[1]}x{image.shape[0]} px, its map of lights {lights.shape[1]}x"
+            f"{lights.shape[0]}, its shares {weights.shape[1]}x{weights.shape[0]}; expected the same size of each"
+        )
+    estimate = field if field is not None else np.array(GREY if answer.light is None else answer.light)
+    return measure_map(estimate, lights, weights, scene.lights, image, scene.saturation, mask)
+
+
+def _reason(error: Exception) -> str:
+    """Return an exception as a sentence, with the last line outside this suite's packages and installed libraries."""
+    frames = traceback.extract_tb(error.__traceback__)
+    foreign = [frame for frame in frames if _HOUSE not in Path(frame.filename).parents]
+    own = [frame for frame in foreign if "site-packages" not in Path(frame.filename).parts] or foreign
+    place = f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
+    name = type(error).__name__
+    return f"{error}{place}" if isinstance(error, ValueError) and not own else f"{name}: {error}{place}"
 
 
 def _light(scene: Scene) -> npt.NDArray[np.float64]:

@@ -189,8 +189,10 @@ def sum_powers(
     ----------
     values
         (rows, Q) or longer rows of interleaved pixels; uint16, float32 or float64, not below 0.
-    free, border
-        See above; `free` is that of the whole image.
+    free
+        (H, W) or (0, 0) bool, see above; that of the whole image.
+    border
+        Pixels left out along every edge.
     top
         Row of the image that `values` begin with.
     height, width

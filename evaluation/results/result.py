@@ -17,6 +17,36 @@ COLUMNS = ("method", "mean", "median", "trimean", "best25", "worst25", "avg")
 
 
 @dataclass(frozen=True, eq=False)
+class MapErrors:
+    """The errors of one method on the images under several lights, by pixel and by region; see `metrics.maps`.
+
+    Attributes
+    ----------
+    images
+        (M,) int64, the numbers of those images among the scenes, rising.
+    pixel
+        Kind of error to (M,) float64, degrees: the mean over each image's pixels; the recovery error is LSMI's
+        MAE_illum. NaN where no pixel of an image is judged.
+    rgb
+        (M,) float64, degrees, LSMI's MAE_rgb; NaN likewise.
+    region_images, region_lights
+        (R,) int64 each: of each region, its image among the scenes and its light's number in that image.
+    region_shares
+        (R,) float64, the region's part of the image's judged pixels.
+    region
+        Kind of error to (R,) float64, degrees: the mean over each region's pixels.
+    """
+
+    images: npt.NDArray[np.int64]
+    pixel: Mapping[ErrorKind, npt.NDArray[np.float64]]
+    rgb: npt.NDArray[np.float64]
+    region_images: npt.NDArray[np.int64]
+    region_lights: npt.NDArray[np.int64]
+    region_shares: npt.NDArray[np.float64]
+    region: Mapping[ErrorKind, npt.NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
 class Result:
     """Estimates and errors of one method on one dataset.
 
@@ -27,18 +57,24 @@ class Result:
     estimates
         (N, 3) float64, camera RGB of length 1, in the order of the scenes.
     errors
-        Kind of error to (N,) float64, degrees.
+        Kind of error to (N,) float64, degrees; of an image under several lights the error against their mean.
     guessed
-        (N,) bool, True where no pixel was usable and the estimate is therefore grey.
+        (N,) bool, True where the method gave no light and grey stands in for it.
+    causes
+        Why it gave none, or none for some pixels, by the image's number among the scenes; None where nobody asked.
+    maps
+        The errors on images under several lights by pixel and region; None where no image is, or none was measured.
     """
 
     method: str
     estimates: npt.NDArray[np.float64]
     errors: Mapping[ErrorKind, npt.NDArray[np.float64]]
     guessed: npt.NDArray[np.bool_]
+    causes: Mapping[int, str] | None = None
+    maps: MapErrors | None = None
 
     def summary(self, kind: ErrorKind) -> Summary:
-        """Return the six numbers of the paper's tables for one kind of error."""
+        """Return the numbers that sum up one kind of error, the six of the paper's tables among them."""
         return summarise(self.errors[kind])
 
 

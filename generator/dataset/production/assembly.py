@@ -32,7 +32,7 @@ from generator.dataset.production.records import (
     ShardRecord,
     Skipped,
     SourceRecord,
-    Table,
+    TableRecord,
     image_key,
 )
 from generator.dataset.production.workplace import Workplace
@@ -127,7 +127,7 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
         description = Description(
             software=software(),
             libraries=identity["libraries"],
-            table=Table.model_validate(identity["table"]),
+            table=TableRecord.model_validate(identity["table"]),
             seed=identity["seed"],
             options=options,
             planned=identity["images"],

@@ -21,7 +21,7 @@ from foundation.errors import InputError
 from foundation.version import software
 from generator.dataset.production.layouts.by_name import require_libraries
 from generator.dataset.production.options import DatasetOptions
-from generator.dataset.production.records import SPLITS, Layout, Light, Split, Table
+from generator.dataset.production.records import SPLITS, Layout, Light, Split, TableRecord
 from generator.files.formats import Format, libraries_of
 
 if TYPE_CHECKING:
@@ -212,10 +212,10 @@ def versions(form: Format, layout: Layout) -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in sorted(names | {*libraries_of(form)})}
 
 
-def table_of(lut: Lut) -> Table:
+def table_of(lut: Lut) -> TableRecord:
     """Return the record of the table."""
     provenance = lut.provenance
-    return Table(
+    return TableRecord(
         sha256=lut.sha256,
         camera=provenance.camera,
         bits=provenance.bits,

@@ -35,7 +35,7 @@ class _Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class Table(_Record):
+class TableRecord(_Record):
     """The table a dataset was made from; `sha256` as `calibration.table.lut.Lut.sha256`."""
 
     sha256: str
@@ -157,7 +157,7 @@ class Description(_Record):
     version: Literal[2] = VERSION
     software: str
     libraries: dict[str, str]
-    table: Table
+    table: TableRecord
     seed: int
     options: dict[str, Any]
     planned: int

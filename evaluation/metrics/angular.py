@@ -1,19 +1,13 @@
-"""Angular errors of estimated lights and their summaries, as the paper defines them in section 4.1.
-
-All angles are degrees. Percentiles are MATLAB's `prctile`, as in the program that the field's tables were made with:
-the i-th of n sorted errors stands at 100 (i − ½) / n percent.
-"""
+"""Angular errors of estimated lights, as the paper defines them in section 4.1; all angles are degrees."""
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
 from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from foundation.angles import angles_deg
-from foundation.errors import InputError
 
 ErrorKind = Literal["reproduction", "recovery"]
 
@@ -71,61 +65,3 @@ def reproduction_error(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> npt.NDA
     floor = _ZERO * given.max(axis=-1, keepdims=True)
     corrected = np.asarray(truth, dtype=np.float64) / np.maximum(given, floor)
     return angles_deg(corrected, np.ones_like(corrected))
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Six numbers for the errors of a method on a dataset, in degrees, in the order of the paper's tables.
-
-    Attributes
-    ----------
-    mean, median
-        Of all errors.
-    trimean
-        (Q1 + 2 Q2 + Q3) / 4.
-    best25, worst25
-        Means of the errors up to the 25th and from the 75th percentile.
-    avg
-        Geometric mean of the five (J. T. Barron, "Convolutional color constancy", ICCV 2015).
-    """
-
-    mean: float
-    median: float
-    trimean: float
-    best25: float
-    worst25: float
-    avg: float
-
-    def as_tuple(self) -> tuple[float, ...]:
-        """Return the six numbers."""
-        return astuple(self)
-
-
-def summarise(errors: npt.ArrayLike) -> Summary:
-    """Return the summary of errors (N,) float, N ≥ 1, degrees.
-
-    Raises
-    ------
-    InputError
-        There is no error to summarise, or one is NaN or infinite.
-
-    Examples
-    --------
-    >>> summarise([1, 2, 3, 4, 10])
-    Summary(mean=4.0, median=3.0, trimean=3.3125, best25=1.0, worst25=10.0, avg=3.31...)
-    """
-    values = np.asarray(errors, dtype=np.float64).ravel()
-    if not values.size or not np.isfinite(values).all():
-        raise InputError(
-            f"{values.size} errors, {int((~np.isfinite(values)).sum())} of them not finite: nothing to sum up"
-        )
-    # NumPy calls MATLAB's definition after Hazen.
-    q1, q2, q3 = np.percentile(values, [25, 50, 75], method="hazen")
-    parts = (
-        float(values.mean()),
-        float(q2),
-        float(q1 + 2 * q2 + q3) / 4,
-        float(values[values <= q1].mean()),
-        float(values[values >= q3].mean()),
-    )
-    return Summary(*parts, avg=float(np.prod(np.asarray(parts) ** 0.2)))

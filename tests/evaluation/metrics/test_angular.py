@@ -1,4 +1,4 @@
-"""Errors and summaries against angles known from geometry and numbers worked by hand."""
+"""Errors against angles known from geometry."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.metrics import recovery_error, reproduction_error, summarise
-from foundation.errors import InputError
+from evaluation.metrics import recovery_error, reproduction_error
 
 lights = st.tuples(*[st.floats(0.01, 100)] * 3)
 
@@ -49,21 +48,3 @@ def test_reproduction_does_not_change_with_the_light(estimate: tuple[float, ...]
 
 def test_small_angles_keep_their_digits() -> None:
     assert recovery_error([1, 1e-9, 0], [1, 0, 0]) == pytest.approx(math.degrees(1e-9), rel=1e-6)
-
-
-def test_the_summary_of_eight_errors() -> None:
-    # By MATLAB's prctile the errors stand at 6.25, 18.75, 31.25 ... percent: Q1 = 2.5, Q2 = 4.5, Q3 = 6.5.
-    summary = summarise([8, 1, 7, 2, 6, 3, 5, 4])
-    assert summary.as_tuple() == pytest.approx((4.5, 4.5, 4.5, 1.5, 7.5, (4.5**3 * 1.5 * 7.5) ** 0.2))
-
-
-def test_the_summary_of_five_errors() -> None:
-    # At 10, 30, 50, 70, 90 percent: Q1 = 1 + 0.75 = 1.75, Q3 = 4 + 0.25 * 6 = 5.5; with 1, 2, 3, 4, 10.
-    summary = summarise([1, 2, 3, 4, 10])
-    assert summary.as_tuple()[:5] == pytest.approx((4, 3, (1.75 + 6 + 5.5) / 4, 1, 10))
-
-
-@pytest.mark.parametrize("errors", [[], [1.0, math.nan]])
-def test_nothing_to_sum_up_is_said(errors: list[float]) -> None:
-    with pytest.raises(InputError, match="nothing to sum up"):
-        summarise(errors)

@@ -1,0 +1,162 @@
+"""`evaluate compare`: two methods on the same images, or a method in two runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from foundation.console import EXIT_CODES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from evaluation.experiments.comparing import Matched
+    from evaluation.metrics import ErrorKind
+    from evaluation.results.errors_file import MethodErrors
+
+HELP = f"""Compare two methods on the same images, or a method in two runs, image by image.
+
+Reads one or two RESULTS: results folders, or the errors.csv in them. Of one, every two of its methods are compared; of
+two, each method that both have. Images are matched by their names; images that one of them lacks are named and left
+out, and ground truths that differ are refused.
+
+Prints Wilcoxon's signed-rank test, and each statistic's difference and ratio with bootstrap intervals. Writes nothing
+unless asked with --out.
+
+{EXIT_CODES}
+"""
+
+
+def compare(
+    results: Annotated[
+        list[str],
+        typer.Argument(metavar="RESULTS", help="Results folder, or its errors.csv.", show_default=False),
+    ],
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Method to compare; give it more than once for several. With two RESULTS, FIRST=SECOND compares "
+            "methods of different names. \\[default: all]",
+            show_default=False,
+        ),
+    ] = None,
+    error: Annotated[
+        Literal["reproduction", "recovery"], typer.Option(help="Angular error to compare.")
+    ] = "reproduction",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Write tables (CSV, LaTeX), the images' errors and a page with scatters to this new folder too.",
+            show_default=False,
+        ),
+    ] = None,
+    level: Annotated[float, typer.Option(help="Confidence of the intervals.", min=0.5, max=0.999)] = 0.95,
+    seed: Annotated[int, typer.Option(help="Of the bootstrap.", min=0)] = 0,
+) -> None:
+    """Compare methods on the same images."""
+    from evaluation.experiments import comparing, comparison_report
+    from evaluation.reports.terminal import print_table
+    from evaluation.results.errors_file import read_errors
+    from foundation.errors import InputError
+    from foundation.files import require_free
+
+    if len(results) > 2:
+        raise InputError(f"{len(results)} results; compare two, or the methods of one")
+    if out is not None:
+        require_free(out, "the comparison")
+    runs = [read_errors(place) for place in results]
+    pairs = _of_one(runs[0], results[0], method, error) if len(runs) == 1 else _of_two(runs, results, method, error)
+    comparisons = comparing.compare(pairs, seed, level)
+    notes = (*comparison_report.notes_of(comparisons), *_unchecked(runs, results))
+    for note in notes:
+        print(note)
+    for made in comparisons:
+        print_table(comparison_report.statistics_table(made, level))
+        print_table(comparison_report.images_table(made, 5))
+    print_table(comparison_report.tests_table(comparisons))
+    for made in comparisons:
+        print(comparing.verdict(made, level))
+    if out is not None:
+        comparison_report.write_comparisons(out, comparisons, notes, level)
+        print(f"written to {out}: report.html, tests.csv, statistics.csv, images.csv, tables.tex")
+
+
+def _of_one(
+    run: Mapping[str, MethodErrors], place: str, wanted: Sequence[str] | None, error: ErrorKind
+) -> list[Matched]:
+    """Return every two of the methods wanted, of one run."""
+    from itertools import combinations
+
+    from evaluation.experiments.comparing import match
+    from foundation.errors import InputError
+
+    chosen = list(dict.fromkeys(_named(run, name, place) for name in wanted or run))
+    if len(chosen) < 2:
+        raise InputError(
+            f"{chosen[0]} of {place} alone; compare it with a second method (--method), or with a second run: "
+            "evaluate compare RESULTS RESULTS"
+        )
+    return [match(run[one], run[other], (one, other), error) for one, other in combinations(chosen, 2)]
+
+
+def _of_two(
+    runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str], wanted: Sequence[str] | None, error: ErrorKind
+) -> list[Matched]:
+    """Return each method wanted, of one run and of the other."""
+    from evaluation.experiments.comparing import match
+    from foundation.errors import InputError
+
+    one, other = runs
+    if wanted:
+        split = [(name, name) if name in one and name in other else name.partition("=")[::2] for name in wanted]
+        chosen = [(_named(one, a, places[0]), _named(other, b or a, places[1])) for a, b in split]
+    elif len(one) == len(other) == 1:
+        chosen = [(next(iter(one)), next(iter(other)))]
+    else:
+        chosen = [(name, name) for name in one if name in other]
+    if not chosen:
+        raise InputError(
+            f"{places[0]} has {', '.join(one)} and {places[1]} has {', '.join(other)}; say which to compare: "
+            "--method FIRST=SECOND"
+        )
+    labels = _labels(places)
+    return [
+        match(one[a], other[b], (f"{a} ({labels[0]})", f"{b} ({labels[1]})"), error) for a, b in dict.fromkeys(chosen)
+    ]
+
+
+def _named(run: Mapping[str, MethodErrors], name: str, place: str) -> str:
+    """Return the method's name as the run writes it; letters large or small are the same."""
+    from foundation.errors import InputError
+
+    if name in run:
+        return name
+    alike = [known for known in run if known.lower() == name.lower()]
+    if len(alike) != 1:
+        raise InputError(f"{place} has no method {name!r}; it has {', '.join(run)}")
+    return alike[0]
+
+
+def _labels(places: Sequence[str]) -> tuple[str, str]:
+    """Return the shortest ends of two paths that tell them apart; 1 and 2 if they are the same place."""
+    one, other = (
+        [part for part in Path(place).absolute().parts if part not in ("errors.csv", "/")] for place in places
+    )
+    for length in range(1, max(len(one), len(other)) + 1):
+        ends = "/".join(one[-length:]), "/".join(other[-length:])
+        if ends[0] != ends[1]:
+            return ends
+    return "1", "2"
+
+
+def _unchecked(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]) -> list[str]:
+    """Return a sentence for each file without ground truths."""
+    return [
+        f"{place} holds no ground truths: whether they agree is not known"
+        for run, place in zip(runs, places, strict=True)
+        if len(runs) == 2 and any(method.truths is None for method in run.values())
+    ]

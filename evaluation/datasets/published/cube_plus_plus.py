@@ -1,0 +1,228 @@
+"""Cube++ and SimpleCube++: 4890 images of Canon EOS 550D and 600D, and 2234 of them reduced four times.
+
+    gt.csv            image, then r, g, b of mean, left, right, left_white, right_white (mean_r …), r + g + b = 1
+    properties.csv    of each image what it shows, and MakerNotes:NormalWhiteLevel; optional
+    PNG/00_0001.png   16 bits, half-size demosaiced raw, 2592 × 1728 (more folders PNG… are taken too)
+
+    train/gt.csv, test/gt.csv      image,r,g,b: the mean of both grey faces
+    train/PNG/…, test/PNG/…        648 × 432, the means of 4 × 4 px, the cube painted over with zeros
+
+E. Ershov et al., "The Cube++ illumination estimation dataset", IEEE Access 8, 2020 (arXiv:2011.10028), and
+github.com/Visillect/CubePlusPlus: description/description.md for layout, levels and truths, code/build_simple_ds.py for
+the rectangle that holds the SpyderCube (the lower right 700 × 1000 px). Not verified against a real copy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from evaluation.datasets.names import Folder, gather, present
+from evaluation.datasets.options import DataOptions, choose, stated
+from evaluation.datasets.published.peaks import PEAK_RULE, Peaks, PeakScene
+from evaluation.datasets.raw_scene import Mask, box_mask
+from evaluation.datasets.truths import Light, light_of, number_of, read_rows
+from evaluation.scene import Image, SceneSet
+from foundation.errors import FormatError, InputError
+
+BLACK = 2048
+"""Black level of both cameras' files: "approximately 2048, not subtracted" (description.md)."""
+SIZE = (1728, 2592)
+"""Height and width of Cube++, px (description.md)."""
+SIMPLE_SCALE = 4
+"""How often SimpleCube++ is reduced (code/build_simple_ds.py)."""
+CUBE_HEIGHT, CUBE_WIDTH = 1000, 700
+"""The rectangle with the SpyderCube, from the lower right corner, px of Cube++ (code/build_simple_ds.py)."""
+
+_TRUTHS = ("mean", "left", "right", "left_white", "right_white")
+_PUBLISHED = {"Cube++": 4890, "SimpleCube++": 2234}
+_WHITE = "MakerNotes:NormalWhiteLevel"
+_SPLITS = ("train", "test")
+
+
+@dataclass(frozen=True)
+class CubePlusPlusScene(PeakScene):
+    """An image of Cube++ or SimpleCube++.
+
+    Attributes
+    ----------
+    scale
+        How often it is reduced, 1 or 4.
+    """
+
+    scale: int = 1
+
+    def mask(self, image: Image) -> Mask:
+        """Return (H, W) bool, True in the rectangle of the SpyderCube, of an image (H, W, 3).
+
+        Raises
+        ------
+        FormatError
+            The image is not of the data set's size, so that the rectangle cannot be placed.
+        """
+        height, width = (side // self.scale for side in SIZE)
+        if image.shape[:2] != (height, width):
+            raise FormatError(
+                f"{self.path} is {image.shape[1]} × {image.shape[0]}, expected {width} × {height}, in which the "
+                "SpyderCube is masked; use the original files, or a folder of images with a CSV"
+            )
+        rows = slice(height - CUBE_HEIGHT // self.scale, None)
+        return box_mask((height, width), rows, slice(width - CUBE_WIDTH // self.scale, None))
+
+
+def is_cube_plus_plus(folder: Folder) -> bool:
+    """Return whether a folder looks like Cube++: a `gt.csv` with the faces of the SpyderCube."""
+    return folder.has("gt.csv") and "left_r" in _first_line(folder.path / "gt.csv")
+
+
+def is_simple_cube(folder: Folder) -> bool:
+    """Return whether a folder looks like SimpleCube++ or one of its parts: `gt.csv` beside a folder `PNG`."""
+    if _is_part(folder):
+        return not is_cube_plus_plus(folder)
+    return any(_is_part(folder.folders[split]) for split in _SPLITS if split in folder.folders)
+
+
+def open_cube_plus_plus(place: str, options: DataOptions) -> SceneSet:
+    """Return Cube++; images are read when they are used.
+
+    Raises
+    ------
+    InputError
+        There is no such ground truth.
+    FormatError
+        A table is missing or damaged, or images are missing or too many.
+    """
+    folder = Folder(Path(place))
+    truth = choose(options.truth, _TRUTHS, "truth", place) or "mean"
+    lights: dict[str, Light] = {}
+    names: list[str] = []
+    columns = [f"{truth}_{channel}" for channel in "rgb"]
+    for where, row in read_rows(folder.path / "gt.csv", ["image", *columns]):
+        names.append(row["image"])
+        if not _is_blank(row, columns):
+            lights[row["image"]] = light_of(row, columns, where)
+    parts = [part for name, part in folder.folders.items() if name.upper().startswith("PNG")]
+    images = gather(parts)
+    kept, note = present(names, images, "gt.csv", folder.path / "PNG", options.partial)
+    without = len([number for number in kept if names[number] not in lights])
+    if without == len(kept):
+        raise InputError(f"no image of {place} has the ground truth {truth!r}; choose another with --truth")
+    whites = _white_levels(folder.path / "properties.csv") if folder.has("properties.csv") else {}
+    black, peaks = BLACK if options.black is None else options.black, Peaks()
+    scenes = tuple(
+        CubePlusPlusScene(
+            f"{name}.png", images[name], lights[name], black, options.saturation or whites.get(name), peaks
+        )
+        for name in (names[number] for number in kept)
+        if name in lights
+    )
+    if without:
+        note += (
+            f"; {without} of these have no {truth} and are left out (the authors give a mean where both grey faces "
+            "agree within 1° and are bright enough)"
+        )
+    return SceneSet(
+        name="Cube++",
+        layout="cube++",
+        place=place,
+        scenes=scenes,
+        treatment={
+            "images": note + _of_published("Cube++", len(kept)),
+            "black level": stated(options.black, f"{BLACK}, subtracted (description.md of the data set)"),
+            "saturation": stated(
+                options.saturation,
+                f"from {_WHITE} of properties.csv, image by image (description.md)" if whites else PEAK_RULE,
+            ),
+            "mask": f"the SpyderCube: the lower right {CUBE_WIDTH} × {CUBE_HEIGHT} px (code/build_simple_ds.py)",
+            "ground truth": f"{truth} of gt.csv",
+        },
+    )
+
+
+def open_simple_cube(place: str, options: DataOptions) -> SceneSet:
+    """Return SimpleCube++, or its part `train` or `test`; images are read when they are used.
+
+    Raises
+    ------
+    InputError
+        There is no such part.
+    FormatError
+        A table is missing or damaged, or images are missing or too many.
+    """
+    folder = Folder(Path(place))
+    splits = [folder.folders[name] for name in _SPLITS if name in folder.folders and _is_part(folder.folders[name])]
+    if _is_part(folder):
+        splits = [folder]
+    if not splits:
+        raise FormatError(f"{place} is no copy of SimpleCube++: it has no train/gt.csv beside train/PNG; complete it")
+    subset = choose(options.subset, [split.path.name for split in splits], "subset", place)
+    black, peaks, notes = BLACK if options.black is None else options.black, Peaks(), list[str]()
+    scenes: list[CubePlusPlusScene] = []
+    for split in splits:
+        if subset not in (None, split.path.name):
+            continue
+        rows = [
+            (row["image"], light_of(row, "rgb", where))
+            for where, row in read_rows(split.path / "gt.csv", ["image", "r", "g", "b"])
+        ]
+        images = split.folders["PNG"].images()
+        source = f"{split.path.name}/gt.csv"
+        kept, note = present([name for name, _ in rows], images, source, split.path / "PNG", options.partial)
+        notes.append(f"{split.path.name} {note}")
+        scenes.extend(
+            CubePlusPlusScene(f"{name}.png", images[name], light, black, options.saturation, peaks, SIMPLE_SCALE)
+            for name, light in (rows[number] for number in kept)
+        )
+    return SceneSet(
+        name="SimpleCube++",
+        layout="simple-cube++",
+        place=place,
+        scenes=tuple(scenes),
+        treatment={
+            "images": ", ".join(notes) + _of_published("SimpleCube++", len(scenes)),
+            "black level": stated(options.black, f"{BLACK}, subtracted (description.md of the data set)"),
+            "saturation": stated(
+                options.saturation,
+                PEAK_RULE + "; where a part only of the 4 × 4 px of a pixel was clipped, that cannot be seen",
+            ),
+            "mask": f"the SpyderCube, painted over: the lower right {CUBE_WIDTH // SIMPLE_SCALE} × "
+            f"{CUBE_HEIGHT // SIMPLE_SCALE} px (description.md)",
+            "ground truth": "r, g, b of gt.csv: the mean of both grey faces",
+        },
+    )
+
+
+def _is_part(folder: Folder) -> bool:
+    return "PNG" in folder.folders and folder.has("gt.csv")
+
+
+def _first_line(path: Path) -> list[str]:
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            return [name.strip() for name in file.readline().split(",")]
+    except (OSError, UnicodeDecodeError):
+        return []
+
+
+def _is_blank(row: Mapping[str, str], columns: Sequence[str]) -> bool:
+    """Return whether an image has no such light: its fields are empty, or NaN as pandas writes them."""
+    return all(row[column].strip().lower() in ("", "nan") for column in columns)
+
+
+def _white_levels(path: Path) -> dict[str, float]:
+    """Return the saturation of each image that a table of properties has one of."""
+    levels: dict[str, float] = {}
+    for where, row in read_rows(path, ["image"]):
+        text = row.get(_WHITE, "").strip()
+        if text:
+            level = number_of(text, where, _WHITE)
+            if not (math.isfinite(level) and level > BLACK):
+                raise FormatError(f"{where}: {_WHITE} is {text}, expected a level above black, {BLACK}; restore it")
+            levels[row["image"]] = level
+    return levels
+
+
+def _of_published(name: str, count: int) -> str:
+    return "" if count == _PUBLISHED[name] else f"; the published {name} has {_PUBLISHED[name]}"

@@ -1,0 +1,92 @@
+"""Values out of MATLAB files, checked: the data sets' ground truths come in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.errors import FormatError
+
+
+def read_mat(path: Path) -> Mapping[str, Any]:
+    """Return the variables of a MATLAB file up to version 7 by name.
+
+    Raises
+    ------
+    FormatError
+        It cannot be read.
+    """
+    from scipy.io import loadmat
+
+    try:
+        return loadmat(path)
+    except NotImplementedError as error:
+        raise FormatError(f"{path} is of MATLAB's version 7.3, expected 7 at most; save it with -v7") from error
+    except Exception as error:
+        reason = (isinstance(error, OSError) and error.strerror) or str(error)
+        raise FormatError(f"{path} cannot be read: {reason}; restore it from the data set's archive") from error
+
+
+def table(content: Mapping[str, Any], name: str, path: Path, columns: int) -> npt.NDArray[np.float64]:
+    """Return a variable as an array (N, columns) float64.
+
+    Raises
+    ------
+    FormatError
+        It is missing, of another shape, or has values that are not finite.
+    """
+    try:
+        values = np.asarray(_get(content, name, path), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise FormatError(f"{path}: {name} is not made of numbers; restore the file") from error
+    if values.ndim != 2 or values.shape[1] != columns or not np.isfinite(values).all():
+        raise FormatError(
+            f"{path}: {name} is {values.shape}, expected (images, {columns}) finite numbers; restore the file"
+        )
+    return values
+
+
+def scalar(content: Mapping[str, Any], name: str, path: Path) -> float:
+    """Return a variable that is one number.
+
+    Raises
+    ------
+    FormatError
+        It is missing, or not one finite number from 0.
+    """
+    values = np.asarray(_get(content, name, path))
+    if values.size != 1 or values.dtype.kind not in "iuf" or not np.isfinite(values).all() or values.min() < 0:
+        raise FormatError(f"{path}: {name} is {values.tolist()}, expected one number from 0; restore the file")
+    return float(values.reshape(-1)[0])
+
+
+def strings(content: Mapping[str, Any], name: str, path: Path) -> list[str] | None:
+    """Return a variable that is a cell array of names, or None if there is none.
+
+    Raises
+    ------
+    FormatError
+        It holds something else.
+    """
+    if name not in content:
+        return None
+    found: list[str] = []
+    for cell in np.asarray(content[name], dtype=object).reshape(-1):
+        value: Any = cell
+        while isinstance(value, np.ndarray) and value.size == 1:
+            value = value.reshape(-1)[0]
+        if not isinstance(value, str):
+            raise FormatError(f"{path}: {name} holds {value!r}, expected names of images; restore the file")
+        found.append(value.strip())
+    return found
+
+
+def _get(content: Mapping[str, Any], name: str, path: Path) -> Any:
+    if name not in content:
+        have = ", ".join(key for key in content if not key.startswith("__"))
+        raise FormatError(f"{path} has {have or 'nothing'}, expected {name} among them; restore the file")
+    return content[name]

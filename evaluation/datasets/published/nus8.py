@@ -1,0 +1,172 @@
+"""NUS 8 cameras: some 230 images each of the same scenes with eight cameras, 1853 in all, a chart in each.
+
+    CAMERA/CAMERA_gt.mat      groundtruth_illuminants (N, 3), darkness_level, saturation_level, CC_coords (N, 4),
+                              all_image_names (N,)
+    CAMERA/CAMERA_0001.PNG    16 bits, demosaiced raw; also in CAMERA/PNG, or for all cameras in images/ and the .mat
+                              files in ground_truth/
+
+D. Cheng, D. Prasad, M. Brown, "Illuminant estimation for color constancy: why spatial-domain methods work and the role
+of the color distribution", JOSA A 31(5), 2014; its page, cvil.eecs.yorku.ca/projects/public_html/illuminant. Levels
+are in the units of the files, black not subtracted; `CC_coords` are first and last row, first and last column of the
+chart, counted from 1, as internal/ReadImage.m of github.com/google/ffcc uses them. Not verified against a real copy; a
+`.mat` of another version that lacks `all_image_names` is taken in the order of the file names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.datasets.names import Folder, present
+from evaluation.datasets.options import DataOptions, choose, stated
+from evaluation.datasets.published.matlab import read_mat, scalar, strings, table
+from evaluation.datasets.raw_scene import Mask, RawScene, box_mask
+from evaluation.datasets.truths import check_light
+from evaluation.scene import Image, SceneSet
+from foundation.errors import FormatError
+
+_ENDING = "_gt.mat"
+
+
+@dataclass(frozen=True)
+class ChartScene(RawScene):
+    """An image with the box of its chart.
+
+    Attributes
+    ----------
+    box
+        First and last row, first and last column of the chart, counted from 1.
+    """
+
+    box: tuple[int, int, int, int] = (1, 1, 1, 1)
+
+    def mask(self, image: Image) -> Mask:
+        """Return (H, W) bool, True in the box of the chart, of an image (H, W, 3).
+
+        Raises
+        ------
+        FormatError
+            The chart is not in the image, as in a reduced copy.
+        """
+        top, bottom, left, right = self.box
+        height, width = image.shape[:2]
+        if not (1 <= top <= bottom <= height and 1 <= left <= right <= width):
+            raise FormatError(
+                f"{self.path} is {width} × {height}, but its chart is in rows {top} to {bottom} and columns {left} to "
+                f"{right} of CC_coords; use the original files"
+            )
+        return box_mask((height, width), slice(top - 1, bottom), slice(left - 1, right))
+
+
+def is_nus8(folder: Folder) -> bool:
+    """Return whether a folder looks like the data set or one of its cameras: `CAMERA_gt.mat` in it or below."""
+    return any(True for _ in _tables(folder))
+
+
+def open_nus8(place: str, options: DataOptions) -> SceneSet:
+    """Return the images of all cameras in a folder, or of one; they are read when they are used.
+
+    Raises
+    ------
+    InputError
+        There is no such camera.
+    FormatError
+        A .mat file is missing or damaged, or images are missing or too many.
+    """
+    folder = Folder(Path(place))
+    tables = {path.name[: -len(_ENDING)]: path for path in _tables(folder)}
+    if not tables:
+        raise FormatError(f"{place} has no CAMERA{_ENDING}, expected one a camera; fetch GROUNDTRUTH from its page")
+    camera = choose(options.camera, tables, "camera", place)
+    scenes: list[RawScene] = []
+    notes: list[str] = []
+    levels: list[str] = []
+    for name, path in tables.items():
+        if camera in (None, name):
+            found, note, level = _open_camera(folder, name, path, options)
+            scenes.extend(found)
+            notes.append(f"{name} {note}")
+            levels.append(f"{name} {level}")
+    black = "darkness_level of the camera's .mat, subtracted: " + ", ".join(level.split("/")[0] for level in levels)
+    white = "from saturation_level of the camera's .mat: " + ", ".join(
+        f"{level.split(' ')[0]} {level.split('/')[1]}" for level in levels
+    )
+    return SceneSet(
+        name=f"NUS {camera}" if camera else ("NUS 8" if len(tables) > 1 else f"NUS {next(iter(tables))}"),
+        layout="nus8",
+        place=place,
+        scenes=tuple(scenes),
+        treatment={
+            "images": ", ".join(notes),
+            "black level": stated(options.black, black),
+            "saturation": stated(options.saturation, white),
+            "mask": "the chart: CC_coords of the .mat, rows and columns counted from 1, both ends included",
+            "ground truth": "groundtruth_illuminants of the .mat",
+        },
+    )
+
+
+def _tables(folder: Folder) -> Iterator[Path]:
+    """Yield the .mat files of the cameras in a folder and in those right below it."""
+    for place in folder.within(1):
+        yield from (place.path / name for name in place.files if name.endswith(_ENDING) and len(name) > len(_ENDING))
+
+
+def _open_camera(root: Folder, camera: str, path: Path, options: DataOptions) -> tuple[list[RawScene], str, str]:
+    """Return the scenes of a camera, a note on their number, and "black/white" of its levels."""
+    content = read_mat(path)
+    lights = table(content, "groundtruth_illuminants", path, 3)
+    boxes = _boxes(content, path)
+    if len(boxes) != len(lights):
+        raise FormatError(f"{path} has {len(lights)} lights and {len(boxes)} CC_coords, expected as many; restore it")
+    folder, images = _images(root, camera, path)
+    names = strings(content, "all_image_names", path)
+    if names is None:
+        names = list(images)
+    if len(names) != len(lights):
+        raise FormatError(
+            f"{path} has {len(lights)} lights for {len(names)} images of {camera} in {folder}, expected as many: "
+            "without all_image_names in the .mat the images are taken in the order of their names; complete the copy"
+        )
+    kept, note = present(names, images, path.name, folder, options.partial)
+    black = scalar(content, "darkness_level", path) if options.black is None else options.black
+    white = scalar(content, "saturation_level", path) if options.saturation is None else options.saturation
+    if white <= black:
+        raise FormatError(f"{path}: saturation {white:g} is not above black {black:g}; correct or give the levels")
+    scenes: list[RawScene] = [
+        ChartScene(
+            names[number],
+            images[names[number]],
+            check_light(lights[number].tolist(), f"{path}, row {number + 1} of groundtruth_illuminants"),
+            black,
+            white,
+            boxes[number],
+        )
+        for number in kept
+    ]
+    return scenes, note, f"{black:g}/{white:g}"
+
+
+def _boxes(content: Mapping[str, Any], path: Path) -> list[tuple[int, int, int, int]]:
+    rows: npt.NDArray[np.int64] = table(content, "CC_coords", path, 4).astype(np.int64)
+    return [(int(top), int(bottom), int(left), int(right)) for top, bottom, left, right in rows]
+
+
+def _images(root: Folder, camera: str, path: Path) -> tuple[Path, dict[str, str]]:
+    """Return where the images of a camera lie, and their paths by name."""
+    beside = Folder(path.parent)
+    places = [beside, *(beside.folders.get(name) for name in ("PNG", "png")), root.folders.get("images")]
+    for place in places:
+        images = {} if place is None else place.images()
+        images = {name: file for name, file in images.items() if name.startswith(f"{camera}_")}
+        if place is not None and images:
+            return place.path, images
+    raise FormatError(
+        f"there is no image {camera}_….PNG beside {path}, in PNG there or in {root.path / 'images'}; unpack the "
+        "archives of PNG files there"
+    )

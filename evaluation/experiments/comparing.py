@@ -1,0 +1,244 @@
+"""Compare the errors of two methods, or of one method in two runs, image by image.
+
+The same images lie under both, so everything is paired: the signed-rank test (F. Wilcoxon, "Individual comparisons by
+ranking methods", Biometrics Bulletin 1 (1945) 80-83), whose recommendation for colour constancy is S. D. Hordley,
+G. D. Finlayson, "Reevaluation of color constancy algorithm performance", JOSA A 23 (2006) 1008-1020; intervals of the
+differences and ratios of all statistics (`bootstrap.paired`); and the images on which the two differ most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.experiments.bootstrap import Compared, paired
+from evaluation.metrics import ErrorKind
+from evaluation.results.errors_file import MethodErrors
+from foundation.angles import angles_deg
+from foundation.errors import InputError
+
+_SAME_TRUTH_DEG: Final = 0.01
+"""Truths that differ by less are the same light written with few digits; six decimals are good to .0001 degrees."""
+
+_TIE_DEG: Final = 2e-6
+"""Errors that differ by less are equal: files hold six decimals, and machines differ in the last ones."""
+
+_NAMED: Final = 5
+"""Images named in a message; of more, the number is told."""
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """The errors of two methods on the images that both have.
+
+    Attributes
+    ----------
+    names
+        Of the two, for tables and figures.
+    kind
+        The error compared.
+    images
+        N names, in the first's order, at least one.
+    one, other
+        (N,) float64 each, degrees.
+    missing
+        Images that only the other has, and images that only the one has.
+    """
+
+    names: tuple[str, str]
+    kind: ErrorKind
+    images: tuple[str, ...]
+    one: npt.NDArray[np.float64]
+    other: npt.NDArray[np.float64]
+    missing: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+
+
+@dataclass(frozen=True)
+class SignedRank:
+    """Wilcoxon's signed-rank test of paired errors.
+
+    Attributes
+    ----------
+    wins, losses, ties
+        Images on which the one's error is smaller, larger, equal.
+    p
+        Two-sided probability of a rank sum as uneven as this where neither is better. Equal errors are ranked and then
+        left out (J. W. Pratt, JASA 54 (1959) 655-667). Exact up to 50 images where none are equal, else from the normal
+        distribution that the rank sum tends to, corrected for ties.
+    effect
+        Matched-pairs rank-biserial correlation (D. S. Kerby, Comprehensive Psychology 3 (2014)): (losses - wins) / all
+        as shares of the rank sum; -1 where the one is better on every image, 0 where neither is, 1 where it is worse.
+    """
+
+    wins: int
+    losses: int
+    ties: int
+    p: float
+    effect: float
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """All that is said of a pair.
+
+    Attributes
+    ----------
+    matched
+        The errors.
+    test
+        Their signed-rank test.
+    p_holm
+        Its p among those of all comparisons made together (`holm`).
+    statistics
+        Each statistic of the one against that of the other, with intervals.
+    """
+
+    matched: Matched
+    test: SignedRank
+    p_holm: float
+    statistics: tuple[Compared, ...]
+
+
+def match(one: MethodErrors, other: MethodErrors, names: tuple[str, str], kind: ErrorKind) -> Matched:
+    """Return the errors of two methods on the images of the same name.
+
+    Raises
+    ------
+    InputError
+        No image is in both, or the ground truths of one differ: the runs are of different data.
+    """
+    places = {image: place for place, image in enumerate(other.images)}
+    both = [(place, places[image]) for place, image in enumerate(one.images) if image in places]
+    if not both:
+        raise InputError(
+            f"{names[0]} and {names[1]} have no image in common, they begin with {one.images[0]} and "
+            f"{other.images[0]}; compare runs on the same data set"
+        )
+    mine, its = (np.array(side, dtype=np.int64) for side in zip(*both, strict=True))
+    if one.truths is not None and other.truths is not None:
+        angles = angles_deg(one.truths[mine], other.truths[its])
+        worst = int(angles.argmax())
+        if angles[worst] > _SAME_TRUTH_DEG:
+            raise InputError(
+                f"the ground truths of {one.images[both[worst][0]]} in {names[0]} and {names[1]} are "
+                f"{angles[worst]:.2f} degrees apart, those of {int((angles > _SAME_TRUTH_DEG).sum())} of {len(both)} "
+                f"images more than {_SAME_TRUTH_DEG:g}: the runs are of different data or ground truths; run both on "
+                "the same"
+            )
+    here = set(one.images)
+    return Matched(
+        names=names,
+        kind=kind,
+        images=tuple(one.images[place] for place, _ in both),
+        one=one.errors[kind][mine],
+        other=other.errors[kind][its],
+        missing=(
+            tuple(image for image in other.images if image not in here),
+            tuple(image for image in one.images if image not in places),
+        ),
+    )
+
+
+def signed_rank(one: npt.ArrayLike, other: npt.ArrayLike) -> SignedRank:
+    """Return the signed-rank test of paired errors.
+
+    Parameters
+    ----------
+    one, other
+        (N,) float each, degrees, in the same order of images.
+
+    Examples
+    --------
+    >>> test = signed_rank([1, 2, 3, 4, 5, 6], [2, 4, 6, 8, 10, 5.5])
+    >>> test.wins, test.losses, test.ties, round(test.effect, 3), round(test.p, 4)
+    (5, 1, 0, -0.905, 0.0625)
+    """
+    from scipy import stats
+
+    difference = np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
+    difference = np.where(np.abs(difference) < _TIE_DEG, 0, difference)
+    wins, losses = int((difference < 0).sum()), int((difference > 0).sum())
+    if not wins + losses:
+        return SignedRank(0, 0, len(difference), 1.0, 0.0)
+    ranks = stats.rankdata(np.abs(difference))
+    under, over = float(ranks[difference < 0].sum()), float(ranks[difference > 0].sum())
+    p = stats.wilcoxon(difference, zero_method="pratt").pvalue
+    return SignedRank(wins, losses, len(difference) - wins - losses, float(p), (over - under) / (over + under))
+
+
+def holm(probabilities: Sequence[float]) -> list[float]:
+    """Return p-values of tests made together, corrected so that one false alarm among all of them has that chance.
+
+    S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statistics 6 (1979) 65-70.
+
+    Examples
+    --------
+    >>> [round(p, 3) for p in holm([0.01, 0.04, 0.03])]
+    [0.03, 0.06, 0.06]
+    """
+    corrected = [1.0] * len(probabilities)
+    least = 0.0
+    for rank, place in enumerate(sorted(range(len(probabilities)), key=lambda place: probabilities[place])):
+        least = max(least, min(1.0, (len(probabilities) - rank) * probabilities[place]))
+        corrected[place] = least
+    return corrected
+
+
+def compare(pairs: Sequence[Matched], seed: int = 0, level: float = 0.95) -> tuple[Comparison, ...]:
+    """Return the comparison of each pair; their p-values are corrected for one another.
+
+    Parameters
+    ----------
+    pairs
+        The pairs that one question is asked of.
+    seed
+        Of the bootstrap.
+    level
+        Confidence of its intervals, between 0 and 1.
+    """
+    tests = [signed_rank(pair.one, pair.other) for pair in pairs]
+    corrected = holm([test.p for test in tests])
+    return tuple(
+        Comparison(pair, test, p, paired(pair.one, pair.other, seed, level=level))
+        for pair, test, p in zip(pairs, tests, corrected, strict=True)
+    )
+
+
+def largest_differences(matched: Matched, count: int = 10) -> list[int]:
+    """Return the places of the images on which the two differ most, by the size of the difference, the largest first.
+
+    Images with equal errors are left out; of equal differences the first image comes first.
+    """
+    size = np.abs(matched.one - matched.other)
+    order = np.argsort(-size, kind="stable")
+    return [int(place) for place in order[:count] if size[place] >= _TIE_DEG]
+
+
+def verdict(comparison: Comparison, level: float = 0.95) -> str:
+    """Return in one sentence what a comparison says, and whether chance would explain it."""
+    matched, test = comparison.matched, comparison.test
+    one, other = matched.names
+    counted = f"{one} errs less than {other} on {test.wins} of {len(matched.images)} images, more on {test.losses}"
+    counted += f", the same on {test.ties}" if test.ties else ""
+    if comparison.p_holm > 1 - level:
+        return f"{counted}: not significant (Holm-corrected p = {comparison.p_holm:.2g})."
+    better = one if test.effect < 0 else other
+    return f"{counted}: {better} errs less (Holm-corrected p = {comparison.p_holm:.2g}, effect {test.effect:+.2f})."
+
+
+def missing_images(matched: Matched) -> tuple[str, ...]:
+    """Return a sentence for each of the two that lacks images of the other."""
+    return tuple(
+        f"{name} lacks {len(lacking)} images of {whose}, which are left out: {_listed(lacking)}"
+        for name, whose, lacking in zip(matched.names, reversed(matched.names), matched.missing, strict=True)
+        if lacking
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    rest = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {rest} more" if rest > 0 else "")

@@ -1,0 +1,117 @@
+"""Cross-validation: every image is estimated by a model that has not seen it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.experiments.folds import require_apart
+from evaluation.learning.feature_learner import FeatureLearner, Features, extract, fit_extracted, truths_of
+from evaluation.methods.method import Learner
+from evaluation.methods.pixels import GREY, unit
+from evaluation.metrics import ErrorKind, recovery_error, reproduction_error
+from evaluation.results.result import Result
+from evaluation.scene import Scene
+from foundation.errors import InputError
+
+
+def cross_validate(
+    scenes: Sequence[Scene],
+    learners: Sequence[Learner],
+    folds: npt.NDArray[np.int64],
+    seed: int = 0,
+    workers: int = 1,
+    on_scene: Callable[[], None] | None = None,
+) -> tuple[Result, ...]:
+    """Return the estimates and errors of learned methods, each image by the model trained on the other folds.
+
+    Images are read once for all learners that extract features, and again in each fold by those that only have
+    `fit(scenes, seed)`.
+
+    Parameters
+    ----------
+    scenes
+        N images with their ground truths.
+    learners
+        At least one.
+    folds
+        (N,) int64, the fold of each image, of at least two kinds.
+    seed
+        Handed to every fit; folds are drawn by the caller.
+    workers
+        Threads that read images and extract features; no number depends on it.
+    on_scene
+        Called once a scene when its features have been extracted; where no learner has any, at the end.
+
+    Returns
+    -------
+    tuple of Result
+        One a learner, in their order, rows in the order of the scenes.
+
+    Raises
+    ------
+    InputError
+        There is no scene or learner or only one fold; folds part images of one group; a ground truth is no light; or a
+        training part has no usable pixel.
+    FormatError
+        An image cannot be read.
+    """
+    truths = truths_of(scenes)
+    if not learners or len(set(folds.tolist())) < 2:
+        raise InputError(
+            f"{len(learners)} methods in {len(set(folds.tolist()))} folds: expected at least one method and two folds"
+        )
+    require_apart(scenes, folds)
+    extracting = [learner for learner in learners if isinstance(learner, FeatureLearner)]
+    features = iter(extract(scenes, extracting, workers, on_scene) if extracting else ())
+    results: list[Result] = []
+    for learner in learners:
+        if isinstance(learner, FeatureLearner):
+            lights, guessed = _by_features(learner, next(features), truths, folds, seed)
+        else:
+            lights, guessed = _by_scenes(learner, scenes, folds, seed)
+        errors: dict[ErrorKind, npt.NDArray[np.float64]] = {
+            "recovery": recovery_error(lights, truths),
+            "reproduction": reproduction_error(lights, truths),
+        }
+        results.append(Result(learner.name, lights, errors, guessed))
+    if on_scene and not extracting:
+        for _ in scenes:
+            on_scene()
+    return tuple(results)
+
+
+def _by_features(
+    learner: FeatureLearner,
+    features: Sequence[Features | None],
+    truths: npt.NDArray[np.float64],
+    folds: npt.NDArray[np.int64],
+    seed: int,
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    lights = np.tile(GREY, (len(features), 1))
+    guessed = np.array([given is None for given in features])
+    for fold in sorted(set(folds.tolist())):
+        train = folds != fold
+        chosen = [given for given, taken in zip(features, train, strict=True) if taken]
+        model = fit_extracted(learner, chosen, truths[train], seed).model
+        for place, given in enumerate(features):
+            if not train[place] and given is not None:
+                lights[place] = unit(model.lights(given[None])[0])
+    return lights, guessed
+
+
+def _by_scenes(
+    learner: Learner, scenes: Sequence[Scene], folds: npt.NDArray[np.int64], seed: int
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    lights = np.tile(GREY, (len(scenes), 1))
+    guessed = np.zeros(len(scenes), dtype=bool)
+    for fold in sorted(set(folds.tolist())):
+        method = learner.fit([scene for scene, where in zip(scenes, folds, strict=True) if where != fold], seed)
+        for place, scene in enumerate(scenes):
+            if folds[place] == fold:
+                image, mask = scene.read()
+                light = method.estimate(image, scene.saturation, mask)
+                lights[place], guessed[place] = light, light is GREY
+    return lights, guessed

@@ -1,0 +1,146 @@
+"""Folds of a data set: drawn by a seed, read from a file, written as one.
+
+A fold is held back while a method is trained on the others. Images that share a group, such as one picture under
+several lights, are always in the same fold: otherwise the method is tested on what it was trained on.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.scene import Scene
+from foundation.errors import FormatError, InputError, first_of
+
+_LEAST = 2
+"""Folds: with one there is nothing left to train on."""
+
+
+def group_of(scene: Scene) -> str:
+    """Return what the scene shares with others that must not be parted from it: its `group`, else its name."""
+    return str(getattr(scene, "group", scene.name))
+
+
+def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | None = None) -> npt.NDArray[np.int64]:
+    """Return the fold of each image, (N,) int64 from 0; the folds differ in size as little as the groups allow.
+
+    Parameters
+    ----------
+    count
+        N images.
+    folds
+        Number of folds, 2 … the number of groups.
+    seed
+        Of the order in which the images are dealt.
+    groups
+        The group of each of the N images; None if every image is one of its own.
+
+    Raises
+    ------
+    InputError
+        There are fewer than two folds, or more folds than groups.
+
+    Examples
+    --------
+    >>> np.bincount(draw_folds(10, 3)).tolist()
+    [4, 3, 3]
+    >>> pairs = draw_folds(6, 3, groups=["a", "b", "c", "a", "b", "c"])
+    >>> (pairs[:3] == pairs[3:]).all()
+    np.True_
+    """
+    names = [str(number) for number in range(count)] if groups is None else list(groups)
+    if len(names) != count:
+        raise ValueError(f"{len(names)} groups of {count} images; expected one an image")
+    kinds, member, sizes = np.unique(names, return_inverse=True, return_counts=True)
+    if not _LEAST <= folds <= len(kinds):
+        told = f"{count} images" + ("" if groups is None else f" in {len(kinds)} groups that stay together")
+        raise InputError(f"{folds} folds of {told}: expected 2 to {len(kinds)} folds")
+    order = np.random.default_rng(seed).permutation(len(kinds))
+    # The largest groups first, each into the emptiest fold: sizes then differ by less than the largest group.
+    order = order[np.argsort(-sizes[order], kind="stable")]
+    filled, chosen = np.zeros(folds, np.int64), np.zeros(len(kinds), np.int64)
+    for kind in order:
+        chosen[kind] = np.argmin(filled)
+        filled[chosen[kind]] += sizes[kind]
+    return chosen[member].astype(np.int64)
+
+
+def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
+    """Return the fold of each image, (N,) int64 from 0, as a CSV file has them: `image,fold`, a line an image.
+
+    Folds may be any words or numbers; they are counted in their sorted order. Images that the data set lacks are
+    refused as well as images that the file lacks.
+
+    Parameters
+    ----------
+    path
+        The file.
+    names
+        Names of the N images.
+
+    Raises
+    ------
+    FormatError
+        The file is not there or no such table, does not name each image once, or has a single fold.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            table = csv.DictReader(stream)
+            columns = list(table.fieldnames or ())
+            rows = [(row.get("image") or "", row.get("fold") or "") for row in table]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FormatError(f"cannot read folds from {path}: {error}; expected CSV, image,fold a line") from error
+    if not {"image", "fold"} <= set(columns):
+        raise FormatError(f"{path} has the columns {','.join(columns)}; expected image,fold; correct its first line")
+    given = dict(rows)
+    twice = [image for image, count in Counter(image for image, _ in rows).items() if count > 1]
+    missing = [name for name in names if not given.get(name)]
+    strange = sorted(set(given) - set(names))
+    for wrong, what in ((twice, "more than once"), (missing, "without a fold"), (strange, "which the data set lacks")):
+        if wrong:
+            raise FormatError(f"{path} has images {what}: {first_of(wrong)}; expected each image of the data set once")
+    kinds, folds = np.unique([given[name] for name in names], return_inverse=True)
+    if len(kinds) < _LEAST:
+        raise FormatError(f"{path} has the fold {first_of(list(kinds))} only; expected at least two")
+    return folds.astype(np.int64)
+
+
+def folds_to_csv(names: Sequence[str], folds: npt.NDArray[np.int64]) -> str:
+    """Return folds (N,) int64 as CSV text that `read_folds` reads: `image,fold`.
+
+    Examples
+    --------
+    >>> print(folds_to_csv(["a.png", "b.png"], np.array([1, 0])), end="")
+    image,fold
+    a.png,1
+    b.png,0
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("image", "fold"))
+    writer.writerows(zip(names, map(int, folds), strict=True))
+    return text.getvalue()
+
+
+def require_apart(scenes: Sequence[Scene], folds: npt.NDArray[np.int64]) -> None:
+    """Refuse folds (N,) int64 that part images of one group.
+
+    Raises
+    ------
+    InputError
+        Some images of a group are in one fold and some in another.
+    """
+    seen: dict[str, int] = {}
+    for scene, fold in zip(scenes, folds, strict=True):
+        group = group_of(scene)
+        if seen.setdefault(group, int(fold)) != int(fold):
+            raise InputError(
+                f"images of {group} are in the folds {seen[group]} and {int(fold)}: a method would be tested on "
+                "what it was trained on; put all images of a group into one fold"
+            )

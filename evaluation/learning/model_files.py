@@ -1,0 +1,208 @@
+"""Model files: what a learned method has learned, as plain arrays with the story of their training.
+
+A model file is NumPy's `.npz` without pickled objects, so that opening one runs no code: the arrays of the model under
+their own names, and under `about` a JSON text with the method, its settings and the provenance. Reading checks all of
+it; a file that is foreign or damaged is refused in one sentence.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod, truths_of
+from evaluation.learning.standard import standard_learners
+from evaluation.methods.method import Method
+from evaluation.scene import Scene, SceneSet
+from foundation.clock import Clock
+from foundation.errors import FormatError, InputError
+from foundation.files import require_free_file, whole_file
+from foundation.hashing import sha256_of
+from foundation.version import software
+
+_FORMAT = "croplab model 1"
+_ABOUT = "about"
+
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """What a model was trained on, by what and when.
+
+    Attributes
+    ----------
+    data_name, data_place, data_layout
+        The data set; see `scene.SceneSet`.
+    treatment
+        What was done to its images before the method saw them.
+    scenes
+        Number of images.
+    sha256
+        Of the images' names and ground truths, 64 hexadecimal digits; see `scenes_sha256`.
+    part
+        The part of the data set: "all", or which folds.
+    seed
+        Of the fit.
+    software
+        Name and version of what trained it.
+    date
+        ISO 8601, UTC.
+    """
+
+    data_name: str
+    data_place: str
+    data_layout: str
+    treatment: Mapping[str, str]
+    scenes: int
+    sha256: str
+    part: str
+    seed: int
+    software: str
+    date: str
+
+    def sentence(self) -> str:
+        """Return in one line what the model was trained on."""
+        return (
+            f"trained on {self.part} of {self.data_name} ({self.data_layout}, {self.scenes} images, seed {self.seed}) "
+            f"by {self.software} on {self.date[:10]}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class StoredMethod(LearnedMethod):
+    """A learned method from a model file.
+
+    Attributes
+    ----------
+    provenance
+        What it was trained on.
+    """
+
+    provenance: TrainingRecord | None = None
+
+
+def provenance_of(data: SceneSet, seed: int, clock: Clock, part: str = "all") -> TrainingRecord:
+    """Return the provenance of a model that is trained on a data set now."""
+    return TrainingRecord(
+        data_name=data.name,
+        data_place=data.place,
+        data_layout=data.layout,
+        treatment=dict(data.treatment),
+        scenes=len(data.scenes),
+        sha256=scenes_sha256(data.scenes),
+        part=part,
+        seed=seed,
+        software=software(),
+        date=clock.now().isoformat(timespec="seconds"),
+    )
+
+
+def scenes_sha256(scenes: Sequence[Scene]) -> str:
+    """Return a hash of the names and ground truths of scenes, in their order: 64 hexadecimal digits.
+
+    Truths count as chromaticities to nine digits, so that their length does not matter.
+    """
+    truths = truths_of(scenes)
+    shares = truths / truths.sum(axis=1, keepdims=True)
+    lines = [
+        f"{scene.name}\t{' '.join(f'{part:.9f}' for part in row)}" for scene, row in zip(scenes, shares, strict=True)
+    ]
+    return sha256_of("\n".join(lines).encode())
+
+
+def save_model(path: Path, method: Method, provenance: TrainingRecord) -> None:
+    """Write a learned method to a new model file.
+
+    Raises
+    ------
+    InputError
+        The method is not one of `standard_learners`, or something is at `path` already.
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    if not isinstance(method, LearnedMethod) or method.learner.key not in standard_learners():
+        raise InputError(
+            f"{method.name} cannot be saved: model files hold {', '.join(standard_learners())}; a class of your own "
+            "keeps what it has learned by its own means, and is trained and evaluated by evaluate cv"
+        )
+    require_free_file(path, "the model")
+    about = {
+        "format": _FORMAT,
+        "method": method.learner.key,
+        "settings": settings_of(method.learner),
+        "provenance": asdict(provenance),
+    }
+    arrays: dict[str, Any] = {_ABOUT: np.array(json.dumps(about, indent=1, sort_keys=True)), **method.model.arrays()}
+    with whole_file(path) as stream:
+        np.savez_compressed(stream, allow_pickle=False, **arrays)
+
+
+def load_model(path: Path) -> StoredMethod:
+    """Return the learned method of a model file.
+
+    Raises
+    ------
+    FormatError
+        The file is not there, is no model file, or is damaged; the message says which.
+    """
+    try:
+        arrays = _read_arrays(path)
+        about = json.loads(str(arrays.pop(_ABOUT)))
+        if about["format"] != _FORMAT:
+            raise ValueError(f"it says {about['format']!r} where {_FORMAT!r} is expected")
+        known = standard_learners()
+        if about["method"] not in known:
+            raise ValueError(f"it holds {about['method']!r}; known are {', '.join(known)}")
+        learner = _with_settings(known[about["method"]], about["settings"])
+        provenance = _provenance(about["provenance"])
+        model = learner.restore(arrays)
+    except KeyError as error:
+        raise _refused(path, f"it lacks {error}") from error
+    except (OSError, ValueError, TypeError, AttributeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+        raise _refused(path, str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+    return StoredMethod(learner, model, provenance.data_name, provenance)
+
+
+def _refused(path: Path, why: str) -> FormatError:
+    return FormatError(f"{path} is no whole model file: {why}; name a file that evaluate train has made")
+
+
+def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+    with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
+        # numpy.load would take a pickle for a file that is no archive; and its own check of sums comes with reading.
+        if (damaged := archive.testzip()) is not None:
+            raise ValueError(f"{damaged} is damaged")
+    with np.load(path, allow_pickle=False) as content:
+        return {name: content[name] for name in content.files}
+
+
+def settings_of(learner: FeatureLearner) -> dict[str, Any]:
+    """Return the settings of a learner as JSON has them, by their names."""
+    if not dataclasses.is_dataclass(learner):
+        raise TypeError(f"{learner.name} is no dataclass, whose fields would be its settings")
+    return {each.name: getattr(learner, each.name) for each in dataclasses.fields(learner)}
+
+
+def _with_settings(learner: FeatureLearner, settings: Mapping[str, Any]) -> FeatureLearner:
+    expected = settings_of(learner)
+    if set(settings) != set(expected):
+        raise ValueError(f"it has the settings {', '.join(sorted(settings))}; expected {', '.join(sorted(expected))}")
+    for name, value in settings.items():
+        if type(value) is not type(expected[name]):
+            raise ValueError(f"the setting {name} is {value!r}, expected one such as {expected[name]!r}")
+    return type(learner)(**settings)
+
+
+def _provenance(given: Mapping[str, Any]) -> TrainingRecord:
+    expected = {each.name for each in dataclasses.fields(TrainingRecord)}
+    if set(given) != expected:
+        raise ValueError(f"its provenance has {', '.join(sorted(given))}; expected {', '.join(sorted(expected))}")
+    return TrainingRecord(**given)

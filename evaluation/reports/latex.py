@@ -1,0 +1,145 @@
+"""Tables for papers, in the layout of the paper's Tables 1 and 2; plain LaTeX that needs no package.
+
+The tables are floats with a caption. Heads of several words are stacked; several tables with the same heads become
+one, each under its title.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from evaluation.results.tables import Table
+
+_SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    **{mark: f"\\{mark}" for mark in "&%$#_{}"},
+    **{mark: f"${mark}$" for mark in "<>|"},
+    "–": "--",
+    "—": "---",
+    "…": r"\ldots{}",
+    "°": r"$^\circ$",
+    "×": r"$\times$",
+    "±": r"$\pm$",
+    "·": r"$\cdot$",
+    "−": "$-$",
+    "≤": r"$\le$",
+    "≥": r"$\ge$",
+    "≈": r"$\approx$",
+    "∞": r"$\infty$",
+    "²": "$^2$",
+    "³": "$^3$",
+    "½": r"$\frac12$",
+    "→": r"$\to$",
+    "α": r"$\alpha$",
+    "β": r"$\beta$",
+    "γ": r"$\gamma$",
+    "Δ": r"$\Delta$",
+    "λ": r"$\lambda$",
+    "μ": r"$\mu$",
+    "σ": r"$\sigma$",
+}
+"""Characters that LaTeX reads as commands or that its default fonts lack, and what sets them."""
+
+
+def escape_latex(text: str) -> str:
+    r"""Return LaTeX that sets a text as it is.
+
+    Examples
+    --------
+    >>> print(escape_latex("A_1 & 25% of σ"))
+    A\_1 \& 25\% of $\sigma$
+    """
+    return "".join(_SPECIAL.get(mark, mark) for mark in text)
+
+
+def table_to_latex(table: Table) -> str:
+    r"""Return a table as a LaTeX float: its title the caption, its notes below it.
+
+    Examples
+    --------
+    >>> from evaluation.results.tables import Table
+    >>> print(table_to_latex(Table("Errors", ("Algorithm", "Best 25%"), (("Gray-world", 1.5),))), end="")
+    \begin{table}[ht]
+    \centering
+    \caption{Errors}
+    \begin{tabular}{|l|r|}
+    \hline
+    \textbf{Algorithm} & \shortstack{\textbf{Best}\\\textbf{25\%}}\\
+    \hline
+    Gray-world & 1.50\\
+    \hline
+    \end{tabular}
+    \end{table}
+    """
+    return _float(table.title, table, [_heads(table), *_rows(table)], table.notes)
+
+
+def tables_to_latex(caption: str, tables: Sequence[Table]) -> str:
+    r"""Return several tables of as many columns as one LaTeX float, as the paper's Table 1: each under its title.
+
+    Parameters
+    ----------
+    caption
+        Of the float.
+    tables
+        At least one; their columns' kinds are those of the first.
+
+    Raises
+    ------
+    ValueError
+        There is no table, or they differ in the number of their columns.
+    """
+    widths = sorted({len(table.columns) for table in tables})
+    if len(widths) != 1:
+        raise ValueError(
+            f"{len(tables)} tables of {widths} columns; expected at least one, and the same columns in each"
+        )
+    lines: list[str] = []
+    for number, table in enumerate(tables):
+        title = f"\\multicolumn{{{len(table.columns)}}}{{|c|}}{{{escape_latex(table.title)}}}\\\\"
+        lines += ["\\hline", "\\hline"] if number else []
+        lines += [title, "\\hline", _heads(table), *_rows(table)]
+    return _float(caption, tables[0], lines, [note for table in tables for note in table.notes])
+
+
+def _float(caption: str, like: Table, lines: Sequence[str], notes: Sequence[str]) -> str:
+    kinds = ["r" if number else "l" for number in like.numeric()]
+    below = [f"\\\\[.3em]\\parbox{{\\linewidth}}{{\\footnotesize {escape_latex(' '.join(notes))}}}"] if notes else []
+    return "\n".join(
+        [
+            "\\begin{table}[ht]",
+            "\\centering",
+            f"\\caption{{{escape_latex(caption)}}}",
+            f"\\begin{{tabular}}{{|{kinds[0]}|{''.join(kinds[1:])}{'|' if kinds[1:] else ''}}}",
+            "\\hline",
+            *lines,
+            "\\hline",
+            "\\end{tabular}",
+            *below,
+            "\\end{table}",
+            "",
+        ]
+    )
+
+
+def _heads(table: Table) -> str:
+    """Return the row of heads; a head of several words over numbers is stacked, as the numbers are narrow."""
+    heads = [
+        _stacked(head) if numeric else f"\\textbf{{{escape_latex(head)}}}"
+        for head, numeric in zip(table.columns, table.numeric(), strict=True)
+    ]
+    return f"{' & '.join(heads)}\\\\\n\\hline"
+
+
+def _stacked(head: str) -> str:
+    words = [f"\\textbf{{{escape_latex(word)}}}" for word in head.split()]
+    over_each_other = r"\\".join(words)
+    return words[0] if len(words) == 1 else f"\\shortstack{{{over_each_other}}}"
+
+
+def _rows(table: Table) -> list[str]:
+    return [f"{' & '.join(map(escape_latex, row))}\\\\" for row in table.texts()]

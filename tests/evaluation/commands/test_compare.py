@@ -1,0 +1,102 @@
+"""`evaluate compare` as a user meets it."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.cli import main
+
+HEAD = "image,method,truth_r,truth_g,truth_b,recovery,reproduction,guessed\n"
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> tuple[str, str]:
+    """Return two runs of methods A and B on 30 images, the second with A improved and one image missing."""
+    random = np.random.default_rng(1)
+    hard = random.gamma(1.5, 2, 30)
+    folders = tmp_path / "first", tmp_path / "second"
+    for folder, gain in zip(folders, (1, 0.7), strict=True):
+        folder.mkdir()
+        lines = [
+            f"im {number},{method},1,2,1,{error / 2:.6f},{error:.6f},0\n"
+            for number in range(30 if gain == 1 else 29)
+            for method, error in (("A", gain * hard[number]), ("B <i>", 2 + hard[number]))
+        ]
+        (folder / "errors.csv").write_text(HEAD + "".join(lines))
+    return str(folders[0]), str(folders[1])
+
+
+def test_two_runs(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", *runs]) == 0
+    printed = capsys.readouterr().out
+    assert "A (second) lacks 1 images of A (first), which are left out: im 29" in printed
+    assert "A (first) errs less than A (second) on 0 of 29 images, more on 29: A (second) errs less" in printed
+    assert "B <i> (first) errs less than B <i> (second) on 0 of 29 images, more on 0, the same on 29: not" in printed
+    assert "corrected for the 2 comparisons" in printed
+
+
+def test_two_methods_of_one_run_and_of_two(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", runs[0]]) == 0
+    assert "A errs less than B <i> on 30 of 30 images" in capsys.readouterr().out
+    assert main(["compare", *runs, "--method", "a=B <i>", "--error", "recovery"]) == 0
+    printed = capsys.readouterr().out
+    assert "A (first) errs less than B <i> (second) on 29 of 29 images" in printed
+    assert "recovery errors of 29 images" in printed
+    assert main(["compare", runs[0], runs[0]]) == 0
+    assert "A (1) errs less than A (2) on 0 of 30 images, more on 0, the same on 30" in capsys.readouterr().out
+
+
+def test_files(runs: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(["compare", *runs, "--out", str(out)]) == 0
+    assert sorted(path.name for path in out.iterdir()) == [
+        "images.csv",
+        "report.html",
+        "statistics.csv",
+        "tables.tex",
+        "tests.csv",
+    ]
+    images = list(csv.DictReader((out / "images.csv").read_text().splitlines()))
+    assert len(images) == 58
+    assert float(images[0]["second_deg"]) == pytest.approx(0.7 * float(images[0]["first_deg"]), abs=1e-6)
+    statistics = list(csv.DictReader((out / "statistics.csv").read_text().splitlines()))
+    assert [row["statistic"] for row in statistics[:6]] == ["mean", "median", "trimean", "best25", "worst25", "avg"]
+    assert float(statistics[0]["ratio"]) == pytest.approx(1 / 0.7, abs=1e-5)
+    page = (out / "report.html").read_text()
+    assert page.count("<svg") == 2
+    assert "B <i>" not in page
+    assert "B &lt;i&gt;" in page
+    capsys.readouterr()
+    assert main(["compare", *runs, "--out", str(out)]) == 2
+    assert str(out) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("extra", "says"),
+    [
+        (["--method", "Z"], "has no method 'Z'; it has A, B <i>"),
+        (["--method", "A"], "A of .* alone; compare it with a second method"),
+        (["b", "c"], "3 results; compare two"),
+    ],
+)
+def test_what_cannot_be_compared_is_said(
+    runs: tuple[str, str], extra: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import re
+
+    assert main(["compare", runs[0], *extra]) == 2
+    assert re.search(says, capsys.readouterr().err.replace("\n", " "))
+
+
+def test_runs_without_a_common_method(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    path = Path(runs[1]) / "errors.csv"
+    path.write_text(path.read_text().replace(",A,", ",C,").replace(",B <i>,", ",D,"))
+    assert main(["compare", *runs]) == 2
+    assert "--method FIRST=SECOND" in capsys.readouterr().err
+    path.write_text(path.read_text().replace(",1,2,1,", ",1,1,1,"))
+    assert main(["compare", *runs, "--method", "A=C"]) == 2
+    assert "ground truths of im 0 in A (first) and C (second) are 19.47 degrees apart" in capsys.readouterr().err

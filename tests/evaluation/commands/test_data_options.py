@@ -1,0 +1,76 @@
+"""The options that every command has which reads a data set."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.datasets import LAYOUTS, DataOptions
+from foundation.errors import InputError
+
+
+def app(seen: list[object]) -> typer.Typer:
+    made = typer.Typer()
+
+    @made.command()
+    @with_data_options
+    def read(place: Annotated[str, typer.Argument()], *, count: int = 3, reading: DataReading) -> None:
+        seen.extend([place, count, reading])
+
+    return made
+
+
+def test_what_is_given_arrives() -> None:
+    seen: list[object] = []
+    words = [
+        "set",
+        "--layout",
+        "nus8",
+        "--camera",
+        "SonyA57",
+        "--black",
+        "128",
+        "--saturation",
+        "4000.5",
+        "--count",
+        "5",
+    ]
+    done = CliRunner().invoke(app(seen), [*words, "--subset", "test", "--truth", "left", "--partial"])
+    assert done.exit_code == 0, done.output
+    assert seen == ["set", 5, DataReading("nus8", "SonyA57", "test", "left", 128.0, 4000.5, True)]
+    reading = seen[2]
+    assert isinstance(reading, DataReading)
+    assert reading.options == DataOptions("SonyA57", "test", "left", 128.0, 4000.5, True)
+
+
+def test_what_is_not_given_is_left_to_the_layout() -> None:
+    seen: list[object] = []
+    assert CliRunner().invoke(app(seen), ["set"]).exit_code == 0
+    assert seen == ["set", 3, DataReading()]
+    assert DataReading().options == DataOptions()
+
+
+def test_the_help_names_every_layout_and_option() -> None:
+    help_text = CliRunner().invoke(app([]), ["--help"], env={"COLUMNS": "300", "TERM": "dumb"}).output
+    layouts = help_text.partition("--layout")[2].partition("--camera")[0]
+    assert [name for name in LAYOUTS if name not in layouts] == []
+    for option in ("--layout", "--camera", "--subset", "--truth", "--black", "--saturation", "--partial"):
+        assert option in help_text
+    assert "--reading" not in help_text
+
+
+def test_a_command_without_the_parameter_is_a_mistake() -> None:
+    def read(place: str) -> None:
+        del place
+
+    with pytest.raises(ValueError, match="read has no parameter 'reading'"):
+        with_data_options(read)
+
+
+def test_levels_that_are_none_are_refused() -> None:
+    with pytest.raises(InputError, match=r"saturation 100 is not above the black level 128"):
+        _ = DataReading(black=128, saturation=100).options

@@ -1,0 +1,91 @@
+"""Cube+: values computed by hand on a made-up copy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.datasets import DataOptions, open_scenes
+from foundation.errors import FormatError, InputError
+from tests.evaluation.datasets.made_up import cube_plus, image_of, write_png
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    cube_plus(tmp_path)
+    return tmp_path
+
+
+def test_levels_mask_and_truth(copy: Path) -> None:
+    data = open_scenes(copy)
+    assert [scene.name for scene in data.scenes] == ["1.PNG", "2.PNG", "3.PNG"]
+    np.testing.assert_array_equal(
+        [scene.truth for scene in data.scenes], [[0.1, 0.5, 0.4], [0.2, 0.5, 0.3], [0.3, 0.5, 0.2]]
+    )
+    image, mask = data.scenes[2].read()
+    assert image.dtype == np.uint16
+    assert image[0, 0].tolist() == [9000 - 2048, 0, 7000 - 2048]  # 100 is below black.
+    assert image[5, 5].tolist() == [952, 2952, 1952]
+    assert mask is not None
+    assert mask.sum() == 100
+    assert mask[1050:, 2050:].all()
+    # The largest value is 9000, and the authors discard pixels from m - 2.
+    assert data.scenes[2].saturation == 9000 - 2 - 2048
+    assert data.scenes[0].saturation == 6950  # Asked before the image is read.
+    assert "the published Cube+ has 1707" in data.treatment["images"]
+
+
+def test_the_left_face(copy: Path) -> None:
+    data = open_scenes(copy, options=DataOptions(truth="left"))
+    assert data.scenes[1].truth.tolist() == [0.25, 0.5, 0.25]
+    assert "cube+_left_gt.txt" in data.treatment["ground truth"]
+    with pytest.raises(InputError, match="has no truth 'right'; it has own, left"):
+        open_scenes(copy, options=DataOptions(truth="right"))
+
+
+def test_cube_is_told_from_cube_plus(copy: Path) -> None:
+    (copy / "cube+_gt.txt").rename(copy / "cube_gt.txt")
+    data = open_scenes(copy)
+    assert data.name == "Cube"
+    assert "the published Cube has 1365" in data.treatment["images"]
+
+
+def test_missing_images(copy: Path) -> None:
+    (copy / "2.PNG").unlink()
+    with pytest.raises(FormatError, match=r"lacks 1 of the 3 images of cube\+_gt.txt \(2\); .* --partial"):
+        open_scenes(copy)
+    data = open_scenes(copy, options=DataOptions(partial=True))
+    assert [scene.name for scene in data.scenes] == ["1.PNG", "3.PNG"]
+    assert data.scenes[1].truth.tolist() == [0.3, 0.5, 0.2]
+    assert "1 of the 3 of cube+_gt.txt is not in this copy and left out" in data.treatment["images"]
+
+
+def test_superfluous_images(copy: Path) -> None:
+    write_png(copy / "4.png", image_of(4, 4))
+    with pytest.raises(FormatError, match=r"has 1 images that cube\+_gt.txt does not know \(4\)"):
+        open_scenes(copy)
+    (copy / "4.png").unlink()
+    write_png(copy / "PNG" / "1.PNG", image_of(4, 4))
+    with pytest.raises(FormatError, match=r"1\.PNG and .*1\.PNG are both there"):
+        open_scenes(copy)
+
+
+def test_a_reduced_copy_is_refused_since_its_cube_would_not_be_masked(copy: Path) -> None:
+    write_png(copy / "1.PNG", image_of(866, 1300))
+    with pytest.raises(FormatError, match=r"1\.PNG is 1300 × 866, expected 2601 × 1732"):
+        open_scenes(copy).scenes[0].read()
+
+
+@pytest.mark.parametrize("line", ["0.2 0.5", "0.2 0.5 red", "0.2 0.5 -0.1", "0 0 0", "nan 0.5 0.5", ""])
+def test_a_line_that_is_no_light_is_named(copy: Path, line: str) -> None:
+    (copy / "cube+_gt.txt").write_text(f"0.1 0.5 0.4\n{line}\n0.3 0.5 0.2\n")
+    with pytest.raises(FormatError, match=r"cube\+_gt\.txt, line 2: .* restore the file"):
+        open_scenes(copy)
+
+
+def test_an_image_of_eight_bits_is_refused(copy: Path) -> None:
+    write_png(copy / "1.PNG", np.zeros((1060, 2060, 3), np.uint8))
+    with pytest.raises(FormatError, match=r"1\.PNG has 8 bits a channel.*expected linear camera RGB of 16 bits"):
+        open_scenes(copy).scenes[0].read()

@@ -1,0 +1,166 @@
+"""LSMI: values computed by hand on made-up copies of both of its forms."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.datasets import DataOptions, open_scenes
+from evaluation.datasets.published import lsmi as reader
+from evaluation.scene import MixedScene
+from foundation.errors import FormatError, InputError
+from tests.data_files import shipped
+from tests.evaluation.datasets.made_up import lsmi, lsmi_prepared
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    lsmi(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def prepared(tmp_path: Path) -> Path:
+    lsmi_prepared(tmp_path)
+    return tmp_path
+
+
+def test_levels_mask_and_lights(copy: Path) -> None:
+    data = open_scenes(copy)
+    assert [scene.name for scene in data.scenes] == [
+        *("sony/Place1_1.tiff", "sony/Place1_12.tiff", "sony/Place2_1.tiff", "sony/Place2_123.tiff"),
+    ]
+    single, double, _, triple = data.scenes
+    assert single.truth.tolist() == [0.5, 1, 0.5]
+    assert not isinstance(single, MixedScene)
+    assert single.saturation == 4095 - 128
+    image, mask = single.read()
+    assert image[0, 0].tolist() == [9000 - 128, 0, 7000 - 128]
+    assert mask is not None
+    assert mask.sum() == 9
+    assert mask[2:5, 2:5].all()
+    assert isinstance(double, MixedScene)
+    assert double.lights.tolist() == [[0.5, 1, 0.5], [2, 1, 1]]
+    assert isinstance(triple, MixedScene)
+    assert len(triple.lights) == 3
+
+
+def test_shares_and_lights_of_pixels(copy: Path) -> None:
+    scene = open_scenes(copy).scenes[1]
+    assert isinstance(scene, MixedScene)
+    weights, lit = scene.read_weights(), scene.read_truth_map()
+    assert weights[0, 0].tolist() == [0.25, 0.75]
+    assert np.isnan(weights[7, 9]).all()
+    assert np.isnan(lit[7, 9]).all()
+    # .25 (.5, 1, .5) + .75 (2, 1, 1) = (1.625, 1, .875), of sum 3.5
+    np.testing.assert_allclose(lit[0, 0], np.array([1.625, 1, 0.875]) / 3.5, rtol=1e-6)
+    np.testing.assert_allclose(scene.truth, np.array([1.625, 1, 0.875]) / 3.5, rtol=1e-6)
+
+
+def test_shares_that_do_not_sum_to_one_are_scaled(copy: Path) -> None:
+    scene = open_scenes(copy).scenes[3]
+    assert isinstance(scene, MixedScene)
+    np.testing.assert_allclose(scene.read_weights()[3, 3], [0.25, 0.25, 0.5], rtol=1e-6)  # .2, .2, .4 in the file
+
+
+def test_the_mean_is_over_pixels_of_unlike_lights(copy: Path) -> None:
+    shares = np.zeros((8, 10, 2))
+    shares[:, :5, 0] = shares[:, 5:, 1] = 1
+    np.save(copy / "sony" / "Place1" / "Place1_12.npy", shares)
+    scene = open_scenes(copy).scenes[1]
+    half = (np.array([0.5, 1, 0.5]) / 2 + np.array([2, 1, 1]) / 4) / 2
+    np.testing.assert_allclose(scene.truth, half, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("subset", "names"),
+    [
+        ("train", ["Place1_1", "Place1_12"]),
+        ("test", ["Place2_1", "Place2_123"]),
+        ("mixed", ["Place1_12", "Place2_123"]),
+        ("test-single", ["Place2_1"]),
+    ],
+)
+def test_parts(copy: Path, subset: str, names: list[str]) -> None:
+    data = open_scenes(copy, options=DataOptions(subset=subset))
+    assert [scene.name for scene in data.scenes] == [f"sony/{name}.tiff" for name in names]
+
+
+def test_a_part_without_a_place_is_told(copy: Path) -> None:
+    with pytest.raises(FormatError, match=r"has no \.tiff of val"):
+        open_scenes(copy, options=DataOptions(subset="val"))
+    with pytest.raises(InputError, match="has no subset 'all'; it has train, val, test, single"):
+        open_scenes(copy, options=DataOptions(subset="all"))
+
+
+def test_the_prepared_form(prepared: Path) -> None:
+    data = open_scenes(prepared)
+    assert [scene.name for scene in data.scenes] == ["sony_512/Place1_1.tiff", "sony_512/Place1_12.tiff"]
+    scene = data.scenes[1]
+    image, mask = scene.read()
+    assert image[0, 0].tolist() == [9000, 100, 7000]
+    assert mask is not None
+    assert mask.sum() == 9
+    assert scene.saturation is None
+    assert isinstance(scene, MixedScene)
+    assert np.isnan(scene.read_truth_map()[7, 9]).all()  # Its shares are 0, as the program leaves them.
+    assert "resized" in data.treatment["saturation"]
+
+
+def test_levels_of_another_camera_come_from_its_raw_file(copy: Path) -> None:
+    (copy / "sony").rename(copy / "galaxy")
+    with pytest.raises(InputError, match=r"galaxy has no raw file of galaxy .* --black and --saturation"):
+        open_scenes(copy)
+    given = open_scenes(copy, options=DataOptions(black=64, saturation=1023))
+    assert given.scenes[0].saturation == 1023 - 64
+    shutil.copy(shipped("raw/canon_eos_550d_colorchart.dng"), copy / "galaxy.dng")
+    data = open_scenes(copy)
+    # tests/data/README.md: "black 2056, white 15000".
+    assert data.scenes[0].saturation == 15000 - 2056
+    assert data.treatment["black level"] == "2056 of galaxy, subtracted (galaxy.dng)"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("Light2", None, r"meta\.json, Place1 has no Light2, expected red, green, blue; run 1_make_mixture_map\.py"),
+        ("Light2", [1, 1], "Light2: 1 1 is no light"),
+        ("Light2", ["a", 1, 1], r"Light2 is .*, expected three numbers"),
+        ("MCCCoord", None, "has no MCCCoord with mcc1, mcc2, mcc3"),
+        ("MCCCoord", {"mcc1": [], "mcc2": [], "mcc3": []}, "other than four corners"),
+    ],
+)
+def test_what_is_wrong_in_the_metadata_is_named(copy: Path, key: str, value: object, message: str) -> None:
+    path = copy / "sony" / "meta.json"
+    meta = json.loads(path.read_text())
+    meta["Place1"][key] = value
+    path.write_text(json.dumps(meta))
+    with pytest.raises(FormatError, match=message):
+        open_scenes(copy)
+
+
+def test_files_that_are_missing(copy: Path) -> None:
+    camera = copy / "sony"
+    (camera / "Place1" / "Place1_12.npy").unlink()
+    with pytest.raises(FormatError, match=r"Place1_12\.npy is missing: .* run 1_make_mixture_map\.py"):
+        open_scenes(copy)
+    shutil.rmtree(camera / "Place1")
+    with pytest.raises(FormatError, match=r"lacks the \.tiff files of 1 of 2 places \(Place1\)"):
+        open_scenes(copy)
+    data = open_scenes(copy, options=DataOptions(partial=True))
+    assert [scene.name for scene in data.scenes] == ["sony/Place2_1.tiff", "sony/Place2_123.tiff"]
+
+
+@pytest.mark.parametrize(
+    "shares", [np.ones((8, 10)), np.ones((8, 10, 3)), np.ones((8, 10, 2), int), -np.ones((8, 10, 2))]
+)
+def test_maps_that_are_none_are_named(copy: Path, shares: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
+    np.save(copy / "sony" / "Place1" / "Place1_12.npy", shares)
+    scene = open_scenes(copy).scenes[1]
+    assert isinstance(scene, reader.LsmiMixedScene)
+    with pytest.raises(FormatError, match=r"Place1_12\.npy"):
+        scene.read_weights()

@@ -1,0 +1,113 @@
+"""NUS 8 cameras: values computed by hand on a made-up copy."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from evaluation.datasets import DataOptions, open_scenes
+from foundation.errors import FormatError, InputError
+from tests.evaluation.datasets.made_up import image_of, nus8, write_mat, write_png
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    nus8(tmp_path)
+    return tmp_path
+
+
+def change(path: Path, **variables: object) -> None:
+    known = {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
+    write_mat(path, {name: value for name, value in (known | variables).items() if value is not None})
+
+
+def test_levels_mask_and_truth_of_each_camera(copy: Path) -> None:
+    data = open_scenes(copy)
+    assert [scene.name for scene in data.scenes] == [
+        *("NikonD5200_0001", "NikonD5200_0003", "SonyA57_0001", "SonyA57_0003"),
+    ]
+    nikon, _, sony, last = data.scenes
+    assert (nikon.saturation, sony.saturation) == (15892, 4093 - 128)
+    assert last.truth.tolist() == [0.2, 0.5, 0.3]
+    image, mask = sony.read()
+    assert image[0, 0].tolist() == [9000 - 128, 0, 7000 - 128]
+    assert nikon.read()[0][0, 0].tolist() == [9000, 100, 7000]
+    assert mask is not None
+    expected = np.zeros((8, 10), bool)
+    expected[1:4, 5:10] = True  # Rows 2 to 4 and columns 6 to 10, counted from 1.
+    np.testing.assert_array_equal(mask, expected)
+    _, column = last.read()
+    assert column is not None
+    assert column.sum() == 8
+    assert column[:, 0].all()
+    assert data.treatment["black level"].endswith("NikonD5200 0, SonyA57 128")
+    assert data.treatment["saturation"].endswith("NikonD5200 15892, SonyA57 4093")
+
+
+def test_one_camera(copy: Path) -> None:
+    data = open_scenes(copy, options=DataOptions(camera="sonya57"))
+    assert (data.name, len(data.scenes)) == ("NUS SonyA57", 2)
+    with pytest.raises(InputError, match="has no camera 'Canon600D'; it has NikonD5200, SonyA57"):
+        open_scenes(copy, options=DataOptions(camera="Canon600D"))
+    assert open_scenes(copy / "SonyA57").name == "NUS SonyA57"
+
+
+def test_images_and_tables_in_folders_of_their_own(copy: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    other = tmp_path_factory.mktemp("other")
+    (other / "images").mkdir()
+    (other / "ground_truth").mkdir()
+    for path in sorted(copy.rglob("*.*")):
+        shutil.copy(path, other / ("images" if path.suffix == ".PNG" else "ground_truth"))
+    assert [scene.name for scene in open_scenes(other).scenes] == [scene.name for scene in open_scenes(copy).scenes]
+
+
+def test_without_names_the_order_of_files_counts_and_must_be_complete(copy: Path) -> None:
+    change(copy / "SonyA57" / "SonyA57_gt.mat", all_image_names=None)
+    assert [scene.truth[0] for scene in open_scenes(copy / "SonyA57").scenes] == [0.1, 0.2]
+    (copy / "SonyA57" / "SonyA57_0001.PNG").unlink()
+    with pytest.raises(FormatError, match="has 2 lights for 1 images of SonyA57"):
+        open_scenes(copy / "SonyA57", options=DataOptions(partial=True))
+
+
+def test_a_missing_image(copy: Path) -> None:
+    (copy / "SonyA57" / "SonyA57_0003.PNG").unlink()
+    with pytest.raises(FormatError, match=r"lacks 1 of the 2 images of SonyA57_gt\.mat \(SonyA57_0003\)"):
+        open_scenes(copy)
+    assert len(open_scenes(copy, options=DataOptions(partial=True)).scenes) == 3
+
+
+def test_a_chart_outside_of_the_image_is_refused(copy: Path) -> None:
+    write_png(copy / "SonyA57" / "SonyA57_0001.PNG", image_of(4, 5))
+    scene = open_scenes(copy / "SonyA57").scenes[0]
+    with pytest.raises(FormatError, match="is 5 × 4, but its chart is in rows 2 to 4 and columns 6 to 10"):
+        scene.read()
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({"darkness_level": None}, "expected darkness_level among them"),
+        ({"saturation_level": [[1, 2]]}, r"saturation_level is \[\[1, 2\]\], expected one number"),
+        ({"saturation_level": [[100]]}, "saturation 100 is not above black 128"),
+        ({"CC_coords": np.ones((3, 4))}, "2 lights and 3 CC_coords"),
+        ({"groundtruth_illuminants": np.ones((2, 2))}, r"groundtruth_illuminants is \(2, 2\), expected"),
+        ({"groundtruth_illuminants": np.zeros((2, 3))}, "row 1 of groundtruth_illuminants: 0 0 0 is no light"),
+        ({"all_image_names": np.ones((2, 1))}, "all_image_names holds .*, expected names of images"),
+    ],
+)
+def test_what_is_wrong_in_a_table_is_named(copy: Path, variables: dict[str, object], message: str) -> None:
+    path = copy / "SonyA57" / "SonyA57_gt.mat"
+    change(path, **variables)
+    with pytest.raises(FormatError, match=message) as told:
+        open_scenes(copy / "SonyA57")
+    assert "SonyA57_gt.mat" in str(told.value)
+
+
+def test_a_damaged_table(copy: Path) -> None:
+    (copy / "SonyA57" / "SonyA57_gt.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
+    with pytest.raises(FormatError, match=r"SonyA57_gt\.mat cannot be read"):
+        open_scenes(copy)

@@ -1,0 +1,180 @@
+"""Every layout keeps the contract, is told from every other, and says what it cannot use."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.datasets import LAYOUTS, DataOptions, layout_of, open_scenes
+from evaluation.datasets.names import Folder
+from evaluation.datasets.raw_scene import RawScene
+from evaluation.scene import MixedScene
+from foundation.errors import FormatError, InputError
+from tests.evaluation.datasets import contract
+from tests.evaluation.datasets.made_up import COPIES, MadeUp
+
+Place = Callable[[str], Path]
+
+
+@pytest.fixture(scope="session")
+def place_of(tmp_path_factory: pytest.TempPathFactory) -> Place:
+    """Return what makes each copy once and gives its place; tests do not change it."""
+    made: dict[Callable[[Path], None], Path] = {}
+
+    def place(name: str) -> Path:
+        copy = COPIES[name]
+        if copy.make not in made:
+            made[copy.make] = tmp_path_factory.mktemp("copy")
+            copy.make(made[copy.make])
+        return made[copy.make] / copy.at
+
+    return place
+
+
+def options_of(copy: MadeUp) -> DataOptions:
+    return DataOptions(partial=copy.partial)
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_every_layout_keeps_the_contract(name: str, place_of: Place) -> None:
+    place = place_of(name)
+    data = open_scenes(place, options=options_of(COPIES[name]))
+    assert data.layout == COPIES[name].layout
+    assert data.place == str(place)
+    contract.check(data)
+
+
+def test_a_generated_dataset_keeps_the_contract(dataset: Path) -> None:
+    assert layout_of(str(dataset)) == "generated"
+    contract.check(open_scenes(dataset))
+
+
+def test_every_layout_has_a_copy() -> None:
+    assert {copy.layout for copy in COPIES.values()} == set(LAYOUTS) - {"generated"}
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_a_layout_is_told_from_every_other(name: str, place_of: Place) -> None:
+    place = place_of(name)
+    assert layout_of(str(place)) == COPIES[name].layout
+    if place.is_dir():
+        layouts = [layout for layout, known in LAYOUTS.items() if not known.general and known.matches(Folder(place))]
+        assert layouts in ([COPIES[name].layout], [])
+
+
+@pytest.mark.parametrize("name", [name for name, copy in COPIES.items() if copy.layout != "thumbnails"])
+def test_opening_reads_no_image(name: str, place_of: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = place_of(name)
+
+    def never(*given: object) -> None:
+        pytest.fail("an image is read")
+
+    monkeypatch.setattr("evaluation.datasets.raw_scene.decode_image", never)
+    monkeypatch.setattr("evaluation.datasets.published.peaks.decode_image", never)
+    monkeypatch.setattr(np, "load", never)
+    assert open_scenes(place, options=options_of(COPIES[name])).scenes
+
+
+@pytest.mark.parametrize("name", ["cube-plus", "nus8", "intel-tau", "lsmi", "ffcc", "folder"])
+def test_hidden_leftovers_of_systems_are_not_seen(name: str, place_of: Place, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(place_of(name), copy)
+    for folder, _, files in os.walk(copy):
+        for file in files:
+            (Path(folder) / f"._{file}").write_bytes(b"resource fork")
+        (Path(folder) / ".DS_Store").write_bytes(b"finder")
+    names = [scene.name for scene in open_scenes(place_of(name)).scenes]
+    assert [scene.name for scene in open_scenes(copy).scenes] == names
+
+
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name != "generated"])
+def test_a_layout_named_for_something_else_says_what_is_missing(layout: str, tmp_path: Path) -> None:
+    (tmp_path / "notes.md").write_text("nothing")
+    with pytest.raises(InputError) as told:
+        open_scenes(tmp_path, layout)
+    assert str(tmp_path) in str(told.value)
+    assert ";" in str(told.value) or "expected" in str(told.value)
+
+
+def test_a_folder_that_looks_like_none_is_told_what_was_looked_for(tmp_path: Path) -> None:
+    (tmp_path / "1.png").write_bytes(b"")
+    with pytest.raises(FormatError, match="is no dataset of a layout that is known") as told:
+        open_scenes(tmp_path)
+    for name, layout in LAYOUTS.items():
+        assert f"{layout.signs} ({name})" in str(told.value)
+
+
+def test_what_is_not_there_or_no_folder_is_told(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="nowhere is no dataset: it does not exist"):
+        open_scenes(tmp_path / "nowhere")
+    (tmp_path / "set.zip").write_bytes(b"PK")
+    with pytest.raises(FormatError, match=r"set\.zip is a file, expected a folder"):
+        open_scenes(tmp_path / "set.zip")
+
+
+def test_a_layout_that_is_none_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'magic' is no layout; the layouts are generated, thumbnails, cube-plus"):
+        open_scenes(tmp_path, "magic")
+
+
+def test_what_looks_like_two_must_be_named(place_of: Place, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(place_of("nus8 camera"), copy)
+    (copy / "cube+_gt.txt").write_text("1 1 1\n")
+    with pytest.raises(InputError, match="looks like cube-plus and nus8; say which it is with --layout"):
+        open_scenes(copy)
+    assert open_scenes(copy, "nus8").layout == "nus8"
+
+
+def test_an_option_without_a_meaning_is_refused(place_of: Place, dataset: Path) -> None:
+    with pytest.raises(InputError, match=r"--camera has no meaning for .*Cube\+.*it has one for nus8, gehler-shi"):
+        open_scenes(place_of("cube-plus"), options=DataOptions(camera="SonyA57"))
+    with pytest.raises(InputError, match="--black has no meaning for"):
+        open_scenes(dataset, options=DataOptions(black=3))
+
+
+@pytest.mark.parametrize("name", [name for name, copy in COPIES.items() if "black" in LAYOUTS[copy.layout].options])
+def test_levels_that_the_user_gives_replace_the_layouts(name: str, place_of: Place) -> None:
+    given = DataOptions(black=1000, saturation=4500, partial=COPIES[name].partial)
+    data = open_scenes(place_of(name), options=given)
+    if data.layout == "folder":
+        return  # Its table goes first, see test_plain_folder.
+    assert "1000, as the user gave it" in data.treatment["black level"]
+    assert "4500, as the user gave it" in data.treatment["saturation"]
+    for scene in data.scenes:
+        assert scene.saturation == 3500
+        image, _ = scene.read()
+        assert image[-1, 0].tolist() in ([2000, 4000, 3000], [0, 0, 0])  # The latter is an 8-bit thumbnail.
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_a_truncated_image_is_an_error_with_its_name(name: str, place_of: Place, tmp_path: Path) -> None:
+    copy = COPIES[name]
+    if copy.layout == "thumbnails":
+        return
+    place = place_of(name) if place_of(name).is_dir() else place_of(name).parent
+    folder = tmp_path / place.name
+    shutil.copytree(place, folder)
+    data = open_scenes(folder, options=options_of(copy))
+    scene = data.scenes[0]
+    assert isinstance(scene, RawScene)
+    path = Path(scene.path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    with pytest.raises(FormatError, match="cannot be read") as told:
+        scene.read()
+    assert path.name in str(told.value)
+    path.unlink()
+    with pytest.raises(FormatError, match="No such file") as told:
+        scene.read()
+    assert path.name in str(told.value)
+
+
+def test_only_lsmi_has_several_lights(place_of: Place) -> None:
+    for name, copy in COPIES.items():
+        data = open_scenes(place_of(name), options=options_of(copy))
+        assert any(isinstance(scene, MixedScene) for scene in data.scenes) == (copy.layout == "lsmi")

@@ -1,0 +1,137 @@
+"""A user's own folder: values computed by hand on a made-up copy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.datasets import DataOptions, open_scenes
+from foundation.errors import FormatError, InputError
+from tests.evaluation.datasets.made_up import image_of, plain_folder, write_png
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    plain_folder(tmp_path)
+    return tmp_path
+
+
+def write_table(folder: Path, *rows: str, head: str = "image,r,g,b") -> None:
+    (folder / "gt.csv").write_text("\n".join([head, *rows]) + "\n")
+
+
+def test_values(copy: Path) -> None:
+    data = open_scenes(copy)
+    assert [scene.name for scene in data.scenes] == ["a.png", "more/b", "c"]
+    png, tiff, array = data.scenes
+    image, mask = png.read()
+    assert image.dtype == np.uint16
+    assert image[0, 0].tolist() == [9000 - 512, 0, 7000 - 512]
+    assert png.saturation == 8192 - 512
+    assert mask is not None
+    assert mask.sum() == 6
+    assert mask[5:, :2].all()
+    floats, none = tiff.read()
+    assert floats.dtype == np.float32
+    assert floats[0, 0].tolist() == [4500, 50, 3500]
+    assert (none, tiff.saturation) == (None, None)
+    halves, _ = array.read()
+    assert halves.dtype == np.float32  # Black is no whole number.
+    assert halves[0, 0].tolist() == [9000 - 100.5, 0, 7000 - 100.5]
+    assert array.saturation == 4000 - 100.5
+    assert array.truth.tolist() == [1, 2, 1]
+    assert data.folds == (1, 0, 1)
+
+
+def test_levels_of_the_user_serve_where_the_table_has_none(copy: Path) -> None:
+    data = open_scenes(copy, options=DataOptions(black=10, saturation=6000))
+    assert [scene.saturation for scene in data.scenes] == [8192 - 512, 6000 - 10, 4000 - 100.5]
+    assert data.scenes[1].read()[0][0, 0].tolist() == [4490, 40, 3490]
+    assert data.treatment["black level"] == "column black of gt.csv, 10 where it is empty"
+
+
+def test_what_is_not_given_is_stated(copy: Path) -> None:
+    write_table(copy, "a,0.2,0.5,0.3")
+    data = open_scenes(copy)
+    assert data.treatment["black level"].startswith("0: assumed")
+    assert data.treatment["saturation"].startswith("none: neither")
+    assert data.treatment["mask"] == "none"
+    assert data.folds is None
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("a.jpg,1,1,1", r"gt\.csv, line 2: a\.jpg is a picture for the eye \(sRGB\)"),
+        ("a.CR2,1,1,1", r"a\.CR2 is a raw file, whose mosaic has yet to be interpolated"),
+        ("a,1,1", "line 2 has 3 fields, expected 4"),
+        ("a,1,1,-1", "line 2: 1 1 -1 is no light"),
+        ("a,1,1,x", "line 2: b is 'x', expected a number"),
+        (",1,1,1", "the image '' is no name"),
+        ("none.png,1,1,1", r"lacks 1 of the 1 images of gt\.csv \(none\.png\)"),
+    ],
+)
+def test_rows_that_cannot_be_used_are_named(copy: Path, row: str, message: str) -> None:
+    write_table(copy, row)
+    with pytest.raises(FormatError, match=message):
+        open_scenes(copy)
+
+
+@pytest.mark.parametrize(
+    ("head", "row", "message"),
+    [
+        ("black", "a,1,1,1,-5", "black is -5, expected a number from 0"),
+        ("black,saturation", "a,1,1,1,512,512", "saturation 512 is not above black 512"),
+        ("mask", "a,1,1,1,lost.png", r"there is no mask .*lost\.png"),
+        ("fold", "a,1,1,1,first", "fold is 'first', expected a whole number"),
+    ],
+)
+def test_columns_that_cannot_be_used_are_named(copy: Path, head: str, row: str, message: str) -> None:
+    write_table(copy, row, head=f"image,r,g,b,{head}")
+    with pytest.raises(FormatError, match=message):
+        open_scenes(copy)
+
+
+def test_an_image_twice_and_a_fold_too_few(copy: Path) -> None:
+    write_table(copy, "a,1,1,1", "a,1,1,1")
+    with pytest.raises(FormatError, match="line 3: the image 'a' is named twice"):
+        open_scenes(copy)
+    write_table(copy, "a,1,1,1,0", "c,1,1,1,", head="image,r,g,b,fold")
+    with pytest.raises(FormatError, match="some rows have a fold and others none"):
+        open_scenes(copy)
+
+
+def test_a_copy_that_lacks_images(copy: Path) -> None:
+    write_table(copy, "a,1,1,1", "z,1,1,1")
+    with pytest.raises(FormatError, match=r"lacks 1 of the 2 images of gt\.csv \(z\); .*--partial"):
+        open_scenes(copy)
+    data = open_scenes(copy, options=DataOptions(partial=True))
+    assert data.treatment["images"] == "1; 1 more of gt.csv are not there"
+
+
+def test_several_tables_must_be_named(copy: Path) -> None:
+    (copy / "other.csv").write_text("image,r,g,b\nc,1,1,1\n")
+    (copy / "notes.csv").write_text("who,what\n")
+    with pytest.raises(InputError, match=r"several tables of lights \(gt\.csv, other\.csv\)"):
+        open_scenes(copy)
+    assert [scene.name for scene in open_scenes(copy / "other.csv").scenes] == ["c"]
+
+
+def test_an_image_of_eight_bits_and_a_mask_of_another_size(copy: Path) -> None:
+    write_png(copy / "eight.png", np.full((4, 4, 3), 9, np.uint8))
+    write_png(copy / "small.png", image_of(4, 4))
+    write_table(copy, "eight,1,1,1,", "small,1,1,1,a_mask.png", head="image,r,g,b,mask")
+    eight, small = open_scenes(copy).scenes
+    with pytest.raises(FormatError, match="has 8 bits a channel"):
+        eight.read()
+    with pytest.raises(FormatError, match=r"a_mask\.png is 10 × 8, expected 4 × 4"):
+        small.read()
+
+
+def test_an_image_with_an_ending_left_out_must_be_one(copy: Path) -> None:
+    np.save(copy / "a.npy", image_of(4, 4))
+    write_table(copy, "a,1,1,1")
+    with pytest.raises(FormatError, match=r"a\.png and a\.npy|a\.npy and a\.png"):
+        open_scenes(copy)

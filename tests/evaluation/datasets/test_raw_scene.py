@@ -1,0 +1,100 @@
+"""Decoding and subtracting black, held against plain arithmetic."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from evaluation.datasets.names import Folder, natural, present
+from evaluation.datasets.raw_scene import decode_image, polygon_mask, subtract_black
+from foundation.errors import FormatError
+from tests.evaluation.datasets.made_up import image_of, write_png, write_tiff
+
+IMAGES = arrays(np.uint16, st.tuples(st.integers(1, 5), st.integers(1, 5), st.just(3)))
+
+
+@given(IMAGES, st.one_of(st.integers(0, 70000), st.floats(0, 70000)))
+def test_black_is_subtracted_and_nothing_falls_below_it(
+    image: np.ndarray[tuple[int, ...], np.dtype[np.uint16]], black: float
+) -> None:
+    lower = subtract_black(image.copy(), black)
+    expected = np.maximum(image.astype(np.float64) - black, 0)
+    np.testing.assert_allclose(lower, expected, rtol=1e-6, atol=5e-3)
+    assert lower.dtype == (np.uint16 if float(black).is_integer() else np.float32)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_floats_stay_floats(dtype: type[np.float32]) -> None:
+    image = np.array([[[0.5, 0.25, 2.0], [-1, 0, 1]]], dtype)
+    lower = subtract_black(image, 0.25)
+    assert lower.dtype == dtype
+    assert lower.tolist() == [[[0.25, 0, 1.75], [0, 0, 0.75]]]
+    assert subtract_black(image, 0)[0, 1].tolist() == [0, 0, 1]
+
+
+def test_red_is_first_in_every_format(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", image_of(3, 4))
+    write_tiff(tmp_path / "a.tif", image_of(3, 4))
+    np.save(tmp_path / "a.npy", image_of(3, 4))
+    for ending in ("png", "tif", "npy"):
+        np.testing.assert_array_equal(decode_image(str(tmp_path / f"a.{ending}")), image_of(3, 4))
+
+
+def test_what_is_no_such_image(tmp_path: Path) -> None:
+    cases = {
+        "grey.npy": (np.zeros((3, 4), np.uint16), r"\(3, 4\), expected \(height, width, 3\)"),
+        "alpha.npy": (np.zeros((3, 4, 4), np.uint16), r"\(3, 4, 4\), expected"),
+        "ints.npy": (np.zeros((3, 4, 3), np.int64), "holds int64, expected uint16"),
+        "nan.npy": (np.full((3, 4, 3), np.nan), "values that are not finite"),
+        "objects.npy": (np.array([[["a", "b", "c"]]], object), "cannot be read"),
+    }
+    for name, (values, message) in cases.items():
+        np.save(tmp_path / name, values, allow_pickle=True)
+        with pytest.raises(FormatError, match=message) as told:
+            decode_image(str(tmp_path / name))
+        assert name in str(told.value)
+    (tmp_path / "a.exr").write_bytes(b"")
+    with pytest.raises(FormatError, match=r"a\.exr ends in '\.exr', expected"):
+        decode_image(str(tmp_path / "a.exr"))
+    (tmp_path / "grey.png").write_bytes(imagecodecs.png_encode(np.zeros((3, 4), np.uint16)))
+    with pytest.raises(FormatError, match=r"grey\.png holds an image \(3, 4\)"):
+        decode_image(str(tmp_path / "grey.png"))
+
+
+def test_one_byte_that_is_wrong_is_noticed(tmp_path: Path) -> None:
+    noisy = np.random.default_rng(0).integers(0, 65536, (40, 40, 3)).astype(np.uint16)
+    write_png(tmp_path / "a.png", noisy)
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(FormatError, match="cannot be read"):
+        decode_image(str(tmp_path / "a.png"))
+
+
+def test_a_polygon_given_the_other_way_round_is_the_same() -> None:
+    corners = np.array([[1.0, 1], [6, 2], [5, 6], [0, 5]])
+    np.testing.assert_array_equal(polygon_mask((8, 8), corners), polygon_mask((8, 8), corners[::-1]))
+    assert polygon_mask((8, 8), corners)[3, 3]
+    assert not polygon_mask((8, 8), corners)[0, 7]
+
+
+def test_numbers_in_names_sort_by_value() -> None:
+    names = ["10.png", "9.png", "IMG_0010.png", "IMG_9.png", "a", "1a10", "1a9"]
+    assert sorted(names, key=natural) == ["1a9", "1a10", "9.png", "10.png", "IMG_9.png", "IMG_0010.png", "a"]
+
+
+def test_a_name_twice_in_a_list_is_told(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="gt names b twice"):
+        present(["a", "b", "b"], {"a": "a.png", "b": "b.png"}, "gt", tmp_path, partial=False)
+
+
+def test_a_file_for_a_folder_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("")
+    with pytest.raises(FormatError, match="a cannot be read"):
+        _ = Folder(tmp_path / "a").files

@@ -1,0 +1,167 @@
+"""Intervals hold what they promise, and are of the statistics that the tables state."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy import stats
+
+from evaluation.experiments.bootstrap import (
+    STATISTICS,
+    independent,
+    interval,
+    intervals,
+    paired,
+    paired_difference,
+    paired_ratio,
+)
+from evaluation.experiments.resampling import ErrorSample, resamples
+from evaluation.metrics import summarise
+from foundation.errors import InputError
+
+WORLDS = 250
+"""Data sets drawn from one population: a share of .95 of them has a standard error of .014."""
+
+
+def skewed(random: np.random.Generator, count: int) -> npt.NDArray[np.float64]:
+    """Return errors distributed as those of colour constancy: their mean is above their median."""
+    return random.gamma(1.5, 2.0, count)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 17, 64])
+def test_statistics_of_resamples_are_those_of_the_metrics(count: int) -> None:
+    # Rounded, so that many errors are equal.
+    errors = np.random.default_rng(count).gamma(1.5, 2.0, count).round(1) + 0.1
+    sample = ErrorSample.of(errors)
+    for drawn in resamples(count, 3, 40):
+        expected = [summarise(np.repeat(errors, row)).as_tuple() for row in drawn]
+        np.testing.assert_allclose(sample.statistics(drawn), expected, rtol=1e-12)
+    if count > 1:
+        expected = [summarise(np.delete(errors, place)).as_tuple() for place in range(count)]
+        np.testing.assert_allclose(sample.without_each(), expected, rtol=1e-12)
+
+
+def test_every_resample_has_as_many_images_and_every_image_the_same_chance() -> None:
+    drawn = np.concatenate(list(resamples(50, 0, 20_000)))
+    assert drawn.shape == (20_000, 50)
+    assert (drawn.sum(axis=1) == 50).all()
+    # Counts of a multinomial: mean 1, variance 49/50.
+    np.testing.assert_allclose(drawn.mean(axis=0), 1, atol=5 * np.sqrt(0.98 / 20_000))
+    assert drawn.var() == pytest.approx(0.98, rel=0.01)
+
+
+def test_interval_is_that_of_scipy() -> None:
+    errors = skewed(np.random.default_rng(5), 80)
+    known = stats.bootstrap((errors,), np.mean, n_resamples=20_000, method="BCa", rng=1).confidence_interval
+    ours = interval(errors, "mean", count=20_000)
+    np.testing.assert_allclose(ours, known, atol=0.02 * (known.high - known.low))
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_interval_covers_the_population_as_often_as_it_says(statistic: str) -> None:
+    covered = coverage()[statistic]
+    assert 0.90 < covered < 0.99
+
+
+def coverage() -> dict[str, float]:
+    """Return the share of data sets of 120 images whose 95 % intervals hold the statistics of the population."""
+    if not _COVERED:
+        random = np.random.default_rng(8)
+        truth = dict(zip(STATISTICS, summarise(skewed(random, 1_000_000)).as_tuple(), strict=True))
+        hits = dict.fromkeys(truth, 0)
+        for _ in range(WORLDS):
+            for name, (low, high) in intervals(skewed(random, 120), count=600).items():
+                hits[name] += low <= truth[name] <= high
+        _COVERED.update({name: hit / WORLDS for name, hit in hits.items()})
+    return _COVERED
+
+
+_COVERED: dict[str, float] = {}
+
+
+def test_lower_confidence_covers_less() -> None:
+    random = np.random.default_rng(9)
+    hits = [
+        low <= 3 <= high
+        for low, high in (interval(skewed(random, 120), "mean", count=600, level=0.5) for _ in range(WORLDS))
+    ]
+    assert 0.40 < np.mean(hits) < 0.60
+
+
+def test_paired_and_independent_differences_cover_and_pairing_narrows() -> None:
+    random = np.random.default_rng(10)
+    hits = np.zeros((2, 2))
+    widths = np.zeros(2)
+    for _ in range(WORLDS // 2):
+        hard = skewed(random, 100)
+        one, other = hard * random.uniform(0.9, 1.3, 100), hard
+        # The population's means are 3.3 and 3; pairs come from one draw of images, the others from two.
+        both = paired(one, other, count=600)[0], independent(one, skewed(random, 140), count=600)[0]
+        for place, compared in enumerate(both):
+            hits[place, 0] += compared.difference[1] <= 0.3 <= compared.difference[2]
+            hits[place, 1] += compared.ratio[1] <= 1.1 <= compared.ratio[2]
+            widths[place] += compared.difference[2] - compared.difference[1]
+    assert ((hits / (WORLDS // 2) > 0.90) & (hits / (WORLDS // 2) < 0.99)).all()
+    assert widths[0] < 0.25 * widths[1]
+
+
+def test_resampling_each_method_alone_would_not_do() -> None:
+    # The world in which an interval of pairs is wrong: it is not narrower than that of strangers.
+    random = np.random.default_rng(11)
+    hard = skewed(random, 300)
+    low, high = paired_ratio(hard * 1.05, hard, "median")[1:]
+    assert low == pytest.approx(1.05)
+    assert high == pytest.approx(1.05)
+    shuffled = paired_ratio(random.permutation(hard) * 1.05, hard, "median")
+    assert shuffled[2] - shuffled[1] > 0.1
+
+
+def test_order_of_images_and_methods() -> None:
+    random = np.random.default_rng(12)
+    one, other = skewed(random, 90), skewed(random, 90)
+    difference, low, high = paired_difference(one, other, "trimean")
+    back = paired_difference(other, one, "trimean")
+    assert (difference, low, high) == pytest.approx((-back[0], -back[2], -back[1]))
+    assert difference == pytest.approx(summarise(one).trimean - summarise(other).trimean)
+    assert paired_ratio(one, other, "best25")[0] == pytest.approx(summarise(one).best25 / summarise(other).best25)
+
+
+def test_ends_are_the_same_every_time_and_at_any_piece_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = skewed(np.random.default_rng(13), 70)
+    first = intervals(errors, seed=4)
+    assert intervals(errors, seed=4) == first
+    assert intervals(errors, seed=5) != first
+    monkeypatch.setattr("evaluation.experiments.resampling._AT_ONCE", 1)
+    assert intervals(errors, seed=4) == first
+
+
+def test_no_spread() -> None:
+    assert interval([2.5], "worst25") == (2.5, 2.5)
+    assert interval([2.5] * 9, "avg") == pytest.approx((2.5, 2.5))
+    assert interval([0, 0, 0], "avg") == (0, 0)
+    ratio = paired_ratio([1, 2, 3], [0, 0, 0], "mean")
+    assert np.isnan(ratio).all()
+    # The best quarter of the other is 0 in some resamples: no upper end then, but a lower one.
+    value, low, high = paired_ratio(np.arange(1.0, 9), np.arange(8.0) * 0.1, "median")
+    assert np.isfinite([value, low]).all()
+    assert high > value
+
+
+@pytest.mark.parametrize(
+    ("errors", "says"), [([], "0 errors"), ([1, np.nan], "1 of them not finite"), ([np.inf, 1], "1 of them not")]
+)
+def test_refuses_what_has_no_statistic(errors: list[float], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        interval(errors, "mean")
+
+
+def test_refuses_what_it_does_not_know() -> None:
+    with pytest.raises(InputError, match="'mode' is no statistic; the statistics are mean, median"):
+        interval([1, 2], "mode")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="3 errors of one method and 2 of the other"):
+        paired([1, 2, 3], [1, 2])
+    with pytest.raises(InputError, match="0 resamples"):
+        interval([1, 2], "mean", count=0)
+    with pytest.raises(InputError, match="a confidence of 95"):
+        interval([1, 2], "mean", level=95)

@@ -1,0 +1,128 @@
+"""Pairs are matched by name, tested as the literature has it, and refused where they are no pairs."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from evaluation.experiments.comparing import (
+    compare,
+    holm,
+    largest_differences,
+    match,
+    missing_images,
+    signed_rank,
+    verdict,
+)
+from evaluation.results.errors_file import MethodErrors
+from foundation.errors import InputError
+
+
+def errors(
+    images: str, values: npt.ArrayLike, truths: npt.NDArray[np.float64] | None = None, method: str = "Mine"
+) -> MethodErrors:
+    """Return errors on images named by letters; recovery errors are half the reproduction errors."""
+    given = np.asarray(values, dtype=np.float64)
+    return MethodErrors(
+        method, tuple(images), truths, {"recovery": given / 2, "reproduction": given}, np.zeros(len(given), bool)
+    )
+
+
+def test_images_are_matched_by_name() -> None:
+    made = match(errors("abcd", [1, 2, 3, 4]), errors("xdcb", [9, 40, 30, 20]), ("one", "other"), "reproduction")
+    assert made.images == ("b", "c", "d")
+    assert made.one.tolist() == [2, 3, 4]
+    assert made.other.tolist() == [20, 30, 40]
+    assert made.missing == (("x",), ("a",))
+    assert missing_images(made) == (
+        "one lacks 1 images of other, which are left out: x",
+        "other lacks 1 images of one, which are left out: a",
+    )
+    assert match(errors("ab", [1, 2]), errors("ab", [3, 4]), ("", ""), "recovery").one.tolist() == [0.5, 1]
+
+
+def test_truths_must_agree_in_direction() -> None:
+    lights = np.array([[1.0, 2, 1], [2, 2, 1], [1, 1, 1]])
+    match(errors("abc", [1, 2, 3], lights), errors("cba", [1, 2, 3], 7 * lights[::-1]), ("A", "B"), "recovery")
+    turned = lights[::-1].copy()
+    turned[1] += [0.1, 0, 0]
+    with pytest.raises(InputError, match=r"ground truths of b in A and B are 1\.\d\d degrees apart, those of 1 of 3"):
+        match(errors("abc", [1, 2, 3], lights), errors("cba", [1, 2, 3], turned), ("A", "B"), "recovery")
+    with pytest.raises(InputError, match="no image in common, they begin with a and x"):
+        match(errors("ab", [1, 2]), errors("xy", [1, 2]), ("A", "B"), "recovery")
+
+
+def by_enumeration(difference: list[float]) -> float:
+    """Return the exact two-sided p of the signed-rank test: the share of all sign patterns as uneven as this one."""
+    ranks = np.argsort(np.argsort(np.abs(difference))) + 1
+    middle = ranks.sum() / 2
+    seen = abs(ranks[np.array(difference) > 0].sum() - middle)
+    sums = [ranks[np.array(signs)].sum() for signs in itertools.product([True, False], repeat=len(ranks))]
+    return float(np.mean([abs(total - middle) >= seen for total in sums]))
+
+
+@pytest.mark.parametrize("difference", [[1, 2, -3, 4, 5, 6.5], [-1, 2, 3, 4, 5, 6, 7, 8.5], [1, -2, 3, -4, 5.5]])
+def test_p_is_that_of_all_sign_patterns(difference: list[float]) -> None:
+    base = np.full(len(difference), 10.0)
+    assert signed_rank(base + difference, base).p == pytest.approx(by_enumeration(difference))
+
+
+def test_counts_and_effect() -> None:
+    base = np.arange(5.0, 45)
+    better, worse = signed_rank(base - 1, base), signed_rank(base + np.linspace(0.1, 1, 40), base)
+    assert (better.wins, better.losses, better.ties, better.effect) == (40, 0, 0, -1)
+    assert (worse.wins, worse.losses, worse.ties, worse.effect) == (0, 40, 0, 1)
+    assert max(better.p, worse.p) < 1e-6
+    same = signed_rank(base, base + 1e-7)
+    assert (same.wins, same.losses, same.ties, same.p, same.effect) == (0, 0, 40, 1, 0)
+
+
+def test_equal_errors_keep_their_ranks() -> None:
+    difference = np.concatenate([np.zeros(10), [1, 2, -3, 4, 5, 6, -7, 8, 9, 10, 11, 12]])
+    made = signed_rank(20 + difference, np.full(22, 20.0))
+    assert (made.wins, made.losses, made.ties) == (2, 10, 10)
+    # Pratt: ten zeros have the ranks 1 to 10, so the others have 11 to 22; wins are 13 and 17 of their sum of 198.
+    assert made.effect == pytest.approx((198 - 2 * 30) / 198)
+    ranks = np.arange(11, 23)
+    sums = np.array([ranks[np.array(signs)].sum() for signs in itertools.product([True, False], repeat=12)])
+    exact = np.mean(abs(sums - 99) >= abs(30 - 99))
+    assert made.p == pytest.approx(exact, rel=0.25)
+
+
+def test_false_alarms_are_as_rare_as_p_says() -> None:
+    random = np.random.default_rng(3)
+    probabilities = [signed_rank(*random.gamma(1.5, 2, (2, 60))).p for _ in range(400)]
+    assert np.mean(np.array(probabilities) < 0.05) == pytest.approx(0.05, abs=0.033)
+    assert np.mean(np.array(probabilities) < 0.5) == pytest.approx(0.5, abs=0.075)
+
+
+def test_holm_by_hand() -> None:
+    # Holm 1979: 4 x .005, 3 x .01, 2 x .03, then not below the one before.
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.9, 0.8]) == [1, 1]
+    assert holm([0.2]) == [0.2]
+
+
+def test_a_comparison_says_who_is_better_and_when_nobody_is() -> None:
+    random = np.random.default_rng(4)
+    hard = random.gamma(1.5, 2, 26)
+    letters = "abcdefghijklmnopqrstuvwxyz"
+    better, equal = errors(letters, hard * 0.8), errors(letters, random.permutation(hard))
+    pairs = [match(better, errors(letters, hard), ("A", "B"), "reproduction")]
+    pairs.append(match(equal, errors(letters, hard), ("C", "B"), "reproduction"))
+    first, second = compare(pairs)
+    assert first.p_holm == pytest.approx(2 * first.test.p)
+    assert second.p_holm >= second.test.p > 0.05
+    assert "A errs less than B on 26 of 26 images, more on 0: A errs less" in verdict(first)
+    assert "not significant" in verdict(second)
+    assert [made.statistic for made in first.statistics] == ["mean", "median", "trimean", "best25", "worst25", "avg"]
+    assert all(made.ratio == pytest.approx((0.8, 0.8, 0.8)) for made in first.statistics)
+
+
+def test_largest_differences_come_first_and_equal_errors_never() -> None:
+    made = match(errors("abcd", [1, 5, 2, 3]), errors("abcd", [2, 1, 2, 3.5]), ("", ""), "reproduction")
+    assert [made.images[place] for place in largest_differences(made)] == ["b", "a", "d"]
+    assert largest_differences(made, 1) == [1]

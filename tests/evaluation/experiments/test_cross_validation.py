@@ -1,0 +1,101 @@
+"""Cross-validation: each image is estimated once, by a model that has not seen it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from evaluation.experiments.cross_validation import cross_validate
+from evaluation.experiments.folds import draw_folds
+from evaluation.learning.regression_trees import RegressionTrees
+from evaluation.methods.pixels import GREY, unit
+from evaluation.scene import Scene
+from foundation.errors import InputError
+from tests.evaluation.learning.made_up_world import MadeUp, world
+
+
+@dataclass(frozen=True)
+class Memory:
+    """A class as a user would write it: it knows the lights of the images that it was fitted to, and no others."""
+
+    name: str = "Memory"
+    known: dict[bytes, npt.NDArray[np.float64]] = field(default_factory=dict[bytes, Any])
+
+    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Memory:
+        return Memory(known={np.asarray(scene.read()[0]).tobytes(): scene.truth for scene in scenes})
+
+    def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> npt.NDArray[np.float64]:
+        known = self.known.get(np.asarray(image).tobytes())
+        return GREY if known is None else unit(known)
+
+
+@dataclass(frozen=True, eq=False)
+class Counted(MadeUp):
+    """A scene that says when it is read."""
+
+    log: list[str] = field(default_factory=list[str])
+
+    def read(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_] | None]:
+        self.log.append(self.name)
+        return super().read()
+
+
+SCENES = world(24)
+FOLDS = draw_folds(24, 3)
+
+
+def test_no_image_is_estimated_by_a_model_that_knows_it() -> None:
+    (result,) = cross_validate(SCENES, [Memory()], FOLDS)
+    assert result.guessed.all()
+    # The same scenes twice under other names: now the memory helps wherever the folds part the two.
+    double = [*SCENES, *(replace(scene, name=f"{scene.name} again") for scene in SCENES)]
+    (leaking,) = cross_validate(double, [Memory()], np.concatenate([FOLDS, (FOLDS + 1) % 3]))
+    assert not leaking.guessed.any()
+    assert leaking.errors["recovery"].max() < 1e-5
+
+
+def test_the_model_of_a_fold_is_that_of_the_other_scenes() -> None:
+    learner = RegressionTrees()
+    (result,) = cross_validate(SCENES, [learner], FOLDS, seed=5)
+    for fold in range(3):
+        method = learner.fit([scene for scene, where in zip(SCENES, FOLDS, strict=True) if where != fold], seed=5)
+        for place in np.flatnonzero(fold == FOLDS):
+            np.testing.assert_array_equal(result.estimates[place], method.estimate(SCENES[place].image))
+
+
+def test_each_image_is_read_once_for_all_folds_and_learners() -> None:
+    log: list[str] = []
+    scenes = [Counted(scene.name, scene.truth, scene.image, log=log) for scene in SCENES]
+    steps: list[int] = []
+    learners = [RegressionTrees(), RegressionTrees(windows=3)]
+    results = cross_validate(scenes, learners, FOLDS, on_scene=lambda: steps.append(1))
+    assert sorted(log) == sorted(scene.name for scene in SCENES)
+    assert len(steps) == len(SCENES)
+    parallel = cross_validate(SCENES, learners, FOLDS, workers=3)
+    for one, other in zip(results, parallel, strict=True):
+        np.testing.assert_array_equal(one.estimates, other.estimates)
+
+
+def test_an_image_without_a_usable_pixel_counts_and_is_marked() -> None:
+    black = replace(SCENES[3], image=np.zeros_like(SCENES[3].image))
+    (result,) = cross_validate([*SCENES[:3], black, *SCENES[4:]], [RegressionTrees()], FOLDS)
+    assert result.guessed.tolist() == [place == 3 for place in range(24)]
+    np.testing.assert_allclose(result.estimates[3], 3**-0.5)
+    assert result.errors["recovery"][3] > 1
+
+
+def test_what_cannot_be_validated_is_refused() -> None:
+    with pytest.raises(InputError, match="0 methods in 3 folds"):
+        cross_validate(SCENES, [], FOLDS)
+    with pytest.raises(InputError, match="1 methods in 1 folds"):
+        cross_validate(SCENES, [Memory()], np.zeros(24, np.int64))
+    with pytest.raises(InputError, match="images of scene 0 are in the folds"):
+        cross_validate([SCENES[0], *SCENES[:1], *SCENES[2:]], [Memory()], np.arange(24) % 2)
+    dark = replace(SCENES[7], truth=np.array([0.0, 1, 1]))
+    with pytest.raises(InputError, match="the ground truth of scene 7 is 0 1 1"):
+        cross_validate([*SCENES[:7], dark, *SCENES[8:]], [Memory()], FOLDS)

@@ -1,0 +1,91 @@
+"""Folds: balanced, drawn by a seed, never parting what belongs together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evaluation.experiments.folds import draw_folds, folds_to_csv, group_of, read_folds, require_apart
+from foundation.errors import FormatError, InputError
+
+NAMES = ["a.png", "b.png", "c.png", "d, e.png"]
+
+
+@pytest.mark.parametrize(("count", "folds"), [(2, 2), (10, 3), (259, 3), (11, 11)])
+def test_folds_are_as_even_as_they_can_be(count: int, folds: int) -> None:
+    sizes = np.bincount(draw_folds(count, folds), minlength=folds)
+    assert len(sizes) == folds
+    assert np.ptp(sizes) <= 1
+
+
+def test_the_seed_decides() -> None:
+    np.testing.assert_array_equal(draw_folds(50, 3, seed=4), draw_folds(50, 3, seed=4))
+    assert (draw_folds(50, 3, seed=4) != draw_folds(50, 3, seed=5)).any()
+
+
+def test_neighbours_are_dealt_to_every_pair_of_folds() -> None:
+    # A draw by blocks or by turns would put scenes that were photographed one after another always together, or never.
+    folds = draw_folds(3000, 3)
+    together = (folds[1:] == folds[:-1]).mean()
+    assert 0.28 < together < 0.39
+
+
+def test_groups_stay_together() -> None:
+    rng = np.random.default_rng(0)
+    groups = [f"picture {number}" for number in rng.integers(0, 40, 300)]
+    folds = draw_folds(300, 3, groups=groups)
+    for group in set(groups):
+        assert len({int(fold) for fold, own in zip(folds, groups, strict=True) if own == group}) == 1
+    assert np.ptp(np.bincount(folds)) <= 15
+
+
+@pytest.mark.parametrize(("count", "folds", "groups"), [(5, 1, None), (5, 6, None), (4, 3, ["a", "a", "b", "b"])])
+def test_impossible_folds_are_refused(count: int, folds: int, groups: list[str] | None) -> None:
+    with pytest.raises(InputError, match="expected 2 to"):
+        draw_folds(count, folds, groups=groups)
+
+
+def test_a_file_of_folds_is_read_as_it_was_written(tmp_path: Path) -> None:
+    path, folds = tmp_path / "folds.csv", np.array([2, 0, 1, 2])
+    path.write_text(folds_to_csv(NAMES, folds))
+    np.testing.assert_array_equal(read_folds(path, NAMES), folds)
+    path.write_text('fold,light,image\nval,1,b.png\ntrain,1,a.png\nval,2,c.png\ntrain,3,"d, e.png"\n')
+    np.testing.assert_array_equal(read_folds(path, NAMES), [0, 1, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("image\na.png\n", "columns image; expected image,fold"),
+        ("image,fold\na.png,0\nb.png,1\nc.png,1\n", "without a fold: d, e.png"),
+        ('image,fold\na.png,0\nb.png,1\nc.png\n"d, e.png",1\n', "without a fold: c.png"),
+        ('image,fold\na.png,0\na.png,1\nb.png,1\nc.png,0\n"d, e.png",1\n', "more than once: a.png"),
+        ('image,fold\na.png,0\nb.png,1\nc.png,0\n"d, e.png",1\nz.png,1\n', "the data set lacks: z.png"),
+        ('image,fold\na.png,7\nb.png,7\nc.png,7\n"d, e.png",7\n', "fold 7 only"),
+    ],
+)
+def test_a_bad_file_of_folds_is_refused(tmp_path: Path, text: str, why: str) -> None:
+    path = tmp_path / "folds.csv"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=why):
+        read_folds(path, NAMES)
+
+
+def test_a_missing_file_of_folds_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"none\.csv"):
+        read_folds(tmp_path / "none.csv", NAMES)
+
+
+def test_folds_that_leak_are_refused() -> None:
+    scenes: Any = [SimpleNamespace(name=f"{number}.png", group=f"picture {number // 2}") for number in range(4)]
+    require_apart(scenes, np.array([0, 0, 1, 1]))
+    with pytest.raises(InputError, match="images of picture 1 are in the folds 0 and 1"):
+        require_apart(scenes, np.array([0, 0, 0, 1]))
+    named: Any = [SimpleNamespace(name="same.png"), SimpleNamespace(name="same.png")]
+    assert group_of(named[0]) == "same.png"
+    with pytest.raises(InputError, match=r"same\.png"):
+        require_apart(named, np.array([0, 1]))

@@ -1,0 +1,283 @@
+"""Methods of strangers in the runner: what they return, raise and change; images under several lights; the order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Event, Lock
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from evaluation.experiments.running import evaluate, ordered_map
+from evaluation.methods import GrayEdge
+from evaluation.methods.naming import find_method
+from evaluation.methods.pixels import GREY
+from evaluation.metrics import recovery_error
+from evaluation.scene import Scene
+from foundation.errors import FormatError, InputError
+from tests.evaluation.made_up import MixedWall, Wall, walls
+
+GRAY_WORLD = GrayEdge("Gray-world", 0, 1, 0, 0)
+LIGHTS = np.array([[2.0, 1, 1], [1, 1, 1]])
+
+
+class Returns:
+    """A stranger's method that returns what it is told to on images whose first pixel is not too bright."""
+
+    name = "Stranger"
+
+    def __init__(self, *values: object) -> None:
+        self.values = iter(values)
+
+    def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> Any:
+        value = next(self.values)
+        if isinstance(value, Exception):
+            raise value
+        return value
+
+
+@pytest.mark.parametrize(
+    ("value", "cause"),
+    [
+        (None, "returned None"),
+        ((np.nan, 1, 1), "returned nan 1 1"),
+        ((np.inf, 1, 1), "returned inf 1 1"),
+        ((0, 0, 0), "returned 0 0 0"),
+        ((1, 1, -0.5), "returned 1 1 -0.5"),
+        (GREY, "no usable pixel"),
+    ],
+)
+def test_what_is_no_light_is_counted_named_and_taken_as_grey(value: object, cause: str) -> None:
+    scenes = walls(3)
+    (result,) = evaluate(scenes, [Returns((3, 4, 0), value, [0.1, 0.1, 0.1])])
+    assert result.guessed.tolist() == [False, True, False]
+    assert result.causes == {1: cause}
+    np.testing.assert_allclose(result.estimates, [[0.6, 0.8, 0], [3**-0.5] * 3, [3**-0.5] * 3])
+    assert result.errors["recovery"][1] == pytest.approx(float(recovery_error([1, 1, 1], scenes[1].truth)))
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ((1, 1), r"shape \(2,\), expected \(3,\)"),
+        (np.ones((4, 3)), r"shape \(4, 3\), expected \(3,\)"),
+        ("red", "returned str, expected three numbers"),
+        (KeyError("where"), r"KeyError: 'where' \(test_running\.py, line \d+\)"),
+        (ValueError("no good"), r"ValueError: no good \(test_running\.py, line \d+\)"),
+    ],
+)
+def test_a_mistake_in_a_method_ends_the_run_with_its_name(value: object, message: str) -> None:
+    with pytest.raises(InputError, match=rf"^Stranger fails on wall 1\.png: .*{message}.*; correct it and run"):
+        evaluate(walls(3), [Returns((1, 1, 1), value, (1, 1, 1))])
+
+
+def test_the_line_of_the_user_s_file_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "own.py"
+    file.write_text(
+        "import numpy as np\n\nclass Own:\n    name = 'Own'\n\n"
+        "    def estimate(self, image, saturation=None, mask=None):\n        return np.linalg.inv(np.zeros((3, 3)))\n"
+    )
+    method = find_method(f"{file}:Own")
+    with pytest.raises(InputError, match=r"Own fails on wall 0\.png: LinAlgError: Singular matrix \(own\.py, line 7\)"):
+        evaluate(walls(1), [method])  # pyright: ignore[reportArgumentType]
+
+
+def test_a_mistake_in_this_suite_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise TypeError("ours")
+
+    monkeypatch.setattr(GrayEdge, "estimate_prepared", broken)
+    with pytest.raises(TypeError, match="ours") as caught:
+        evaluate(walls(1), [GRAY_WORLD])
+    assert caught.value.__notes__ == ["while Gray-world was on wall 0.png"]
+
+
+class Destroys:
+    """A stranger's method that uses the image it is given as its own."""
+
+    name = "Destroys"
+
+    def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> npt.NDArray[np.float64]:
+        light = image.mean(axis=(0, 1)).astype(np.float64)
+        image[:] = 0
+        return light
+
+
+class InMemory(Wall):
+    """A wall that hands out the same array every time, as thumbnails do."""
+
+    def read(self) -> tuple[npt.NDArray[np.float32], None]:
+        return IMAGE, None
+
+
+IMAGE = (np.random.default_rng(0).random((6, 6, 3)) + 0.1).astype(np.float32)
+
+
+def test_a_method_cannot_change_what_others_see() -> None:
+    scenes = [InMemory("one", np.ones(3)), InMemory("two", np.ones(3))]
+    alone = evaluate(scenes, [GRAY_WORLD])[0].estimates
+    both = evaluate(scenes, [Destroys(), GRAY_WORLD])
+    np.testing.assert_array_equal(both[1].estimates, alone)
+    assert both[0].errors["recovery"][1] == both[0].errors["recovery"][0]
+
+
+class CountsCallers:
+    """A stranger's method that two threads must not enter at once."""
+
+    name = "Counts"
+
+    def __init__(self) -> None:
+        self.busy = Lock()
+
+    def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> npt.NDArray[np.float64]:
+        assert self.busy.acquire(blocking=False), "two threads at once"
+        sum(range(20_000))
+        self.busy.release()
+        return np.asarray(image.mean(axis=(0, 1)), dtype=np.float64)
+
+
+def test_a_stranger_s_method_has_one_caller_at_a_time() -> None:
+    scenes = walls(40)
+    (one,) = evaluate(scenes, [CountsCallers()], workers=1)
+    (four,) = evaluate(scenes, [CountsCallers()], workers=4)
+    np.testing.assert_array_equal(one.estimates, four.estimates)
+
+
+def test_order_and_memory_are_bounded() -> None:
+    taken: list[int] = []
+
+    def things() -> Iterator[int]:
+        for number in range(100):
+            taken.append(number)
+            yield number
+
+    for number, value in enumerate(ordered_map(lambda thing: thing**2, things(), 3)):
+        assert value == number**2
+        assert len(taken) <= number + 7
+
+
+def test_what_has_not_begun_is_dropped_when_one_fails() -> None:
+    begun: list[int] = []
+    release = Event()
+
+    def work(thing: int) -> int:
+        begun.append(thing)
+        if thing == 0:
+            raise KeyError(thing)
+        release.wait()
+        return thing
+
+    pulling = ordered_map(work, range(1000), 2)
+    release.set()
+    with pytest.raises(KeyError):
+        list(pulling)
+    assert len(begun) <= 5
+
+
+class HalfRight:
+    """A stranger's local method: right on the left part, grey elsewhere; globally it says white."""
+
+    name = "Half right"
+
+    def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> npt.NDArray[np.float64]:
+        return np.ones(3)
+
+    def estimate_map(self, image: Any, saturation: float | None = None, mask: Any = None) -> npt.NDArray[np.float32]:
+        found = np.full(image.shape, 1 / 3, np.float32)
+        found[:, :4] = (0.5, 0.25, 0.25)
+        return found
+
+
+def test_several_lights_are_judged_by_pixel_and_region() -> None:
+    scenes: list[Scene] = [*walls(1), MixedWall("mixed", LIGHTS)]
+    whole, local = evaluate(scenes, [Returns((1, 1, 1), (1, 1, 1)), HalfRight()], workers=1)
+    off = float(recovery_error(LIGHTS[0], LIGHTS[1]))
+    assert whole.maps is not None
+    assert local.maps is not None
+    assert whole.maps.images.tolist() == local.maps.images.tolist() == [1]
+    assert whole.maps.pixel["recovery"] == pytest.approx([off / 4], abs=1e-4)
+    assert whole.maps.region["recovery"] == pytest.approx([off, 0], abs=1e-4)
+    assert whole.maps.region_shares == pytest.approx([0.25, 0.75])
+    assert local.maps.pixel["recovery"] == pytest.approx([0], abs=1e-4)
+    assert local.maps.rgb == pytest.approx([0], abs=1e-4)
+    # Both are held to the mean light by their one estimate.
+    assert local.errors["recovery"][1] == whole.errors["recovery"][1] > 1
+
+
+def test_masked_pixels_of_several_lights_do_not_count() -> None:
+    (result,) = evaluate([MixedWall("masked", LIGHTS, masked=True)], [Returns((1, 1, 1))])
+    assert result.maps is not None
+    assert result.maps.pixel["recovery"] == pytest.approx([0], abs=1e-4)
+    assert result.maps.region_lights.tolist() == [1]
+
+
+def _two_pixels(found: Any) -> Any:
+    found[0, 0] = np.nan
+    found[0, 1] = 0
+    return found
+
+
+def _half(found: Any) -> Any:
+    return found[:6]
+
+
+def _integers(found: Any) -> Any:
+    return (found * 100).astype(np.uint8)
+
+
+def altered(monkeypatch: pytest.MonkeyPatch, change: Callable[[Any], Any]) -> HalfRight:
+    """Return a method whose map is changed before it is returned."""
+    right = HalfRight().estimate_map
+
+    def wrong(_: object, image: Any, saturation: float | None = None, mask: Any = None) -> Any:
+        return change(right(image, saturation, mask))
+
+    monkeypatch.setattr(HalfRight, "estimate_map", wrong)
+    return HalfRight()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [(_half, r"float32 of shape \(6, 16, 3\), expected floats \(12, 16, 3\)"), (_integers, "uint8 of shape")],
+)
+def test_a_map_that_is_none_ends_the_run(
+    monkeypatch: pytest.MonkeyPatch, change: Callable[[Any], Any], message: str
+) -> None:
+    method = altered(monkeypatch, change)
+    with pytest.raises(InputError, match=f"Half right fails on mixed: estimate_map returned {message}"):
+        evaluate([MixedWall("mixed", LIGHTS)], [method])
+
+
+def test_pixels_without_a_light_are_counted_and_grey(monkeypatch: pytest.MonkeyPatch) -> None:
+    (result,) = evaluate([MixedWall("mixed", LIGHTS)], [altered(monkeypatch, _two_pixels)])
+    assert result.causes == {0: "no light in 2 of 192 pixels of its map"}
+    assert not result.guessed.any()
+    assert result.maps is not None
+    # Two of 192 pixels are grey now, where the light is red.
+    assert result.maps.pixel["recovery"][0] == pytest.approx(float(recovery_error(*LIGHTS)) * 2 / 192, rel=1e-3)
+
+
+def test_a_map_of_another_size_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def small(_: object) -> npt.NDArray[np.float32]:
+        return np.ones((3, 4, 2), np.float32)
+
+    monkeypatch.setattr(MixedWall, "read_weights", small)
+    monkeypatch.setattr(MixedWall, "truth", LIGHTS[0])
+    whole = np.ones((12, 16, 3), np.float32)
+
+    def large(_: object) -> npt.NDArray[np.float32]:
+        return whole
+
+    monkeypatch.setattr(MixedWall, "read_truth_map", large)
+    with pytest.raises(FormatError, match=r"mixed is 16x12 px, its map of lights 16x12, its shares 4x3"):
+        evaluate([InMemoryMixed("mixed", LIGHTS)], [HalfRight()])
+
+
+class InMemoryMixed(MixedWall):
+    """A wall under two lights whose image does not come from its map."""
+
+    def read(self) -> tuple[npt.NDArray[np.float32], None]:
+        return np.ones((12, 16, 3), np.float32), None

@@ -1,0 +1,179 @@
+"""Model files: whole, plain, with their story; foreign and damaged ones are refused in one sentence."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evaluation.learning.feature_learner import LearnedMethod
+from evaluation.learning.model_files import load_model, save_model, scenes_sha256
+from evaluation.learning.regression_trees import RegressionTrees
+from evaluation.methods.standard import standard_methods
+from foundation.errors import FormatError, InputError
+from tests.evaluation.learning.made_up_world import world
+from tests.evaluation.learning.stories import story
+
+SCENES = world(12)
+Parts = dict[str, Any]
+Change = Callable[[Parts, Parts], object]
+
+
+@pytest.fixture(scope="module")
+def fitted() -> LearnedMethod:
+    return RegressionTrees(windows=3).fit(SCENES)
+
+
+@pytest.fixture
+def saved(fitted: LearnedMethod, tmp_path: Path) -> Path:
+    save_model(tmp_path / "model.npz", fitted, story(SCENES, "Cube+"))
+    return tmp_path / "model.npz"
+
+
+def rewrite(path: Path, change: Change) -> None:
+    """Write the archive anew after `change` was made to its arrays and its story."""
+    with np.load(path) as content:
+        arrays: dict[str, Any] = {name: content[name] for name in content.files}
+    about = json.loads(str(arrays["about"]))
+    change(arrays, about)
+    arrays["about"] = np.array(json.dumps(about))
+    np.savez(path, **arrays)
+
+
+def test_the_story_is_kept_and_told(saved: Path) -> None:
+    method = load_model(saved)
+    assert method.name == "Regression trees (simple features) (trained on Cube+)"
+    assert method.provenance is not None
+    assert method.provenance.scenes == 12
+    assert method.provenance.sha256 == scenes_sha256(SCENES)
+    assert method.provenance.treatment == {"mask": "none"}
+    assert method.provenance.sentence().startswith("trained on all of Cube+ (memory, 12 images, seed 3) by croplab ")
+    assert method.provenance.sentence().endswith(" on 2026-11-22")
+    assert method.learner == RegressionTrees(windows=3)
+
+
+def test_the_file_is_plain_arrays(saved: Path) -> None:
+    with np.load(saved, allow_pickle=False) as content:
+        assert {content[name].dtype.kind for name in content.files} <= set("fiuU")
+
+
+def test_the_hash_knows_names_lights_and_order() -> None:
+    hashes = {
+        scenes_sha256(SCENES),
+        scenes_sha256(SCENES[::-1]),
+        scenes_sha256(SCENES[:11]),
+        scenes_sha256(world(12, 1)),
+    }
+    assert len(hashes) == 4
+    assert scenes_sha256(world(12)) == scenes_sha256(SCENES)
+
+
+def test_nothing_is_overwritten(saved: Path, fitted: LearnedMethod) -> None:
+    before = saved.read_bytes()
+    with pytest.raises(InputError, match="already exists; name another place for the model"):
+        save_model(saved, fitted, story(SCENES))
+    assert saved.read_bytes() == before
+
+
+def test_only_learned_methods_are_saved(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="Gray-world cannot be saved"):
+        save_model(tmp_path / "model.npz", standard_methods()["gray-world"], story(SCENES))
+    assert not list(tmp_path.iterdir())
+
+
+class Payload:
+    """What a hostile file would run when it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return (pytest.fail, ("a pickle was loaded",))
+
+
+@pytest.mark.parametrize("kind", ["missing", "text", "empty", "pickle", "pickled array", "thumbnails"])
+def test_foreign_files_are_refused(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "model.npz"
+    match kind:
+        case "text":
+            path.write_text("no model")
+        case "empty":
+            path.write_bytes(b"")
+        case "pickle":
+            path.write_bytes(pickle.dumps(Payload()))
+        case "pickled array":
+            np.savez(path, about=np.array([Payload()], dtype=object))
+        case "thumbnails":
+            np.savez(path, images=np.ones((1, 2, 2, 3)), gt=np.ones((1, 3)), names=np.array(["a"]))
+        case _:
+            pass
+    with pytest.raises(FormatError, match=r"model\.npz is no whole model file: .*; name a file that evaluate train"):
+        load_model(path)
+
+
+def test_any_damage_is_found(saved: Path) -> None:
+    whole = saved.read_bytes()
+    expected = load_model(saved).estimate(SCENES[0].image)
+    rng = np.random.default_rng(0)
+    for size in rng.integers(0, len(whole), 10):
+        saved.write_bytes(whole[:size])
+        with pytest.raises(FormatError):
+            load_model(saved)
+    refused = 0
+    for place in rng.integers(0, len(whole), 40):
+        flipped = bytearray(whole)
+        flipped[place] ^= 0xFF
+        saved.write_bytes(flipped)
+        try:
+            loaded = load_model(saved)
+        except FormatError:
+            refused += 1
+        else:  # Dates and other fields of the archive's own are not part of the model.
+            np.testing.assert_array_equal(loaded.estimate(SCENES[0].image), expected)
+    assert refused > 20
+
+
+def drop(name: str) -> Change:
+    return lambda arrays, _: arrays.pop(name)
+
+
+def put(name: str, value: Any) -> Change:
+    return lambda arrays, _: arrays.update({name: value})
+
+
+def tell(**changes: Any) -> Change:
+    return lambda _, about: about.update(changes)
+
+
+UNFIT: list[tuple[Change, str]] = [
+    (drop("value"), "lacks 'value'"),
+    (put("value", np.zeros((2, 2))), "trees of the shapes"),
+    (lambda arrays, _: arrays["value"].fill(np.nan), "not finite"),
+    (lambda arrays, _: arrays["left"].fill(200), "lead nowhere"),
+    (tell(format="croplab model 9"), "croplab model 9"),
+    (tell(method="oracle"), "'oracle'; known are"),
+    (tell(settings={"depth": 3}), "settings depth; expected"),
+    (lambda _, about: about["settings"].update(depth="deep"), "depth is 'deep'"),
+    (lambda _, about: about["provenance"].pop("seed"), "provenance"),
+    (lambda _, about: about.pop("method"), "lacks 'method'"),
+]
+
+
+@pytest.mark.parametrize(("change", "why"), UNFIT)
+def test_what_does_not_fit_together_is_refused(saved: Path, change: Change, why: str) -> None:
+    rewrite(saved, change)
+    with pytest.raises(FormatError, match=why):
+        load_model(saved)
+
+
+def test_an_archive_with_other_members_is_refused(saved: Path) -> None:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.writestr("about.npy", "no array")
+    saved.write_bytes(content.getvalue())
+    with pytest.raises(FormatError):
+        load_model(saved)

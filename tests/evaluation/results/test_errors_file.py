@@ -1,0 +1,73 @@
+"""`errors.csv` is read by the names of its columns, and what is wrong in it is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from evaluation.results.errors_file import read_errors
+from foundation.errors import FormatError, InputError
+
+HEAD = "image,method,estimate_r,estimate_g,estimate_b,truth_r,truth_g,truth_b,recovery,reproduction,guessed"
+
+
+def written(folder: Path, *lines: str, head: str = HEAD) -> Path:
+    path = folder / "errors.csv"
+    path.write_text("\n".join([head, *lines]) + "\n")
+    return path
+
+
+def test_a_folder_and_its_file(tmp_path: Path) -> None:
+    path = written(
+        tmp_path,
+        "b.png,Gray-world,.3,.4,.3,1,2,1,1.5,2.5,0",
+        '"a, 1.png",Gray-world,.3,.4,.3,2,2,1,0.5,0.25,1',
+        "b.png,Mine,.3,.4,.3,1,2,1,3,4,0",
+    )
+    run = read_errors(tmp_path)
+    assert list(run) == ["Gray-world", "Mine"]
+    grey = run["Gray-world"]
+    assert grey.images == ("b.png", "a, 1.png")
+    assert grey.truths is not None
+    assert grey.truths.tolist() == [[1, 2, 1], [2, 2, 1]]
+    assert grey.errors["recovery"].tolist() == [1.5, 0.5]
+    assert grey.errors["reproduction"].tolist() == [2.5, 0.25]
+    assert grey.guessed.tolist() == [False, True]
+    assert read_errors(path)["Mine"].errors["reproduction"].tolist() == [4]
+
+
+def test_columns_in_another_order_and_without_truths(tmp_path: Path) -> None:
+    path = written(tmp_path, "7,a.png,Mine,2", head="reproduction,image,method,recovery")
+    mine = read_errors(path)["Mine"]
+    assert mine.truths is None
+    assert (mine.errors["recovery"][0], mine.errors["reproduction"][0]) == (2, 7)
+    assert not mine.guessed.any()
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("a,Mine,1,1,1,1,1,1,x,2,0", "line 2: recovery is 'x'"),
+        ("a,Mine,1,1,1,1,1,1,nan,2,0", "line 2: recovery is 'nan'"),
+        ("a,Mine,1,1,1,1,1", "line 2: recovery is None"),
+        ("a,Mine,1,1,1,1,1,1,-1,2,0", "line 2: a has .*none is below 0"),
+        ("a,Mine,1,1,1,0,0,0,1,2,0", "line 2: a has"),
+        ("a,Mine,1,1,1,1,1,1,1,2,maybe", "guessed is 'maybe'"),
+        ("a,Mine,1,1,1,1,1,1,1,2,0\na,Mine,1,1,1,1,1,1,1,2,0", "line 3: Mine on a stands there a second time"),
+        ("", "no line of errors"),
+    ],
+)
+def test_faults_are_named(tmp_path: Path, line: str, says: str) -> None:
+    with pytest.raises(FormatError, match=says):
+        read_errors(written(tmp_path, line))
+
+
+def test_other_files(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="has the columns image, method; expected recovery, reproduction too"):
+        read_errors(written(tmp_path, head="image,method").rename(tmp_path / "x.csv"))
+    with pytest.raises(InputError, match=r"cannot read .*errors.csv.*name a results folder"):
+        read_errors(tmp_path)
+    (tmp_path / "errors.csv").write_bytes(b"\xff\xfe\x80")
+    with pytest.raises(FormatError, match="no CSV text in UTF-8"):
+        read_errors(tmp_path)
