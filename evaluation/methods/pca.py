@@ -65,7 +65,7 @@ class BrightDark:
         self, prepared: PreparedImage, direction: npt.NDArray[np.float64], peaks: npt.NDArray[np.float64], count: int
     ) -> npt.NDArray[np.float64]:
         """Return the sum of x xᵀ (3, 3) over the pixels at either end."""
-        from evaluation.methods.loops import BINS, count_projections, sum_outer_bins
+        from evaluation.methods.filters.loops import BINS, count_projections, sum_outer_bins
 
         image: Any = prepared.image
         free = prepared.free()

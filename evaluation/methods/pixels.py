@@ -71,7 +71,7 @@ def dilate_clipped(
     """
     import cv2
 
-    from evaluation.methods.loops import mark_clipped
+    from evaluation.methods.filters.loops import mark_clipped
 
     clipped = np.zeros(image.shape[:2], dtype=np.uint8)
     kind: Any = image.dtype

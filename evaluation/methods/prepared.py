@@ -77,6 +77,7 @@ class PreparedImage:
         self._moments: dict[int, npt.NDArray[np.float64]] = {}
         self._norms: dict[tuple[int, float, float, int], npt.NDArray[np.float64]] = {}
         self._derivatives: dict[tuple[int, float], npt.NDArray[np.float32]] = {}
+        self._smaller: dict[int, PreparedImage] = {}
 
     @property
     def height(self) -> int:
@@ -141,7 +142,7 @@ class PreparedImage:
         Whole numbers are summed exactly, floats in float64.
         """
         if border not in self._moments:
-            from evaluation.methods.loops import float_moments, whole_moments
+            from evaluation.methods.filters.loops import float_moments, whole_moments
 
             if self.image.dtype == np.uint16:
                 whole, count = whole_moments(cast("Any", self.image), self.free(), border)
@@ -185,7 +186,7 @@ class PreparedImage:
         return self._norms[key]
 
     def _sum_powers(self, order: int, sigma: float, p: float, border: int, scale: float) -> npt.NDArray[np.float64]:
-        from evaluation.methods.loops import sum_powers
+        from evaluation.methods.filters.loops import sum_powers
 
         sums = np.zeros(3)
         shape = (self.height, self.width)
@@ -206,7 +207,7 @@ class PreparedImage:
         key = (order, float(sigma))
         if key in self._derivatives:
             return self._derivatives[key]
-        from evaluation.methods.gaussian import differentiated_strips
+        from evaluation.methods.filters.gaussian import differentiated_strips
 
         found = np.empty((self.height, self.width, 3), dtype=np.float32)
         for top, rows in differentiated_strips(self.image, order, sigma, self.scale):
@@ -215,9 +216,23 @@ class PreparedImage:
             self._derivatives[key] = found
         return found
 
+    def at_most(self, longest: int) -> PreparedImage:
+        """Return the image, prepared, with its longer side shrunk to so many px; itself where it is no longer.
+
+        The smaller image is float32 and holds means of usable pixels; see `shrinking.shrink`.
+        """
+        if max(self.height, self.width) <= longest:
+            return self
+        if longest not in self._smaller:
+            from evaluation.methods.filters.shrinking import shrink
+
+            image, mask = shrink(self.image, self.usable(0), longest)
+            self._smaller[longest] = PreparedImage(image, None, mask)
+        return self._smaller[longest]
+
     def strips(self, order: int, sigma: float) -> Iterator[tuple[int, npt.NDArray[np.float32]]]:
-        """Yield the derivative in strips: the first row's number, and (rows, ≥ 3 W) float32, good until the next."""
-        from evaluation.methods.gaussian import differentiated_strips
+        """Yield the derivative in strips: the first row's number, (rows, Q) float32, good until the next; Q ≥ 3 W."""
+        from evaluation.methods.filters.gaussian import differentiated_strips
 
         if self.height * self.width <= KEPT_PIXELS:
             yield 0, self.derivative(order, sigma).reshape(self.height, -1)

@@ -105,7 +105,7 @@ def differentiated_strips(
         The number of the strip's first row; (rows, Q) float32, interleaved pixels, of which the first 3 W numbers of a
         row count. The array is written anew for the next strip.
     """
-    from evaluation.methods.convolution import BLOCK, TILE, filter_strip
+    from evaluation.methods.filters.convolution import BLOCK, TILE, filter_strip
 
     height, width = image.shape[:2]
     kernels = [gaussian_kernel(sigma, one) for one in range(3)]

@@ -1,0 +1,71 @@
+"""White balance of OpenCV's xphoto as methods: what a program that uses OpenCV gets.
+
+`GrayworldWB` is Gray-world over the pixels that are not too colourful; `LearningBasedWB` is D. Cheng et al., "Effective
+learning-based illuminant estimation using simple features", CVPR 2015, with the model that OpenCV brings, which was
+trained on other cameras. Both correct an image; the light is what they divide by: for each channel the sum before over
+the sum after. Masked and saturated pixels are given to them as black, which both leave out. `SimpleWB` stretches each
+channel between percentiles, offset included, and so is no estimate of a light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.methods.pixels import GREY, unit
+from evaluation.methods.prepared import PreparedImage
+from evaluation.scene import Image
+
+_TOP = 16383
+"""Value that white gets: a quarter of uint16, so that a channel multiplied by up to 4 is not cut off."""
+
+
+@dataclass(frozen=True)
+class OpenCvBalance:
+    """A white balance of xphoto.
+
+    Attributes
+    ----------
+    name
+        Its name in tables.
+    kind
+        "grayworld" or "learning".
+
+    Examples
+    --------
+    >>> image = np.random.default_rng(0).uniform(0.1, 1, (40, 60, 1)) * [0.5, 1.0, 0.7]
+    >>> OpenCvBalance("Gray-world of OpenCV", "grayworld").estimate(image).round(2)
+    array([0.38, 0.76, 0.53])
+    """
+
+    name: str
+    kind: Literal["grayworld", "learning"]
+
+    def estimate(
+        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
+    ) -> npt.NDArray[np.float64]:
+        """Return the light (3,) float64, camera RGB of length 1; see `method.Method.estimate`."""
+        return self.estimate_prepared(PreparedImage(image, saturation, mask))
+
+    def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
+        """Return the same of a prepared image: (3,) float64."""
+        import cv2
+
+        xphoto: Any = cv2.xphoto
+        usable = prepared.usable(0)
+        peak = float(prepared.image[usable].max(initial=0)) if usable.any() else 0.0
+        if not peak:
+            return GREY
+        scaled = np.where(usable[..., None], prepared.image, 0)[..., ::-1] / peak * _TOP
+        given = np.rint(scaled).astype(np.uint16)
+        if self.kind == "grayworld":
+            balance = xphoto.createGrayworldWB()
+        else:
+            balance = xphoto.createLearningBasedWB()
+            balance.setRangeMaxVal(_TOP)
+        after = np.asarray(balance.balanceWhite(given)).reshape(-1, 3).sum(axis=0, dtype=np.float64)
+        before = given.reshape(-1, 3).sum(axis=0, dtype=np.float64)
+        return unit(np.divide(before, after, out=np.zeros(3), where=after > 0)[::-1])
