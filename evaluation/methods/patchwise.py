@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -125,10 +126,11 @@ def _interpolate(
     lights: npt.NDArray[np.float64], rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.float32]:
     """Return the lights (R, C, 3) of patches at every pixel: linear between their centres, constant beyond."""
-    values = lights.astype(np.float32)
+    values: Any = lights.astype(np.float32)
     for axis, bounds in enumerate((rows, columns)):
         centres = (bounds[:-1] + bounds[1:] - 1) / 2
-        at = np.asarray(np.interp(np.arange(bounds[-1]), centres, np.arange(len(centres))), dtype=np.float64)
+        places: Any = np.arange(bounds[-1])
+        at = np.asarray(np.interp(places, centres, np.arange(len(centres))), dtype=np.float64)
         low = np.minimum(at.astype(np.int64), max(0, len(centres) - 2))
         high = np.minimum(low + 1, len(centres) - 1)
         share = (at - low).astype(np.float32).reshape(-1, *[1] * (2 - axis))
