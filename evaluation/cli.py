@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 import typer
 
 from evaluation.commands import compare as compare_command
+from evaluation.commands import describe as describe_command
+from evaluation.commands import paper as paper_command
 from evaluation.commands import run as run_command
+from evaluation.commands import transfer as transfer_command
 from foundation.console import EXIT_CODES, run
 
 if TYPE_CHECKING:
@@ -25,7 +28,10 @@ app = typer.Typer(
 """,
 )
 app.command("run", help=run_command.HELP)(run_command.run)
+app.add_typer(paper_command.app, name="paper", help=paper_command.HELP)
 app.command("compare", help=compare_command.HELP)(compare_command.compare)
+app.command("describe", help=describe_command.HELP)(describe_command.describe)
+app.command("transfer", help=transfer_command.HELP)(transfer_command.transfer)
 
 
 @app.callback()

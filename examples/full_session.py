@@ -1,4 +1,6 @@
-"""A complete table, for once not in small: 707 lights, 32 768 colours, full-size frames of a simulated EOS 550D.
+"""A complete table, for once not in small: 707 lights, 32 768 colours, full-size frames of a simulated camera.
+
+The camera is an EOS 550D unless ``--body`` names the paper's other one, the EOS 6D Mark II.
 
 `make full-session` prints chart and lights, takes the session in the simulated lab, builds and verifies the table, and
 tells what each step took: time, memory, disk. The table stays; the session's raw files, some 27 GB, are removed at the
@@ -16,13 +18,14 @@ import time
 from pathlib import Path
 
 NEEDED_GB = 60
+BODIES = ("EOS 550D", "EOS 6D Mark II")
 LAB = """\
 rig = "simulated"
 chart = "chart/chart.json"
 illuminations = "illuminations.csv"
 
 [simulated]
-body = "EOS 550D"
+body = "{body}"
 """
 
 
@@ -53,6 +56,7 @@ def main() -> None:
     """Take, build, verify, tell."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="folder for everything")
+    parser.add_argument("--body", choices=BODIES, default=BODIES[0], help="the simulated camera")
     parser.add_argument("--keep-session", action="store_true", help="do not remove the raw files at the end")
     chosen = parser.parse_args()
     out: Path = chosen.out
@@ -63,7 +67,7 @@ def main() -> None:
     if not (out / "illuminations.csv").exists():
         step(out, "chart", "acquire", "chart", "chart", "--no-tiff")
         step(out, "illuminations.csv", "acquire", "illuminations", "illuminations.csv")
-        (out / "LAB.toml").write_text(LAB)
+        (out / "LAB.toml").write_text(LAB.format(body=chosen.body))
     step(out, "session", "acquire", "run", "LAB.toml", "session")
     if not (out / "lut").exists():
         step(out, "lut", "build-lut", "session", "lut")

@@ -71,7 +71,7 @@ def compare(
     runs = [read_errors(place) for place in results]
     pairs = _of_one(runs[0], results[0], method, error) if len(runs) == 1 else _of_two(runs, results, method, error)
     comparisons = comparing.compare(pairs, seed, level)
-    notes = (*comparison_report.notes_of(comparisons), *_unchecked(runs, results))
+    notes = (*comparison_report.notes_of(comparisons), *_unchecked(runs, results), *_guessed(runs, results))
     for note in notes:
         print(note)
     for made in comparisons:
@@ -159,4 +159,14 @@ def _unchecked(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]
         f"{place} holds no ground truths: whether they agree is not known"
         for run, place in zip(runs, places, strict=True)
         if len(runs) == 2 and any(method.truths is None for method in run.values())
+    ]
+
+
+def _guessed(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]) -> list[str]:
+    """Return a sentence for each method that gave no light for some images."""
+    return [
+        f"{name} of {place} gave no light for {method.guessed.sum()} of {len(method.images)} images; grey stands in"
+        for run, place in zip(runs, places, strict=True)
+        for name, method in run.items()
+        if method.guessed.any()
     ]

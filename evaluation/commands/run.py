@@ -8,51 +8,68 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from evaluation.commands.choosing import METHOD_HELP
+from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from evaluation.methods.method import Method
     from evaluation.metrics import ErrorKind
-    from evaluation.results.result import Result
+    from evaluation.results.run import Run
 
-_CAUSES = "too small for it, clipped, black or even"
-"""Why an image has no usable pixel for a method."""
+HELP = f"""Estimate the light of every image of a data set and sum up the errors.
 
-_WIDE = 10_000
-"""Columns of a terminal that no table of methods fills: the table is measured as wide as it likes to be."""
+Reads DATA: a dataset made by generate (folder or URL), or a real data set in the layout of its authors. Methods are the
+suite's own, classes of yours, trained models, and estimates that any other program has made; with none named, all of
+the suite's. Prints a table in the paper's order: mean, median, trimean, best 25 %, worst 25 % and Avg., their geometric
+mean, all in degrees; where several lights fall on images, the errors by pixel and region too; and what was done to the
+images. Writes nothing unless asked with --out, --csv or --images.
 
-HELP = f"""Estimate the light of every image of a dataset and sum up the errors.
-
-Reads DATASET, a folder or a URL (made by generate). Prints a table in the paper's order: mean, median, trimean, best
-25 %, worst 25 % and Avg., their geometric mean, all in degrees. Writes nothing unless asked with --csv or --images.
+A run with --out that was stopped goes on when the same command is given again.
 
 {EXIT_CODES}
 """
 
 
+@with_data_options
 def run(
-    dataset: Annotated[
-        str, typer.Argument(metavar="DATASET", help="Folder of the dataset, or its URL.", show_default=False)
+    data: Annotated[
+        str, typer.Argument(metavar="DATA", help="Folder or file of the data set, or its URL.", show_default=False)
     ],
-    layout: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="Layout of the data set. \\[default: by what it looks like]", show_default=False
-        ),
-    ] = None,
+    method: Annotated[list[str] | None, typer.Option(metavar="METHOD", help=METHOD_HELP, show_default=False)] = None,
     methods: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="LIST",
             help="Methods between commas, or all: white-patch, gray-world, shades-of-gray, general-gray-world, "
-            "gray-edge-1, gray-edge-2, pca.",
+            "gray-edge-1, gray-edge-2, pca. \\[default: all, unless --method or --estimates is given]",
+            show_default=False,
         ),
-    ] = "all",
+    ] = None,
+    estimates: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FILE.csv",
+            help="Estimates of another program: columns image,r,g,b, a line an image. NAME=FILE.csv names them in the "
+            "tables. Give it more than once for several.",
+            show_default=False,
+        ),
+    ] = None,
     error: Annotated[
-        Literal["reproduction", "recovery"], typer.Option(help="Angular error to sum up.")
+        Literal["reproduction", "recovery"],
+        typer.Option(help="Angular error that is printed, and drawn in the report; files have both."),
     ] = "reproduction",
+    statistics: Annotated[
+        Literal["paper", "all"],
+        typer.Option(help="Print the paper's six statistics, or also 95th percentile, maximum and share below 3°."),
+    ] = "paper",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RESULTS",
+            help="Write everything to this new folder: tables, each image's errors, report.html, LaTeX.",
+            show_default=False,
+        ),
+    ] = None,
     csv: Annotated[
         Path | None, typer.Option(metavar="OUT.csv", help="Write the table to this new file too.", show_default=False)
     ] = None,
@@ -62,79 +79,82 @@ def run(
             metavar="OUT.csv", help="Write each image's estimates and errors to this new file.", show_default=False
         ),
     ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print every statistic as JSON in place of the tables.")] = False,
     workers: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False),
+        typer.Option(
+            metavar="N",
+            help="Threads, one image each; classes of yours are called by one at a time. \\[default: one a processor]",
+            min=1,
+            show_default=False,
+        ),
     ] = None,
+    *,
+    reading: DataReading,
 ) -> None:
     """Evaluate methods on a data set."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    from evaluation.datasets import open_scenes
-    from evaluation.experiments.running import evaluate
+    from evaluation.commands.choosing import choose_estimates, choose_methods
+    from evaluation.experiments.run_folder import run_methods
     from evaluation.results.result import images_csv, table_csv
+    from foundation.console import orderly_end, progress
     from foundation.files import write_whole
     from foundation.processors import processor_count
 
-    chosen = _choose(methods)
-    _require_free(csv, images)
-    data = open_scenes(dataset, layout)
-    scenes = data.scenes
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("images", total=len(scenes))
-        results = evaluate(scenes, chosen, workers or processor_count(), lambda: progress.advance(task))
-    print(f"{data.name}: {error} angular error of {len(scenes)} images, degrees")
-    _print_table(results, error)
-    for result in results:
-        if result.guessed.any():
-            counted = f"{result.guessed.sum()} of {len(scenes)} images"
-            print(f"{result.method}: no usable pixel in {counted} ({_CAUSES}); their light was taken to be grey")
+    listed = [text.strip() for text in methods.split(",")] if methods is not None else []
+    if methods is None and not method and not estimates:
+        listed = ["all"]
+    chosen = choose_methods([*listed, *(method or [])])
+    _require_free(csv, images, out)
+    found = reading.open(data)
+    given = choose_estimates(estimates or [], [scene.name for scene in found.scenes])
+    with orderly_end(), progress("images") as advance:
+        made = run_methods(found, [*chosen, *given], out, error, workers or processor_count(), advance)
+    if json:
+        _print_json(made)
+    else:
+        _print(made, error, statistics == "all")
     if csv is not None:
-        write_whole(csv, table_csv(results, error))
+        write_whole(csv, table_csv(made.results, error))
     if images is not None:
-        write_whole(images, images_csv(scenes, results))
+        write_whole(images, images_csv(found.scenes, made.results))
 
 
-def _require_free(csv: Path | None, images: Path | None) -> None:
+def _require_free(csv: Path | None, images: Path | None, out: Path | None) -> None:
     from foundation.errors import InputError
-    from foundation.files import require_free_file
+    from foundation.files import require_free, require_free_file
 
     for path, what in ((csv, "the table"), (images, "the images' errors")):
         if path is not None:
             require_free_file(path, what)
     if csv is not None and images is not None and os.path.realpath(csv) == os.path.realpath(images):
         raise InputError(f"--csv and --images are both {images}; give each a file of its own")
+    if out is not None:
+        require_free(out, "the results")
+        for path in (csv, images):
+            if path is not None and Path(os.path.realpath(path)).is_relative_to(os.path.realpath(out)):
+                raise InputError(f"{path} lies in {out}, which --out makes and fills; name a place outside")
 
 
-def _print_table(results: Sequence[Result], error: ErrorKind) -> None:
-    """Print the summaries; in a narrow terminal names are folded, numbers never cut."""
-    from rich.console import Console
-    from rich.table import Table
+def _print(made: Run, error: ErrorKind, further: bool) -> None:
+    """Print the tables, what was done to the images, and what else is to be said."""
+    from evaluation.reports.terminal import print_table
+    from evaluation.results.summary_tables import lights_tables, summary_table
 
-    longest_word = max(len(word) for result in results for word in result.method.split())
-    table = Table()
-    table.add_column("Algorithm", min_width=longest_word)
-    for column in ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg."):
-        table.add_column(column, justify="right", no_wrap=True, min_width=len(column))
-    for result in results:
-        table.add_row(result.method, *(f"{number:.2f}" for number in result.summary(error).as_tuple()))
-    console = Console()
-    needed = Console(width=_WIDE).measure(table)
-    # A file or pipe has no width, but rich would take that of the terminal on stdin or stderr.
-    console.width = max(console.width, needed.minimum) if console.is_terminal else needed.maximum
-    console.print(table)
+    print_table(summary_table(made.subject, made.results, error, further))
+    for table in lights_tables(made.subject, made.results, error):
+        print_table(table)
+    for note in made.notes:
+        print(note)
+    for what, how in made.treatment.items():
+        print(f"{what}: {how}")
 
 
-def _choose(text: str) -> list[Method]:
-    from evaluation.methods.standard import standard_methods
-    from foundation.errors import InputError
+def _print_json(made: Run) -> None:
+    import json
 
-    known = standard_methods()
-    if text.strip().lower() == "all":
-        return list(known.values())
-    names = [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in known:
-            raise InputError(f"{name!r} is no method; the methods are {', '.join(known)}, or all")
-    return [known[name] for name in dict.fromkeys(names)]
+    from evaluation.results.summary_tables import statistics_rows
+
+    table = statistics_rows(made.subject, made.results)
+    rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    about = {"data_set": made.subject.name, "images": len(made.subject.images), "treatment": dict(made.treatment)}
+    print(json.dumps({**about, "notes": list(made.notes), "errors": rows}, indent=2, ensure_ascii=False))

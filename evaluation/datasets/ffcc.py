@@ -25,7 +25,7 @@ _SAMPLE = 100
 """Names of a folder that are looked at to tell the layout."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ThumbnailScene(BesideTextScene):
     """A linear thumbnail; `white` is None unless the user gives it."""
 
@@ -45,7 +45,7 @@ def is_ffcc(folder: Folder) -> bool:
     return False
 
 
-def open_ffcc(place: str, options: DataOptions) -> SceneSet:
+def open_ffcc(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
     """Return the thumbnails of a folder and of those below it; thumbnails and lights are read when they are used.
 
     Raises
@@ -53,7 +53,7 @@ def open_ffcc(place: str, options: DataOptions) -> SceneSet:
     FormatError
         There is none, or a text file is missing or has no thumbnail.
     """
-    folder = Folder(Path(place))
+    folder = listed or Folder(Path(place))
     black = 0.0 if options.black is None else options.black
     scenes: list[ThumbnailScene] = []
     without: list[str] = []

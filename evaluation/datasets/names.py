@@ -38,17 +38,17 @@ class Folder:
                         (folders if entry.is_dir() else files).append(entry.name)
         except OSError as error:
             raise FormatError(f"{self.path} cannot be read: {error.strerror or error}; name a folder") from error
-        return sorted(files, key=natural), sorted(folders, key=natural)
+        return files, folders
 
-    @property
+    @cached_property
     def files(self) -> Sequence[str]:
-        """The names of its files, numbers in them by their value."""
-        return self._entries[0]
+        """The names of its files, sorted."""
+        return sorted(self._entries[0])
 
     @cached_property
     def folders(self) -> Mapping[str, Folder]:
         """The folders in it by their names, numbers in them by their value."""
-        return {name: Folder(self.path / name) for name in self._entries[1]}
+        return {name: Folder(self.path / name) for name in in_natural_order(self._entries[1])}
 
     def has(self, name: str) -> bool:
         """Return whether a file of that name is in it."""
@@ -78,7 +78,7 @@ class Folder:
                         f"{self.path} has {name} and {Path(found[stem]).name}, expected one file an image; remove one"
                     )
                 found[stem] = f"{self.path}{os.sep}{name}"
-        return found
+        return {stem: found[stem] for stem in in_natural_order(found)}
 
 
 def gather(folders: Iterable[Folder], endings: Collection[str] = (".png",)) -> dict[str, str]:
@@ -99,6 +99,23 @@ def gather(folders: Iterable[Folder], endings: Collection[str] = (".png",)) -> d
             )
         found |= images
     return found
+
+
+def in_natural_order(names: Iterable[str]) -> list[str]:
+    """Return names sorted so that numbers in them go by their values.
+
+    Examples
+    --------
+    >>> in_natural_order(["a10", "10", "9", "a2"])
+    ['9', '10', 'a2', 'a10']
+    """
+    given = list(names)
+    if len({name.translate(_DIGITS) for name in given}) <= 1:
+        return sorted(given)  # Numbers of as many digits in the same places: a million names in a second.
+    return sorted(given, key=natural)
+
+
+_DIGITS = str.maketrans("0123456789", "0" * 10)
 
 
 def natural(name: str) -> list[str | int]:

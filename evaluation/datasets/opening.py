@@ -42,7 +42,7 @@ class Layout:
     matches
         Whether a folder looks like it; reads names, and the first lines of tables, at most.
     open
-        Returns the data set at a path or URL.
+        Returns the data set at a path or URL; takes the names in its folder where they were read already.
     options
         The fields of `DataOptions` that have a meaning for it.
     general
@@ -52,7 +52,7 @@ class Layout:
     title: str
     signs: str
     matches: Callable[[Folder], bool]
-    open: Callable[[str, DataOptions], SceneSet]
+    open: Callable[[str, DataOptions, Folder | None], SceneSet]
     options: tuple[str, ...] = ()
     general: bool = False
 
@@ -62,10 +62,10 @@ LAYOUTS: Mapping[str, Layout] = {
         "a dataset made by generate",
         "dataset.json",
         lambda folder: folder.has("dataset.json"),
-        lambda place, _: open_generated(place),
+        lambda place, _, __: open_generated(place),
     ),
     "thumbnails": Layout(
-        "thumbnails in a NumPy archive", "a file .npz", lambda _: False, lambda place, _: open_thumbnails(place)
+        "thumbnails in a NumPy archive", "a file .npz", lambda _: False, lambda place, _, __: open_thumbnails(place)
     ),
     "cube-plus": Layout("Cube+, or Cube", "cube+_gt.txt", is_cube_plus, open_cube_plus, ("truth", *_LEVELS, "partial")),
     "cube++": Layout(
@@ -142,7 +142,7 @@ def open_scenes(place: Path | str, layout: str | None = None, options: DataOptio
     """
     chosen = DataOptions() if options is None else options
     text = str(place)
-    name = layout_of(text) if layout is None else layout
+    name, names = _recognise(text) if layout is None else (layout, None)
     if name not in LAYOUTS:
         raise InputError(f"{name!r} is no layout; the layouts are {', '.join(LAYOUTS)}")
     known = LAYOUTS[name]
@@ -152,7 +152,7 @@ def open_scenes(place: Path | str, layout: str | None = None, options: DataOptio
         raise InputError(
             f"--{idle[0]} has no meaning for {text}, {known.title} ({name}); it has one for {', '.join(able)}"
         )
-    return known.open(text, chosen)
+    return known.open(text, chosen, names)
 
 
 def layout_of(place: str) -> str:
@@ -165,13 +165,18 @@ def layout_of(place: str) -> str:
     FormatError
         It looks like none, or is not there.
     """
+    return _recognise(place)[0]
+
+
+def _recognise(place: str) -> tuple[str, Folder | None]:
+    """Return the layout of a place, and the names in its folder if it is one."""
     if "://" in place:
-        return "generated"
+        return "generated", None
     path = Path(place)
     if path.is_file():
         by_ending = {".npz": "thumbnails", ".csv": "folder"}
         if path.suffix.lower() in by_ending:
-            return by_ending[path.suffix.lower()]
+            return by_ending[path.suffix.lower()], None
         raise FormatError(f"{place} is a file, expected a folder, an archive .npz or a table .csv; name one of these")
     if not path.is_dir():
         raise FormatError(f"{place} is no dataset: it does not exist; name its folder, file or URL")
@@ -183,4 +188,4 @@ def layout_of(place: str) -> str:
         raise FormatError(f"{place} is no dataset of a layout that is known. Looked for: {signs}. Name its folder")
     if len(found) > 1:
         raise InputError(f"{place} looks like {' and '.join(found)}; say which it is with --layout")
-    return found[0]
+    return found[0], folder

@@ -12,8 +12,10 @@ The table is the folder's only .csv with those columns, or is named itself. Pict
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +36,7 @@ _MOST = 50
 """Tables of a folder whose heads are read to find the one with the lights."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class OwnScene(RawScene):
     """An image of the user's.
 
@@ -78,7 +80,7 @@ def is_plain_folder(folder: Folder) -> bool:
     return bool(_tables(folder))
 
 
-def open_plain_folder(place: str, options: DataOptions) -> SceneSet:
+def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
     """Return the images of a table; they are read when they are used.
 
     Parameters
@@ -87,6 +89,8 @@ def open_plain_folder(place: str, options: DataOptions) -> SceneSet:
         The folder with the table, or the table.
     options
         `black` and `saturation` serve images whose levels the table does not give.
+    listed
+        The names in that folder, where they were read already.
 
     Raises
     ------
@@ -95,19 +99,19 @@ def open_plain_folder(place: str, options: DataOptions) -> SceneSet:
     FormatError
         There is no table, it is damaged, or an image is missing, named twice or a picture for the eye.
     """
-    path = _table_of(Path(place))
+    path = _table_of(Path(place), listed)
     folder = path.parent
     scenes: list[OwnScene] = []
     folds: list[int] = []
     missing: list[str] = []
-    names: set[str] = set()
+    seen: set[str] = set()
     given: set[str] = set()
-    listings: dict[str, Mapping[str, str]] = {}
+    listings: dict[str, _Listing] = {"": _Listing(listed)} if listed else {}
     for where, row in read_rows(path, COLUMNS):
         name = row["image"].strip()
-        if not name or name in names:
+        if not name or name in seen:
             raise FormatError(f"{where}: the image {name!r} is {'named twice' if name else 'no name'}; correct it")
-        names.add(name)
+        seen.add(name)
         image = _find(folder, name, where, listings)
         light = light_of(row, COLUMNS[1:], where)
         if image is None:
@@ -119,7 +123,7 @@ def open_plain_folder(place: str, options: DataOptions) -> SceneSet:
     if not scenes or (missing and not options.partial):
         remedy = "complete the folder" + (", or take what is there with --partial" if scenes else "")
         raise FormatError(
-            f"{folder} lacks {len(missing)} of the {len(names)} images of {path.name} "
+            f"{folder} lacks {len(missing)} of the {len(seen)} images of {path.name} "
             f"({first_of(missing) or 'it is empty'}); {remedy}"
         )
     if "fold" in given and min(folds) < 0:
@@ -148,10 +152,10 @@ def _stated(column: str, given: set[str], path: Path, option: float | None, othe
     return stated(option, otherwise)
 
 
-def _table_of(place: Path) -> Path:
+def _table_of(place: Path, listed: Folder | None) -> Path:
     if place.is_file():
         return place
-    tables = _tables(Folder(place))
+    tables = _tables(listed or Folder(place))
     if not tables:
         raise FormatError(f"{place} has no table with the columns {','.join(COLUMNS)}; write one, a row an image")
     if len(tables) > 1:
@@ -175,10 +179,25 @@ def _with_columns(folder: Folder) -> Iterator[str]:
             yield name
 
 
-def _find(folder: Path, name: str, where: str, listings: dict[str, Mapping[str, str]]) -> str | None:
+@dataclass(frozen=True)
+class _Listing:
+    """The names in a folder, for quick questions."""
+
+    folder: Folder
+
+    @cached_property
+    def files(self) -> frozenset[str]:
+        return frozenset(self.folder.files if self.folder.path.is_dir() else ())
+
+    @cached_property
+    def images(self) -> Mapping[str, str]:
+        return self.folder.images(IMAGE_ENDINGS) if self.files else {}
+
+
+def _find(folder: Path, name: str, where: str, listings: dict[str, _Listing]) -> str | None:
     """Return the path of an image that a table names with or without its ending; None if it is not there."""
-    path = folder / name
-    ending = path.suffix.lower()
+    below, _, file = name.rpartition("/")
+    ending = f".{file.rpartition('.')[2].lower()}"
     if ending in _PICTURES:
         raise FormatError(
             f"{where}: {name} is a picture for the eye (sRGB), whose values are not proportional to light; expected "
@@ -189,12 +208,12 @@ def _find(folder: Path, name: str, where: str, listings: dict[str, Mapping[str, 
             f"{where}: {name} is a raw file, whose mosaic has yet to be interpolated; make a linear 16-bit file of it, "
             "for instance with dcraw -h -D -4 -T or rawpy, and name that"
         )
-    if ending in IMAGE_ENDINGS:
-        return str(path) if path.is_file() else None
-    below = str(path.parent)
     if below not in listings:
-        listings[below] = Folder(path.parent).images(IMAGE_ENDINGS) if path.parent.is_dir() else {}
-    return listings[below].get(path.name)
+        listings[below] = _Listing(Folder(folder / below))
+    listing = listings[below]
+    if ending in IMAGE_ENDINGS:
+        return f"{listing.folder.path}{os.sep}{file}" if file in listing.files else None
+    return listing.images.get(file)
 
 
 def _scene(

@@ -21,7 +21,7 @@ Mask = npt.NDArray[np.bool_]
 """(H, W), True where a pixel must not be used."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class RawScene:
     """An image in a file, with its levels; a layout with a mask has a subclass.
 
@@ -72,7 +72,7 @@ class RawScene:
         return None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class BesideTextScene(RawScene):
     """An image whose light stands in a text file of its own, read when it is asked for; `light` is not used.
 

@@ -220,7 +220,7 @@ def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[Scen
                 error.add_note(f"while {method.name} was on {scene.name}")
                 raise
             raise InputError(
-                f"{method.name} fails on {scene.name}: {_reason(error)}; correct it and run the same command again"
+                f"{method.name} fails on {scene.name}: {_reason(error)}; correct it and run again"
             ) from error
         if truth is not None and isinstance(scene, MixedScene) and image is not None:
             answer = SceneAnswer(answer.light, answer.cause, _map_error(scene, answer, field, truth, image, mask))

@@ -129,7 +129,7 @@ def _interpolate(
     values: Any = lights.astype(np.float32)
     for axis, bounds in enumerate((rows, columns)):
         centres = (bounds[:-1] + bounds[1:] - 1) / 2
-        places: Any = np.arange(bounds[-1])
+        places = np.arange(int(bounds[-1]), dtype=np.float64)
         at = np.asarray(np.interp(places, centres, np.arange(len(centres))), dtype=np.float64)
         low = np.minimum(at.astype(np.int64), max(0, len(centres) - 2))
         high = np.minimum(low + 1, len(centres) - 1)

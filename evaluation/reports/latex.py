@@ -45,6 +45,10 @@ _SPECIAL = {
 """Characters that LaTeX reads as commands or that its default fonts lack, and what sets them."""
 
 
+_WIDE = 7
+"""Columns of the paper's tables; with more a table is set smaller, to fit a page's text."""
+
+
 def escape_latex(text: str) -> str:
     r"""Return LaTeX that sets a text as it is.
 
@@ -68,7 +72,7 @@ def table_to_latex(table: Table) -> str:
     \caption{Errors}
     \begin{tabular}{|l|r|}
     \hline
-    \textbf{Algorithm} & \shortstack{\textbf{Best}\\\textbf{25\%}}\\
+    \textbf{Algorithm} & \shortstack{\strut\textbf{Best}\\\textbf{25\%}}\\
     \hline
     Gray-world & 1.50\\
     \hline
@@ -108,12 +112,14 @@ def tables_to_latex(caption: str, tables: Sequence[Table]) -> str:
 
 def _float(caption: str, like: Table, lines: Sequence[str], notes: Sequence[str]) -> str:
     kinds = ["r" if number else "l" for number in like.numeric()]
-    below = [f"\\\\[.3em]\\parbox{{\\linewidth}}{{\\footnotesize {escape_latex(' '.join(notes))}}}"] if notes else []
+    said = " ".join(f"{note.rstrip('.')}." for note in dict.fromkeys(notes))
+    below = [f"\\\\[.3em]\\parbox{{\\linewidth}}{{\\footnotesize {escape_latex(said)}}}"] if notes else []
     return "\n".join(
         [
             "\\begin{table}[ht]",
             "\\centering",
             f"\\caption{{{escape_latex(caption)}}}",
+            *(["\\scriptsize\\setlength{\\tabcolsep}{3pt}"] if len(kinds) > _WIDE else []),
             f"\\begin{{tabular}}{{|{kinds[0]}|{''.join(kinds[1:])}{'|' if kinds[1:] else ''}}}",
             "\\hline",
             *lines,
@@ -138,7 +144,7 @@ def _heads(table: Table) -> str:
 def _stacked(head: str) -> str:
     words = [f"\\textbf{{{escape_latex(word)}}}" for word in head.split()]
     over_each_other = r"\\".join(words)
-    return words[0] if len(words) == 1 else f"\\shortstack{{{over_each_other}}}"
+    return words[0] if len(words) == 1 else f"\\shortstack{{\\strut{over_each_other}}}"
 
 
 def _rows(table: Table) -> list[str]:

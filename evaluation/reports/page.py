@@ -34,10 +34,13 @@ th, td {{ padding: .25rem .8rem .25rem 0; border-bottom: 1px solid var(--grid); 
 th {{ font-weight: 600; vertical-align: bottom }} .number {{ text-align: right; padding: .25rem 0 .25rem .9rem;
   font-variant-numeric: tabular-nums; white-space: nowrap }} th.number {{ white-space: normal }}
 .note, figcaption {{ color: var(--faint); font-size: .9rem }}
-figure {{ margin: .8rem 0 }} figure > img, figure > svg {{ display: block; max-width: 100%; height: auto }}
+figure {{ margin: .8rem 0; overflow-x: auto }} figure > svg {{ min-width: 36rem }}
+figure > img, figure > svg {{ display: block; max-width: 100%; height: auto }}
 figcaption {{ max-width: 75ch; margin-top: .3rem }} svg text {{ font-family: system-ui, sans-serif }}
 .row {{ display: flex; flex-wrap: wrap; gap: 1rem 1.4rem }}
 .row > figure {{ flex: 1 1 15rem; max-width: 100%; margin: 0 }}
+details {{ margin: .5rem 0; border-top: 1px solid var(--grid) }} details[open] {{ padding-bottom: .8rem }}
+summary {{ cursor: pointer; padding: .45rem 0; font-weight: 600 }}
 @media print {{ body {{ margin: 0; max-width: none }} figure, tr {{ break-inside: avoid }} }}
 """
 
@@ -114,6 +117,13 @@ def figure_part(picture: bytes, caption: str, alt: str | None = None) -> Part:
 def row_part(parts: Sequence[Part]) -> Part:
     """Return parts side by side, as many as the screen is wide for."""
     return Part(f"<div class='row'>{''.join(part.html for part in parts)}</div>\n")
+
+
+def details_part(summary: str, parts: Sequence[Part], open_at_first: bool = False) -> Part:
+    """Return parts that a click on their summary shows and hides."""
+    shown = " open" if open_at_first else ""
+    content = "".join(part.html for part in parts)
+    return Part(f"<details{shown}><summary>{html.escape(summary)}</summary>\n{content}</details>\n")
 
 
 def page(title: str, parts: Sequence[Part]) -> str:

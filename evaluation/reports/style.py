@@ -21,6 +21,9 @@ _NAMES = {INK: "ink", FAINT: "faint", GRID: "grid", PAPER: "paper"}
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f8790")
 """Colours of series, in the order of their use."""
 
+_RASTER_DPI = 180
+"""Resolution of what is drawn as a picture within an SVG, pixels an inch: sharp on a screen of twice the usual."""
+
 DASHES = ("-", "--", ":", "-.")
 """Line styles: the first for the first round of colours, and so on."""
 
@@ -96,7 +99,7 @@ def svg_of(draw: Callable[..., None], *arguments: Any, inches: tuple[float, floa
         FigureCanvasSVG(figure)
         draw(figure, *arguments)
         stream = BytesIO()
-        figure.savefig(stream, format="svg", metadata={"Date": None})
+        figure.savefig(stream, format="svg", dpi=_RASTER_DPI, metadata={"Date": None})
     text = stream.getvalue().decode()
     for colour, name in _NAMES.items():
         text = re.sub(re.escape(colour), f"var(--{name})", text, flags=re.IGNORECASE)

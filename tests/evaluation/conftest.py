@@ -36,8 +36,8 @@ def dataset(make_dataset: Callable[[int, int], Path]) -> Path:
 
 
 @pytest.fixture
-def make_dataset(tmp_path: Path) -> Callable[[int, int], Path]:
-    """Return a maker of datasets of 8 random scenes whose colours reflect as their code, under two lights, no noise."""
+def made_lut(tmp_path: Path) -> Path:
+    """Return a table in which colours reflect as their code, under two lights, no noise."""
     folder = tmp_path / "lut"
     folder.mkdir()
     index = np.arange(512)
@@ -48,10 +48,16 @@ def make_dataset(tmp_path: Path) -> Callable[[int, int], Path]:
     known = Provenance(camera="Test", bits=3, white_level=9000, session_sha256="0", chart_sha256="0", software="test")
     plan = [Illumination(number, "uniform", None, Colour(1, 2, 3)) for number in range(2)]
     writer.finish(plan, LIGHTS, known)
+    return folder
+
+
+@pytest.fixture
+def make_dataset(made_lut: Path, tmp_path: Path) -> Callable[[int, int], Path]:
+    """Return a maker of datasets of 8 random scenes under the lights of that table."""
 
     def make(width: int, height: int) -> Path:
         scenes = random_scenes(8, width, height)
-        generate_dataset(open_lut(folder), tmp_path / "made", scenes, [0, 1], options=DatasetOptions(previews=False))
+        generate_dataset(open_lut(made_lut), tmp_path / "made", scenes, [0, 1], options=DatasetOptions(previews=False))
         return tmp_path / "made"
 
     return make

@@ -10,7 +10,7 @@ import pytest
 from fsspec.core import url_to_fs
 
 from evaluation.cli import main
-from evaluation.experiments import running
+from evaluation.experiments import run_folder
 from evaluation.methods import standard_methods
 
 
@@ -46,7 +46,7 @@ def test_the_command_counts_images_without_a_usable_pixel(
     make_dataset: Callable[[int, int], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([str(make_dataset(12, 12))]) == 0
-    after = capsys.readouterr().out.rpartition("┘")[2]
+    after = capsys.readouterr().out.rpartition("┘")[2].partition("black level: ")[0]
     reason = "no usable pixel in 16 of 16 images (too small for it, clipped, black or even)"
     assert after.split("\n") == [
         "",
@@ -72,7 +72,7 @@ def test_a_file_gets_the_whole_table_however_narrow_the_terminal(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "30")
     assert main([str(dataset)]) == 0
-    first, *table = capsys.readouterr().out.splitlines()
+    first, *table = capsys.readouterr().out.partition("black level: ")[0].splitlines()
     assert first == "made: reproduction angular error of 16 images, degrees"
     assert {len(line) for line in table} == {len(table[0])}
     for method in standard_methods().values():
@@ -87,7 +87,7 @@ def test_a_narrow_terminal_cuts_no_number(
     for columns in (30, 75, 120):
         monkeypatch.setenv("COLUMNS", str(columns))
         assert main([str(dataset)]) == 0
-        printed[columns] = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out)
+        printed[columns] = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out).partition("black level: ")[0]
     numbers = {columns: re.findall(r"\d\.\d\d ", text) for columns, text in printed.items()}
     assert len(numbers[120]) == 6 * len(standard_methods())
     assert numbers[30] == numbers[75] == numbers[120]
@@ -105,6 +105,13 @@ def test_a_narrow_terminal_cuts_no_number(
         (("made", "--csv", "made/gt.txt"), "made/gt.txt already exists; name another place for the table"),
         (("made", "--images", "empty"), "empty already exists; name another place for the images' errors"),
         (("made", "--csv", "new.csv", "--images", "lut/../new.csv"), "are both lut/../new.csv; give each a file"),
+        (("made", "--out", "lut"), "lut already exists; name another place for the results"),
+        (("made", "--out", "new", "--csv", "new/table.csv"), "new/table.csv lies in new, which --out makes"),
+        (("made", "--method", "regression-trees"), "regression-trees learns from images first: evaluate train"),
+        (("made", "--method", "none.py:Own"), "none.py is not there"),
+        (("made", "--method", "none.npz"), "none.npz"),
+        (("made", "--estimates", "none.csv"), "cannot read none.csv"),
+        (("made", "--estimates", "lut/illuminations.csv"), "expected the columns image,r,g,b"),
     ],
 )
 def test_what_cannot_be_done_is_one_sentence(
@@ -118,7 +125,7 @@ def test_what_cannot_be_done_is_one_sentence(
         pytest.fail("the work must not begin")
 
     monkeypatch.chdir(dataset.parent)
-    monkeypatch.setattr(running, "evaluate", never)
+    monkeypatch.setattr(run_folder, "answer_scenes", never)
     Path("empty").mkdir()
     before = {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")}
     assert main([*arguments]) == 2

@@ -33,7 +33,7 @@ _OWN = {"cube+_gt.txt": ("Cube+", 1707), "cube_gt.txt": ("Cube", 1365)}
 """Name and number of images by the file of ground truths; arXiv:1712.00436."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class CubePlusScene(PeakScene):
     """An image of Cube or Cube+."""
 
@@ -59,7 +59,7 @@ def is_cube_plus(folder: Folder) -> bool:
     return any(folder.has(name) for name in _OWN)
 
 
-def open_cube_plus(place: str, options: DataOptions) -> SceneSet:
+def open_cube_plus(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
     """Return Cube+ or Cube; images are read when they are used.
 
     Raises
@@ -67,7 +67,7 @@ def open_cube_plus(place: str, options: DataOptions) -> SceneSet:
     FormatError
         The ground truth is missing or damaged, or images are missing or too many.
     """
-    folder = Folder(Path(place))
+    folder = listed or Folder(Path(place))
     file = next((name for name in _OWN if folder.has(name)), None)
     if file is None:
         raise FormatError(f"{place} is no copy of Cube+: it has no cube+_gt.txt; fetch it from the data set's page")

@@ -42,7 +42,7 @@ _WHITE = "MakerNotes:NormalWhiteLevel"
 _SPLITS = ("train", "test")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class CubePlusPlusScene(PeakScene):
     """An image of Cube++ or SimpleCube++.
 
@@ -84,7 +84,7 @@ def is_simple_cube(folder: Folder) -> bool:
     return any(_is_part(folder.folders[split]) for split in _SPLITS if split in folder.folders)
 
 
-def open_cube_plus_plus(place: str, options: DataOptions) -> SceneSet:
+def open_cube_plus_plus(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
     """Return Cube++; images are read when they are used.
 
     Raises
@@ -94,7 +94,7 @@ def open_cube_plus_plus(place: str, options: DataOptions) -> SceneSet:
     FormatError
         A table is missing or damaged, or images are missing or too many.
     """
-    folder = Folder(Path(place))
+    folder = listed or Folder(Path(place))
     truth = choose(options.truth, _TRUTHS, "truth", place) or "mean"
     lights: dict[str, Light] = {}
     names: list[str] = []
@@ -141,7 +141,7 @@ def open_cube_plus_plus(place: str, options: DataOptions) -> SceneSet:
     )
 
 
-def open_simple_cube(place: str, options: DataOptions) -> SceneSet:
+def open_simple_cube(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
     """Return SimpleCube++, or its part `train` or `test`; images are read when they are used.
 
     Raises
@@ -151,7 +151,7 @@ def open_simple_cube(place: str, options: DataOptions) -> SceneSet:
     FormatError
         A table is missing or damaged, or images are missing or too many.
     """
-    folder = Folder(Path(place))
+    folder = listed or Folder(Path(place))
     splits = [folder.folders[name] for name in _SPLITS if name in folder.folders and _is_part(folder.folders[name])]
     if _is_part(folder):
         splits = [folder]

@@ -70,7 +70,7 @@ behind the number of their row."""
 _KNOWN = frozenset(NAMES)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class MacbethScene(RawScene):
     """An image with its ColorChecker.
 
@@ -111,7 +111,7 @@ def is_gehler_shi(folder: Folder) -> bool:
     )
 
 
-def open_gehler_shi(place: str, options: DataOptions) -> SceneSet:
+def open_gehler_shi(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
     """Return the data set, or one camera of it; images are read when they are used.
 
     Raises
@@ -121,7 +121,7 @@ def open_gehler_shi(place: str, options: DataOptions) -> SceneSet:
     FormatError
         A file is damaged, or images or corners are missing or too many.
     """
-    folder = Folder(Path(place))
+    folder = listed or Folder(Path(place))
     places = list(folder.within(_DEPTH))
     truth = choose(options.truth, _TRUTHS, "truth", place) or "recommended"
     path, lights = _read_truth(places, truth, place)

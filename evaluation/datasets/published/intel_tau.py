@@ -40,7 +40,7 @@ def is_intel_tau(folder: Folder) -> bool:
     return bool(_cameras(folder))
 
 
-def open_intel_tau(place: str, options: DataOptions) -> SceneSet:
+def open_intel_tau(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
     """Return the images, or those of a camera or a part; images and lights are read when they are used.
 
     Raises
@@ -50,7 +50,7 @@ def open_intel_tau(place: str, options: DataOptions) -> SceneSet:
     FormatError
         Images or lights are missing or too many.
     """
-    folder = Folder(Path(place))
+    folder = listed or Folder(Path(place))
     cameras = _cameras(folder)
     if not cameras:
         raise FormatError(f"{place} is no copy of INTEL-TAU: no folder has {', '.join(SUBSETS)}; unpack a camera there")

@@ -47,7 +47,7 @@ _IMAGE = re.compile(r"(?P<place>.+)_(?P<lights>[123]{1,3})\.tiff?")
 _RAW = (".dng", ".nef", ".arw")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class LsmiScene(RawScene):
     """An image under one light.
 
@@ -79,7 +79,7 @@ class LsmiScene(RawScene):
         return mask
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class LsmiMixedScene(LsmiScene):
     """An image under two or three lights; `light` is not used.
 
@@ -99,10 +99,11 @@ class LsmiMixedScene(LsmiScene):
 
     @property
     def truth(self) -> npt.NDArray[np.float64]:
-        """The light (3,) float64, r + g + b = 1: the mean over the pixels whose lights are known; read once."""
+        """The light (3,) float64, r + g + b = 1: the mean of the pixels' lights, where they are known; read once."""
         if "" not in self._means:
-            lights = self.read_truth_map().reshape(-1, 3)
-            self._means[""] = lights[np.isfinite(lights[:, 0])].mean(axis=0, dtype=np.float64)
+            weights = self.read_weights().reshape(-1, len(self.several))
+            mean = weights[np.isfinite(weights[:, 0])].mean(axis=0, dtype=np.float64) @ self.lights
+            self._means[""] = mean / mean.sum()
         return self._means[""]
 
     @property
@@ -147,7 +148,7 @@ def is_lsmi(folder: Folder) -> bool:
     return bool(_cameras(folder))
 
 
-def open_lsmi(place: str, options: DataOptions) -> SceneSet:
+def open_lsmi(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
     """Return the images of all cameras or of one, of all parts or of one; they are read when they are used.
 
     `options.subset` is a part, "train", "val" or "test", or a number of lights, "single" or "mixed", or both:
@@ -160,7 +161,7 @@ def open_lsmi(place: str, options: DataOptions) -> SceneSet:
     FormatError
         A file is missing, or meta.json or split.json is damaged.
     """
-    folder = Folder(Path(place))
+    folder = listed or Folder(Path(place))
     cameras = _cameras(folder)
     if not cameras:
         raise FormatError(f"{place} is no copy of LSMI: it has no meta.json beside split.json; name a camera's folder")

@@ -1,4 +1,4 @@
-"""NUS 8 cameras: some 230 images each of the same scenes with eight cameras, 1853 in all, a chart in each.
+"""NUS 8 cameras: 1736 images of the same scenes with eight cameras, a chart in each; a ninth, NikonD40, has 117 more.
 
     CAMERA/CAMERA_gt.mat      groundtruth_illuminants (N, 3), darkness_level, saturation_level, CC_coords (N, 4),
                               all_image_names (N,)
@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -31,9 +31,21 @@ from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError
 
 _ENDING = "_gt.mat"
+_PUBLISHED: Final = {
+    "Canon1DsMkIII": 259,
+    "Canon600D": 200,
+    "FujifilmXM1": 196,
+    "NikonD5200": 200,
+    "OlympusEPL6": 208,
+    "PanasonicGX1": 203,
+    "SamsungNX2000": 202,
+    "SonyA57": 268,
+    "NikonD40": 117,
+}
+"""Images of each camera, as the list of ground truths in github.com/TheZino/COCOA has them."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ChartScene(RawScene):
     """An image with the box of its chart.
 
@@ -68,7 +80,7 @@ def is_nus8(folder: Folder) -> bool:
     return any(True for _ in _tables(folder))
 
 
-def open_nus8(place: str, options: DataOptions) -> SceneSet:
+def open_nus8(place: str, options: DataOptions, listed: Folder | None = None) -> SceneSet:
     """Return the images of all cameras in a folder, or of one; they are read when they are used.
 
     Raises
@@ -78,7 +90,7 @@ def open_nus8(place: str, options: DataOptions) -> SceneSet:
     FormatError
         A .mat file is missing or damaged, or images are missing or too many.
     """
-    folder = Folder(Path(place))
+    folder = listed or Folder(Path(place))
     tables = {path.name[: -len(_ENDING)]: path for path in _tables(folder)}
     if not tables:
         raise FormatError(f"{place} has no CAMERA{_ENDING}, expected one a camera; fetch GROUNDTRUTH from its page")
@@ -90,7 +102,9 @@ def open_nus8(place: str, options: DataOptions) -> SceneSet:
         if camera in (None, name):
             found, note, level = _open_camera(folder, name, path, options)
             scenes.extend(found)
-            notes.append(f"{name} {note}")
+            published = _PUBLISHED.get(name, len(found))
+            of = "" if len(found) == published else f" (published: {published})"
+            notes.append(f"{name} {note}{of}")
             levels.append(f"{name} {level}")
     black = "darkness_level of the camera's .mat, subtracted: " + ", ".join(level.split("/")[0] for level in levels)
     white = "from saturation_level of the camera's .mat: " + ", ".join(

@@ -42,7 +42,7 @@ class Peaks:
         return self._known[path]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class PeakScene(RawScene):
     """An image whose saturation is taken from its own largest value unless `white` is given.
 

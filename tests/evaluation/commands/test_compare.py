@@ -100,3 +100,25 @@ def test_runs_without_a_common_method(runs: tuple[str, str], capsys: pytest.Capt
     path.write_text(path.read_text().replace(",1,2,1,", ",1,1,1,"))
     assert main(["compare", *runs, "--method", "A=C"]) == 2
     assert "ground truths of im 0 in A (first) and C (second) are 19.47 degrees apart" in capsys.readouterr().err
+
+
+def test_runs_of_the_command_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("one", "two"):
+        wish = ("--method", "white-patch", "--method", "gray-world", "--out", str(tmp_path / name))
+        assert main(["run", str(dataset), *wish]) == 0
+    capsys.readouterr()
+    assert main(["compare", str(tmp_path / "one"), str(tmp_path / "two")]) == 0
+    printed = capsys.readouterr().out
+    assert "White-Patch (one) errs less than White-Patch (two) on 0 of 16 images, more on 0, the same on 16" in printed
+    assert "ground truths" not in printed
+    assert main(["compare", str(tmp_path / "one")]) == 0
+    # Random codes: white is in every image, and grey on average only by chance.
+    assert "White-Patch errs less than Gray-world on 16 of 16 images" in capsys.readouterr().out
+
+
+def test_images_without_a_light_are_told(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    path = Path(runs[0]) / "errors.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:-1], lines[-1][:-1] + "1"]) + "\n")
+    assert main(["compare", runs[0]]) == 0
+    assert f"B <i> of {runs[0]} gave no light for 1 of 30 images; grey stands in" in capsys.readouterr().out

@@ -174,6 +174,11 @@ def test_a_truncated_image_is_an_error_with_its_name(name: str, place_of: Place,
     assert path.name in str(told.value)
 
 
+def test_the_reference_describes_every_layout() -> None:
+    told = (Path(__file__).parents[3] / "docs" / "reference" / "datasets.md").read_text(encoding="utf-8")
+    assert [name for name in LAYOUTS if f"| `{name}` |" not in told] == []
+
+
 def test_only_lsmi_has_several_lights(place_of: Place) -> None:
     for name, copy in COPIES.items():
         data = open_scenes(place_of(name), options=options_of(copy))

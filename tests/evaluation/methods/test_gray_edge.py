@@ -56,7 +56,7 @@ def photograph(height: int, width: int) -> npt.NDArray[np.uint16]:
     waves = [2 + np.sin(x / (17 + 5 * one)) + np.cos(y / (23 - 4 * one)) for one in range(3)]
     edges = 1 + 2.0 * ((x // 61 + y // 47) % 3 == 0)
     image = np.stack(waves, axis=-1) * edges[..., None] * np.array([400.0, 1000.0, 600.0])
-    noise = np.clip(random.normal(0, 12, image.shape), -50, 50)
+    noise = np.asarray(np.clip(random.normal(0, 12, (height, width, 3)), -50, 50), dtype=np.float64)
     return np.asarray(image + noise + 60, dtype=np.uint16)
 
 

@@ -72,8 +72,8 @@ def test_the_mean_is_over_pixels_of_unlike_lights(copy: Path) -> None:
     shares[:, :5, 0] = shares[:, 5:, 1] = 1
     np.save(copy / "sony" / "Place1" / "Place1_12.npy", shares)
     scene = open_scenes(copy).scenes[1]
-    half = (np.array([0.5, 1, 0.5]) / 2 + np.array([2, 1, 1]) / 4) / 2
-    np.testing.assert_allclose(scene.truth, half, rtol=1e-6)
+    # Half of the pixels have (.5, 1, .5), half (2, 1, 1): the mean is (1.25, 1, .75).
+    np.testing.assert_allclose(scene.truth, np.array([1.25, 1, 0.75]) / 3, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,7 @@ def test_levels_mask_and_truth_of_each_camera(copy: Path) -> None:
     assert column.sum() == 8
     assert column[:, 0].all()
     assert data.treatment["black level"].endswith("NikonD5200 0, SonyA57 128")
+    assert data.treatment["images"] == "NikonD5200 2 (published: 200), SonyA57 2 (published: 268)"
     assert data.treatment["saturation"].endswith("NikonD5200 15892, SonyA57 4093")
 
 

@@ -1,0 +1,103 @@
+"""`evaluate describe`: what a data set is made of, beside another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from evaluation.commands.data_options import DataReading, with_data_options
+from foundation.console import EXIT_CODES
+
+if TYPE_CHECKING:
+    from evaluation.experiments.describing import DataDescription
+
+HELP = f"""Describe the images and lights of a data set, and hold them beside another's: how real is what was generated.
+
+Reads DATA, a data set of any layout that evaluate run reads, or a STATS.json written by --out. Figures: luminance
+percentiles, exposure, clipping, chroma spread, near-grey share, grey-world offsets, edges, noise, and the distribution
+of the lights. Scenes are seen at 64 x 64 cells at most and with the light divided out, so sets of different sizes and
+units compare. Masked and clipped pixels are left out. The options of reading are DATA's: where the other set needs some
+too, write its STATS.json first and give that to --against.
+
+Prints tables, and with --against one sentence for each figure: within 25 % or not. Writes nothing unless asked with
+--out or --report.
+
+{EXIT_CODES}
+"""
+
+
+@with_data_options
+def describe(
+    data: Annotated[
+        str,
+        typer.Argument(metavar="DATA", help="Folder, file or URL of it, or a STATS.json.", show_default=False),
+    ],
+    against: Annotated[
+        str | None,
+        typer.Option(metavar="DATA", help="Data set, or STATS.json, to hold it beside.", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="STATS.json", help="Write DATA's description to this new file.", show_default=False),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="PAGE.html", help="Write a page with figures to this new file.", show_default=False),
+    ] = None,
+    against_layout: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Layout of the data set beside it.", show_default=False)
+    ] = None,
+    cells: Annotated[int, typer.Option(help="Cells a side that images are reduced to; 0: none.", min=0)] = 64,
+    seed: Annotated[int, typer.Option(help="Of the bootstrap.", min=0)] = 0,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False)
+    ] = None,
+    *,
+    reading: DataReading,
+) -> None:
+    """Describe a data set."""
+    from evaluation.experiments.describing import report as reporting
+    from evaluation.experiments.describing.against import compare_figures, sentence
+    from evaluation.experiments.describing.statistics_json import statistics_to_json
+    from evaluation.reports.terminal import print_table
+    from foundation.files import require_free_file, write_whole
+    from foundation.processors import processor_count
+
+    for path, what in ((out, "the statistics"), (report, "the page")):
+        if path is not None:
+            require_free_file(path, what)
+    threads = workers or processor_count()
+    one = _described(data, reading, cells, threads)
+    other = None if against is None else _described(against, DataReading(against_layout), cells, threads)
+    if other is None:
+        print_table(reporting.figures_table(one))
+    print_table(reporting.lights_table([one] if other is None else [one, other]))
+    if other is not None:
+        for note in reporting.seen_notes(one, other):
+            print(note)
+        compared = compare_figures(one, other, seed)
+        for table in reporting.compared_tables(compared, (one.name, other.name)):
+            print_table(table)
+        for made in compared:
+            print(sentence(made, (one.name, other.name)))
+    if out is not None:
+        write_whole(out, statistics_to_json(one))
+    if report is not None:
+        write_whole(report, reporting.describe_page(one, other, seed))
+
+
+def _described(place: str, reading: DataReading, cells: int, workers: int) -> DataDescription:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from evaluation.experiments.describing import describe
+    from evaluation.experiments.describing.statistics_json import read_statistics
+
+    if reading.layout is None and place.endswith(".json") and Path(place).is_file():
+        return read_statistics(place)
+    data = reading.open(place)
+    with Progress(console=Console(stderr=True)) as progress:
+        task = progress.add_task(data.name, total=len(data.scenes))
+        return describe(data, cells, workers, lambda: progress.advance(task))

@@ -1,0 +1,355 @@
+"""`evaluate paper`: the experiments of the paper's section 4, a command each, with its numbers beside ours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from foundation.console import EXIT_CODES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator
+
+    from evaluation.experiments.paper.reporting import PaperReport
+    from generator import Lut
+    from generator.pictures.sources import Source
+
+HELP = f"""Repeat the experiments of the paper's section 4.
+
+N. Banic et al., "CroP: Color constancy benchmark dataset generator". Every command prints its numbers, the paper's
+beside them where it has some, and with --out writes a page, CSV, LaTeX and figures to a new folder. docs/paper.md holds
+all of them as made with full tables of both cameras.
+
+{EXIT_CODES}
+"""
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
+
+Luts = Annotated[
+    list[Path], typer.Argument(metavar="LUT...", help="Tables made by build-lut, a folder each.", show_default=False)
+]
+Kind = Annotated[Literal["reproduction", "recovery"], typer.Option(help="Angular error to print.")]
+Out = Annotated[
+    Path | None, typer.Option(metavar="FOLDER", help="Write page, tables and figures here.", show_default=False)
+]
+Seed = Annotated[int, typer.Option(metavar="N", help="Of all that is drawn at random.", min=0)]
+Layout = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Layout of DATA. \\[default: by what it looks like]", show_default=False),
+]
+Workers = Annotated[
+    int | None, typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False)
+]
+
+
+_TABLE1 = f"""Plain methods on eight generated data sets (table 1).
+
+Reads LUTs, the pictures and the ground truths. Generates, in memory, two sets of scenes, the pictures and as many of
+random codes, under two choices of lights for each LUT: the nearest to the ground truths, and lights drawn at random.
+Prints each method's six numbers for each of the data sets, the paper's below them. Writes nothing unless asked with
+--out.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("table1", help=_TABLE1)
+def table1(
+    luts: Luts,
+    pictures: Annotated[
+        str,
+        typer.Option(
+            metavar="PLACE",
+            help="The scenes: a folder of photographs, or a real data set, whose raw images are developed to sRGB "
+            "with their ground truths.",
+            show_default=False,
+        ),
+    ],
+    lights_like: Annotated[
+        str,
+        typer.Option(
+            metavar="TRUTHS",
+            help="Ground truths whose nearest lights are one choice of lights: FILE.csv, FILE.csv#START for the rows "
+            "whose names begin so, or a data set.",
+            show_default=False,
+        ),
+    ],
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Camera of the data set in --pictures, for its colour matrix: Canon EOS-1Ds Mark III, "
+            "Canon EOS 550D, Canon EOS 600D. \\[default: no matrix]",
+            show_default=False,
+        ),
+    ] = None,
+    side: Annotated[int, typer.Option(metavar="PX", help="Longest side of every image.", min=1, max=65535)] = 512,
+    sizes: Annotated[
+        str, typer.Option(metavar="LIST", help="Further sides, px, between commas, to show what they change.")
+    ] = "",
+    hot: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST",
+            help="Hot photosites in a million that a table is taken to have, between commas, to show what they do to "
+            "White-Patch.",
+        ),
+    ] = "",
+    error: Kind = "reproduction",
+    seed: Seed = 0,
+    out: Out = None,
+    workers: Workers = None,
+) -> None:
+    """Run plain methods on eight generated data sets."""
+    from evaluation.experiments.paper.hot import hot_rows
+    from evaluation.experiments.paper.reporting import table1_report
+    from evaluation.experiments.paper.table1 import settings, size_dependence
+    from evaluation.experiments.paper.table1 import table1 as run
+    from evaluation.experiments.paper.truths import read_truths
+    from foundation.processors import processor_count
+
+    sides, shares = [int(side) for side in _numbers(sizes, "side of an image, px", 65535)], _numbers(hot, "share", 1e6)
+    _require_free(out)
+    opened = _open(luts)
+    scenes, says = _pictures(pictures, camera)
+    truths = read_truths(lights_like)
+    chosen = settings(opened, scenes, truths.lights, side, seed)
+    threads = workers or processor_count()
+    with _progress(sum(len(part.scenes) for part in chosen)) as step:
+        blocks = run(chosen, threads, step)
+    found = size_dependence(opened, scenes, truths.lights, sides, seed, threads)
+    raised = hot_rows(chosen, shares, seed, threads)
+    conditions = (
+        f"Pictures: {says}. Images: longest side {side} px. Lights like those of {truths.name}. Seed {seed}.",
+        f"Tables: {'; '.join(f'{lut.provenance.camera}, {len(lut.white)} lights, {lut.folder}' for lut in opened)}.",
+    )
+    _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out)
+
+
+_TABLE2 = f"""Learned methods trained on real and on generated images (table 2).
+
+Reads the real DATA, in the paper Cube+, and a generated data set. Trains each method on both, by cross-validation on
+the real one, and tests on the real one. The paper's numbers stand beside those of Cube+ only; on any data set
+`evaluate transfer` compares more trainings. Writes nothing unless asked with --out.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("table2", help=_TABLE2)
+def table2(
+    data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set; the paper's is Cube+.")],
+    generated: Annotated[
+        str, typer.Option(metavar="PLACE", help="Data set made by generate, to train on.", show_default=False)
+    ],
+    methods: Annotated[
+        str, typer.Option(metavar="LIST", help="Learned methods, between commas.")
+    ] = "smart-color-cat,regression-trees,color-beaver",
+    folds: Annotated[str, typer.Option(metavar="N|FILE", help="Folds of the cross-validation, or their file.")] = "3",
+    layout: Layout = None,
+    error: Kind = "reproduction",
+    seed: Seed = 0,
+    out: Out = None,
+    workers: Workers = None,
+) -> None:
+    """Train learned methods on real and on generated images."""
+    from evaluation.datasets import open_scenes
+    from evaluation.experiments.folds import draw_folds, read_folds
+    from evaluation.experiments.paper.reporting import table2_report
+    from evaluation.experiments.paper.table2 import table2 as run
+    from evaluation.experiments.paper.table2 import table2_tables
+    from evaluation.learning.standard import standard_learners
+    from foundation.errors import InputError
+    from foundation.processors import processor_count
+
+    _require_free(out)
+    names = [name.strip() for name in methods.split(",") if name.strip()]
+    known = standard_learners()
+    for name in names:
+        if name not in known:
+            raise InputError(f"{name!r} is no learned method; the methods are {', '.join(known)}")
+    learners = {name: known[name] for name in names}
+    real, made = open_scenes(data, layout), open_scenes(generated)
+    count = len(real.scenes)
+    if folds.isdigit():
+        drawn = draw_folds(count, int(folds), seed)
+    else:
+        drawn = read_folds(Path(folds), [scene.name for scene in real.scenes])
+    with _progress(2 * count) as step:
+        found = run(real.scenes, made.scenes, learners, drawn, seed, workers or processor_count(), step)
+    is_cube = real.layout == "cube-plus"
+    conditions = (
+        f"Real: {real.name}, {count} images, {int(drawn.max()) + 1} folds. Generated: {made.name}, {len(made.scenes)} "
+        f"images. Seed {seed}. {error.capitalize()} error, degrees.",
+        *(() if is_cube else ("The paper's table is of Cube+, so only its ratios stand beside these.",)),
+    )
+    _finish(table2_report(table2_tables(found, error, real.name, is_cube), conditions), conditions, out)
+
+
+_BITS = f"""Influence of colour reduction on methods (section 4.2).
+
+Reads DATA. Its linear images are tone mapped to 8 bits by the Flash operator, 0 to 7 bits of each code set to zero, and
+taken back to linear; each method's numbers are printed for every number of bits and for the images as they are. Writes
+nothing unless asked with --out.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("bits", help=_BITS)
+def bits(
+    data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images; the paper's is NUS C1.")],
+    sigma: Annotated[
+        float, typer.Option(metavar="PX", help="Scale of Gray-Edge; 6 is usual for images of full size.", min=0.1)
+    ] = 6.0,
+    layout: Layout = None,
+    error: Kind = "reproduction",
+    out: Out = None,
+    workers: Workers = None,
+) -> None:
+    """Run methods on images whose colours were reduced."""
+    from evaluation.datasets import open_scenes
+    from evaluation.experiments.paper.bits import bits_methods, bits_removed
+    from evaluation.experiments.paper.reporting import bits_report
+    from foundation.processors import processor_count
+
+    _require_free(out)
+    opened = open_scenes(data, layout)
+    with _progress(len(opened.scenes)) as step:
+        found = bits_removed(opened.scenes, bits_methods(sigma), workers=workers or processor_count(), on_scene=step)
+    conditions = (f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px.",)
+    _finish(bits_report(found, error, opened.name, conditions), conditions, out)
+
+
+_REDUCTION = f"""One picture with 0 to 7 bits of each code set to zero (a figure of section 4.2).
+
+Reads PICTURE. Prints how many colours are left and how far from the picture. Writes nothing unless asked with --out;
+the figure is there only.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("reduction", help=_REDUCTION)
+def reduction(
+    picture: Annotated[Path, typer.Argument(metavar="PICTURE", help="Any picture file.", show_default=False)],
+    out: Out = None,
+) -> None:
+    """Show a picture with its colours reduced."""
+    from evaluation.experiments.paper.reporting import reduction_report
+    from generator import read_picture
+
+    _require_free(out)
+    _finish(reduction_report(read_picture(picture), picture.name), (), out)
+
+
+_CHROMATICITIES = f"""Chromaticities of tables' lights as their cameras see them (figures of section 3.3).
+
+Reads LUTs, and ground truths of real data sets. Prints how near the lights come to those. Writes nothing unless asked
+with --out; the figure is there only.
+
+{EXIT_CODES}
+"""
+
+
+@app.command("chromaticities", help=_CHROMATICITIES)
+def chromaticities(
+    luts: Luts,
+    truths: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TRUTHS",
+            help="Ground truths to show beside the lights: FILE.csv, FILE.csv#START, or a data set. Repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Out = None,
+) -> None:
+    """Show the chromaticities of tables' lights."""
+    from evaluation.experiments.paper.reporting import chromaticities_report
+    from evaluation.experiments.paper.truths import read_truths
+
+    _require_free(out)
+    report = chromaticities_report(_open(luts), [read_truths(place) for place in truths or ()])
+    _finish(report, (), out)
+    if out is None:
+        print("Name a folder with --out for the figure.")
+
+
+def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None) -> None:
+    """Print the tables and write the folder, if one was named."""
+    from evaluation.experiments.paper.reporting import write_report
+    from evaluation.reports.terminal import print_table
+
+    for line in conditions:
+        print(line)
+    for table in report.tables:
+        print()
+        print_table(table)
+    if out is not None:
+        write_report(report, out)
+        print(f"\n{out / 'report.html'}")
+
+
+def _open(folders: Sequence[Path]) -> list[Lut]:
+    from generator import open_lut
+
+    return [open_lut(folder) for folder in folders]
+
+
+def _pictures(place: str, camera: str | None) -> tuple[Sequence[Source], str]:
+    """Return the source pictures at a place, and what was done to get them."""
+    from evaluation.datasets import open_scenes
+    from evaluation.datasets.opening import layout_of
+    from evaluation.experiments.paper.developing import developed
+    from foundation.errors import FormatError, InputError
+    from generator import find_pictures
+
+    try:
+        layout = layout_of(place)
+    except FormatError:
+        layout = None
+    if layout is None:
+        if camera is not None:
+            raise InputError(f"--camera {camera} is for a data set of raw images; {place} is none")
+        found = find_pictures(place)
+        return found, f"{len(found)} of {place}"
+    if layout == "generated":
+        raise InputError(f"{place} was made by generate; name photographs, or a data set of real raw images")
+    data = open_scenes(place, layout)
+    matrix = f"with the colour matrix of {camera}" if camera else "without a colour matrix"
+    return developed(data, camera), f"{len(data.scenes)} of {data.name}, developed to sRGB {matrix}"
+
+
+def _numbers(text: str, what: str, most: float) -> list[float]:
+    """Return the whole numbers from 1 to `most` between commas."""
+    from foundation.errors import InputError
+
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    for part in parts:
+        if not part.isdigit() or not 1 <= int(part) <= most:
+            raise InputError(f"{part!r} is no {what}; write whole numbers from 1 to {most:g} between commas")
+    return [float(part) for part in parts]
+
+
+def _require_free(out: Path | None) -> None:
+    """Refuse a folder that is taken before the work begins."""
+    from foundation.files import require_free
+
+    if out is not None:
+        require_free(out, "the report")
+
+
+@contextmanager
+def _progress(total: int) -> Generator[Callable[[], None]]:
+    """Show a bar of so many images, and yield what moves it on by one."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True)) as progress:
+        task: Any = progress.add_task("images", total=total)
+        yield lambda: progress.advance(task)

@@ -1,0 +1,216 @@
+"""`evaluate transfer`: what generated images are worth as training data for real ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from evaluation.commands.data_options import DataReading, with_data_options
+from foundation.console import EXIT_CODES
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from evaluation.experiments.transfer.material import AnyLearner
+    from evaluation.experiments.transfer.plan import TransferPlan
+    from evaluation.methods.method import Method
+    from evaluation.scene import SceneSet
+
+_FOLDS = "3"
+"""Folds of the field's tables, on NUS and on Cube+."""
+
+_ALIKE = 2.0
+"""Ratio of sizes from which the reader is told: learned methods reduce images by up to 2 themselves."""
+
+HELP = f"""Train learned methods on generated images and test them on real ones.
+
+Trains each method on each data set of --train and tests it on --test, beside real cross-validation of the same method,
+the constant light (median of the training lights), and statistics methods. With --naive also trained without a table:
+the same pictures, linear sRGB times the same lights, with and without the camera's colour matrix. Prints mean, median,
+trimean, best and worst quarter, their bootstrap intervals, and their ratios to real cross-validation, paired by image.
+Training sets that share pictures with the test set, by name or content, are refused. Writes nothing unless asked with
+--out: results.csv, errors.csv (each image), folds, tables.tex, report.html and run.json.
+
+{EXIT_CODES}
+"""
+
+
+@with_data_options
+def transfer(
+    train: Annotated[
+        list[str],
+        typer.Option(metavar="GENERATED", help="Data set to train on; may be repeated.", show_default=False),
+    ],
+    test: Annotated[str, typer.Option(metavar="REAL", help="Data set to test on.", show_default=False)],
+    methods: Annotated[str, typer.Option(metavar="LIST", help="Learned methods between commas, or all.")] = "all",
+    statistics: Annotated[
+        str, typer.Option(metavar="LIST", help="Statistics methods for reference between commas, all or none.")
+    ] = "gray-world,shades-of-gray,gray-edge-1",
+    folds: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|FILE",
+            help="Folds of real cross-validation: a number, or a CSV file image,fold. \\[default: those of the "
+            f"data set's authors, else {_FOLDS}]",
+            show_default=False,
+        ),
+    ] = None,
+    naive: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PICTURES", help="Folder of the pictures that --train was generated from.", show_default=False
+        ),
+    ] = None,
+    matrix: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CAMERA|FILE|none",
+            help="Colour matrix of the naive baseline: of a camera, or a file of 3 x 3 numbers, linear sRGB to camera. "
+            "\\[default: the camera of the table]",
+            show_default=False,
+        ),
+    ] = None,
+    images: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Training images of every generated and naive row. \\[default: all of the smallest set]",
+            min=1,
+            show_default=False,
+        ),
+    ] = None,
+    seeds: Annotated[
+        int, typer.Option(metavar="K", help="Seeds of learners, training images and drawn folds.", min=1)
+    ] = 1,
+    side: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PX",
+            help="Make all images this small first, averaging areas, so that training and test images are alike.",
+            min=1,
+            show_default=False,
+        ),
+    ] = None,
+    shared: Annotated[
+        Literal["refuse", "leave-out", "keep"], typer.Option(help="Training images that share a picture with the test.")
+    ] = "refuse",
+    error: Annotated[
+        Literal["reproduction", "recovery"], typer.Option(help="Angular error to sum up.")
+    ] = "reproduction",
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Write the results to this new folder.", show_default=False)
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False),
+    ] = None,
+    *,
+    reading: DataReading,
+) -> None:
+    """Train on generated data, test on real data; options of reading are those of the test set."""
+    from dataclasses import asdict, replace
+
+    from evaluation.datasets import open_scenes
+    from evaluation.experiments.transfer.figures import figures_of
+    from evaluation.experiments.transfer.outcome import TransferOutcome, save_outcome
+    from evaluation.experiments.transfer.plan import plan_transfer
+    from evaluation.experiments.transfer.rows import count_images
+    from evaluation.experiments.transfer.rows import transfer as run_transfer
+    from evaluation.reports.terminal import print_table
+    from evaluation.results.method_records import describe_method
+    from foundation.console import orderly_end, progress
+    from foundation.files import require_free
+    from foundation.processors import processor_count
+
+    if out is not None:
+        require_free(out, "the results")
+    threads = workers or processor_count()
+    learners = _learners(methods)
+    references = _references(statistics)
+    tested = reading.open(test)
+    plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared)
+    if told := _sizes(tested, plan, side):
+        plan = replace(plan, notes=(*plan.notes, told))
+    drawn = _folds(folds, tested, seeds)
+    smallest = min(len(some.scenes) for some in plan.training)
+    wanted = smallest if images is None else images
+    count = count_images(tested.scenes, plan.training, len(drawn), wanted)
+    with orderly_end(), progress("images") as advance:
+        steps = iter(range(1, count + 1))
+        rows = run_transfer(
+            *(tested.scenes, plan.training, learners, drawn, wanted, references),
+            *(side, threads, lambda: advance(next(steps), count)),
+        )
+    figures = figures_of(rows, error)
+    settings: dict[str, Any] = {
+        "methods": [describe_method(learner) for learner in learners],
+        "statistics": [describe_method(method) for method in references],
+        "folds": folds or ("the data set's own" if tested.folds is not None else _FOLDS),
+        "matrix": matrix,
+        "images": wanted,
+        "seeds": list(range(seeds)),
+        "side": side,
+        "shared": shared,
+        "error": error,
+        "reading": asdict(reading),
+    }
+    outcome = TransferOutcome(tested, plan, rows, figures, drawn, settings)
+    for table in outcome.tables():
+        print_table(table)
+        print()
+    for note in plan.notes:
+        print(note)
+    if out is not None:
+        save_outcome(outcome, out)
+
+
+def _learners(text: str) -> list[AnyLearner]:
+    """Return the learned methods of a list, built-in ones or classes of the user's own, and the constant light."""
+    from evaluation.commands.choosing import choose_learners
+    from evaluation.learning.constant_light import ConstantLight
+    from foundation.errors import InputError
+
+    constant = ConstantLight()
+    chosen = [each for each in choose_learners(text.split(",")) if each.name != constant.name]
+    titles = [each.name for each in chosen]
+    for title in titles:
+        if titles.count(title) > 1:
+            raise InputError(f"two methods are called {title}; give one another name: names head the rows")
+    return [*chosen, constant]
+
+
+def _references(text: str) -> list[Method]:
+    from evaluation.commands.choosing import choose_methods
+
+    return [] if text.strip().lower() == "none" else choose_methods(text.split(","))
+
+
+def _folds(text: str | None, test: SceneSet, seeds: int) -> tuple[npt.NDArray[np.int64], ...]:
+    """Return the folds of each seed: drawn by it, or the same for all where they are given."""
+    import numpy as np
+
+    from evaluation.experiments.folds import draw_folds, group_of, read_folds
+
+    if text is None and test.folds is not None:
+        return (np.array(test.folds, dtype=np.int64),) * seeds
+    wanted = text or _FOLDS
+    if wanted.isdecimal():
+        groups = [group_of(scene) for scene in test.scenes]
+        return tuple(draw_folds(len(groups), int(wanted), seed, groups) for seed in range(seeds))
+    return (read_folds(Path(wanted), [scene.name for scene in test.scenes]),) * seeds
+
+
+def _sizes(test: SceneSet, plan: TransferPlan, side: int | None) -> str:
+    """Return what the reader is told of the sizes of images; nothing where they are alike."""
+    if side is not None:
+        return f"All images were made small to at most {side} px by averaging areas without clipped and masked pixels"
+    sizes = [max(scenes[0].read()[0].shape) for scenes in (test.scenes, plan.training[0].scenes)]
+    if max(sizes) <= _ALIKE * min(sizes):
+        return ""
+    return (
+        f"Training images have sides of up to {sizes[1]} px and test images of up to {sizes[0]} px: methods see detail "
+        f"and noise in one that the other lacks; --side {min(sizes)} makes them alike"
+    )

@@ -1,0 +1,184 @@
+"""Influence of colour reduction: linear images after bits of their sRGB codes were set to zero (section 4.2).
+
+Real linear images are tone mapped by Flash to codes of 8 bits, the lowest n bits of each code are set to zero, and the
+reversed operator takes them back to linear; then methods estimate their lights. Flash's k and scale are those of the
+image before (`generator.pictures.tonemap`), so that with n = 0 only the rounding to whole codes is left. Masked pixels
+have no say in k and scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.experiments.running import ordered_map, truths_of
+from evaluation.methods.gray_edge import GrayEdge
+from evaluation.methods.method import Method
+from evaluation.methods.pixels import usable
+from evaluation.methods.standard import standard_methods
+from evaluation.metrics import ErrorKind
+from evaluation.results.answers import SceneAnswer, read_light, results_of
+from evaluation.results.result import Result
+from evaluation.results.tables import Table
+from evaluation.scene import Image, Scene
+from foundation.errors import InputError
+from generator.pictures.tonemap import fit_flash
+
+BITS: Final = tuple(range(8))
+"""Numbers of bits set to zero, as in the paper's figure."""
+
+GRAY_EDGE_SIGMA: Final = 6.0
+"""Scale of Gray-Edge, px: that of its entry in the NUS tables, for images of full size."""
+
+
+def clear_bits(codes: npt.NDArray[np.uint8], bits: int) -> npt.NDArray[np.uint8]:
+    """Return codes (...) uint8 with their lowest `bits` bits, 0 … 8, set to zero.
+
+    Raises
+    ------
+    InputError
+        A code has no such number of bits.
+
+    Examples
+    --------
+    >>> clear_bits(np.array([7, 8, 200, 255], np.uint8), 3)
+    array([  0,   8, 200, 248], dtype=uint8)
+    """
+    if not 0 <= bits <= 8:
+        raise InputError(f"{bits} bits of a code of 8 were to be set to zero, expected 0 to 8")
+    return codes & np.uint8(0xFF << bits & 0xFF)
+
+
+def reduce_colours(
+    image: Image, bits: int | Sequence[int], mask: npt.NDArray[np.bool_] | None = None
+) -> list[npt.NDArray[np.float32]]:
+    """Return a linear image after `bits` bits of its tone-mapped codes were set to zero, for each of these numbers.
+
+    Parameters
+    ----------
+    image
+        (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0, any unit.
+    bits
+        How many, 0 … 8; or several such numbers.
+    mask
+        (H, W) bool, True where a pixel has no say in the operator.
+
+    Returns
+    -------
+    list
+        For each number (H, W, 3) float32, in units of the image's largest unmasked value.
+
+    Examples
+    --------
+    >>> wall = np.array([[[500.0, 1000.0, 700.0], [20.0, 30.0, 10.0]]])
+    >>> raw, coarse = reduce_colours(wall, (0, 6))
+    >>> raw.round(3)
+    array([[[0.5  , 1.   , 0.701],
+            [0.02 , 0.03 , 0.01 ]]], dtype=float32)
+    >>> coarse.round(3)
+    array([[[0.143, 0.349, 0.349],
+            [0.   , 0.023, 0.   ]]], dtype=float32)
+    """
+    counts = (bits,) if isinstance(bits, int) else tuple(bits)
+    values = np.asarray(image, dtype=np.float64)
+    seen = values.reshape(-1, 3) if mask is None else values[~mask]
+    largest = float(seen.max(initial=0.0))
+    if not largest:
+        return [np.zeros(values.shape, np.float32) for _ in counts]
+    operator = fit_flash(seen / largest)
+    codes = np.clip(np.rint(operator.apply(values / largest)), 0, 255).astype(np.uint8)
+    return [operator.invert(clear_bits(codes, count)).astype(np.float32) for count in counts]
+
+
+def bits_methods(sigma: float = GRAY_EDGE_SIGMA) -> tuple[Method, ...]:
+    """Return the methods of the paper's figure: Gray-world, Shades-of-Gray, Gray-Edge of order 1 at a scale in px."""
+    known = standard_methods()
+    edge = (
+        known["gray-edge-1"]
+        if sigma == GRAY_EDGE_SIGMA
+        else GrayEdge(f"1st-order Gray-Edge (σ={sigma:g})", 1, 1, sigma)
+    )
+    return (known["gray-world"], known["shades-of-gray"], edge)
+
+
+@dataclass(frozen=True, eq=False)
+class BitsResult:
+    """What methods made of a data set's images, as they are and after bits were set to zero.
+
+    Attributes
+    ----------
+    raw
+        One result a method, on the images as they are.
+    reduced
+        The same by the number of bits set to zero.
+    """
+
+    raw: tuple[Result, ...]
+    reduced: Mapping[int, tuple[Result, ...]]
+
+
+def bits_removed(
+    scenes: Sequence[Scene],
+    methods: Sequence[Method],
+    bits: Sequence[int] = BITS,
+    workers: int = 1,
+    on_scene: Callable[[], None] | None = None,
+) -> BitsResult:
+    """Return errors of methods on images with bits set to zero; each image is read once.
+
+    Parameters
+    ----------
+    scenes
+        Real linear images with their ground truths, at least one.
+    methods
+        At least one.
+    bits
+        Numbers of bits to set to zero, 0 … 8.
+    workers
+        Threads, one image each; no number depends on it.
+    on_scene
+        Called after each image, from the calling thread.
+
+    Raises
+    ------
+    InputError
+        There is no scene or no method.
+    """
+    truths = truths_of(scenes, methods)
+
+    def answers_for(scene: Scene) -> list[list[SceneAnswer]]:
+        image, mask = scene.read()
+        # Clipped pixels are known before the reduction only; they have their say in the operator, as in a camera.
+        left_out = ~usable(image, scene.saturation, mask, border=0)
+        versions: list[Image] = [image, *reduce_colours(image, bits, mask)]
+        return [[read_light(method.estimate(version, None, left_out)) for method in methods] for version in versions]
+
+    answers: list[list[list[SceneAnswer]]] = []
+    for given in ordered_map(answers_for, scenes, workers):
+        answers.append(given)
+        if on_scene:
+            on_scene()
+    names = [method.name for method in methods]
+    raw, *reduced = (
+        results_of(names, truths, [given[version] for given in answers]) for version in range(1 + len(bits))
+    )
+    return BitsResult(raw, dict(zip(bits, reduced, strict=True)))
+
+
+def bits_table(found: BitsResult, kind: ErrorKind, name: str) -> Table:
+    """Return the six numbers of every method for the images as they are and each number of bits."""
+    versions = {"as it is": found.raw, **{str(count): results for count, results in found.reduced.items()}}
+    return Table(
+        f"{name}: {kind} angular error after bits of the sRGB codes were set to zero, degrees",
+        ("Algorithm", "Bits set to zero", "Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg."),
+        tuple(
+            (results[place].method, label, *results[place].summary(kind).as_tuple())
+            for place in range(len(found.raw))
+            for label, results in versions.items()
+        ),
+        notes=("0 bits: rounded to codes of 8 bits and taken back, nothing set to zero.",),
+    )

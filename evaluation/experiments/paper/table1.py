@@ -1,0 +1,313 @@
+"""The paper's first table: plain methods on eight generated data sets (section 4.3).
+
+Two sets of scenes (pictures that are given, and pictures of random codes), two tables, two choices of lights (nearest
+to the ground truths of a real data set, and drawn from all of the table) make eight data sets. The paper names neither
+the size nor the number of its images, nor how many lights it drew. Ours: as many random scenes as pictures, squares of
+`side` px; pictures scaled to a longest side of `side` px; one light for each image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.experiments.paper.published import TABLE1, Cell
+from evaluation.experiments.paper.rendering import (
+    ChosenLights,
+    RenderedScene,
+    ScaledSource,
+    lights_at_random,
+    lights_like,
+    rendered,
+)
+from evaluation.experiments.running import evaluate
+from evaluation.methods.standard import standard_methods
+from evaluation.metrics import ErrorKind
+from evaluation.results.tables import Table
+from foundation.errors import InputError
+from generator.pictures.sources import Source, random_scenes
+
+if TYPE_CHECKING:
+    from evaluation.results.result import Result
+    from generator import Lut
+
+METHODS: Final = ("white-patch", "gray-world", "shades-of-gray")
+"""The methods of the table, by their names on the command line."""
+
+SIDE: Final = 512
+"""Side of an image, px; White-Patch takes the largest of so many noisy values, and its error grows with them."""
+
+SENSORS: Final[Mapping[str, str]] = {"Canon EOS 550D": "550D", "Canon EOS 6D Mark II": "6D"}
+"""The paper's names of its cameras, by those that tables have."""
+
+NUMBERS: Final = ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")
+"""Heads of the six numbers of a summary, as in the paper."""
+
+
+_HEAD: Final = ("scenes", "sensor", "illuminations", "images", "method", "error")
+"""What a row of numbers is about, in CSV."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """One of the eight data sets and what the methods made of it.
+
+    Attributes
+    ----------
+    cell
+        Scenes, sensor and illuminations, as the paper names them: ``("C1", "6D", "Random")``.
+    images
+        Number of images.
+    lights
+        How their lights were chosen, in words.
+    results
+        One a method, in the order of `METHODS`.
+    """
+
+    cell: Cell
+    images: int
+    lights: str
+    results: tuple[Result, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """One of the eight data sets before it is evaluated."""
+
+    cell: Cell
+    scenes: tuple[RenderedScene, ...]
+    lights: str
+
+
+def sensor_of(lut: Lut) -> str:
+    """Return the paper's name of a table's camera, or the camera's own."""
+    return SENSORS.get(lut.provenance.camera, lut.provenance.camera)
+
+
+def settings(
+    luts: Sequence[Lut], pictures: Sequence[Source], truths: npt.NDArray[np.float64], side: int = SIDE, seed: int = 0
+) -> tuple[Setting, ...]:
+    """Return the data sets of the table in the paper's order: scenes, then tables, then lights.
+
+    Parameters
+    ----------
+    luts
+        The tables, in the paper 6D and 550D.
+    pictures
+        The given pictures, at least one.
+    truths
+        (N, 3) float64 ≥ 0, the ground truths that the first choice of lights is to be like; linear camera RGB of any
+        length, taken as they are although another camera saw them, as in the paper.
+    side
+        Longest side of every image, px.
+    seed
+        0 … 2⁶⁴ − 1; chooses random codes, random lights and samples.
+
+    Raises
+    ------
+    InputError
+        There is no picture, or the side is no size.
+    """
+    count = len(pictures)
+    if not count:
+        raise InputError("there is no picture to print; name some")
+    sets: dict[str, Sequence[Source]] = {
+        "C1": [ScaledSource(picture, side) for picture in pictures],
+        "Random": random_scenes(count, side, side, seed),
+    }
+    found: list[Setting] = []
+    for scenes, sources in sets.items():
+        for lut in luts:
+            choices: dict[str, ChosenLights] = {
+                "C1": lights_like(lut, truths, count),
+                "Random": lights_at_random(lut, count, seed),
+            }
+            found += [
+                Setting((scenes, sensor_of(lut), lights), rendered(lut, sources, chosen, seed), chosen.how)
+                for lights, chosen in choices.items()
+            ]
+    return tuple(found)
+
+
+def table1(
+    chosen: Sequence[Setting], workers: int = 1, on_scene: Callable[[], None] | None = None
+) -> tuple[Block, ...]:
+    """Return what the methods make of each data set.
+
+    Parameters
+    ----------
+    chosen
+        The data sets; see `settings`.
+    workers
+        Threads; no number depends on it.
+    on_scene
+        Called after each image.
+    """
+    methods = [standard_methods()[name] for name in METHODS]
+    return tuple(
+        Block(part.cell, len(part.scenes), part.lights, evaluate(part.scenes, methods, workers, on_scene))
+        for part in chosen
+    )
+
+
+def block_title(cell: Cell) -> str:
+    """Return the paper's head of a data set.
+
+    Examples
+    --------
+    >>> block_title(("C1", "6D", "Random"))
+    'C1 scenes, 6D sensor, random illuminations'
+    """
+    scenes, sensor, lights = (part.lower() if part == "Random" else part for part in cell)
+    return f"{scenes[0].upper()}{scenes[1:]} scenes, {sensor} sensor, {lights} illuminations"
+
+
+def block_table(block: Block, kind: ErrorKind) -> Table:
+    """Return the table of one data set: each method's six numbers, and below them the paper's where it has some."""
+    published = TABLE1.get(block.cell, {})
+    rows: list[tuple[str | float | None, ...]] = []
+    for result in block.results:
+        rows.append((result.method, *result.summary(kind).as_tuple()))
+        if result.method in published:
+            rows.append(("paper", *published[result.method].as_tuple()))
+    notes = [f"{block.images} images; lights {block.lights}."]
+    notes += [
+        f"{result.method}: no usable pixel in {int(result.guessed.sum())} images, whose light was taken to be grey."
+        for result in block.results
+        if result.guessed.any()
+    ]
+    return Table(block_title(block.cell), ("Algorithm", *NUMBERS), tuple(rows), notes=tuple(notes))
+
+
+def joint_table(blocks: Sequence[Block]) -> Table:
+    """Return all data sets, both kinds of error and the paper's numbers as one table, for CSV."""
+    kinds: tuple[ErrorKind, ...] = ("reproduction", "recovery")
+    rows: list[tuple[str | float | None, ...]] = []
+    for block in blocks:
+        published = TABLE1.get(block.cell, {})
+        for result in block.results:
+            head = (*block.cell, block.images, result.method)
+            given = {str(kind): result.summary(kind).as_tuple() for kind in kinds}
+            if result.method in published:
+                given["paper"] = published[result.method].as_tuple()
+            rows += [(*head, name, *numbers) for name, numbers in given.items()]
+    return Table(
+        "Errors on generated data sets, degrees",
+        (*_HEAD, "mean", "median", "trimean", "best25", "worst25", "avg"),
+        tuple(rows),
+    )
+
+
+@dataclass(frozen=True)
+class SizeRow:
+    """Median errors of the methods on one data set whose images have one side.
+
+    Attributes
+    ----------
+    cell
+        The data set.
+    side
+        Longest side of the images, px.
+    medians
+        Median reproduction errors, degrees, by method.
+    """
+
+    cell: Cell
+    side: int
+    medians: Mapping[str, float]
+
+
+def size_dependence(
+    luts: Sequence[Lut],
+    pictures: Sequence[Source],
+    truths: npt.NDArray[np.float64],
+    sides: Sequence[int],
+    seed: int = 0,
+    workers: int = 1,
+) -> tuple[SizeRow, ...]:
+    """Return the methods' median reproduction errors for images of several sizes; parameters as of `settings`.
+
+    Parameters
+    ----------
+    luts, pictures, seed
+        As of `settings`.
+    truths
+        (N, 3) float64, as of `settings`.
+    sides
+        Longest sides of the images, px.
+    workers
+        Threads.
+    """
+    rows: list[SizeRow] = []
+    for side in sides:
+        for block in table1(settings(luts, pictures, truths, side, seed), workers):
+            medians = {result.method: result.summary("reproduction").median for result in block.results}
+            rows.append(SizeRow(block.cell, side, medians))
+    return tuple(rows)
+
+
+def size_table(rows: Sequence[SizeRow]) -> Table:
+    """Return the medians of `size_dependence` as a table."""
+    names = list(dict.fromkeys(name for row in rows for name in row.medians))
+    return Table(
+        "Median reproduction error for images of several sizes, degrees",
+        ("Data set", "Side, px", *names),
+        tuple((block_title(row.cell), row.side, *(row.medians[name] for name in names)) for row in rows),
+    )
+
+
+@dataclass(frozen=True)
+class TableNoise:
+    """How bright and how noisy the print's white is in a table.
+
+    Attributes
+    ----------
+    camera
+        The table's camera.
+    lights
+        Its lights.
+    level
+        Median over the lights of the white cell's brightest channel, share of saturation.
+    spread
+        Median over the lights of the standard deviation of the white cell's samples over their mean, R, G and B.
+    largest
+        Median over the lights of the largest of its samples over their mean, less 1; R, G and B.
+    """
+
+    camera: str
+    lights: int
+    level: float
+    spread: tuple[float, float, float]
+    largest: tuple[float, float, float]
+
+
+def table_noise(lut: Lut) -> TableNoise:
+    """Return how bright and noisy the white of a table's print is: what White-Patch lives on."""
+    white = np.asarray(lut.samples[:, -1], dtype=np.float64)
+    mean = np.maximum(white.mean(axis=1), 1.0)
+    spread = np.median(white.std(axis=1, ddof=1) / mean, axis=0)
+    largest = np.median(white.max(axis=1) / mean - 1, axis=0)
+    return TableNoise(
+        lut.provenance.camera,
+        len(white),
+        float(np.median(mean.max(axis=1)) / lut.provenance.white_level),
+        (float(spread[0]), float(spread[1]), float(spread[2])),
+        (float(largest[0]), float(largest[1]), float(largest[2])),
+    )
+
+
+def noise_table(found: Sequence[TableNoise]) -> Table:
+    """Return the noise of tables' white as a table, percent."""
+    columns = ("Camera", "Lights", "White, % of saturation", "Spread of its samples R, %", "G, %", "B, %")
+    return Table(
+        "The print's white in the tables: medians over the lights",
+        (*columns, "Largest sample above the mean R, %", "G, %", "B, %"),
+        tuple(
+            (noise.camera, noise.lights, *(100 * part for part in (noise.level, *noise.spread, *noise.largest)))
+            for noise in found
+        ),
+    )

@@ -1,0 +1,141 @@
+"""The paper's second table: learned methods trained on real and on generated images, tested on the real ones (4.4).
+
+Trained on real: by cross-validation, each image's light estimated by a method that has not seen it. Trained on
+generated: fitted once to all generated images. Both are tested on the same real images. The paper has Cube+ for the
+real ones, of which it states neither folds nor seeds; other data sets give the same table without the paper's numbers
+beside it, and `evaluate transfer` compares more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.experiments.cross_validation import cross_validate
+from evaluation.experiments.paper.published import TABLE2
+from evaluation.experiments.paper.table1 import NUMBERS
+from evaluation.experiments.running import evaluate
+from evaluation.metrics import ErrorKind
+from evaluation.results.tables import Table
+from foundation.errors import InputError
+
+if TYPE_CHECKING:
+    from evaluation.methods.method import Learner
+    from evaluation.results.result import Result
+    from evaluation.scene import Scene
+
+LEARNERS: Final[Mapping[str, str]] = {
+    "regression-trees": "Regression trees (simple features)",
+    "smart-color-cat": "Smart Color Cat",
+    "color-beaver": "Color Beaver (using Gray-world)",
+}
+"""The learners of the table: our short names, and the paper's names."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """What one learner reaches, trained on real and on generated images.
+
+    Attributes
+    ----------
+    learner
+        Its short name.
+    real, generated
+        Its results on the real images.
+    """
+
+    learner: str
+    real: Result
+    generated: Result
+
+
+def table2(
+    real: Sequence[Scene],
+    generated: Sequence[Scene],
+    learners: Mapping[str, Learner],
+    folds: npt.NDArray[np.int64],
+    seed: int = 0,
+    workers: int = 1,
+    on_scene: Callable[[], None] | None = None,
+) -> tuple[Trained, ...]:
+    """Return the results of each learner, trained on real and on generated images.
+
+    Parameters
+    ----------
+    real
+        The real images, in the paper Cube+.
+    generated
+        Generated images.
+    learners
+        By short names, at least one.
+    folds
+        (N,) int64, the fold of each real image.
+    seed
+        Of all that is random in the fits.
+    workers
+        Threads.
+    on_scene
+        Called after each real image of each test.
+
+    Raises
+    ------
+    InputError
+        There are no images to train on, or no learner.
+    """
+    if not generated or not learners:
+        raise InputError(f"{len(learners)} learners and {len(generated)} generated images: name at least one of each")
+    chosen = list(learners.values())
+    crossed = cross_validate(real, chosen, folds, seed, workers, on_scene)
+    fitted = [learner.fit(generated, seed) for learner in chosen]
+    moved = evaluate(real, fitted, workers, on_scene)
+    return tuple(Trained(name, *both) for name, *both in zip(learners, crossed, moved, strict=True))
+
+
+def table2_tables(found: Sequence[Trained], kind: ErrorKind, name: str, with_published: bool = True) -> list[Table]:
+    """Return the two halves of the paper's table, and the ratios of their medians.
+
+    Parameters
+    ----------
+    found
+        What `table2` returns.
+    kind
+        Kind of error.
+    name
+        Of the real data set.
+    with_published
+        Whether the paper's numbers, which are of Cube+, stand below ours.
+    """
+    heads: Mapping[str, str] = {
+        "real": f"Trained and tested on {name} (through cross-validation)",
+        "generated": f"Trained on the generated data set and tested on {name}",
+    }
+    tables: list[Table] = []
+    for training, title in heads.items():
+        rows: list[tuple[str | float | None, ...]] = []
+        published = TABLE2["real" if training == "real" else "generated"]
+        for trained in found:
+            result = trained.real if training == "real" else trained.generated
+            rows.append((result.method, *result.summary(kind).as_tuple()))
+            known = published.get(LEARNERS.get(trained.learner, ""))
+            if known and with_published:
+                rows.append(("paper", *known.as_tuple()))
+        tables.append(Table(title, ("Algorithm", *NUMBERS), tuple(rows)))
+    return [*tables, _ratios(found, kind, name)]
+
+
+def _ratios(found: Sequence[Trained], kind: ErrorKind, name: str) -> Table:
+    rows: list[tuple[str | float | None, ...]] = []
+    for trained in found:
+        ours = trained.generated.summary(kind).median / trained.real.summary(kind).median
+        paper = LEARNERS.get(trained.learner)
+        theirs = TABLE2["generated"][paper].median / TABLE2["real"][paper].median if paper else None
+        rows.append((trained.real.method, ours, theirs))
+    return Table(
+        f"Median trained on generated images over median trained on real ones, tested on {name}",
+        ("Algorithm", "Ratio", "In the paper, on Cube+"),
+        tuple(rows),
+    )

@@ -1,0 +1,313 @@
+"""A run into a results folder: taken up where it was stopped, published whole.
+
+While methods run, `.RESULTS.partial` holds the answers for each image so far. A run of the same data set, methods,
+settings and software goes on there, wherever it was killed; its folder is the same to the last byte as that of a run
+that was left alone. When all images are done, the files are written there and the folder gets its name.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.experiments.folds import folds_to_csv
+from evaluation.experiments.running import SceneMethod, answer_scenes, ordered_map, truths_of
+from evaluation.learning.model_files import StoredMethod, scenes_sha256
+from evaluation.methods.method import Method
+from evaluation.metrics import ErrorKind
+from evaluation.reports.developed import developed
+from evaluation.reports.latex import table_to_latex
+from evaluation.reports.run_page import MOST_SHOWN, chosen_images, run_page
+from evaluation.results.answers import SceneAnswer, results_of
+from evaluation.results.errors_file import ERRORS_FILE
+from evaluation.results.journal import JOURNAL_FILE, AnswerJournal, read_journal
+from evaluation.results.method_records import describe_method
+from evaluation.results.result import Result
+from evaluation.results.run import Run
+from evaluation.results.run_files import errors_csv, run_json, several_lights_csv
+from evaluation.results.summary_tables import Subject, lights_tables, statistics_rows, summary_table
+from evaluation.results.tables import table_to_csv
+from evaluation.scene import MixedScene, Scene, SceneSet
+from foundation.errors import InputError
+from foundation.files import make_folder, partial_path, publish_folder, require_free, write_whole
+from foundation.held_folders import LOCK_FILE, held_folder
+from foundation.version import software
+
+WHAT = "the results"
+"""What the folder holds, for messages."""
+
+_WAIT = "wait for it, or name another place"
+
+
+def run_methods(
+    data: SceneSet,
+    methods: Sequence[Method | SceneMethod],
+    folder: Path | None = None,
+    kind: ErrorKind = "reproduction",
+    workers: int = 1,
+    on_scene: Callable[[int, int], None] | None = None,
+) -> Run:
+    """Return what methods make of a data set, and write it to a results folder where one is named.
+
+    Parameters
+    ----------
+    data
+        The data set.
+    methods
+        At least one, no two of one name.
+    folder
+        The new results folder; None for none.
+    kind
+        The error that the folder's LaTeX table and figures show; the other files have both.
+    workers
+        Threads, one image each; no byte depends on it.
+    on_scene
+        Called after each image with how many are done, and how many there are.
+
+    Raises
+    ------
+    InputError
+        The folder is taken, or another run's or program's; two methods have one name; or as `running.evaluate`.
+    FormatError
+        An image cannot be read.
+    StorageError
+        The disk is full, read-only or gone; what was answered until then is kept.
+    """
+    names = [method.name for method in methods]
+    twice = [name for number, name in enumerate(names) if name in names[:number]]
+    if twice:
+        raise InputError(f"two methods are called {twice[0]!r}; give one another name, or leave one out")
+    truths = truths_of(data.scenes, methods)
+    run = _run_of(data, methods, truths, ())
+
+    def finished(answers: Sequence[Sequence[SceneAnswer]]) -> Run:
+        return _run_of(data, methods, truths, results_of(names, truths, answers))
+
+    if folder is None:
+        return finished(_answers(data.scenes, methods, [], None, workers, on_scene))
+    require_free(folder, WHAT)
+    partial = partial_path(folder)
+    make_folder(folder.parent, folder)
+    with held_folder(partial, f"another program works on {folder}; {_WAIT}", of=folder):
+        journal = partial / JOURNAL_FILE
+        known = read_journal(journal, _identity(run))
+        with journal.open("ab", buffering=0) as stream:
+            answers = _answers(
+                data.scenes, methods, known, AnswerJournal(stream, len(known), folder), workers, on_scene
+            )
+        run = finished(answers)
+        _publish(run, data.scenes, folder, kind, workers)
+    return run
+
+
+def write_run(
+    run: Run, scenes: Sequence[Scene], folder: Path, kind: ErrorKind = "reproduction", workers: int = 1
+) -> None:
+    """Write results that were made otherwise, such as by cross-validation, to a new results folder.
+
+    Parameters
+    ----------
+    run
+        The results; see `describe_run`.
+    scenes
+        The images that they are of, from which some are shown.
+    folder
+        The new folder.
+    kind
+        The error that the LaTeX table and the figures show.
+    workers
+        Threads.
+
+    Raises
+    ------
+    InputError
+        The folder is taken.
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    require_free(folder, WHAT)
+    partial = partial_path(folder)
+    make_folder(folder.parent, folder)
+    with held_folder(partial, f"another program works on {folder}; {_WAIT}", of=folder):
+        _publish(run, scenes, folder, kind, workers)
+
+
+def describe_run(
+    data: SceneSet,
+    results: tuple[Result, ...],
+    methods: Sequence[Mapping[str, Any]],
+    settings: Mapping[str, Any] | None = None,
+    folds: npt.NDArray[np.int64] | None = None,
+    notes: tuple[str, ...] = (),
+) -> Run:
+    """Return results as a run.
+
+    Parameters
+    ----------
+    data
+        The data set.
+    results
+        One a method, of its N images.
+    methods
+        A JSON object each, see `method_records.describe_method`.
+    settings
+        What else the results depend on: JSON.
+    folds
+        (N,) int64, the fold of each image; None where the methods were not cross-validated.
+    notes
+        Sentences that belong beside the results.
+    """
+    return Run(
+        subject=Subject(
+            data.name,
+            tuple(scene.name for scene in data.scenes),
+            tuple(isinstance(scene, MixedScene) for scene in data.scenes),
+        ),
+        layout=data.layout,
+        place=data.place,
+        treatment=data.treatment,
+        data_sha256=scenes_sha256(data.scenes),
+        truths=np.stack([scene.truth for scene in data.scenes]),
+        results=results,
+        methods=tuple(methods),
+        settings={} if settings is None else settings,
+        folds=folds,
+        notes=notes,
+        software=software(),
+    )
+
+
+def _run_of(
+    data: SceneSet,
+    methods: Sequence[Method | SceneMethod],
+    truths: npt.NDArray[np.float64],
+    results: tuple[Result, ...],
+) -> Run:
+    described = [describe_method(method) for method in methods]
+    run = describe_run(data, results, described)
+    notes = tuple(
+        f"{method.name} was trained on these very images: its errors say nothing of others"
+        for method in methods
+        if isinstance(method, StoredMethod) and method.provenance and method.provenance.sha256 == run.data_sha256
+    )
+    return describe_run(data, results, described, notes=notes)
+
+
+def _identity(run: Run) -> dict[str, Any]:
+    """Return what must be the same for a run to go on with what another has made; its keys stand in messages."""
+    return {
+        "data set": {
+            "images": len(run.subject.images),
+            "sha256": run.data_sha256,
+            "several lights": sum(run.subject.mixed),
+        },
+        "treatment": dict(run.treatment),
+        "methods": list(run.methods),
+        "settings": dict(run.settings),
+        "software": run.software,
+    }
+
+
+def _answers(
+    scenes: Sequence[Scene],
+    methods: Sequence[Method | SceneMethod],
+    known: list[tuple[SceneAnswer, ...]],
+    journal: AnswerJournal | None,
+    workers: int,
+    on_scene: Callable[[int, int], None] | None,
+) -> list[tuple[SceneAnswer, ...]]:
+    """Return the answers for all scenes, given those for the first ones; the others go to the journal as they come."""
+    answers = list(known)
+    if on_scene:
+        on_scene(len(answers), len(scenes))
+    for given in answer_scenes(scenes[len(known) :], methods, workers):
+        if journal is not None:
+            journal.append(given)
+        answers.append(given)
+        if on_scene:
+            on_scene(len(answers), len(scenes))
+    return answers
+
+
+def _publish(run: Run, scenes: Sequence[Scene], folder: Path, kind: ErrorKind, workers: int) -> None:
+    partial = partial_path(folder)
+    pictures = _pictures(run, scenes, kind, workers)
+    for name, text in _files(run, kind, pictures).items():
+        write_whole(partial / name, text)
+    (partial / JOURNAL_FILE).unlink(missing_ok=True)
+    _clear(partial, set(_files_of(run)))
+    publish_folder(partial, folder, WHAT)
+
+
+def _clear(folder: Path, kept: set[str]) -> None:
+    """Remove leftovers of writes that never finished."""
+    for path in folder.iterdir():
+        if path.name not in kept | {LOCK_FILE}:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def _files_of(run: Run) -> tuple[str, ...]:
+    """Return the names of the files of a results folder."""
+    several = any(result.maps is not None for result in run.results)
+    return (
+        *("run.json", "results.csv", ERRORS_FILE, "table.tex", "report.html"),
+        *(("pixels.csv", "regions.csv") if several else ()),
+        *(("folds.csv",) if run.folds is not None else ()),
+    )
+
+
+def _files(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> dict[str, str]:
+    """Return the texts of the files of a results folder by their names."""
+    subject, results = run.subject, run.results
+    tables = [summary_table(subject, results, kind), *lights_tables(subject, results, kind)]
+    pixels, regions = several_lights_csv(subject.images, results)
+    content = {
+        "data_set": {
+            "name": subject.name,
+            "layout": run.layout,
+            "place": run.place,
+            "images": len(subject.images),
+            "images_under_several_lights": sum(subject.mixed),
+            "sha256": run.data_sha256,
+        },
+        "treatment": dict(run.treatment),
+        "methods": [dict(method) for method in run.methods],
+        "settings": dict(run.settings),
+        "notes": [*run.notes, *tables[0].notes],
+        "no_estimate": {result.method: int(result.guessed.sum()) for result in results},
+        "software": run.software,
+    }
+    texts = {
+        "run.json": run_json(content),
+        "results.csv": table_to_csv(statistics_rows(subject, results)),
+        ERRORS_FILE: errors_csv(subject.images, run.truths, results),
+        "table.tex": "\n".join(map(table_to_latex, tables)),
+        "report.html": run_page(run, kind, pictures),
+        "pixels.csv": pixels,
+        "regions.csv": regions,
+        "folds.csv": "" if run.folds is None else folds_to_csv(subject.images, run.folds),
+    }
+    return {name: texts[name] for name in _files_of(run)}
+
+
+def _pictures(run: Run, scenes: Sequence[Scene], kind: ErrorKind, workers: int) -> dict[tuple[int, int], bytes]:
+    """Return the pictures of each method's worst and median images; each image is read once."""
+    shown: dict[int, list[int]] = {}
+    for number, result in enumerate(run.results[:MOST_SHOWN]):
+        for place in sum(chosen_images(result, kind), ()):
+            shown.setdefault(place, []).append(number)
+
+    def develop(place: int) -> list[bytes]:
+        return developed(scenes[place], [run.results[number].estimates[place] for number in shown[place]])
+
+    made = ordered_map(develop, shown, workers)
+    return {
+        (number, place): picture
+        for (place, numbers), those in zip(shown.items(), made, strict=True)
+        for number, picture in zip(numbers, those, strict=True)
+    }

@@ -1,0 +1,160 @@
+"""What a transfer is to be: data sets opened, compared and cut to what may be trained on, before the work begins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from evaluation.datasets.generated import GeneratedScene
+from evaluation.experiments.transfer.matrices import ColourMatrix, camera_matrix, choose_matrix
+from evaluation.experiments.transfer.naive import naive_scenes
+from evaluation.experiments.transfer.overlap import shared_images
+from evaluation.experiments.transfer.pictures import find_sources
+from evaluation.experiments.transfer.rows import TrainingSet
+from evaluation.scene import Scene, SceneSet
+from foundation.errors import InputError, first_of
+
+Shared = Literal["refuse", "leave-out", "keep"]
+"""What to do about training images that show what test images show."""
+
+
+@dataclass(frozen=True, eq=False)
+class TransferPlan:
+    """Training sets that may be trained on, and what was done to make them so.
+
+    Attributes
+    ----------
+    training
+        For each generated set itself and, where there are pictures, its naive counterparts; images that were left out
+        are in none of them.
+    sets
+        The data sets as they were opened.
+    notes
+        Sentences for the reader: images left out, matrices used, cautions.
+    """
+
+    training: tuple[TrainingSet, ...]
+    sets: tuple[SceneSet, ...]
+    notes: tuple[str, ...]
+
+
+def plan_transfer(
+    test: SceneSet,
+    sets: Sequence[SceneSet],
+    pictures: Path | str | None = None,
+    matrix: str | None = None,
+    shared: Shared = "refuse",
+) -> TransferPlan:
+    """Return the training sets of a transfer.
+
+    Parameters
+    ----------
+    test
+        The test set.
+    sets
+        Data sets to train on, usually generated; of one that is divided into train, validation and test the images of
+        `train`.
+    pictures
+        Folder of the source pictures of the generated sets, for the naive baseline; None for no such baseline.
+    matrix
+        A camera, a file or `none`, see `matrices.choose_matrix`; None for the matrix of the camera of each generated
+        set's table, if it is known.
+    shared
+        What to do about training images that show what test images show.
+
+    Raises
+    ------
+    InputError
+        There is nothing to train on; a training set is the test set, or shares images with it that are neither left out
+        nor kept on purpose; two training sets have one name; or a naive baseline cannot be made.
+    """
+    if not sets:
+        raise InputError("no data set to train on: name at least one with --train")
+    names = [some.name for some in sets]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(
+            f"two training sets are called {first_of(twice)}; rename the folder of one: names head the rows"
+        )
+    training: list[TrainingSet] = []
+    notes: list[str] = []
+    for some in sets:
+        scenes = _trainable(some, test, shared, notes)
+        if pictures is None:
+            training.append(TrainingSet(some.name, "generated", scenes))
+        else:
+            training += _with_naive(some, scenes, pictures, matrix, notes)
+    return TransferPlan(tuple(training), tuple(sets), tuple(notes))
+
+
+def _trainable(some: SceneSet, test: SceneSet, shared: Shared, notes: list[str]) -> tuple[Scene, ...]:
+    """Return the images of a set that may be trained on."""
+    common = shared_images(some, test)
+    dropped: set[int] = set()
+    if common:
+        first = common[0]
+        told = (
+            f"{len(common)} of {len(some.scenes)} images of {some.name} are also in the test set, by {first.by}: "
+            f"{first_of([one.name for one in common], 3)}"
+        )
+        if shared == "refuse":
+            raise InputError(
+                f"{told}; --shared leave-out trains without them, --shared keep with them (what was tested is then no "
+                "longer unseen)"
+            )
+        notes.append(f"{told}; {'left out' if shared == 'leave-out' else 'kept: what is tested is not unseen'}")
+        dropped = {one.position for one in common} if shared == "leave-out" else set()
+    kept = [scene for place, scene in enumerate(some.scenes) if place not in dropped]
+    divided = [
+        scene for scene in kept if isinstance(scene, GeneratedScene) and scene.entry.split not in (None, "train")
+    ]
+    if divided:
+        notes.append(f"{some.name}: {len(divided)} images of its parts validation and test are not trained on")
+        left_out = {id(scene) for scene in divided}
+        kept = [scene for scene in kept if id(scene) not in left_out]
+    if not kept:
+        raise InputError(f"{some.name} has no image left to train on: all are shared with the test set or set apart")
+    return tuple(kept)
+
+
+def _with_naive(
+    some: SceneSet, scenes: Sequence[Scene], pictures: Path | str, matrix: str | None, notes: list[str]
+) -> list[TrainingSet]:
+    """Return a generated set's images and their naive counterparts, all of the pictures that were found."""
+    made = [scene for scene in scenes if isinstance(scene, GeneratedScene)]
+    if not made:
+        raise InputError(f"{some.name} was not made by generate and has no naive counterpart; leave out --naive")
+    dataset = made[0].dataset
+    found, missing = find_sources(dataset, pictures)
+    kept = tuple(scene for scene in made if scene.entry.source in found)
+    if not kept:
+        raise InputError(
+            f"none of the {len(missing)} pictures of {some.name} is in {pictures}, by name and hash: "
+            f"{first_of(missing, 3)}; name the folder that the data set was made from"
+        )
+    if missing:
+        notes.append(
+            f"{some.name}: {len(missing)} of {len(missing) + len(found)} pictures are not in {pictures}: "
+            f"{first_of(missing)}; {len(made) - len(kept)} images of them are left out of its every row"
+        )
+    sets = [
+        TrainingSet(some.name, "generated", kept),
+        TrainingSet(some.name, "naive", naive_scenes(kept, found)),
+    ]
+    chosen = _matrix_for(some.name, dataset.description.table.camera, matrix, notes)
+    if chosen is not None:
+        sets.append(TrainingSet(some.name, "naive with matrix", naive_scenes(kept, found, chosen)))
+    return sets
+
+
+def _matrix_for(name: str, camera: str, asked: str | None, notes: list[str]) -> ColourMatrix | None:
+    """Return the colour matrix for a generated set's naive counterparts."""
+    chosen = choose_matrix(asked) if asked is not None else camera_matrix(camera)
+    if chosen is not None:
+        rows = "; ".join(" ".join(f"{part:.3f}" for part in row) for row in chosen.rows)
+        notes.append(f"{name}: colour matrix of {chosen.name}, {chosen.source}, rows of sum 1: {rows}")
+    elif asked is None:
+        notes.append(f"{name}: no colour matrix is known for {camera}; --matrix names one")
+    return chosen

@@ -1,0 +1,124 @@
+"""Images made small for learning: training and test images of one size, noise and fine detail averaged alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.scene import Image, Scene
+
+_COVERED: Final = 1e-3
+"""Least share of a pixel's area that must be usable; less is rounding of areas rather than a colour."""
+
+
+@dataclass(frozen=True, eq=False)
+class SmallScene:
+    """A scene made small, in memory.
+
+    Attributes
+    ----------
+    name
+        The image's name.
+    truth
+        (3,) float64, linear camera RGB of the light, of any length.
+    image
+        (H, W, 3) float32, linear camera RGB, in the unit of the image that it was.
+    mask
+        (H, W) bool, True where no pixel was usable; None if every one was.
+    saturation
+        None where clipped pixels were left out; that of the image where it was small already.
+    """
+
+    name: str
+    truth: npt.NDArray[np.float64]
+    image: Image
+    mask: npt.NDArray[np.bool_] | None
+    saturation: float | None
+
+    def read(self) -> tuple[Image, npt.NDArray[np.bool_] | None]:
+        """Return the image (H, W, 3) and its mask (H, W) bool."""
+        return self.image, self.mask
+
+
+def make_small(
+    scenes: Sequence[Scene], side: int, workers: int = 1, on_scene: Callable[[], None] | None = None
+) -> tuple[SmallScene, ...]:
+    """Return scenes of which no side is longer than `side`, px; see `shrink_image`.
+
+    Parameters
+    ----------
+    scenes
+        The scenes; each is read once.
+    side
+        Longest side allowed, px.
+    workers
+        Threads.
+    on_scene
+        Called after each scene, from the calling thread.
+    """
+
+    def small(scene: Scene) -> SmallScene:
+        image, mask = scene.read()
+        if max(image.shape[:2]) <= side:
+            return SmallScene(scene.name, scene.truth, image, mask, scene.saturation)
+        return SmallScene(scene.name, scene.truth, *shrink_image(image, side, scene.saturation, mask), None)
+
+    made: list[SmallScene] = []
+    with ThreadPoolExecutor(max(1, workers)) as pool:
+        for scene in pool.map(small, scenes):
+            made.append(scene)
+            if on_scene:
+                on_scene()
+    return tuple(made)
+
+
+def shrink_image(
+    image: Image, side: int, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Return an image made small by averaging areas, without clipped and masked pixels.
+
+    Parameters
+    ----------
+    image
+        (H, W, 3) uint16, float32 or float64, linear camera RGB.
+    side
+        Longest side of the result, px.
+    saturation
+        Value from which a channel is clipped; None if none is.
+    mask
+        (H, W) bool, True where a pixel must not be used, or None.
+
+    Returns
+    -------
+    tuple of ndarray
+        The image (h, w, 3) float32, and (h, w) bool, True where no pixel was usable; the image is 0 there.
+
+    Examples
+    --------
+    >>> image = np.zeros((2, 4, 3), np.float32)
+    >>> image[:, 0], image[:, 1], image[0, 2] = 10, 30, 900
+    >>> small, mask = shrink_image(image, side=2, saturation=900)
+    >>> small[..., 0], mask
+    (array([[20.,  0.]], dtype=float32), array([[False, False]]))
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    scale = side / max(height, width)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    usable = np.ones((height, width), np.float32)
+    if saturation is not None:
+        usable[(image >= saturation).any(axis=2)] = 0
+    if mask is not None:
+        usable[mask] = 0
+    share = np.asarray(cv2.resize(usable, size, interpolation=cv2.INTER_AREA))
+    weighted = image.astype(np.float32) * usable[..., None]
+    summed = np.asarray(cv2.resize(weighted, size, interpolation=cv2.INTER_AREA))
+    empty = share < _COVERED
+    small = np.where(empty[..., None], 0, summed / np.where(empty, 1, share)[..., None])
+    return small.astype(np.float32), empty

@@ -1,0 +1,180 @@
+"""`evaluate paper` as a user meets it: each command end to end on small tables and data sets."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from evaluation.cli import main
+from generator import DatasetOptions, generate_dataset
+from generator.lights.choices import RandomLights
+from generator.pictures.sources import random_scenes
+from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker, make_table
+
+__all__ = ["make_table"]
+
+NUMBER = re.compile(r"\d+\.\d\d\b")
+
+
+@pytest.fixture
+def thumbnails(tmp_path: Path) -> Path:
+    """Return an archive of 9 thumbnails of smooth colours under lights of their own."""
+    rng = np.random.default_rng(0)
+    lights = np.array([0.5, 1.0, 0.6]) * rng.uniform(0.8, 1.25, (9, 3))
+    ramps = np.exp(rng.uniform(-2, 2, (9, 3, 3, 3))).repeat(10, axis=1).repeat(10, axis=2)
+    path = tmp_path / "photos.npz"
+    images = (ramps * lights[:, None, None]).astype(np.float32)
+    np.savez(path, images=images, gt=lights, names=np.array([f"p{number}" for number in range(9)]))
+    return path
+
+
+@pytest.fixture
+def truths(tmp_path: Path) -> Path:
+    """Return a file with the ground truths of two cameras."""
+    path = tmp_path / "truths.csv"
+    rows = [f"{name},{r},{g},{b}" for name, (r, g, b) in zip(("A/1", "A/2", "B/1", "B/2"), LIGHTS, strict=True)]
+    path.write_text("\n".join(["File,GT_R,GT_G,GT_B", *rows]))
+    return path
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open() as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_table1(
+    make_table: TableMaker, thumbnails: Path, truths: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tables = [str(make_table(f"Canon EOS {name}", noise=0.05).folder) for name in ("6D Mark II", "550D")]
+    out = tmp_path / "out"
+    wish = ("--camera", "Canon EOS 550D", "--side", "24", "--sizes", "12,24", "--hot", "500", "--out", str(out))
+    given = ("--pictures", str(thumbnails), "--lights-like", f"{truths}#A", "--workers", "2")
+    assert main(["paper", "table1", *tables, *given, *wish]) == 0
+    printed = capsys.readouterr().out
+    assert "9 of photos, developed to sRGB with the colour matrix of Canon EOS 550D" in printed
+    assert printed.count("sensor, C1 illuminations\n┏") == 4
+    rows = rows_of(out / "table1.csv")
+    assert len(rows) == 8 * 3 * 3
+    paper = [row for row in rows if row["error"] == "paper"]
+    assert paper[0]["median"] == "2.59"
+    # What is printed is what the file holds.
+    first = rows[0]
+    assert re.search(rf"White-Patch +│ +{float(first['mean']):.2f} │ +{float(first['median']):.2f} │", printed)
+    assert {path.name for path in out.iterdir()} == {
+        *("report.html", "table1.csv", "table1.tex", "table1_recovery.tex", "noise.csv"),
+        *("sizes.csv", "sizes.svg", "hot.csv", "hot.tex"),
+    }
+    page = (out / "report.html").read_text()
+    assert page.index("Reproduction error") < page.index("Images of other sizes") < page.index("Recovery error")
+    assert "C1 scenes, 6D sensor, C1 illuminations" in (out / "table1.tex").read_text()
+    assert [row["Per million"] for row in rows_of(out / "hot.csv")] == ["500"] * 8
+    assert main(["paper", "table1", *tables, *given, *wish]) == 2
+    assert "already exists; name another place for the report" in capsys.readouterr().err
+
+
+def test_table1_of_photographs(
+    make_table: TableMaker, truths: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "pictures").mkdir()
+    for number in range(3):
+        Image.fromarray(np.full((8, 8, 3), 90 * number, np.uint8)).save(tmp_path / "pictures" / f"{number}.png")
+    lut = str(make_table("Test").folder)
+    given = ("--pictures", str(tmp_path / "pictures"), "--lights-like", str(truths), "--side", "16")
+    assert main(["paper", "table1", lut, *given, "--error", "recovery"]) == 0
+    printed = capsys.readouterr().out
+    assert f"3 of {tmp_path / 'pictures'}" in printed
+    assert len(NUMBER.findall(printed)) > 4 * 18
+    assert main(["paper", "table1", lut, *given, "--camera", "Canon EOS 550D"]) == 2
+    assert "is for a data set of raw images" in capsys.readouterr().err
+
+
+def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made, out = tmp_path / "made", tmp_path / "out"
+    scenes = random_scenes(12, 30, 30)
+    options = DatasetOptions(previews=False)
+    generate_dataset(make_table("Test"), made, scenes, RandomLights(1, len(LIGHTS), 0), options=options)
+    wish = ("--generated", str(made), "--methods", "regression-trees", "--out", str(out))
+    assert main(["paper", "table2", str(thumbnails), *wish]) == 0
+    printed = capsys.readouterr().out
+    assert "Real: photos, 9 images, 3 folds. Generated: made, 12 images. Seed 0." in printed
+    assert "The paper's table is of Cube+" in printed
+    real, generated = (rows_of(out / f"trained_on_{name}.csv") for name in ("real", "generated"))
+    (ratio,) = rows_of(out / "ratios.csv")
+    assert float(ratio["Ratio"]) == pytest.approx(float(generated[0]["Med."]) / float(real[0]["Med."]))
+    assert float(ratio["In the paper, on Cube+"]) == pytest.approx(1.66 / 0.89)
+    assert main(["paper", "table2", str(thumbnails), "--generated", str(made), "--methods", "magic"]) == 2
+    assert "'magic' is no learned method; the methods are" in capsys.readouterr().err
+
+
+def test_bits(thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(["paper", "bits", str(thumbnails), "--sigma", "1.5", "--out", str(out)]) == 0
+    assert "photos, 9 images. Gray-Edge at a scale of 1.5 px." in capsys.readouterr().out
+    rows = rows_of(out / "bits.csv")
+    labels = ["as it is", *map(str, range(8))]
+    assert [row["Bits set to zero"] for row in rows] == labels * 3
+    assert [row["Algorithm"] for row in rows[::9]] == [
+        "Gray-world",
+        "Shades-of-Gray (p=2)",
+        "1st-order Gray-Edge (σ=1.5)",
+    ]
+    assert "median reproduction error" in (out / "bits.svg").read_text()
+
+
+def test_reduction(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    codes = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    Image.fromarray(codes).save(tmp_path / "noise.png")
+    assert main(["paper", "reduction", str(tmp_path / "noise.png"), "--out", str(tmp_path / "out")]) == 0
+    assert "Colours in the picture" in capsys.readouterr().out
+    strip = np.asarray(Image.open(tmp_path / "out" / "reduction.png"))
+    np.testing.assert_array_equal(strip[:20, :30], codes)
+    np.testing.assert_array_equal(strip[26:46, 36:66], codes & 0b11100000)
+
+
+def test_chromaticities(
+    make_table: TableMaker, truths: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tables = [str(make_table(f"Canon EOS {name}").folder) for name in ("6D Mark II", "550D")]
+    out = tmp_path / "out"
+    wish = ("--truths", f"{truths}#A", "--truths", f"{truths}#B", "--out", str(out))
+    assert main(["paper", "chromaticities", *tables, *wish]) == 0
+    assert "Canon EOS 6D Mark II" in capsys.readouterr().out
+    assert len(rows_of(out / "chromaticities.csv")) == 2 * len(LIGHTS)
+    assert [row["Data set"] for row in rows_of(out / "coverage.csv")] == ["A", "B", "A", "B"]
+    assert "black bodies (2)" in (out / "chromaticities.svg").read_text()
+    assert main(["paper", "chromaticities", *tables]) == 0
+    assert "--out" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("bits", "nowhere.npz"), "nowhere.npz is no dataset"),
+        (("reduction", "nowhere.png"), "there is no such file"),
+        (("chromaticities", "nowhere"), "nowhere is no table"),
+        (
+            ("table1", "nowhere", "--pictures", ".", "--lights-like", "x.csv", "--sizes", "12,big"),
+            "'big' is no side of an image",
+        ),
+        (("bits", "nowhere.npz", "--out", "taken"), "taken already exists"),
+    ],
+)
+def test_what_cannot_be_done_is_one_sentence(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("taken").mkdir()
+    Path("taken", "file").touch()
+    assert main(["paper", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error

@@ -1,0 +1,106 @@
+"""`evaluate run` with methods of strangers: a file of ten lines, as the docs have it, and estimates from anywhere."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.cli import main
+from evaluation.datasets import open_scenes
+from evaluation.metrics import recovery_error, summarise
+from tests.data_files import available
+
+HOW_TO = Path(__file__).parents[3] / "docs" / "how-to" / "evaluate.md"
+
+
+@pytest.fixture
+def thumbnails(tmp_path: Path) -> Path:
+    """Return an archive of nine thumbnails whose brightest pixels show the light."""
+    random = np.random.default_rng(5)
+    lights = random.random((9, 3)) + 0.4
+    images = (random.random((9, 16, 16, 1)) * lights[:, None, None]).astype(np.float32)
+    path = tmp_path / "thumbs.npz"
+    np.savez(path, images=images, gt=lights, names=[f"image {number}.png" for number in range(9)])
+    return path
+
+
+def example(folder: Path) -> None:
+    """Write the file of the how-to into a folder."""
+    found = re.search(r"```python (\w+\.py)\n(.*?)```", HOW_TO.read_text(encoding="utf-8"), re.DOTALL)
+    assert found is not None
+    (folder / found[1]).write_text(found[2], encoding="utf-8")
+
+
+def test_the_ten_lines_of_the_docs(
+    thumbnails: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    example(tmp_path)
+    (command,) = re.findall(r"^    evaluate (run DATA --method brightest\.py.*)$", HOW_TO.read_text(), re.MULTILINE)
+    assert main([str(thumbnails) if word == "DATA" else word for word in command.split()]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"│ Brightest percent │ 0\.00", printed)
+    assert re.search(r"│ Gray-world +│ 0\.00", printed)
+    record = json.loads((tmp_path / "RESULTS" / "run.json").read_text())
+    assert record["methods"][0]["class"] == "brightest.py:Brightest"
+    assert len(record["methods"][0]["file_sha256"]) == 64
+    rows = list(csv.DictReader((tmp_path / "RESULTS" / "results.csv").read_text().splitlines()))
+    assert {row["method"] for row in rows} == {"Brightest percent", "Gray-world"}
+
+
+def test_estimates_of_another_program(thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenes = open_scenes(thumbnails).scenes
+    lines = [f"{scene.name.removesuffix('.png')},1,1,1" for scene in scenes]
+    (tmp_path / "grey.csv").write_text("image,r,g,b\n" + "\n".join(lines[::-1]))
+    (tmp_path / "bad.csv").write_text("\n".join([f"{scenes[0].name},nan,1,1", *lines[1:]]))
+    given = ("--estimates", f"{tmp_path}/grey.csv", "--estimates", f"NoNo={tmp_path}/bad.csv")
+    assert main(["run", str(thumbnails), *given, "--error", "recovery", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    expected = summarise(recovery_error([1, 1, 1], np.stack([scene.truth for scene in scenes])))
+    for row in printed["errors"]:
+        assert row["method"] in ("grey", "NoNo")
+        if row["error"] == "recovery":
+            assert row["median"] == pytest.approx(expected.median)
+            assert row["below3"] == pytest.approx(expected.below3)
+            assert row["no_estimate"] == (row["method"] == "NoNo")
+    assert printed["notes"] == []
+    assert main(["run", str(thumbnails), *given]) == 0
+    taken = "their light was taken to be grey"
+    out = capsys.readouterr().out
+    assert f"NoNo: no light for 1 of 9 images (image 0.png returned nan 1 1); {taken}" in out
+    assert "Gray-world" not in out  # Nothing but what was asked for.
+
+
+def test_every_statistic_is_printed_on_request(thumbnails: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", str(thumbnails), "--methods", "white-patch", "--statistics", "all"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"95% ┃ +Max\. ┃ < 3° \(%\)", out)
+    assert re.search(r"│ +100\.00 │", out)
+
+
+def test_what_a_method_raises_is_one_sentence(
+    thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "wrong.py").write_text(
+        "class Wrong:\n    name = 'Wrong'\n\n    def estimate(self, image, saturation=None, mask=None):\n"
+        "        return image[999, 999]\n"
+    )
+    out = tmp_path / "out"
+    assert main(["run", str(thumbnails), "--method", f"{tmp_path}/wrong.py:Wrong", "--out", str(out)]) == 2
+    message = capsys.readouterr().err
+    assert "error: Wrong fails on image 0.png: IndexError: index 999 is out of bounds" in message
+    assert "(wrong.py, line 5); correct it and run again" in message
+    assert not out.exists()
+
+
+def test_the_published_figures_of_plain_methods(capsys: pytest.CaptureFixture[str]) -> None:
+    # Where the thumbnails of NUS are; the figures came with them (Gray-world with its border differs by design).
+    for path in available("benchmark/nus_canon_1ds_mk3_64x64.npz"):
+        assert main(["run", str(path), "--methods", "shades-of-gray", "--error", "recovery", "--json"]) == 0
+        row = next(row for row in json.loads(capsys.readouterr().out)["errors"] if row["error"] == "recovery")
+        assert (row["mean"], row["median"]) == pytest.approx((4.51, 3.37), abs=0.06)

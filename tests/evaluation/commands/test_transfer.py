@@ -1,0 +1,175 @@
+"""`evaluate transfer` as a user meets it: what it prints, writes and refuses."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.cli import main
+from evaluation.datasets.generated import open_generated
+from evaluation.experiments.transfer import rows as transfer_rows
+from evaluation.metrics import summarise
+from evaluation.results.errors_file import read_errors
+from tests.evaluation.experiments.transfer.conftest import Maker, save_pictures, write_table
+
+OWN = """
+import numpy as np
+
+class Map:
+    name = "Map of the mean"
+
+    def fit(self, scenes, seed=0):
+        means = np.array([self.mean(*scene.read()) for scene in scenes])
+        lights = np.array([scene.truth / scene.truth.sum() for scene in scenes])
+        self.map = np.linalg.lstsq(means, lights, rcond=None)[0]
+        return self
+
+    def mean(self, image, mask=None):
+        mean = image.mean(axis=(0, 1))
+        return mean / mean.sum()
+
+    def estimate(self, image, saturation=None, mask=None):
+        return np.maximum(self.mean(image) @ self.map, 1e-3)
+"""
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a working folder with a generated set, its pictures, a real one as thumbnails, and a method."""
+    save_pictures(tmp_path / "pictures", [f"{number}.png" for number in range(6)])
+    Maker(tmp_path, write_table(tmp_path / "lut")).make()
+    random = np.random.default_rng(1)
+    lights = random.dirichlet([40, 60, 40], 30)
+    images = random.uniform(0, 1, (30, 8, 8, 3)) * lights[:, None, None]
+    images[:, :2, :2] = 0
+    names = np.array([f"real_{number:02d}" for number in range(30)])
+    np.savez(tmp_path / "real.npz", images=images.astype(np.float32), gt=lights, names=names)
+    (tmp_path / "own.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+BASIC = ("transfer", "--train", "made", "--test", "real.npz", "--methods", "own.py:Map", "--statistics", "gray-world")
+
+
+def test_tables_and_files(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wish = ("--naive", "pictures", "--images", "10", "--seeds", "2", "--out", "out", "--error", "recovery")
+    assert main([*BASIC, *wish]) == 0
+    printed = capsys.readouterr().out
+    assert "real: recovery angular error of 30 images, degrees" in printed
+    for head in ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg."):
+        assert printed.count(f" {head} ") == 4
+    for row in ("real, cross-validated", "made: generated", "made: linear sRGB × light", "made: matrix × linear sRGB"):
+        assert row in printed
+    assert "colour matrix of Canon EOS 550D" in printed
+    assert "Training images have sides of up to 24 px and test images of up to 8 px" in printed
+    out = place / "out"
+    assert sorted(path.name for path in out.iterdir()) == [
+        *("errors.csv", "folds_0.csv", "folds_1.csv", "report.html", "results.csv", "run.json", "tables.tex")
+    ]
+    rows = list(csv.DictReader((out / "results.csv").read_text().splitlines()))
+    # Four ways to train the map, two of them for the constant light, and Gray-world; six statistics each.
+    assert len(rows) == (4 + 2 + 1) * 6
+    errors = read_errors(out)
+    assert len(errors) == (4 + 2) * 2 + 1
+    for row in rows:
+        training = {"none": "", "cross-validation": ", real, cross-validated", "generated": ", made: generated"}
+        if row["training"] not in training or row["statistic"] != "worst25":
+            continue
+        name = row["method"] + training[row["training"]]
+        several = [each.errors["recovery"] for full, each in errors.items() if full.split(", seed")[0] == name]
+        assert len(several) == int(row["seeds"])
+        expected = np.mean([summarise(each).worst25 for each in several])
+        assert float(row["degrees"]) == pytest.approx(expected, abs=1e-5)
+        assert float(row["low"]) < expected < float(row["high"])
+    run = json.loads((out / "run.json").read_text())
+    assert run["settings"]["images"] == 10
+    assert run["training_sets"][0]["generated"]["table"]["camera"] == "Canon EOS 550D"
+    assert len(run["notes"]) == 2
+    page = (out / "report.html").read_text()
+    assert page.count("<table>") == 5
+    assert "<svg" in page
+    assert "pixels that are zero in every channel" in page
+    assert (out / "tables.tex").read_text().count("\\begin{tab") >= 4
+
+
+def test_the_results_can_be_compared(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*BASIC, "--out", "out"]) == 0
+    capsys.readouterr()
+    pair = ("Map of the mean, real, cross-validated", "Map of the mean, made: generated")
+    assert main(["compare", "out", "--method", pair[0], "--method", pair[1]]) == 0
+    assert "errs less" in capsys.readouterr().out
+
+
+def test_the_same_command_gives_the_same_bytes(place: Path) -> None:
+    for out, workers in (("one", "1"), ("two", "3")):
+        assert main([*BASIC, "--images", "7", "--side", "6", "--out", out, "--workers", workers]) == 0
+    for path in (place / "one").iterdir():
+        assert path.read_bytes() == (place / "two" / path.name).read_bytes(), path.name
+
+
+def test_folds_are_read(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "folds.csv").write_text("image,fold\n" + "".join(f"real_{n:02d},{n % 2}\n" for n in range(30)))
+    assert main([*BASIC, "--folds", "folds.csv", "--out", "out", "--statistics", "none"]) == 0
+    assert (place / "out" / "folds_0.csv").read_text() == (place / "folds.csv").read_text()
+    cross_validated = [line for line in capsys.readouterr().out.splitlines() if "cross-validated" in line]
+    assert all(" 15 " in line for line in cross_validated[:2])
+
+
+def test_images_made_small_are_alike(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*BASIC, "--side", "6"]) == 0
+    printed = capsys.readouterr().out
+    assert "All images were made small to at most 6 px" in printed
+    assert "sides of up to" not in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--test", "made"), "made is both training and test"),
+        (("--methods", "magic"), "'magic' is no method that learns; expected regression-trees"),
+        (("--methods", "own.py:Nothing"), "Nothing"),
+        (("--statistics", "magic"), "'magic'"),
+        (("--images", "13"), "13 training images of 12 were asked for"),
+        (("--folds", "31"), "31 folds of 30 images"),
+        (("--folds", "none.csv"), "cannot read folds from none.csv"),
+        (("--naive", "lut"), "holds no picture"),
+        (("--naive", "pictures", "--matrix", "Pinhole"), "'Pinhole' is neither a file nor a camera"),
+        (("--train", "made/../made"), "two training sets are called made"),
+        (("--out", "lut"), "lut already exists; name another place for the results"),
+        (("--train", "lut"), "is no dataset"),
+    ],
+)
+def test_what_cannot_be_done_is_one_sentence(
+    place: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    message: str,
+) -> None:
+    def never(*given: object) -> None:
+        pytest.fail("no method must be trained")
+
+    monkeypatch.setattr(transfer_rows, "gather", never)
+    before = sorted(place.rglob("*"))
+    assert main([*BASIC, *arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert [path for path in sorted(place.rglob("*")) if "__pycache__" not in path.parts] == before
+
+
+def test_test_images_that_were_printed_are_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with np.load("real.npz") as data:
+        content = {name: data[name] for name in data.files}
+    names = content["names"].copy()
+    names[4] = "3"
+    np.savez("other.npz", **content | {"names": names})
+    wish = [*BASIC[:4], "other.npz", *BASIC[5:]]
+    assert main(wish) == 2
+    assert "2 of 12 images of made are also in the test set, by name: 3.png" in capsys.readouterr().err
+    assert main([*wish, "--shared", "leave-out", "--out", "out"]) == 0
+    assert json.loads((place / "out" / "run.json").read_text())["training"][0]["images"] == 10
+    assert len(open_generated("made").scenes) == 12

@@ -1,0 +1,135 @@
+"""Bits set to zero in tone-mapped codes, and what methods then make of the images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evaluation.experiments.paper.bits import bits_methods, bits_removed, bits_table, clear_bits, reduce_colours
+from evaluation.experiments.running import evaluate
+from evaluation.methods.standard import standard_methods
+from foundation.errors import InputError
+from generator.pictures.tonemap import fit_flash
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A made-up raw image."""
+
+    image: npt.NDArray[np.float64]
+    mask: npt.NDArray[np.bool_] | None = None
+    saturation: float | None = None
+    name: str = "photo"
+    truth: npt.NDArray[np.float64] = field(default_factory=lambda: np.array([0.4, 1.0, 0.6]))
+
+    def read(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_] | None]:
+        return self.image, self.mask
+
+
+def photo(seed: int, side: int = 40) -> npt.NDArray[np.float64]:
+    """Return smooth colours under a light, with a range of brightness as photographs have."""
+    rng = np.random.default_rng(seed)
+    grid = np.linspace(0, 3, side)
+    waves = [np.sin(np.add.outer(a * grid, b * grid)) for a, b in rng.uniform(-2, 2, (3, 2))]
+    return np.exp(np.stack(waves, axis=-1) * rng.uniform(0.5, 2)) * [0.4, 1.0, 0.6]
+
+
+@given(code=st.integers(0, 255), bits=st.integers(0, 8))
+def test_cleared_codes_are_whole_steps_below(code: int, bits: int) -> None:
+    (cleared,) = clear_bits(np.array([code], np.uint8), bits)
+    assert cleared == code // 2**bits * 2**bits
+
+
+@pytest.mark.parametrize("bits", [-1, 9])
+def test_a_code_has_eight_bits(bits: int) -> None:
+    with pytest.raises(InputError, match=f"{bits} bits"):
+        clear_bits(np.zeros(1, np.uint8), bits)
+
+
+@given(seed=st.integers(0, 2**32), scale=st.floats(1e-3, 1e5))
+def test_the_operator_is_undone_to_rounding(seed: int, scale: float) -> None:
+    image = photo(seed, 12)
+    image /= image.max()
+    operator = fit_flash(image)
+    np.testing.assert_allclose(operator.invert(operator.apply(image)), image, rtol=1e-9)
+    # The unit does not matter: images are taken relative to their largest value.
+    for ours, other in zip(reduce_colours(image, (0, 3)), reduce_colours(image * scale, (0, 3)), strict=True):
+        np.testing.assert_allclose(ours, other, atol=0.02)
+        assert (np.abs(ours - other) > 1e-6).mean() < 0.01
+
+
+@given(seed=st.integers(0, 2**32))
+def test_no_bit_is_unchanged_within_quantisation(seed: int) -> None:
+    image = photo(seed, 12)
+    image /= image.max()
+    operator = fit_flash(image)
+    codes = operator.apply(image)
+    (restored,) = reduce_colours(image, 0)
+    # Half a code away in every channel at most: between what the codes just below and above stand for.
+    again = operator.apply(restored.astype(np.float64))
+    assert np.abs(again - codes).max() <= 0.51
+
+
+def test_more_bits_are_farther_away() -> None:
+    image = photo(1)
+    image /= image.max()
+    distances = [float(np.abs(reduced - image).mean()) for reduced in reduce_colours(image, range(8))]
+    assert distances == sorted(distances)
+    assert distances[0] < 0.01 < distances[7]
+
+
+def test_a_masked_pixel_has_no_say() -> None:
+    image, mask = photo(2), np.zeros((40, 40), np.bool_)
+    mask[:5] = True
+    dark, bright = image.copy(), image.copy()
+    dark[mask], bright[mask] = 0, 1e6
+    for one, other in zip(reduce_colours(dark, (0, 4), mask), reduce_colours(bright, (0, 4), mask), strict=True):
+        np.testing.assert_array_equal(one[~mask], other[~mask])
+    (without,) = reduce_colours(dark, 4)
+    (with_mask,) = reduce_colours(dark, 4, mask)
+    assert np.abs(without[~mask] - with_mask[~mask]).max() > 1e-3
+
+
+def test_a_black_image_stays_black() -> None:
+    assert all(not reduced.any() for reduced in reduce_colours(np.zeros((4, 4, 3)), (0, 7)))
+
+
+def test_images_as_they_are_give_what_evaluate_gives() -> None:
+    mask = np.zeros((40, 40), np.bool_)
+    mask[:, :8] = True
+    scenes = [Photo(photo(seed), mask if seed % 2 else None, 3.0) for seed in range(4)]
+    assert any((scene.image >= 3.0).any() for scene in scenes)
+    methods = bits_methods(sigma=2)
+    found = bits_removed(scenes, methods, (0, 3), workers=2)
+    for ours, usual in zip(found.raw, evaluate(scenes, methods), strict=True):
+        np.testing.assert_array_equal(ours.estimates, usual.estimates)
+        for kind in ("recovery", "reproduction"):
+            np.testing.assert_array_equal(ours.errors[kind], usual.errors[kind])
+    # Rounded to codes the images are nearly the same, with bits at zero they are not.
+    for raw, exact, coarse in zip(found.raw, found.reduced[0], found.reduced[3], strict=True):
+        near = np.abs(exact.errors["recovery"] - raw.errors["recovery"]).max()
+        assert near < 0.15
+        assert np.abs(coarse.errors["recovery"] - raw.errors["recovery"]).max() > near
+
+
+def test_the_table_has_every_method_and_number() -> None:
+    found = bits_removed([Photo(photo(3)), Photo(photo(4))], bits_methods(sigma=2), (0, 5))
+    table = bits_table(found, "recovery", "made up")
+    assert [row[:2] for row in table.rows[:3]] == [("Gray-world", "as it is"), ("Gray-world", "0"), ("Gray-world", "5")]
+    assert len(table.rows) == 9
+    assert table.rows[2][3] == float(np.median(found.reduced[5][0].errors["recovery"]))
+
+
+def test_the_usual_scale_is_the_standard_method() -> None:
+    assert bits_methods()[2] is not None
+    assert bits_methods()[2].name == standard_methods()["gray-edge-1"].name
+
+
+def test_nothing_to_do() -> None:
+    with pytest.raises(InputError, match="0 images"):
+        bits_removed([], bits_methods())

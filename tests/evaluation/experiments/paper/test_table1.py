@@ -1,0 +1,134 @@
+"""Plain methods on generated data sets: the eight of them, and worlds in which White-Patch is right or wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evaluation.experiments.paper.published import TABLE1
+from evaluation.experiments.paper.table1 import (
+    Setting,
+    block_table,
+    joint_table,
+    noise_table,
+    sensor_of,
+    settings,
+    size_dependence,
+    size_table,
+    table1,
+    table_noise,
+)
+from evaluation.experiments.running import evaluate
+from evaluation.methods.standard import standard_methods
+from foundation.errors import InputError
+from generator.pictures.sources import random_scenes
+from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
+
+PICTURES = random_scenes(5, 24, 16, seed=8)
+TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0]])
+SIX_D, FIVE_FIFTY_D = "Canon EOS 6D Mark II", "Canon EOS 550D"
+
+
+def small(make_table: TableMaker, noise: tuple[float, float] = (0.0, 0.0)) -> tuple[Setting, ...]:
+    luts = [make_table(SIX_D, noise[0]), make_table(FIVE_FIFTY_D, noise[1])]
+    return settings(luts, PICTURES, TRUTHS, side=48, seed=3)
+
+
+def test_the_eight_data_sets_are_the_paper_s_in_its_order(make_table: TableMaker) -> None:
+    chosen = small(make_table)
+    assert [part.cell for part in chosen] == list(TABLE1)
+    assert all(len(part.scenes) == 5 for part in chosen)
+    images = [part.scenes[0].read()[0] for part in chosen]
+    assert [image.shape for image in images] == [(32, 48, 3)] * 4 + [(48, 48, 3)] * 4
+    # Nearest to the ground truths in turn, and drawn: not the same lights.
+    assert [scene.light for scene in chosen[0].scenes] == [0, 3, 0, 3, 0]
+    assert [scene.light for scene in chosen[1].scenes] != [scene.light for scene in chosen[0].scenes]
+    # Both tables show the same scenes: what differs is the sensor.
+    np.testing.assert_array_equal(chosen[4].scenes[1].source.read().picture, chosen[6].scenes[1].source.read().picture)
+
+
+def test_without_noise_a_white_pixel_is_the_light(make_table: TableMaker) -> None:
+    random = [block for block in table1(small(make_table)) if block.cell[0] == "Random"]
+    assert len(random) == 4
+    for block in random:
+        # 2304 pixels in 512 colours hold each channel's brightest code; rounding is 1 in 1000.
+        assert block.results[0].errors["recovery"].max() < 0.05
+        # Uniform codes are grey on average; the mean of few is not.
+        assert block.results[1].errors["recovery"].max() < 2
+
+
+def test_the_noisier_table_is_worse_for_the_maximum_and_not_for_means(make_table: TableMaker) -> None:
+    blocks = {block.cell: block for block in table1(small(make_table, (0.02, 0.2)))}
+    for scenes, lights in (("Random", "C1"), ("Random", "Random")):
+        quiet, noisy = blocks[scenes, "6D", lights], blocks[scenes, "550D", lights]
+        medians = [[result.summary("recovery").median for result in block.results] for block in (quiet, noisy)]
+        assert medians[1][0] > 3 * medians[0][0]
+        assert abs(medians[1][1] - medians[0][1]) < 1
+
+
+def test_the_numbers_are_evaluate_s(make_table: TableMaker) -> None:
+    chosen = small(make_table, (0.05, 0.05))[:1]
+    (block,) = table1(chosen, workers=2)
+    methods = [standard_methods()[name] for name in ("white-patch", "gray-world", "shades-of-gray")]
+    for ours, usual in zip(block.results, evaluate(chosen[0].scenes, methods), strict=True):
+        np.testing.assert_array_equal(ours.errors["reproduction"], usual.errors["reproduction"])
+
+
+def test_the_paper_s_row_stands_below_ours(make_table: TableMaker) -> None:
+    (block,) = table1(small(make_table, (0.05, 0.05))[5:6])
+    table = block_table(block, "reproduction")
+    assert table.title == "Random scenes, 6D sensor, random illuminations"
+    assert [row[0] for row in table.rows] == [
+        "White-Patch",
+        "paper",
+        "Gray-world",
+        "paper",
+        "Shades-of-Gray (p=2)",
+        "paper",
+    ]
+    assert table.rows[1][1:] == (2.46, 2.15, 2.33, 0.88, 4.34, 2.16)
+    assert table.rows[0][1:] == block.results[0].summary("reproduction").as_tuple()
+    assert block_table(block, "recovery").rows[0] != table.rows[0]
+    joint = joint_table([block])
+    assert len(joint.rows) == 3 * 3
+    assert joint.rows[2][:6] == ("Random", "6D", "Random", 5, "White-Patch", "paper")
+
+
+def test_another_camera_has_no_numbers_of_the_paper(make_table: TableMaker) -> None:
+    lut = make_table("Kodak Brownie")
+    assert sensor_of(lut) == "Kodak Brownie"
+    blocks = table1(settings([lut], PICTURES, TRUTHS, side=16))
+    assert [row[0] for row in block_table(blocks[0], "recovery").rows] == [
+        "White-Patch",
+        "Gray-world",
+        "Shades-of-Gray (p=2)",
+    ]
+    assert {row[5] for row in joint_table(blocks).rows} == {"reproduction", "recovery"}
+
+
+def test_images_too_small_for_a_method_are_told(make_table: TableMaker) -> None:
+    (block, *_) = table1(settings([make_table("Test")], PICTURES, TRUTHS, side=2))
+    assert "White-Patch: no usable pixel in 5 images" in " ".join(block_table(block, "recovery").notes)
+
+
+def test_the_size_of_images_matters_where_there_is_noise(make_table: TableMaker) -> None:
+    rows = size_dependence([make_table("Test", noise=0.2)], PICTURES, TRUTHS, (24, 96))
+    assert [(row.cell, row.side) for row in rows[:2]] == [(("C1", "Test", "C1"), 24), (("C1", "Test", "Random"), 24)]
+    assert len(rows) == 8
+    table = size_table(rows)
+    assert table.rows[0][1] == 24
+    assert table.rows[0][2] == rows[0].medians["White-Patch"]
+
+
+def test_noise_of_the_print_s_white(make_table: TableMaker) -> None:
+    noise = table_noise(make_table("Test", noise=0.05, samples=400))
+    # Of 400 samples the largest normal deviate is about three standard deviations up.
+    assert noise.spread == pytest.approx([0.05] * 3, rel=0.15)
+    assert noise.largest == pytest.approx([0.15] * 3, rel=0.4)
+    assert noise.level == pytest.approx(float(np.median(LIGHTS.max(axis=1))) / 9000, rel=0.02)
+    assert noise_table([noise]).rows[0][:2] == ("Test", len(LIGHTS))
+
+
+def test_no_pictures(make_table: TableMaker) -> None:
+    with pytest.raises(InputError, match="no picture"):
+        settings([make_table("Test")], [], TRUTHS)

@@ -1,0 +1,180 @@
+"""Results folders: the same bytes wherever a run was killed, and nothing taken from another run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evaluation.experiments import run_folder
+from evaluation.experiments.run_folder import describe_run, run_methods, write_run
+from evaluation.experiments.running import evaluate
+from evaluation.methods import GrayEdge
+from evaluation.results.errors_file import read_errors
+from evaluation.scene import Scene, SceneSet
+from foundation.errors import InputError
+from foundation.files import partial_path
+from foundation.held_folders import held_folder
+from tests.evaluation.made_up import MixedWall, as_set, walls
+
+METHODS = [GrayEdge("Gray-world", 0, 1, 0, 0), GrayEdge("White-Patch", 0, np.inf, 0, 0)]
+LIGHTS = np.array([[2.0, 1, 1], [1, 1, 1]])
+COUNT = 5
+
+
+def mixed_set(log: list[str] | None = None) -> SceneSet:
+    scenes: tuple[Scene, ...] = (*walls(COUNT - 1, log), MixedWall("mixed.png", LIGHTS))
+    return as_set(scenes)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+class Killed(BaseException):
+    """The end of a process, wherever it is."""
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("results") / "out"
+    run_methods(mixed_set(), METHODS, folder)
+    assert not partial_path(folder).exists()
+    return content(folder)
+
+
+def test_the_files_of_a_results_folder(undisturbed: dict[str, bytes]) -> None:
+    names = {"run.json", "results.csv", "errors.csv", "table.tex", "report.html", "pixels.csv", "regions.csv"}
+    assert set(undisturbed) == names
+    assert len(undisturbed["errors.csv"].splitlines()) == 1 + COUNT * len(METHODS)
+
+
+@pytest.mark.parametrize(("done", "workers"), [(0, 1), (2, 3), (COUNT, 1)])
+def test_killed_after_any_image_it_ends_the_same(
+    tmp_path: Path, undisturbed: dict[str, bytes], done: int, workers: int
+) -> None:
+    folder = tmp_path / "out"
+
+    def kill(count: int, _: int) -> None:
+        if count == done:
+            raise Killed
+
+    with pytest.raises(Killed):
+        run_methods(mixed_set(), METHODS, folder, workers=workers, on_scene=kill)
+    assert not folder.exists()
+    log: list[str] = []
+    counts: list[int] = []
+    run_methods(mixed_set(log), METHODS, folder, workers=workers, on_scene=lambda count, _: counts.append(count))
+    assert counts == list(range(done, COUNT + 1))
+    assert content(folder) == undisturbed
+    assert not partial_path(folder).exists()
+
+
+@pytest.mark.parametrize("written", [2, 6])
+def test_killed_while_files_are_written_it_ends_the_same(
+    tmp_path: Path, undisturbed: dict[str, bytes], monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
+    folder, write_whole = tmp_path / "out", run_folder.write_whole
+    left = iter(range(written))
+
+    def writes(path: Path, text: str) -> None:
+        if next(left, None) is None:
+            path.with_name(f".{path.name}.partial").write_text(text[: len(text) // 2])
+            raise Killed
+        write_whole(path, text)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(run_folder, "write_whole", writes)
+        with pytest.raises(Killed):
+            run_methods(mixed_set(), METHODS, folder)
+    assert not folder.exists()
+    counts: list[int] = []
+    run_methods(mixed_set(), METHODS, folder, on_scene=lambda count, _: counts.append(count))
+    assert counts == [COUNT]  # No image is estimated a second time.
+    assert content(folder) == undisturbed
+
+
+def _stopped(folder: Path) -> bytes:
+    def kill(count: int, _: int) -> None:
+        if count == 2:
+            raise Killed
+
+    with pytest.raises(Killed):
+        run_methods(mixed_set(), METHODS, folder, on_scene=kill)
+    return next(partial_path(folder).iterdir()).read_bytes()
+
+
+def _other_truth() -> SceneSet:
+    scenes: list[Any] = list(mixed_set().scenes)
+    scenes[3] = type(scenes[3])(scenes[3].name, scenes[3].truth * (1, 1, 1.001), 3)
+    return as_set(tuple(scenes))
+
+
+def _other_treatment() -> SceneSet:
+    return SceneSet("Walls", "made up", "nowhere", mixed_set().scenes, {"black level": "129"})
+
+
+@pytest.mark.parametrize(
+    ("data", "methods", "what"),
+    [
+        (_other_truth, METHODS, "data set"),
+        (lambda: as_set(walls(COUNT)), METHODS, "data set"),
+        (_other_treatment, METHODS, "treatment"),
+        (mixed_set, METHODS[::-1], "methods"),
+        (mixed_set, [METHODS[0], GrayEdge("White-Patch", 0, 9, 0, 0)], "methods"),
+        (mixed_set, METHODS[:1], "methods"),
+    ],
+)
+def test_what_another_run_has_made_is_not_taken(
+    tmp_path: Path, data: Callable[[], SceneSet], methods: list[GrayEdge], what: str
+) -> None:
+    folder = tmp_path / "out"
+    before = _stopped(folder)
+    with pytest.raises(InputError, match=rf"\.out\.partial holds what another run has made so far: its {what} differ"):
+        run_methods(data(), methods, folder)
+    assert next(partial_path(folder).iterdir()).read_bytes() == before
+
+
+def test_two_programs_do_not_work_on_one_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    with held_folder(partial_path(folder), "busy"), pytest.raises(InputError, match="another program works on"):
+        run_methods(mixed_set(), METHODS, folder)
+
+
+def test_what_is_there_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").touch()
+    log: list[str] = []
+    with pytest.raises(InputError, match="already exists; name another place for the results"):
+        run_methods(as_set(walls(2, log)), METHODS, tmp_path / "out")
+    assert not log
+
+
+def test_two_methods_of_one_name_are_refused() -> None:
+    with pytest.raises(InputError, match="two methods are called 'Gray-world'"):
+        run_methods(mixed_set(), [METHODS[0], GrayEdge("Gray-world", 0, 2, 0)])
+
+
+def test_errors_are_read_back(tmp_path: Path) -> None:
+    made = run_methods(mixed_set(), METHODS, tmp_path / "out")
+    found = read_errors(tmp_path / "out")
+    assert list(found) == ["Gray-world", "White-Patch"]
+    for result in made.results:
+        read = found[result.method]
+        assert read.images == made.subject.images
+        np.testing.assert_allclose(read.errors["recovery"], result.errors["recovery"], atol=1e-6)
+        assert read.truths is not None
+        np.testing.assert_allclose(read.truths, made.truths / made.truths.sum(axis=1, keepdims=True), atol=1e-8)
+
+
+def test_folds_are_written_with_results_that_were_made_otherwise(tmp_path: Path) -> None:
+    data = as_set(walls(4))
+    results = evaluate(data.scenes, METHODS)
+    run = describe_run(data, results, [{"name": "A"}, {"name": "B"}], {"seed": 3}, np.array([0, 1, 0, 1]), ("A note.",))
+    write_run(run, data.scenes, tmp_path / "cv")
+    assert "folds.csv" in content(tmp_path / "cv")
+    assert b'"seed": 3' in content(tmp_path / "cv")["run.json"]
+    assert b"A note." in content(tmp_path / "cv")["report.html"]

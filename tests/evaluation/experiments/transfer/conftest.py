@@ -1,0 +1,92 @@
+"""Generated sets of a table that is itself naive: what a code reflects is its linear sRGB, nothing is printed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+
+from acquisition.lights.illuminations import Illumination
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
+from drivers.presenter import Colour
+from evaluation.datasets.generated import open_generated
+from evaluation.scene import SceneSet
+from foundation.srgb import decode_srgb
+from generator.dataset.making import DatasetOptions, generate_dataset
+from generator.lights.choices import LightChoice, ListedLights
+from generator.pictures.picture import UNPREPARED, Preparation
+from generator.pictures.sources import find_pictures
+
+LIGHTS = np.array([[4000.0, 8000, 3000], [3000, 8000, 6000]])
+"""Counts of white under the two lights of the table."""
+WHITE_LEVEL = 9000
+BOTH = ListedLights((0, 1))
+
+
+@dataclass(frozen=True)
+class Maker:
+    """Makes generated sets in a folder, of its pictures and its table."""
+
+    folder: Path
+    lut: Lut
+
+    @property
+    def pictures(self) -> Path:
+        return self.folder / "pictures"
+
+    def make(
+        self,
+        name: str = "made",
+        lights: LightChoice = BOTH,
+        preparation: Preparation = UNPREPARED,
+        split: tuple[float, float, float] | None = None,
+        pictures: Path | None = None,
+        seed: int = 0,
+    ) -> SceneSet:
+        reading = {} if preparation == UNPREPARED else preparation.describe()
+        options = DatasetOptions(previews=False, split=split, reading=reading)
+        sources = find_pictures(pictures or self.pictures, preparation)
+        generate_dataset(self.lut, self.folder / name, sources, lights, seed=seed, options=options)
+        return open_generated(self.folder / name)
+
+
+def save_pictures(folder: Path, names: Sequence[str], seed: int = 0, side: int = 24) -> None:
+    """Save pictures of flat patches, of codes that the table keeps whole."""
+    random = np.random.default_rng(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        patches: npt.NDArray[np.uint8] = random.integers(0, 8, (side // 4, side // 4, 3)).astype(np.uint8) * 32
+        Image.fromarray(patches.repeat(4, axis=0).repeat(4, axis=1)).save(folder / name)
+
+
+def write_table(folder: Path, matrix: npt.NDArray[np.float64] | None = None, camera: str = "Canon EOS 550D") -> Lut:
+    """Write a table whose samples are linear sRGB, through a matrix if there is one, times the light."""
+    folder.mkdir(parents=True)
+    index = np.arange(512)
+    codes = np.stack([index >> 6, index >> 3 & 7, index & 7], axis=-1) * 32
+    linear = decode_srgb(codes / 255)
+    if matrix is not None:
+        linear = np.maximum(linear @ matrix.T, 0)
+    writer = LutWriter(folder, 2, 512, 2)
+    for number, light in enumerate(LIGHTS):
+        writer.put(number, np.rint(linear * light)[:, None, :].repeat(2, axis=1).astype(np.uint16))
+    known = Provenance(
+        camera=camera, bits=3, white_level=WHITE_LEVEL, session_sha256="0", chart_sha256="0", software="test"
+    )
+    plan = [Illumination(number, "uniform", None, Colour(1, 2, 3)) for number in range(2)]
+    writer.finish(plan, LIGHTS, known)
+    return open_lut(folder)
+
+
+@pytest.fixture
+def maker(tmp_path: Path) -> Maker:
+    """Return a maker of generated sets of three pictures."""
+    save_pictures(tmp_path / "pictures", ("a.png", "b.png", "c.png"))
+    return Maker(tmp_path, write_table(tmp_path / "lut"))

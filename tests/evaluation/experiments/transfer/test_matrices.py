@@ -1,0 +1,63 @@
+"""Colour matrices: against figures published by others, from files, and what is no matrix."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.experiments.transfer.matrices import camera_matrix, cameras, choose_matrix
+from foundation.errors import InputError
+
+
+def test_every_camera_keeps_white() -> None:
+    assert len(cameras()) == 7
+    for name in cameras():
+        found = camera_matrix(name)
+        assert found is not None
+        assert found.name == name
+        np.testing.assert_allclose(found.rows.sum(axis=1), 1, rtol=0, atol=1e-12)
+        # Each channel sees most of its own primary.
+        assert (found.rows.argmax(axis=1) == [0, 1, 2]).all()
+
+
+@pytest.mark.parametrize("name", ["Canon EOS 550D", "EOS 550D", "550d", "canon eos550d", "Canon EOS-550D"])
+def test_names_of_a_camera(name: str) -> None:
+    found = camera_matrix(name)
+    assert found is not None
+    assert found.name == "Canon EOS 550D"
+
+
+@pytest.mark.parametrize("name", ["", "Canon", "EOS", "5D", "Nikon 550D", "50D"])
+def test_what_is_no_camera(name: str) -> None:
+    assert camera_matrix(name) is None
+
+
+def test_the_matrix_that_a_second_reading_found() -> None:
+    # Found apart, with sRGB's matrix to more digits: rows of the EOS 550D to three decimals.
+    found = camera_matrix("EOS 550D")
+    assert found is not None
+    expected = [[0.578, 0.344, 0.079], [0.088, 0.674, 0.238], [0.035, 0.217, 0.748]]
+    np.testing.assert_allclose(found.rows, expected, atol=0.0011)
+
+
+def test_files(tmp_path: Path) -> None:
+    path = tmp_path / "matrix.txt"
+    path.write_text("2 0 0\n0,1,1 # remark\n\n1;1;2\n")
+    found = choose_matrix(str(path))
+    assert found is not None
+    np.testing.assert_array_equal(found.rows, [[1, 0, 0], [0, 0.5, 0.5], [0.25, 0.25, 0.5]])
+    assert choose_matrix("None") is None
+    for text, message in (
+        ("1 2\n3 4 5\n6 7 8\n", r"rows have \[2, 3, 3\] numbers"),
+        ("1 0 0\n0 1 0\n", "expected three rows"),
+        ("1 0 0\n0 x 0\n0 0 1", "could not convert"),
+        ("1 0 0\n0 nan 0\n0 0 1", "is no colour matrix"),
+        ("1 0 0\n0 1 0\n1 0 -1", "sums 1 1 0, expected sums above 0"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=message):
+            choose_matrix(str(path))
+    with pytest.raises(InputError, match=r"'Pinhole' is neither a file nor a camera.*Canon EOS 550D"):
+        choose_matrix("Pinhole")

@@ -1,0 +1,161 @@
+"""Rows of a transfer: right in worlds where the answer is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from evaluation.experiments.cross_validation import cross_validate
+from evaluation.experiments.folds import draw_folds
+from evaluation.experiments.transfer.figures import TransferFigures, figures_of
+from evaluation.experiments.transfer.rows import TrainingSet, TransferRow, draw_images, transfer
+from evaluation.learning.constant_light import ConstantLight
+from evaluation.methods.gray_edge import GrayEdge
+from evaluation.methods.method import Method
+from evaluation.scene import Image, Scene
+from foundation.errors import InputError
+from tests.evaluation.experiments.transfer.worlds import COOL, MeanColour, world
+
+LEARNERS = (MeanColour(), ConstantLight())
+TEST = world(120, seed=1)
+FOLDS = tuple(draw_folds(120, 3, seed) for seed in range(2))
+
+
+def _rows(*training: TrainingSet, images: int = 80) -> tuple[TransferRow, ...]:
+    return transfer(TEST, training, LEARNERS, FOLDS, images, [GrayEdge("Gray-world", 0, 1, 0)])
+
+
+def _ratio(found: TransferFigures, method: str, data: str, place: int = 1) -> tuple[float, float, float]:
+    (figure,) = [one.ratios[place] for one in found.to_real if (one.row.method, one.row.data) == (method, data)]
+    return figure.value, figure.low, figure.high
+
+
+def test_what_comes_from_the_same_world_is_worth_as_much() -> None:
+    found = figures_of(_rows(TrainingSet("same", "generated", world(200, seed=2))), "reproduction")
+    for place in range(6):
+        for method in ("Mean colour", "Constant light"):
+            ratio, low, high = _ratio(found, method, "same", place)
+            assert 0.85 < ratio < 1.15
+            assert low < 1.05
+            assert high > 0.95
+
+
+def test_lights_elsewhere_and_surfaces_of_another_kind_are_found_out() -> None:
+    elsewhere = TrainingSet("elsewhere", "generated", world(200, seed=2, centre=COOL))
+    tinted = TrainingSet("tinted", "generated", world(200, seed=2, cast=(1.0, 1.0, 0.7)))
+    found = figures_of(_rows(elsewhere, tinted), "reproduction")
+    # The constant light is that of another world, and the interval leaves no doubt.
+    assert _ratio(found, "Constant light", "elsewhere")[1] > 2
+    # A straight map of chromaticities is none of their colours: where no light of its training was, it is off.
+    assert _ratio(found, "Mean colour", "elsewhere")[1] > 2
+    assert _ratio(found, "Mean colour", "tinted")[1] > 1.5
+    assert _ratio(found, "Constant light", "tinted")[2] < 1.3
+
+
+def test_the_rows_and_their_order() -> None:
+    same = world(90, seed=2)
+    rows = _rows(TrainingSet("a", "generated", same), TrainingSet("a", "naive", same), images=50)
+    assert [(row.method, row.kind, row.images, len(row.results)) for row in rows] == [
+        ("Mean colour", "cross-validation", 80, 2),
+        ("Mean colour", "generated", 50, 2),
+        ("Mean colour", "naive", 50, 2),
+        ("Constant light", "cross-validation", 80, 2),
+        ("Constant light", "generated", 50, 2),
+        ("Gray-world", "none", 0, 1),
+    ]
+    # Naive counterparts that are the generated images themselves give the same estimates: the same places are drawn.
+    for one, other in zip(rows[1].results, rows[2].results, strict=True):
+        np.testing.assert_array_equal(one.estimates, other.estimates)
+    assert (rows[1].results[0].estimates != rows[1].results[1].estimates).any()
+
+
+def test_cross_validation_is_that_of_the_command_of_its_own() -> None:
+    rows = transfer(TEST, [], LEARNERS, FOLDS, 1)
+    for seed, folds in enumerate(FOLDS):
+        for row, result in zip(rows, cross_validate(TEST, LEARNERS, folds, seed), strict=True):
+            np.testing.assert_allclose(row.results[seed].estimates, result.estimates, rtol=1e-12)
+
+
+def test_threads_change_nothing_and_a_run_repeats_itself() -> None:
+    made = [
+        transfer(TEST, [TrainingSet("a", "generated", world(60, seed=2))], LEARNERS, FOLDS, 40, workers=workers)
+        for workers in (1, 3, 3)
+    ]
+    for rows in zip(*made, strict=True):
+        for row in rows[1:]:
+            np.testing.assert_array_equal(row.results[1].estimates, rows[0].results[1].estimates)
+
+
+@dataclass(frozen=True)
+class Mean:
+    light: npt.NDArray[np.float64]
+    name: str = "Mean light"
+
+    def estimate(
+        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
+    ) -> npt.NDArray[np.float64]:
+        if not image.any():
+            raise ZeroDivisionError("black")
+        return self.light
+
+
+@dataclass(frozen=True)
+class MeanLearner:
+    """A user's class: no features, only `fit`."""
+
+    name: str = "Mean light"
+
+    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Method:
+        mean = np.mean([scene.truth / np.linalg.norm(scene.truth) for scene in scenes], axis=0)
+        return Mean(mean / np.linalg.norm(mean))
+
+
+def test_a_learner_that_reads_scenes_itself() -> None:
+    training = world(30, seed=2)
+    rows = transfer(TEST, [TrainingSet("a", "generated", training)], [MeanLearner()], FOLDS, 30)
+    assert [row.kind for row in rows] == ["cross-validation", "generated"]
+    expected = MeanLearner().fit(training).estimate(np.ones((1, 1, 3)))
+    np.testing.assert_allclose(rows[1].results[0].estimates, np.tile(expected, (120, 1)))
+
+
+@dataclass(frozen=True)
+class Stubborn:
+    """A user's class with a mistake in it."""
+
+    name: str = "Stubborn"
+
+    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Method:
+        raise KeyError("weights")
+
+
+def test_mistakes_of_a_users_class_are_named() -> None:
+    with pytest.raises(InputError, match="Stubborn fails to learn from 80 images: KeyError: 'weights'"):
+        transfer(TEST, [], [Stubborn()], FOLDS, 1)
+    black = (replace(TEST[0], cast=(0.0, 0.0, 0.0)), *TEST[1:])
+    with pytest.raises(InputError, match=r"Mean light fails on 1_000: ZeroDivisionError: black \(test_rows.py"):
+        transfer(black, [], [MeanLearner()], FOLDS, 1)
+
+
+def test_an_image_without_a_usable_pixel_is_guessed() -> None:
+    black = (replace(TEST[0], cast=(0.0, 0.0, 0.0)), *TEST[1:])
+    for row in transfer(black, [TrainingSet("a", "generated", world(40, seed=2))], [MeanColour()], FOLDS, 40):
+        assert row.results[0].guessed.nonzero()[0].tolist() == [0]
+        np.testing.assert_allclose(row.results[0].estimates[0], 3**-0.5)
+
+
+def test_images_are_drawn_without_repeats() -> None:
+    drawn = [draw_images(1000, 100, seed) for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    assert len(np.unique(drawn[2])) == 100
+    assert len(np.intersect1d(drawn[0], drawn[2])) < 30
+    with pytest.raises(InputError, match="11 training images of 10"):
+        draw_images(10, 11, 0)
+
+
+def test_nothing_to_learn_with_is_said() -> None:
+    with pytest.raises(InputError, match="0 learned methods and 2 seeds"):
+        transfer(TEST, [], [], FOLDS, 1)

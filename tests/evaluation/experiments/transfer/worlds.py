@@ -1,0 +1,84 @@
+"""Made-up worlds: scenes of random surfaces under lights of a given spread, and a learner that takes no time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.learning.feature_learner import FeatureLearner, Features
+from evaluation.scene import Image
+
+WARM = (0.45, 0.38, 0.17)
+COOL = (0.22, 0.42, 0.36)
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """A scene of 16 × 16 surfaces whose mean is not quite grey."""
+
+    name: str
+    truth: npt.NDArray[np.float64]
+    seed: int
+    cast: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    saturation: float | None = None
+
+    def read(self) -> tuple[npt.NDArray[np.float64], None]:
+        random = np.random.default_rng(self.seed)
+        surfaces = random.uniform(0, 1, (16, 16, 3)) * random.uniform(0.8, 1.2, 3)
+        return 1000 * surfaces * self.cast * self.truth, None
+
+
+def world(
+    count: int,
+    seed: int,
+    centre: tuple[float, float, float] = WARM,
+    cast: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> tuple[Patches, ...]:
+    """Return scenes under lights around a centre, their surfaces with a cast of their own."""
+    random = np.random.default_rng([seed, 99])
+    lights = np.array(centre) * np.exp(random.normal(0, 0.12, (count, 3)))
+    return tuple(
+        Patches(f"{seed}_{number:03d}", light / light.sum(), 1000 * seed + number, cast)
+        for number, light in enumerate(lights)
+    )
+
+
+@dataclass(frozen=True)
+class MeanColour(FeatureLearner):
+    """A straight map from the chromaticities of the mean colour to those of the light, by least squares."""
+
+    @property
+    def key(self) -> str:
+        return "mean-colour"
+
+    @property
+    def name(self) -> str:
+        return "Mean colour"
+
+    def features(
+        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
+    ) -> npt.NDArray[np.float64] | None:
+        mean = image.reshape(-1, 3).mean(axis=0, dtype=np.float64)
+        return None if not mean.any() else np.append(mean / mean.sum(), 1)[[0, 2, 3]]
+
+    def fit_features(self, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> StraightMap:
+        solved = np.linalg.lstsq(np.asarray(features, dtype=np.float64), truths, rcond=None)[0]
+        return StraightMap(np.asarray(solved, dtype=np.float64))
+
+    def restore(self, arrays: Mapping[str, npt.NDArray[np.generic]]) -> StraightMap:
+        return StraightMap(np.asarray(arrays["map"], dtype=np.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class StraightMap:
+    map: npt.NDArray[np.float64]
+
+    def lights(self, features: Features) -> npt.NDArray[np.float64]:
+        found = np.maximum(np.asarray(features, dtype=np.float64) @ self.map, 1e-6)
+        return found / found.sum(axis=1, keepdims=True)
+
+    def arrays(self) -> Mapping[str, npt.NDArray[np.generic]]:
+        return {"map": self.map}

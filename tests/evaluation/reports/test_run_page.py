@@ -1,0 +1,137 @@
+"""The report of a run: figures and pictures show what the numbers say."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from evaluation.experiments.run_folder import describe_run
+from evaluation.experiments.running import evaluate
+from evaluation.methods import GrayEdge
+from evaluation.reports import error_figures
+from evaluation.reports.developed import developed
+from evaluation.reports.error_figures import error_curves, error_planes
+from evaluation.reports.run_page import chosen_images, run_page
+from evaluation.results.result import Result
+from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
+from tests.evaluation.reports.test_page import checked
+
+METHODS = [GrayEdge("Gray-world", 0, 1, 0, 0), GrayEdge("White <Patch>", 0, np.inf, 0, 0)]
+
+
+def result_of(errors: Sequence[float], method: str = "M") -> Result:
+    both = np.array(errors, dtype=np.float64)
+    count = len(both)
+    return Result(method, np.ones((count, 3)), {"recovery": both, "reproduction": both}, np.zeros(count, bool))
+
+
+def panels(jpeg: bytes) -> list[npt.NDArray[Any]]:
+    """Return the pictures of a row as (H, W, 3) RGB, without the gaps between them."""
+    row = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert row is not None
+    side = (row.shape[1] - 12) // 3
+    return [row[:, left : left + side, ::-1].astype(int) for left in (0, side + 6, 2 * side + 12)]
+
+
+def cast(picture: npt.NDArray[Any]) -> float:
+    """Return the largest mean difference between two channels, in codes."""
+    means = picture.reshape(-1, 3).mean(axis=0)
+    return float(means.max() - means.min())
+
+
+def test_the_truth_removes_the_cast_and_a_wrong_estimate_does_not() -> None:
+    scene = Wall("wall", np.array([2.0, 1.0, 0.5]))
+    (wrong, right) = developed(scene, [np.array([0.5, 1.0, 2.0]), scene.truth])
+    raw, by_wrong, by_truth = panels(wrong)
+    assert cast(by_truth) < 3 < 40 < cast(raw) < cast(by_wrong)
+    assert raw[..., 0].mean() > raw[..., 2].mean()
+    np.testing.assert_allclose(panels(right)[1], by_truth, atol=12)
+
+
+def test_several_lights_are_corrected_by_pixel() -> None:
+    scene = MixedWall("mixed", np.array([[3.0, 1, 1], [1, 1, 3]]))
+    (jpeg,) = developed(scene, [scene.truth])
+    _, by_mean, by_pixel = panels(jpeg)
+    outer = np.s_[:, [4, -5]]
+    assert cast(by_pixel[outer]) < 6
+    assert cast(by_mean[:, 4]) > 20
+
+
+def test_masked_pixels_are_grey_and_do_not_set_the_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = MixedWall("masked", np.array([[1.0, 1, 1], [1, 1, 1]]), masked=True)
+    read = MixedWall.read
+
+    def glaring(self: MixedWall) -> Any:
+        image, mask = read(self)
+        image[:, :4] *= 1000
+        return image, mask
+
+    monkeypatch.setattr(MixedWall, "read", glaring)
+    (jpeg,) = developed(scene, [np.ones(3)])
+    raw = panels(jpeg)[0]
+    assert raw[:, 5] == pytest.approx(118, abs=8)  # 0.18 in the curve of sRGB.
+    assert raw[:, -5].min() > 240
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-9])
+def test_a_black_image_and_a_light_without_a_channel(value: float) -> None:
+    class Black(Wall):
+        def read(self) -> tuple[npt.NDArray[np.float32], None]:
+            return np.full((5, 5, 3), value, np.float32), None
+
+    assert len(developed(Black("black", np.array([1.0, 1, 0])), [np.array([0.0, 1, 1])])) == 1
+
+
+def test_worst_and_median_images_are_chosen() -> None:
+    worst, middle = chosen_images(result_of([5, 1, 9, 3, 2, 8, 4]), "recovery")
+    assert worst == (2, 5, 0)
+    assert middle == (6, 3)  # The median is 4; 5 is shown already.
+    assert chosen_images(result_of([1.0]), "recovery") == ((0,), ())
+
+
+def test_the_curve_reaches_its_shares(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Any] = []
+
+    def keep(draw: Any, *arguments: Any, inches: Any) -> bytes:
+        from matplotlib.figure import Figure
+
+        figure: Any = Figure()
+        draw(figure, *arguments)
+        drawn.append(figure)
+        return b""
+
+    monkeypatch.setattr(error_figures, "svg_of", keep)
+    error_curves([result_of([4, 1, 3, 2]), result_of([2, 2, 2, 2], "Same")], "recovery")
+    first, second = drawn[0].axes[0].lines
+    np.testing.assert_allclose(first.get_xdata(), [0, 1, 2, 3, 4])
+    np.testing.assert_allclose(first.get_ydata(), [0, 25, 50, 75, 100])
+    np.testing.assert_allclose(second.get_xdata()[1:], 2)
+    error_planes([result_of([4, 1, 3, 2])], np.array([[1.0, 1, 2], [1, 1, 1], [2, 1, 1], [1, 2, 1]]), "recovery")
+    (points,) = drawn[1].axes[0].collections
+    # The largest error, that of the first light, is drawn last.
+    np.testing.assert_allclose(points.get_offsets()[-1], (0.25, 0.5))
+    assert points.get_array()[-1] == 4
+
+
+def test_many_methods_and_images_make_a_page_that_closes() -> None:
+    data = as_set((*walls(6), MixedWall("mixed & <odd>", np.array([[2.0, 1, 1], [1, 1, 1]]))))
+    results = evaluate(data.scenes, METHODS)
+    run = describe_run(data, results, [{"name": "A", "settings": {"p": [1] * 99}}, {"name": "B", "class": "x:Y"}])
+    pictures = {
+        (number, place): developed(data.scenes[place], [result.estimates[place]])[0]
+        for number, result in enumerate(results)
+        for place in sum(chosen_images(result, "recovery"), ())
+    }
+    text = run_page(run, "recovery", pictures)
+    found = checked(text)
+    assert text.count("<details") == len(METHODS)
+    assert len(re.findall(r"src='data:image/jpeg", text)) == len(pictures)
+    for words in ("White <Patch>", "as it was drawn", "MAE_illum", "1 of them under several lights", "mixed & <odd>"):
+        assert words in found.text
+    assert text == run_page(run, "recovery", pictures)
