@@ -58,6 +58,8 @@ def describe(
     reading: DataReading,
 ) -> None:
     """Describe a data set."""
+    from dataclasses import replace
+
     from evaluation.experiments.describing import report as reporting
     from evaluation.experiments.describing.against import compare_figures, sentence
     from evaluation.experiments.describing.statistics_json import statistics_to_json
@@ -71,6 +73,8 @@ def describe(
     threads = workers or processor_count()
     one = _described(data, reading, cells, threads)
     other = None if against is None else _described(against, DataReading(against_layout), cells, threads)
+    if other is not None and one.name == other.name:
+        one, other = (replace(made, name=f"{made.name} ({place})") for made, place in ((one, data), (other, against)))
     if other is None:
         print_table(reporting.figures_table(one))
     print_table(reporting.lights_table([one] if other is None else [one, other]))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
@@ -37,10 +38,6 @@ Out = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Write page, tables and figures here.", show_default=False)
 ]
 Seed = Annotated[int, typer.Option(metavar="N", help="Of all that is drawn at random.", min=0)]
-Layout = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="Layout of DATA. \\[default: by what it looks like]", show_default=False),
-]
 Workers = Annotated[
     int | None, typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False)
 ]
@@ -78,15 +75,14 @@ def table1(
             show_default=False,
         ),
     ],
-    camera: Annotated[
-        str | None,
+    matrix: Annotated[
+        str,
         typer.Option(
-            metavar="NAME",
-            help="Camera of the data set in --pictures, for its colour matrix: Canon EOS-1Ds Mark III, "
-            "Canon EOS 550D, Canon EOS 600D. \\[default: no matrix]",
-            show_default=False,
+            metavar="CAMERA|FILE|none",
+            help="Colour matrix by which a data set in --pictures is developed: a camera such as Canon EOS-1Ds Mark "
+            "III, or a file of 3 x 3 numbers, linear sRGB to camera RGB.",
         ),
-    ] = None,
+    ] = "none",
     side: Annotated[int, typer.Option(metavar="PX", help="Longest side of every image.", min=1, max=65535)] = 512,
     sizes: Annotated[
         str, typer.Option(metavar="LIST", help="Further sides, px, between commas, to show what they change.")
@@ -107,15 +103,15 @@ def table1(
     """Run plain methods on eight generated data sets."""
     from evaluation.experiments.paper.hot import hot_rows
     from evaluation.experiments.paper.reporting import table1_report
+    from evaluation.experiments.paper.scenes.truths import read_truths
     from evaluation.experiments.paper.table1 import settings, size_dependence
     from evaluation.experiments.paper.table1 import table1 as run
-    from evaluation.experiments.paper.truths import read_truths
     from foundation.processors import processor_count
 
     sides, shares = [int(side) for side in _numbers(sizes, "side of an image, px", 65535)], _numbers(hot, "share", 1e6)
     _require_free(out)
     opened = _open(luts)
-    scenes, says = _pictures(pictures, camera)
+    scenes, says = _pictures(pictures, matrix)
     truths = read_truths(lights_like)
     chosen = settings(opened, scenes, truths.lights, side, seed)
     threads = workers or processor_count()
@@ -141,6 +137,7 @@ the real one, and tests on the real one. The paper's numbers stand beside those 
 
 
 @app.command("table2", help=_TABLE2)
+@with_data_options
 def table2(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set; the paper's is Cube+.")],
     generated: Annotated[
@@ -150,11 +147,12 @@ def table2(
         str, typer.Option(metavar="LIST", help="Learned methods, between commas.")
     ] = "smart-color-cat,regression-trees,color-beaver",
     folds: Annotated[str, typer.Option(metavar="N|FILE", help="Folds of the cross-validation, or their file.")] = "3",
-    layout: Layout = None,
     error: Kind = "reproduction",
     seed: Seed = 0,
     out: Out = None,
     workers: Workers = None,
+    *,
+    reading: DataReading,
 ) -> None:
     """Train learned methods on real and on generated images."""
     from evaluation.datasets import open_scenes
@@ -173,7 +171,7 @@ def table2(
         if name not in known:
             raise InputError(f"{name!r} is no learned method; the methods are {', '.join(known)}")
     learners = {name: known[name] for name in names}
-    real, made = open_scenes(data, layout), open_scenes(generated)
+    real, made = reading.open(data), open_scenes(generated)
     count = len(real.scenes)
     if folds.isdigit():
         drawn = draw_folds(count, int(folds), seed)
@@ -201,24 +199,25 @@ nothing unless asked with --out.
 
 
 @app.command("bits", help=_BITS)
+@with_data_options
 def bits(
     data: Annotated[str, typer.Argument(metavar="DATA", help="Real data set of linear images; the paper's is NUS C1.")],
     sigma: Annotated[
         float, typer.Option(metavar="PX", help="Scale of Gray-Edge; 6 is usual for images of full size.", min=0.1)
     ] = 6.0,
-    layout: Layout = None,
     error: Kind = "reproduction",
     out: Out = None,
     workers: Workers = None,
+    *,
+    reading: DataReading,
 ) -> None:
     """Run methods on images whose colours were reduced."""
-    from evaluation.datasets import open_scenes
     from evaluation.experiments.paper.bits import bits_methods, bits_removed
     from evaluation.experiments.paper.reporting import bits_report
     from foundation.processors import processor_count
 
     _require_free(out)
-    opened = open_scenes(data, layout)
+    opened = reading.open(data)
     with _progress(len(opened.scenes)) as step:
         found = bits_removed(opened.scenes, bits_methods(sigma), workers=workers or processor_count(), on_scene=step)
     conditions = (f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px.",)
@@ -271,7 +270,7 @@ def chromaticities(
 ) -> None:
     """Show the chromaticities of tables' lights."""
     from evaluation.experiments.paper.reporting import chromaticities_report
-    from evaluation.experiments.paper.truths import read_truths
+    from evaluation.experiments.paper.scenes.truths import read_truths
 
     _require_free(out)
     report = chromaticities_report(_open(luts), [read_truths(place) for place in truths or ()])
@@ -301,28 +300,30 @@ def _open(folders: Sequence[Path]) -> list[Lut]:
     return [open_lut(folder) for folder in folders]
 
 
-def _pictures(place: str, camera: str | None) -> tuple[Sequence[Source], str]:
+def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str]:
     """Return the source pictures at a place, and what was done to get them."""
     from evaluation.datasets import open_scenes
     from evaluation.datasets.opening import layout_of
-    from evaluation.experiments.paper.developing import developed
+    from evaluation.experiments.paper.scenes.developing import developed
+    from evaluation.experiments.transfer.matrices import choose_matrix
     from foundation.errors import FormatError, InputError
     from generator import find_pictures
 
+    chosen = choose_matrix(matrix)
     try:
         layout = layout_of(place)
     except FormatError:
         layout = None
     if layout is None:
-        if camera is not None:
-            raise InputError(f"--camera {camera} is for a data set of raw images; {place} is none")
+        if chosen is not None:
+            raise InputError(f"--matrix {matrix} is for a data set of raw images; {place} is none")
         found = find_pictures(place)
         return found, f"{len(found)} of {place}"
     if layout == "generated":
         raise InputError(f"{place} was made by generate; name photographs, or a data set of real raw images")
     data = open_scenes(place, layout)
-    matrix = f"with the colour matrix of {camera}" if camera else "without a colour matrix"
-    return developed(data, camera), f"{len(data.scenes)} of {data.name}, developed to sRGB {matrix}"
+    how = f"with the colour matrix of {chosen.name}" if chosen else "without a colour matrix"
+    return developed(data, chosen), f"{len(data.scenes)} of {data.name}, developed to sRGB {how}"
 
 
 def _numbers(text: str, what: str, most: float) -> list[float]:

@@ -25,6 +25,11 @@ class GeneratedScene:
         return self.entry.image
 
     @property
+    def group(self) -> str:
+        """Name of the picture that it was made from, which other images may share: they are kept in one fold."""
+        return self.entry.source
+
+    @property
     def truth(self) -> npt.NDArray[np.float64]:
         """The light (3,) float64, linear camera RGB, r + g + b = 1."""
         return np.array(self.entry.truth)

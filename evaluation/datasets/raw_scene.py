@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -152,7 +152,7 @@ def polygon_mask(shape: tuple[int, int], corners: npt.NDArray[np.float64]) -> Ma
 
 
 def subtract_black(image: Image, black: float) -> Image:
-    """Return an image (H, W, 3) with a black level subtracted, 0 where it was below.
+    """Return an image (H, W, 3) with a black level subtracted, 0 where it was below; the image given is used up.
 
     It stays uint16 where the level is whole, and becomes float32 where it is not; float images keep their dtype.
 
@@ -163,13 +163,11 @@ def subtract_black(image: Image, black: float) -> Image:
     """
     import cv2
 
-    if not black:
-        return image if image.dtype == np.uint16 else np.maximum(image, 0)
     if image.dtype == np.uint16 and not float(black).is_integer():
         image = image.astype(np.float32)
-    levels = np.array([black, black, black, 0.0])
-    lower = cv2.subtract(image, levels)  # Saturates at 0 in integers.
-    return cast("Image", np.asarray(lower if image.dtype == np.uint16 else np.maximum(lower, 0), dtype=image.dtype))
+    if black:
+        cv2.subtract(image, np.array([black, black, black, 0.0]), dst=image)  # Saturates at 0 in integers.
+    return image if image.dtype == np.uint16 else np.maximum(image, 0, out=image)
 
 
 def decode_image(path: str, eight_bits: bool = False) -> Image:

@@ -8,10 +8,17 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.experiments.folds import require_apart
-from evaluation.learning.feature_learner import FeatureLearner, Features, extract, fit_extracted, truths_of
+from evaluation.learning.feature_learner import (
+    FeatureLearner,
+    Features,
+    extract,
+    fit_extracted,
+    require_installed,
+    truths_of,
+)
 from evaluation.methods.method import Learner
-from evaluation.methods.pixels import GREY, unit
-from evaluation.metrics import ErrorKind, recovery_error, reproduction_error
+from evaluation.methods.pixels import unit
+from evaluation.results.answers import NO_PIXEL, SceneAnswer, read_light, results_of
 from evaluation.results.result import Result
 from evaluation.scene import Scene
 from foundation.errors import InputError
@@ -54,33 +61,29 @@ def cross_validate(
     ------
     InputError
         There is no scene or learner or only one fold; folds part images of one group; a ground truth is no light; or a
-        training part has no usable pixel.
+        training part has no usable pixel; or a method needs what is not installed.
     FormatError
         An image cannot be read.
     """
     truths = truths_of(scenes)
-    if not learners or len(set(folds.tolist())) < 2:
-        raise InputError(
-            f"{len(learners)} methods in {len(set(folds.tolist()))} folds: expected at least one method and two folds"
-        )
+    kinds = sorted(set(folds.tolist()))
+    if not learners or len(kinds) < 2:
+        raise InputError(f"{len(learners)} methods in {len(kinds)} folds: expected at least one method and two folds")
+    for learner in learners:
+        require_installed(learner)
     require_apart(scenes, folds)
     extracting = [learner for learner in learners if isinstance(learner, FeatureLearner)]
     features = iter(extract(scenes, extracting, workers, on_scene) if extracting else ())
-    results: list[Result] = []
-    for learner in learners:
-        if isinstance(learner, FeatureLearner):
-            lights, guessed = _by_features(learner, next(features), truths, folds, seed)
-        else:
-            lights, guessed = _by_scenes(learner, scenes, folds, seed)
-        errors: dict[ErrorKind, npt.NDArray[np.float64]] = {
-            "recovery": recovery_error(lights, truths),
-            "reproduction": reproduction_error(lights, truths),
-        }
-        results.append(Result(learner.name, lights, errors, guessed))
+    answers = [
+        _by_features(learner, next(features), truths, folds, seed)
+        if isinstance(learner, FeatureLearner)
+        else _by_scenes(learner, scenes, folds, seed)
+        for learner in learners
+    ]
     if on_scene and not extracting:
         for _ in scenes:
             on_scene()
-    return tuple(results)
+    return results_of([learner.name for learner in learners], truths, list(zip(*answers, strict=True)))
 
 
 def _by_features(
@@ -89,29 +92,27 @@ def _by_features(
     truths: npt.NDArray[np.float64],
     folds: npt.NDArray[np.int64],
     seed: int,
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    lights = np.tile(GREY, (len(features), 1))
-    guessed = np.array([given is None for given in features])
+) -> list[SceneAnswer]:
+    answers = [SceneAnswer(None, NO_PIXEL)] * len(features)
     for fold in sorted(set(folds.tolist())):
         train = folds != fold
         chosen = [given for given, taken in zip(features, train, strict=True) if taken]
         model = fit_extracted(learner, chosen, truths[train], seed).model
         for place, given in enumerate(features):
             if not train[place] and given is not None:
-                lights[place] = unit(model.lights(given[None])[0])
-    return lights, guessed
+                answers[place] = read_light(unit(model.lights(given[None])[0]))
+    return answers
 
 
-def _by_scenes(
-    learner: Learner, scenes: Sequence[Scene], folds: npt.NDArray[np.int64], seed: int
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    lights = np.tile(GREY, (len(scenes), 1))
-    guessed = np.zeros(len(scenes), dtype=bool)
+def _by_scenes(learner: Learner, scenes: Sequence[Scene], folds: npt.NDArray[np.int64], seed: int) -> list[SceneAnswer]:
+    answers = [SceneAnswer(None, NO_PIXEL)] * len(scenes)
     for fold in sorted(set(folds.tolist())):
         method = learner.fit([scene for scene, where in zip(scenes, folds, strict=True) if where != fold], seed)
         for place, scene in enumerate(scenes):
             if folds[place] == fold:
                 image, mask = scene.read()
-                light = method.estimate(image, scene.saturation, mask)
-                lights[place], guessed[place] = light, light is GREY
-    return lights, guessed
+                try:
+                    answers[place] = read_light(method.estimate(image, scene.saturation, mask))
+                except ValueError as error:
+                    raise InputError(f"{method.name} on {scene.name}: {error}; correct the method") from error
+    return answers

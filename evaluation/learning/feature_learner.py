@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Protocol
 
 import numpy as np
@@ -51,6 +52,11 @@ class FeatureLearner(ABC):
     @abstractmethod
     def name(self) -> str:
         """Its name in tables."""
+
+    @property
+    def needs(self) -> tuple[str, str] | None:
+        """What training needs beside NumPy and SciPy: the module, and the command that installs it; None if nothing."""
+        return None
 
     @abstractmethod
     def features(
@@ -193,6 +199,32 @@ def fit_extracted(
     stacked: Any = np.stack([given for given in features if given is not None])
     chosen = truths[usable]
     return LearnedMethod(learner, learner.fit_features(stacked, chosen / chosen.sum(axis=1, keepdims=True), seed))
+
+
+def require_installed(learner: object) -> None:
+    """Refuse a learner whose training needs a library that is not installed.
+
+    Raises
+    ------
+    InputError
+        It does; the message has the remedy.
+    """
+    reason = what_is_missing(learner)
+    if reason:
+        raise InputError(reason)
+
+
+def what_is_missing(learner: object) -> str | None:
+    """Return why a learner cannot be trained here, with the remedy; None if it can, or is not one of the house's."""
+    needs = learner.needs if isinstance(learner, FeatureLearner) else None
+    if not isinstance(learner, FeatureLearner) or needs is None:
+        return None
+    module, remedy = needs
+    try:
+        import_module(module)
+    except ImportError:
+        return f"training {learner.key} needs {module}, which is not installed: {remedy}"
+    return None
 
 
 def truths_of(scenes: Sequence[Scene]) -> npt.NDArray[np.float64]:

@@ -23,10 +23,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.learning.feature_learner import FeatureLearner, Features
+from evaluation.learning.feature_learner import FeatureLearner, Features, require_installed
 from evaluation.learning.working_size import chromaticities, lights_from_chromaticities, reduce
 from evaluation.scene import Image
-from foundation.errors import InputError
 
 _FEATURES = 4
 """Mean, brightest, dominant and palette mode (section 3.1)."""
@@ -78,6 +77,11 @@ class RegressionTrees(FeatureLearner):
         """Its name in tables."""
         return "Regression trees (simple features)"
 
+    @property
+    def needs(self) -> tuple[str, str]:
+        """What training needs: the module, and the command that installs it."""
+        return "sklearn", "pip install 'croplab[learn]'; a model that is trained already does without"
+
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
     ) -> npt.NDArray[np.float32] | None:
@@ -99,13 +103,9 @@ class RegressionTrees(FeatureLearner):
 
     def fit_features(self, features: Features, truths: npt.NDArray[np.float64], seed: int = 0) -> Forest:
         """Return the trees fitted to features (N, 8) float32 and lights (N, 3) float64; needs scikit-learn."""
-        try:
-            import sklearn.tree
-        except ImportError as error:
-            raise InputError(
-                "training regression trees needs scikit-learn: pip install 'croplab[learn]' (a model that is trained "
-                "already does without)"
-            ) from error
+        require_installed(self)
+        import sklearn.tree
+
         make: Any = sklearn.tree.DecisionTreeRegressor
         given = features.reshape(len(features), _FEATURES, 2)
         lights = truths[:, :_TARGETS]
@@ -188,12 +188,11 @@ class Forest:
 
     def lights(self, features: Features) -> npt.NDArray[np.float64]:
         """Return the lights (N, 3) float64, r + g + b = 1, of features (N, 8) float32."""
-        given = features.reshape(len(features), _FEATURES, 2)
-        every = np.stack([self._estimates(one) for one in given])
-        return lights_from_chromaticities(np.stack([_consensus(one, self.agreement) for one in every]))
+        every = np.stack([self.estimates(one) for one in features])
+        return lights_from_chromaticities(np.stack([consensus(one, self.agreement) for one in every]))
 
-    def _estimates(self, feature: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-        """Return what each tree estimates, (windows, 4, 2) float64, from features (4, 2)."""
+    def estimates(self, feature: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+        """Return what each tree estimates, (windows, 4, 2) float64, r and g, from features (8,) float32."""
         windows, _, _, nodes = self.split.shape
         start: npt.NDArray[np.int64] = np.arange(windows * _FEATURES * _TARGETS, dtype=np.int64) * nodes
         which = np.tile(np.repeat(np.arange(_FEATURES), _TARGETS), windows)
@@ -201,7 +200,7 @@ class Forest:
         for _ in range(self.depth):
             place: npt.NDArray[np.int64] = start + at
             part = self.split.ravel()[place]
-            lower = feature[which, np.maximum(part, 0)] <= self.threshold.ravel()[place]
+            lower = feature[2 * which + np.maximum(part, 0)] <= self.threshold.ravel()[place]
             child = np.where(lower, self.left.ravel()[place], self.right.ravel()[place])
             at = np.where(part < 0, at, child)
         return self.value.ravel()[start + at].reshape(windows, _FEATURES, _TARGETS)
@@ -216,8 +215,23 @@ def _frequent_colours(pixels: npt.NDArray[np.float32], bins: int, most: int) -> 
     return sums[fullest] / counts[fullest, None]
 
 
-def _consensus(estimates: npt.NDArray[np.float64], agreement: float) -> npt.NDArray[np.float64]:
-    """Return the median (2,) float64 of the estimates, (windows, 4, 2) float64, on which three features agree."""
+def consensus(estimates: npt.NDArray[np.float64], agreement: float) -> npt.NDArray[np.float64]:
+    """Return the median (2,) float64 of the estimates on which three features agree; of all where none do.
+
+    Parameters
+    ----------
+    estimates
+        (windows, 4, 2) float64, r and g by each window's trees of each feature.
+    agreement
+        Distance in chromaticity within which two features agree.
+
+    Examples
+    --------
+    The fourth feature is outvoted:
+
+    >>> consensus(np.array([[[0.30, 0.4], [0.31, 0.4], [0.32, 0.4], [0.60, 0.2]]]), 0.025)
+    array([0.31, 0.4 ])
+    """
     apart = np.linalg.norm(estimates[:, :, None] - estimates[:, None], axis=-1) <= agreement
     agreed = np.zeros(estimates.shape[:2], dtype=bool)
     for members in itertools.combinations(range(_FEATURES), _AGREEING):

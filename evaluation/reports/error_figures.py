@@ -66,9 +66,14 @@ def error_planes(results: Sequence[Result], truths: npt.NDArray[np.float64], kin
         Which error gives the colour.
     """
     shown = results[:_PANELS]
-    rows = math.ceil(len(shown) / _COLUMNS)
-    wide = 8.6 if len(shown) > 1 else 4.6
-    return svg_of(_draw_planes, shown, truths, kind, inches=(wide, 0.7 + 2.6 * rows))
+    columns = _columns(len(shown))
+    wide, high = (4.6, 3.6) if len(shown) == 1 else (8.6, 0.7 + (7.8 / columns) * math.ceil(len(shown) / columns))
+    return svg_of(_draw_planes, shown, truths, kind, inches=(wide, high))
+
+
+def _columns(panels: int) -> int:
+    """Return how many panels stand beside each other: two pairs look better than three and one."""
+    return 2 if panels == 4 else min(_COLUMNS, panels)
 
 
 def _draw_planes(figure: Any, results: Sequence[Result], truths: npt.NDArray[np.float64], kind: ErrorKind) -> None:
@@ -80,7 +85,7 @@ def _draw_planes(figure: Any, results: Sequence[Result], truths: npt.NDArray[np.
     top = max(float(percentiles(every, (_BRIGHTEST_PERCENTILE,))[0]), 1e-3)
     # Neither end of the scale may vanish, on a light page or on a dark one.
     colours = ListedColormap(colormaps["viridis"](np.linspace(0.15, 0.92, 256)))
-    columns = min(_COLUMNS, len(results))
+    columns = _columns(len(results))
     grid = figure.subplots(math.ceil(len(results) / columns), columns, squeeze=False, sharex=True, sharey=True)
     drawn = None
     for axes, result in zip(grid.flat, results, strict=False):

@@ -28,7 +28,7 @@ h2 {{ font-size: 1.2rem; margin: 2.4rem 0 .6rem }} h3 {{ font-size: 1rem; margin
 p {{ margin: .4rem 0; max-width: 75ch; overflow-wrap: break-word }}
 .scroll {{ overflow-x: auto; margin: .6rem 0 }}
 table {{ border-collapse: collapse; font-size: .95rem }}
-caption {{ text-align: left; font-weight: 600; padding-bottom: .4rem }}
+.title {{ font-weight: 600; margin: 1.2rem 0 .2rem }}
 th, td {{ padding: .25rem .8rem .25rem 0; border-bottom: 1px solid var(--grid); vertical-align: baseline;
   text-align: left }}
 th {{ font-weight: 600; vertical-align: bottom }} .number {{ text-align: right; padding: .25rem 0 .25rem .9rem;
@@ -87,7 +87,8 @@ def table_part(table: Table) -> Part:
     )
     notes = "".join(f"<p class='note'>{html.escape(note)}</p>\n" for note in table.notes)
     return Part(
-        f"<div class='scroll' tabindex='0'><table><caption>{html.escape(table.title)}</caption>"
+        f"<p class='title'>{html.escape(table.title)}</p>\n"
+        f"<div class='scroll' tabindex='0'><table aria-label='{html.escape(table.title, quote=True)}'>"
         f"<thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>\n{notes}"
     )
 

@@ -107,7 +107,7 @@ def is_gehler_shi(folder: Folder) -> bool:
     known = {name for files, _ in _TRUTHS.values() for name in files}
     return any(
         known.intersection(place.files) or any(name.endswith("_macbeth.txt") for name in place.files[:_SAMPLE])
-        for place in folder.within(_DEPTH - 1)
+        for place in folder.within(1)
     )
 
 

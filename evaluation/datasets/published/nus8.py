@@ -31,6 +31,8 @@ from evaluation.scene import Image, SceneSet
 from foundation.errors import FormatError
 
 _ENDING = "_gt.mat"
+_OVER = 2
+"""By how many px a chart's box may go over the edge of its image, px: what rounding and counting from 0 can make."""
 _PUBLISHED: Final = {
     "Canon1DsMkIII": 259,
     "Canon600D": 200,
@@ -67,12 +69,13 @@ class ChartScene(RawScene):
         """
         top, bottom, left, right = self.box
         height, width = image.shape[:2]
-        if not (1 <= top <= bottom <= height and 1 <= left <= right <= width):
+        over = max(-top, -left, bottom - height, right - width)
+        if over > _OVER or not (0 < bottom >= top <= height and 0 < right >= left <= width):
             raise FormatError(
                 f"{self.path} is {width} × {height}, but its chart is in rows {top} to {bottom} and columns {left} to "
                 f"{right} of CC_coords; use the original files"
             )
-        return box_mask((height, width), slice(top - 1, bottom), slice(left - 1, right))
+        return box_mask((height, width), slice(max(top - 1, 0), bottom), slice(max(left - 1, 0), right))
 
 
 def is_nus8(folder: Folder) -> bool:

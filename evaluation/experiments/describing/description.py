@@ -7,16 +7,21 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from evaluation.experiments.describing.cells import CELLS
+from evaluation.experiments.describing.lights import log_chroma
 from evaluation.experiments.describing.measuring import CHROMA_EDGES, LUMINANCE_EDGES, measure_scene
 from evaluation.experiments.describing.noise import NoiseCurve, photon_transfer
 from evaluation.experiments.describing.quantities import QUANTITIES, Summed
 from evaluation.scene import MixedScene, SceneSet
 from foundation.errors import InputError
+
+OF_LIGHTS: Final = {"light_red": 0, "light_blue": 1}
+"""Numbers that each light has, and not each image: places of ln(R/G) and ln(B/G)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +43,8 @@ class DataDescription:
     masked
         Mean share of the pixels that are masked.
     values
-        (N,) float64 each, by the names that `QUANTITIES` makes its figures of; NaN where an image has no such number.
+        (N,) float64 each, by the names that `QUANTITIES` makes its figures of, but those of lights; NaN where an image
+        has no such number.
     lights
         (L, 3) float64, linear camera RGB with r + g + b = 1: of every image the light, or each of its lights.
     luminance
@@ -132,7 +138,9 @@ def describe(
 
 
 def known_values(description: DataDescription, value: str) -> npt.NDArray[np.float64]:
-    """Return the numbers (M,) float64 that are known of the images, M ≤ N."""
+    """Return the numbers (M,) float64 that are known of the images, or of the lights."""
+    if value in OF_LIGHTS:
+        return log_chroma(description.lights)[:, OF_LIGHTS[value]]
     given = description.values[value]
     return given[np.isfinite(given)]
 

@@ -37,7 +37,7 @@ class ImageNumbers:
     size
         Width and height, px.
     values
-        By the names that `quantities.QUANTITIES` makes its figures of; NaN where one is not known.
+        By the names that `quantities.QUANTITIES` makes its figures of, but those of lights; NaN where one is not known.
     lights
         (K, 3) float64: the light, or the lights, linear camera RGB with r + g + b = 1.
     luminance, chroma
@@ -78,7 +78,6 @@ def measure_scene(scene: Scene, side: int = CELLS) -> ImageNumbers:
     cells = reduce_scene(scene, image, mask, side)
     lights = np.asarray(scene.lights if isinstance(scene, MixedScene) else [scene.truth], dtype=np.float64)
     values, luminance, chroma = _of_cells(cells)
-    values |= dict(zip(("light_red", "light_blue"), map(float, log_chroma(lights).mean(axis=0)), strict=True))
     blocks = measure_blocks(image, scene.saturation, mask)
     bright = _percentile(blocks[:, 0, 1], 99)
     values["noise"] = relative_noise(blocks, _NOISE_FROM * bright) if len(blocks) else np.nan

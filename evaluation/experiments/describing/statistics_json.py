@@ -16,7 +16,7 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.describing.description import DataDescription, figures, known_values
+from evaluation.experiments.describing.description import OF_LIGHTS, DataDescription, figures, known_values
 from evaluation.experiments.describing.lights import light_distribution
 from evaluation.experiments.describing.measuring import CHROMA_EDGES, LUMINANCE_EDGES
 from evaluation.experiments.describing.noise import NoiseCurve, NoiseLevel
@@ -67,7 +67,7 @@ def statistics_to_json(description: DataDescription) -> str:
             }
             for quantity in QUANTITIES
         ],
-        "quantiles": {name: _quantiles(known_values(description, name)) for name in description.values},
+        "quantiles": {name: _quantiles(known_values(description, name)) for name in (*description.values, *OF_LIGHTS)},
         "noise": {
             "unit": description.noise_unit,
             **{channel: asdict(curve) for channel, curve in zip(_CHANNELS, description.noise, strict=True)},
@@ -113,7 +113,7 @@ def _description(content: Mapping[str, Any]) -> DataDescription:
     data, noise = content["data"], content["noise"]
     images = tuple(map(str, content["images"]))
     values = {name: _array(given) for name, given in content["values"].items()}
-    missing = {quantity.value for quantity in QUANTITIES} - values.keys()
+    missing = {quantity.value for quantity in QUANTITIES} - values.keys() - OF_LIGHTS.keys()
     if missing or any(given.shape != (len(images),) for given in values.values()):
         raise ValueError(f"values of {len(images)} images expected, and of {', '.join(sorted(missing)) or 'each name'}")
     lights = _array(content["lights"])

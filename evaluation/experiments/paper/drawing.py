@@ -21,8 +21,11 @@ if TYPE_CHECKING:
 _MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")
 """Markers of series, so that they differ in print without colour."""
 
-_SEEN: Final = 3
-"""Decimals of a chromaticity that the eye can tell apart in the figure; points nearer than that are drawn once."""
+_SEEN: Final = 0.004
+"""Width of a dot in the figure of chromaticities; of points in one square of that width one is drawn."""
+
+_PLACE: Final = re.compile(rb'(<use [^>]*\bx="[\d.]+?\.\d)\d*(" y="[\d.]+?\.\d)\d*"')
+"""The place of a dot, of which a tenth of a point is as much as can be seen."""
 
 
 def bits_figure(found: BitsResult, kind: ErrorKind) -> bytes:
@@ -47,7 +50,7 @@ def _draw_bits(figure: Any, found: BitsResult, kind: ErrorKind) -> None:
 
 def sizes_figure(rows: Sequence[SizeRow], method: str) -> bytes:
     """Return a method's median error against the images' side, a line for each data set."""
-    return svg_of(_draw_sizes, rows, method, inches=(7.2, 3.8))
+    return svg_of(_draw_sizes, rows, method, inches=(7.6, 4.8))
 
 
 def _draw_sizes(figure: Any, rows: Sequence[SizeRow], method: str) -> None:
@@ -68,7 +71,7 @@ def _draw_sizes(figure: Any, rows: Sequence[SizeRow], method: str) -> None:
     axes.set_ylim(bottom=0)
     axes.set_xlabel("longest side of an image, px")
     axes.set_ylabel(f"{method}: median reproduction error, degrees")
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.legend(loc="outside lower center", ncols=2)
 
 
 def chromaticities_figure(
@@ -97,7 +100,9 @@ def _draw_chromaticities(
             axes.scatter(*uniform.T, s=7, color=FAINT, linewidths=0, label=f"uniform ({len(uniform)})", zorder=2)
         for number, (name, truths) in enumerate(sets.items()):
             style = series_style(number)
-            seen = np.unique(rb_of(truths).round(_SEEN), axis=0)
+            points = rb_of(truths)
+            _, first = np.unique((points / _SEEN).round(), axis=0, return_index=True)
+            seen = points[first]
             axes.scatter(*seen.T, s=5, color=style["color"], linewidths=0, alpha=0.6, label=name, zorder=3)
         if len(bodies):
             axes.scatter(
@@ -128,4 +133,4 @@ def standalone(svg: bytes) -> bytes:
     True
     """
     style = f"<style>{CSS_VARIABLES}\nsvg {{ background: var(--paper); font-family: system-ui, sans-serif }}</style>"
-    return re.sub(rb"(<svg\b[^>]*>)", lambda found: found[1] + style.encode(), svg, count=1)
+    return _PLACE.sub(rb'\1\2"', re.sub(rb"(<svg\b[^>]*>)", lambda found: found[1] + style.encode(), svg, count=1))

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.paper.rendering import RenderedScene
-from evaluation.experiments.paper.table1 import NUMBERS, Setting, block_title
+from evaluation.experiments.paper.scenes.rendering import RenderedScene
+from evaluation.experiments.paper.table1 import NUMBERS, Setting, block_title, thinned
 from evaluation.experiments.running import evaluate
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
@@ -133,7 +133,7 @@ def hot_rows(chosen: Sequence[Setting], shares: Sequence[float], seed: int = 0, 
     Parameters
     ----------
     chosen
-        The data sets; see `table1.settings`.
+        The data sets; see `table1.settings`. At most `table1.STUDIED` images of each are used.
     shares
         Hot photosites in a million of a light's values.
     seed
@@ -144,9 +144,10 @@ def hot_rows(chosen: Sequence[Setting], shares: Sequence[float], seed: int = 0, 
     method = standard_methods()["white-patch"]
     rows: list[HotRow] = []
     for part in chosen:
+        scenes = thinned(part.scenes)
         for share in shares:
             hot = hot_photosites(part.scenes[0].lut, share, seed)
-            (result,) = evaluate([HotScene(scene, hot) for scene in part.scenes], [method], workers)
+            (result,) = evaluate([HotScene(scene, hot) for scene in scenes], [method], workers)
             rows.append(HotRow(block_title(part.cell), share, len(hot.places), result))
     return tuple(rows)
 

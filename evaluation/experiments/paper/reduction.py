@@ -11,7 +11,7 @@ import numpy.typing as npt
 from evaluation.experiments.paper.bits import BITS, clear_bits
 from evaluation.results.tables import Table
 
-PANEL: Final = 240
+PANEL: Final = 200
 """Longest side of a panel, px: eight of them fit a page, and the steps of 3 bits can still be seen."""
 
 _GAP: Final = 6

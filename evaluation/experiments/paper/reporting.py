@@ -13,9 +13,10 @@ import numpy.typing as npt
 from evaluation.experiments.paper.bits import bits_table
 from evaluation.experiments.paper.chromaticities import chromaticity_rows, coverage_table, table_lights
 from evaluation.experiments.paper.drawing import bits_figure, chromaticities_figure, sizes_figure, standalone
+from evaluation.experiments.paper.facts import noise_table, print_colours, print_table, table_noise
 from evaluation.experiments.paper.hot import hot_table
 from evaluation.experiments.paper.reduction import reduction_strip, reduction_table
-from evaluation.experiments.paper.table1 import block_table, joint_table, noise_table, size_table, table_noise
+from evaluation.experiments.paper.table1 import block_table, joint_table, size_table
 from evaluation.reports.latex import table_to_latex, tables_to_latex
 from evaluation.reports.page import Part, figure_part, heading, page, paragraph, table_part
 from evaluation.results.tables import Table, table_to_csv
@@ -24,8 +25,8 @@ from foundation.files import whole_folder
 if TYPE_CHECKING:
     from evaluation.experiments.paper.bits import BitsResult
     from evaluation.experiments.paper.hot import HotRow
+    from evaluation.experiments.paper.scenes.truths import Truths
     from evaluation.experiments.paper.table1 import Block, SizeRow
-    from evaluation.experiments.paper.truths import Truths
     from evaluation.metrics import ErrorKind
     from generator import Lut
 
@@ -101,14 +102,16 @@ def table1_report(
     first = [block_table(block, kind) for block in blocks]
     second = [block_table(block, other) for block in blocks]
     noise = noise_table([table_noise(lut) for lut in luts])
+    prints = print_table([print_colours(lut) for lut in luts])
     files = {
         "table1.csv": table_to_csv(joint_table(blocks)).encode(),
         "table1.tex": tables_to_latex(_TABLE1.format(kind=kind), first).encode(),
         f"table1_{other}.tex": tables_to_latex(_TABLE1.format(kind=other), second).encode(),
         "noise.csv": table_to_csv(noise).encode(),
+        "print.csv": table_to_csv(prints).encode(),
     }
     parts = [*map(paragraph, conditions), heading(f"{kind.capitalize()} error, degrees"), *map(table_part, first)]
-    tables = [*first, noise]
+    tables = [*first, noise, prints]
     if sizes:
         drawn = sizes_figure(sizes, "White-Patch")
         table = size_table(sizes)
@@ -123,7 +126,7 @@ def table1_report(
         tables.append(table)
         files |= {"hot.csv": table_to_csv(table).encode(), "hot.tex": table_to_latex(table).encode()}
         parts += [heading("Hot photosites"), table_part(table)]
-    parts += [heading("The tables"), table_part(noise)]
+    parts += [heading("The tables"), table_part(noise), table_part(prints)]
     parts += [heading(f"{other.capitalize()} error, degrees"), *map(table_part, second)]
     return PaperReport("Table 1: plain methods on generated data sets", tuple(tables), tuple(parts), files)
 

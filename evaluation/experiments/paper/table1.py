@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from evaluation.experiments.paper.published import TABLE1, Cell
-from evaluation.experiments.paper.rendering import (
+from evaluation.experiments.paper.scenes.rendering import (
     ChosenLights,
     RenderedScene,
     ScaledSource,
@@ -35,11 +35,17 @@ if TYPE_CHECKING:
     from evaluation.results.result import Result
     from generator import Lut
 
+_Thing = TypeVar("_Thing")
+
 METHODS: Final = ("white-patch", "gray-world", "shades-of-gray")
 """The methods of the table, by their names on the command line."""
 
 SIDE: Final = 512
 """Side of an image, px; White-Patch takes the largest of so many noisy values, and its error grows with them."""
+
+STUDIED: Final = 64
+"""Most images of a data set on which sizes and hot photosites are studied: their medians differ by more than chance
+among 64, and every image of 1024 px is drawn for each of them."""
 
 SENSORS: Final[Mapping[str, str]] = {"Canon EOS 550D": "550D", "Canon EOS 6D Mark II": "6D"}
 """The paper's names of its cameras, by those that tables have."""
@@ -131,6 +137,18 @@ def settings(
                 for lights, chosen in choices.items()
             ]
     return tuple(found)
+
+
+def thinned(things: Sequence[_Thing], most: int = STUDIED) -> Sequence[_Thing]:
+    """Return at most `most` of the things, evenly spaced.
+
+    Examples
+    --------
+    >>> [source.number for source in thinned(random_scenes(7, 4, 4), 3)]
+    [0, 2, 4]
+    """
+    count = min(len(things), most)
+    return [things[place * len(things) // count] for place in range(count)]
 
 
 def table1(
@@ -229,7 +247,7 @@ def size_dependence(
     seed: int = 0,
     workers: int = 1,
 ) -> tuple[SizeRow, ...]:
-    """Return the methods' median reproduction errors for images of several sizes; parameters as of `settings`.
+    """Return the methods' median reproduction errors for images of several sizes, of `STUDIED` pictures at most.
 
     Parameters
     ----------
@@ -244,7 +262,7 @@ def size_dependence(
     """
     rows: list[SizeRow] = []
     for side in sides:
-        for block in table1(settings(luts, pictures, truths, side, seed), workers):
+        for block in table1(settings(luts, thinned(pictures), truths, side, seed), workers):
             medians = {result.method: result.summary("reproduction").median for result in block.results}
             rows.append(SizeRow(block.cell, side, medians))
     return tuple(rows)
@@ -257,57 +275,4 @@ def size_table(rows: Sequence[SizeRow]) -> Table:
         "Median reproduction error for images of several sizes, degrees",
         ("Data set", "Side, px", *names),
         tuple((block_title(row.cell), row.side, *(row.medians[name] for name in names)) for row in rows),
-    )
-
-
-@dataclass(frozen=True)
-class TableNoise:
-    """How bright and how noisy the print's white is in a table.
-
-    Attributes
-    ----------
-    camera
-        The table's camera.
-    lights
-        Its lights.
-    level
-        Median over the lights of the white cell's brightest channel, share of saturation.
-    spread
-        Median over the lights of the standard deviation of the white cell's samples over their mean, R, G and B.
-    largest
-        Median over the lights of the largest of its samples over their mean, less 1; R, G and B.
-    """
-
-    camera: str
-    lights: int
-    level: float
-    spread: tuple[float, float, float]
-    largest: tuple[float, float, float]
-
-
-def table_noise(lut: Lut) -> TableNoise:
-    """Return how bright and noisy the white of a table's print is: what White-Patch lives on."""
-    white = np.asarray(lut.samples[:, -1], dtype=np.float64)
-    mean = np.maximum(white.mean(axis=1), 1.0)
-    spread = np.median(white.std(axis=1, ddof=1) / mean, axis=0)
-    largest = np.median(white.max(axis=1) / mean - 1, axis=0)
-    return TableNoise(
-        lut.provenance.camera,
-        len(white),
-        float(np.median(mean.max(axis=1)) / lut.provenance.white_level),
-        (float(spread[0]), float(spread[1]), float(spread[2])),
-        (float(largest[0]), float(largest[1]), float(largest[2])),
-    )
-
-
-def noise_table(found: Sequence[TableNoise]) -> Table:
-    """Return the noise of tables' white as a table, percent."""
-    columns = ("Camera", "Lights", "White, % of saturation", "Spread of its samples R, %", "G, %", "B, %")
-    return Table(
-        "The print's white in the tables: medians over the lights",
-        (*columns, "Largest sample above the mean R, %", "G, %", "B, %"),
-        tuple(
-            (noise.camera, noise.lights, *(100 * part for part in (noise.level, *noise.spread, *noise.largest)))
-            for noise in found
-        ),
     )

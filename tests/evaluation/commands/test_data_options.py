@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
+from evaluation.cli import main
 from evaluation.commands.data_options import DataReading, with_data_options
 from evaluation.datasets import LAYOUTS, DataOptions
 from foundation.errors import InputError
+from tests.evaluation.datasets.made_up import nus8
 
 
 def app(seen: list[object]) -> typer.Typer:
@@ -74,3 +77,17 @@ def test_a_command_without_the_parameter_is_a_mistake() -> None:
 def test_levels_that_are_none_are_refused() -> None:
     with pytest.raises(InputError, match=r"saturation 100 is not above the black level 128"):
         _ = DataReading(black=128, saturation=100).options
+
+
+def test_the_command_reads_one_camera_and_states_what_it_applied(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nus8(tmp_path)
+    words = ("--camera", "sonya57", "--saturation", "20000", "--method", "white-patch")
+    assert main(["run", str(tmp_path), *words]) == 0
+    printed = capsys.readouterr().out
+    assert "NUS SonyA57: reproduction angular error of 2 images" in printed
+    assert "saturation: 20000, as the user gave it" in printed
+    assert "black level: darkness_level of the camera's .mat, subtracted: SonyA57 128" in printed
+    assert main(["run", str(tmp_path), "--truth", "left"]) == 2
+    assert "--truth has no meaning for" in capsys.readouterr().err

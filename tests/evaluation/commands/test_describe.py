@@ -58,6 +58,16 @@ def test_two_sets(dataset: Path, thumbnails: str, capsys: pytest.CaptureFixture[
         assert line.replace("'", "&#x27;") in text
 
 
+def test_sets_of_one_name_are_told_apart(thumbnails: str, capsys: pytest.CaptureFixture[str]) -> None:
+    stats = Path(thumbnails).parent / "s.json"
+    assert main(["describe", thumbnails, "--out", str(stats)]) == 0
+    capsys.readouterr()
+    assert main(["describe", thumbnails, "--against", str(stats)]) == 0
+    printed = capsys.readouterr().out
+    assert f"in real [1] ({thumbnails}), " in printed
+    assert f"in real [1] ({stats}): 1.00 times as much" in printed
+
+
 def test_sets_seen_at_different_detail_are_warned_of(thumbnails: str, capsys: pytest.CaptureFixture[str]) -> None:
     stats = Path(thumbnails).parent / "coarse.json"
     assert main(["describe", thumbnails, "--cells", "4", "--out", str(stats)]) == 0

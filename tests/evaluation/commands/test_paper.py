@@ -52,7 +52,7 @@ def test_table1(
 ) -> None:
     tables = [str(make_table(f"Canon EOS {name}", noise=0.05).folder) for name in ("6D Mark II", "550D")]
     out = tmp_path / "out"
-    wish = ("--camera", "Canon EOS 550D", "--side", "24", "--sizes", "12,24", "--hot", "500", "--out", str(out))
+    wish = ("--matrix", "Canon EOS 550D", "--side", "24", "--sizes", "12,24", "--hot", "500", "--out", str(out))
     given = ("--pictures", str(thumbnails), "--lights-like", f"{truths}#A", "--workers", "2")
     assert main(["paper", "table1", *tables, *given, *wish]) == 0
     printed = capsys.readouterr().out
@@ -66,7 +66,7 @@ def test_table1(
     first = rows[0]
     assert re.search(rf"White-Patch +│ +{float(first['mean']):.2f} │ +{float(first['median']):.2f} │", printed)
     assert {path.name for path in out.iterdir()} == {
-        *("report.html", "table1.csv", "table1.tex", "table1_recovery.tex", "noise.csv"),
+        *("report.html", "table1.csv", "table1.tex", "table1_recovery.tex", "noise.csv", "print.csv"),
         *("sizes.csv", "sizes.svg", "hot.csv", "hot.tex"),
     }
     page = (out / "report.html").read_text()
@@ -89,7 +89,7 @@ def test_table1_of_photographs(
     printed = capsys.readouterr().out
     assert f"3 of {tmp_path / 'pictures'}" in printed
     assert len(NUMBER.findall(printed)) > 4 * 18
-    assert main(["paper", "table1", lut, *given, "--camera", "Canon EOS 550D"]) == 2
+    assert main(["paper", "table1", lut, *given, "--matrix", "Canon EOS 550D"]) == 2
     assert "is for a data set of raw images" in capsys.readouterr().err
 
 

@@ -51,12 +51,13 @@ def check_scene(scene: Scene) -> None:
         assert not mask.all(), "no pixel is left"
     saturation = scene.saturation
     assert saturation is None or (np.isfinite(saturation) and saturation > 0)
-    second, _ = scene.read()
-    np.testing.assert_array_equal(image, second)
+    first = image.copy()
     image[...] = 0  # What a caller does to its image must not reach the next reading.
-    np.testing.assert_array_equal(scene.read()[0], second)
+    second, again = scene.read()
+    np.testing.assert_array_equal(second, first)
+    np.testing.assert_array_equal(again, mask)
     if isinstance(scene, MixedScene):
-        check_mixed(scene, second.shape[:2])
+        check_mixed(scene, first.shape[:2])
 
 
 def check_mixed(scene: MixedScene, shape: tuple[int, ...]) -> None:

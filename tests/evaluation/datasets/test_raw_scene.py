@@ -32,10 +32,10 @@ def test_black_is_subtracted_and_nothing_falls_below_it(
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_floats_stay_floats(dtype: type[np.float32]) -> None:
     image = np.array([[[0.5, 0.25, 2.0], [-1, 0, 1]]], dtype)
+    assert subtract_black(image.copy(), 0)[0, 1].tolist() == [0, 0, 1]
     lower = subtract_black(image, 0.25)
     assert lower.dtype == dtype
     assert lower.tolist() == [[[0.25, 0, 1.75], [0, 0, 0.75]]]
-    assert subtract_black(image, 0)[0, 1].tolist() == [0, 0, 1]
 
 
 def test_red_is_first_in_every_format(tmp_path: Path) -> None:

@@ -7,14 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from evaluation.experiments import run_folder
 from evaluation.experiments.run_folder import describe_run, run_methods, write_run
 from evaluation.experiments.running import evaluate
+from evaluation.learning.model_files import StoredMethod, provenance_of
+from evaluation.learning.standard import standard_learners
 from evaluation.methods import GrayEdge
 from evaluation.results.errors_file import read_errors
 from evaluation.scene import Scene, SceneSet
+from foundation.clock import SystemClock
 from foundation.errors import InputError
 from foundation.files import partial_path
 from foundation.held_folders import held_folder
@@ -178,3 +182,23 @@ def test_folds_are_written_with_results_that_were_made_otherwise(tmp_path: Path)
     assert "folds.csv" in content(tmp_path / "cv")
     assert b'"seed": 3' in content(tmp_path / "cv")["run.json"]
     assert b"A note." in content(tmp_path / "cv")["report.html"]
+
+
+class Flat:
+    """A model that always sees the same light."""
+
+    def lights(self, features: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+        return np.ones((len(features), 3))
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        return {"seen": np.ones(3)}
+
+
+def test_a_model_judged_on_what_it_was_trained_on_is_said_to_be() -> None:
+    data, other = as_set(walls(3)), as_set(walls(4))
+    record = provenance_of(data, 0, SystemClock())
+    learner = standard_learners()["regression-trees"]
+    model = StoredMethod(learner, Flat(), data.name, record)
+    assert run_methods(other, [model]).notes == ()
+    (note,) = run_methods(data, [model]).notes
+    assert note.startswith(f"{learner.name} (trained on Walls) was trained on these very images")

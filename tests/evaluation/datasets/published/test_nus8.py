@@ -81,6 +81,15 @@ def test_a_missing_image(copy: Path) -> None:
     assert len(open_scenes(copy, options=DataOptions(partial=True)).scenes) == 3
 
 
+def test_a_chart_over_the_edge_by_a_pixel_is_cut(copy: Path) -> None:
+    change(copy / "SonyA57" / "SonyA57_gt.mat", CC_coords=np.array([[0, 2, 9, 11], [7, 9, 1, 2]]))
+    first, second = (scene.read()[1] for scene in open_scenes(copy / "SonyA57").scenes)
+    assert first is not None
+    assert second is not None
+    assert np.argwhere(first).tolist() == [[0, 8], [0, 9], [1, 8], [1, 9]]
+    assert np.argwhere(second).tolist() == [[6, 0], [6, 1], [7, 0], [7, 1]]
+
+
 def test_a_chart_outside_of_the_image_is_refused(copy: Path) -> None:
     write_png(copy / "SonyA57" / "SonyA57_0001.PNG", image_of(4, 5))
     scene = open_scenes(copy / "SonyA57").scenes[0]

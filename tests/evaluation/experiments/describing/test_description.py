@@ -14,7 +14,7 @@ from evaluation.experiments.describing.statistics_json import read_statistics, s
 from evaluation.scene import SceneSet
 from foundation.errors import FormatError, InputError
 from tests.data_files import available
-from tests.evaluation.experiments.describing.scenes import Made, made_set, random_set
+from tests.evaluation.experiments.describing.scenes import Made, MadeMixture, made_set, random_set
 
 
 def test_threads_change_nothing_and_every_image_is_counted() -> None:
@@ -25,6 +25,17 @@ def test_threads_change_nothing_and_every_image_is_counted() -> None:
     assert one.images == tuple(f"a {number}" for number in range(9))
     assert one.sizes == ((16, 16, 9),)
     assert one.lights.shape == (9, 3)
+
+
+def test_figures_of_lights_are_of_every_light_of_a_mixture() -> None:
+    lights = np.array([[0.6, 1.0, 0.3], [0.3, 1.0, 0.8]])
+    image = np.ones((20, 20, 3))
+    mixed = MadeMixture("m", lights.mean(axis=0), image, lights=lights)
+    made = describe(made_set("x", [mixed, Made("a", np.array([1.0, 1, 1]), image)]))
+    assert made.mixed == 1
+    reds = np.log([0.6, 0.3, 1])
+    assert figures(made)["light_red"] == pytest.approx(reds.mean())
+    assert figures(made)["light_spread_red"] == pytest.approx(reds.std())
 
 
 def test_sizes_noise_unit_and_no_image() -> None:

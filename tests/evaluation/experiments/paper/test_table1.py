@@ -10,19 +10,17 @@ from evaluation.experiments.paper.table1 import (
     Setting,
     block_table,
     joint_table,
-    noise_table,
     sensor_of,
     settings,
     size_dependence,
     size_table,
     table1,
-    table_noise,
 )
 from evaluation.experiments.running import evaluate
 from evaluation.methods.standard import standard_methods
 from foundation.errors import InputError
 from generator.pictures.sources import random_scenes
-from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker
+from tests.evaluation.experiments.paper.conftest import TableMaker
 
 PICTURES = random_scenes(5, 24, 16, seed=8)
 TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0]])
@@ -118,15 +116,6 @@ def test_the_size_of_images_matters_where_there_is_noise(make_table: TableMaker)
     table = size_table(rows)
     assert table.rows[0][1] == 24
     assert table.rows[0][2] == rows[0].medians["White-Patch"]
-
-
-def test_noise_of_the_print_s_white(make_table: TableMaker) -> None:
-    noise = table_noise(make_table("Test", noise=0.05, samples=400))
-    # Of 400 samples the largest normal deviate is about three standard deviations up.
-    assert noise.spread == pytest.approx([0.05] * 3, rel=0.15)
-    assert noise.largest == pytest.approx([0.15] * 3, rel=0.4)
-    assert noise.level == pytest.approx(float(np.median(LIGHTS.max(axis=1))) / 9000, rel=0.02)
-    assert noise_table([noise]).rows[0][:2] == ("Test", len(LIGHTS))
 
 
 def test_no_pictures(make_table: TableMaker) -> None:

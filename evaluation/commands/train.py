@@ -1,0 +1,93 @@
+"""`evaluate train`: what a method learns from a data set, as a model file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evaluation.commands.data_options import DataReading, with_data_options
+from foundation.console import EXIT_CODES
+
+LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, convnet or constant-light"
+"""The suite's own, for the help of commands."""
+
+HELP = f"""Train a method on every image of a data set and write what it has learned to a model file.
+
+METHOD is {LEARNERS_HELP}. MODEL.npz is a new file of plain arrays with the story of their training: data set, number of
+images and a hash of their names and lights, what was done to the images, settings, seed, software and date. evaluate
+run DATA --method MODEL.npz estimates with it, on the same camera or another; the tables say what it was trained on.
+
+{EXIT_CODES}
+"""
+
+
+@with_data_options
+def train(
+    method: Annotated[str, typer.Argument(metavar="METHOD", help=f"One of {LEARNERS_HELP}.", show_default=False)],
+    data: Annotated[
+        str, typer.Argument(metavar="DATA", help="Folder or file of the data set, or its URL.", show_default=False)
+    ],
+    *,
+    out: Annotated[
+        Path, typer.Option(metavar="MODEL.npz", help="The new file to write the model to.", show_default=False)
+    ],
+    seed: Annotated[int, typer.Option(metavar="N", help="Of all that is random in the training.", min=0)] = 0,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Threads that read images; the model does not depend on it. \\[default: one a processor]",
+            min=1,
+            show_default=False,
+        ),
+    ] = None,
+    reading: DataReading,
+) -> None:
+    """Train a method on a data set."""
+    from evaluation.commands.choosing import choose_learners
+    from evaluation.learning.feature_learner import (
+        FeatureLearner,
+        extract,
+        fit_extracted,
+        require_installed,
+        truths_of,
+    )
+    from evaluation.learning.model_files import provenance_of, save_model
+    from foundation.clock import SystemClock
+    from foundation.console import orderly_end, progress
+    from foundation.errors import InputError
+    from foundation.files import require_free_file
+    from foundation.processors import processor_count
+
+    learners = choose_learners([method])
+    if len(learners) != 1:
+        raise InputError(f"{method} are {len(learners)} methods, a model file holds one; name one")
+    (learner,) = learners
+    if not isinstance(learner, FeatureLearner):
+        raise InputError(
+            f"{method} is a class of your own, which a model file cannot hold: evaluate cv {method} {data} trains and "
+            "evaluates it; let its fit write a file of its own if it is to be kept"
+        )
+    if out.suffix != ".npz":
+        raise InputError(f"--out is {out}, expected a name that ends in .npz, by which evaluate run knows a model")
+    require_free_file(out, "the model")
+    require_installed(learner)
+    found = reading.open(data)
+    truths = truths_of(found.scenes)
+    count = len(found.scenes)
+    with orderly_end(), progress("images") as advance:
+        steps = iter(range(1, count + 1))
+        (features,) = extract(
+            found.scenes, [learner], workers or processor_count(), lambda: advance(next(steps), count)
+        )
+        fitted = fit_extracted(learner, features, truths, seed)
+        record = provenance_of(found, seed, SystemClock())
+        save_model(out, fitted, record)
+    unused = sum(given is None for given in features)
+    print(f"{out}: {learner.name}, {record.sentence()}")
+    if unused:
+        print(f"{unused} of {count} images have no usable pixel and were left out of the training")
+    for what, how in found.treatment.items():
+        print(f"{what}: {how}")

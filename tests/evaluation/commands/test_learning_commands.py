@@ -1,0 +1,133 @@
+"""The commands `evaluate train` and `evaluate cv`."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.cli import main
+from evaluation.datasets import open_scenes
+from evaluation.experiments.folds import group_of
+from evaluation.learning.model_files import load_model
+from tests.evaluation.learning.made_up_world import world
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    scenes = world(30)
+    np.savez(
+        tmp_path / "world.npz",
+        images=np.stack([scene.image for scene in scenes]),
+        gt=np.stack([scene.truth for scene in scenes]),
+        names=np.array([scene.name for scene in scenes]),
+    )
+    return tmp_path / "world.npz"
+
+
+def test_a_model_is_trained_saved_and_used(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = tmp_path / "models" / "cat.npz"
+    assert main(["train", "smart-color-cat", str(data), "--out", str(model), "--seed", "4"]) == 0
+    printed = capsys.readouterr().out
+    assert "Smart Color Cat, trained on all of world (thumbnails, 30 images, seed 4)" in printed
+    assert "mask: pixels that are zero in every channel" in printed
+    loaded = load_model(model)
+    assert loaded.provenance is not None
+    assert loaded.provenance.data_place == str(data)
+    assert main(["run", str(data), "--method", str(model)]) == 0
+    printed = capsys.readouterr().out
+    assert "Smart Color Cat (trained on world)" in printed
+    before = model.read_bytes()
+    assert main(["train", "smart-color-cat", str(data), "--out", str(model)]) == 2
+    assert "already exists" in capsys.readouterr().err
+    assert model.read_bytes() == before
+
+
+def test_cross_validation_prints_and_writes(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, folds = tmp_path / "results", tmp_path / "folds.csv"
+    given = ["cv", "smart-color-cat", str(data), "--error", "recovery"]
+    assert main([*given, "--out", str(out), "--save-folds", str(folds)]) == 0
+    printed = capsys.readouterr().out
+    assert "Constant light" in printed
+    assert "cross-validated in 3 folds, drawn by seed 0; seed 0" in printed
+    assert folds.read_text() == (out / "folds.csv").read_text()
+    with (out / "results.csv").open() as stream:
+        assert {row["method"] for row in csv.DictReader(stream)} == {"Constant light", "Smart Color Cat"}
+    # The same folds from the file give the same table.
+    table = printed[: printed.index("cross-validated")]
+    assert main([*given, "--folds", str(folds)]) == 0
+    assert capsys.readouterr().out.startswith(table)
+    assert main([*given, "--seed", "1"]) == 0
+    assert not capsys.readouterr().out.startswith(table)
+
+
+def test_a_class_of_the_users_own(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np\n\n\n"
+        "class Mean:\n"
+        "    name = 'My mean'\n\n"
+        "    def fit(self, scenes, seed=0):\n"
+        "        self.light = np.mean([scene.truth / scene.truth.sum() for scene in scenes], axis=0)\n"
+        "        return self\n\n"
+        "    def estimate(self, image, saturation=None, mask=None):\n"
+        "        return self.light\n"
+    )
+    mine = f"{tmp_path / 'mine.py'}:Mean"
+    assert main(["cv", mine, str(data)]) == 0
+    assert "My mean" in capsys.readouterr().out
+    assert main(["train", mine, str(data), "--out", str(tmp_path / "model.npz")]) == 2
+    assert "is a class of your own, which a model file cannot hold: evaluate cv" in capsys.readouterr().err
+
+
+def test_all_leaves_out_what_is_not_installed_and_says_why(
+    data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+    assert main(["cv", "all", str(data), "--folds", "2"]) == 0
+    printed = capsys.readouterr().out
+    assert "Log-chroma" in printed
+    assert "Convolutional network is left out: training convnet needs torch" in printed
+    assert "pip install 'croplab[learn]'" in printed
+    assert main(["cv", "convnet", str(data)]) == 2
+    assert "pip install 'croplab[torch]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["cv", "oracle", "DATA"], "'oracle' is no method that learns"),
+        (["cv", "smart-color-cat", "DATA", "--folds", "31"], "31 folds of 30 images: expected 2 to 30"),
+        (["cv", "smart-color-cat", "DATA", "--folds", "three"], "'three', expected a number from 2, or a CSV file"),
+        (["cv", "smart-color-cat", "DATA", "--folds", "none.csv"], "none.csv"),
+        (["train", "all", "DATA", "--out", "x.npz"], "a model file holds one"),
+        (["train", "smart-color-cat", "DATA", "--out", "model.txt"], "ends in .npz"),
+    ],
+)
+def test_mistakes_are_named(
+    arguments: list[str],
+    why: str,
+    data: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(data.parent)
+    assert main([str(data) if argument == "DATA" else argument for argument in arguments]) == 2
+    assert why in capsys.readouterr().err
+    assert [path.name for path in data.parent.iterdir()] == ["world.npz"]
+
+
+def test_images_of_one_picture_stay_in_one_fold(
+    dataset: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    scenes = open_scenes(dataset).scenes
+    groups = [group_of(scene) for scene in scenes]
+    assert len(set(groups)) == 8
+    assert main(["cv", "constant-light", str(dataset), "--save-folds", str(tmp_path / "folds.csv")]) == 0
+    assert "8 groups of images kept together" in capsys.readouterr().out
+    with (tmp_path / "folds.csv").open() as stream:
+        folds = [row["fold"] for row in csv.DictReader(stream)]
+    assert len(set(zip(groups, folds, strict=True))) == 8

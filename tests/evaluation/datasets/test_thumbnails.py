@@ -1,0 +1,56 @@
+"""Thumbnails in an archive: what is masked, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from evaluation.datasets import open_scenes
+from foundation.errors import FormatError
+from tests.data_files import available
+from tests.evaluation.datasets import contract
+from tests.evaluation.datasets.made_up import thumbnails
+
+SOME = {"images": np.ones((2, 4, 5, 3), np.float32), "gt": np.ones((2, 3)), "names": ["a", "b"]}
+
+
+def test_values(tmp_path: Path) -> None:
+    thumbnails(tmp_path)
+    one, two = open_scenes(tmp_path / "thumbs.npz").scenes
+    image, mask = one.read()
+    assert image[0, 0].tolist() == [9000, 100, 7000]
+    assert mask is not None
+    assert mask.sum() == 1
+    assert mask[1, 1]
+    assert two.truth.tolist() == [1, 2, 1]
+    assert one.saturation is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"gt": np.ones((3, 3))}, r"images \(2, 4, 5, 3\), gt \(3, 3\)"),
+        ({"gt": np.array([[1, 1, 1], [1, -1, 1]])}, "gt of b: 1 -1 1 is no light"),
+        ({"images": np.ones((2, 4, 5, 3), np.uint8)}, "has images of uint8, expected uint16"),
+        ({"images": np.ones((2, 4, 5))}, r"images \(2, 4, 5\)"),
+        ({"names": ["a"]}, r"names \(1,\)"),
+        ({"gt": [["a", "b", "c"]] * 2}, "is no archive of thumbnails"),
+    ],
+)
+def test_what_is_no_such_archive(tmp_path: Path, change: dict[str, npt.ArrayLike], message: str) -> None:
+    np.savez(
+        tmp_path / "set.npz", allow_pickle=False, **{name: np.asarray(value) for name, value in (SOME | change).items()}
+    )
+    with pytest.raises(FormatError, match=message):
+        open_scenes(tmp_path / "set.npz")
+
+
+@pytest.mark.parametrize("path", available("benchmark/nus_canon_600d_64x64.npz"))
+def test_real_thumbnails(path: Path) -> None:
+    scenes = open_scenes(path).scenes
+    assert len(scenes) == 200
+    for scene in scenes[::50]:
+        contract.check_scene(scene)

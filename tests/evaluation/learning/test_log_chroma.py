@@ -1,0 +1,131 @@
+"""Log-chroma: a light shifts the histogram, the torus is cut where no light lies, gradients are derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from evaluation.learning.log_chroma import LogChroma, fold
+from evaluation.learning.log_chroma_training import BINS, crossentropy, likelihood, moments
+from evaluation.metrics import recovery_error
+from foundation.errors import InputError
+from tests.evaluation.learning.made_up_world import world
+
+LEARNER = LogChroma()
+
+
+def extracted(image: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
+    found = LEARNER.features(image)
+    assert found is not None
+    return found
+
+
+def test_a_light_shifts_both_histograms() -> None:
+    # Powers of two and whole bins: no pixel comes to lie on the other side of a bin's edge, none below the least value.
+    (scene,) = world(1)
+    image = scene.image / scene.image.max() * 0.5 + 0.25
+    image[0, 0] = 4
+    plain = extracted(image)
+    lit = extracted((image * np.exp([-3 / 32, 0, 5 / 32])).astype(np.float32))
+    shifted = np.roll(plain, (3, -5), axis=(1, 2))
+    for channel, allowed in ((0, 0.02), (1, 0.05)):
+        differ = np.abs(lit[channel].astype(int) - shifted[channel]).sum() / 2
+        assert differ <= allowed * plain[channel].sum()
+        assert np.abs(lit[channel].astype(int) - plain[channel]).sum() / 2 > 0.5 * plain[channel].sum()
+
+
+def test_folding_keeps_every_count_and_place() -> None:
+    counts = np.zeros((1, 2, 128, 128), np.uint16)
+    counts[0, 0, 70, 127] = 3
+    counts[0, 0, 6, 63] = 1
+    narrow, wide = fold(counts, wide=False), fold(counts, wide=True)
+    assert narrow[0, 0, 6, 63] == 1
+    assert wide[0, 0, 35, 63] == 0.75
+    assert wide[0, 0, 3, 31] == 0.25
+    assert not narrow[0, 1].any()
+
+
+def relit(count: int, reds: npt.NDArray[np.float64], seed: int = 0) -> list[Any]:
+    """Return the scenes of the world under lights whose red over green and blue over green are given, (N, 2)."""
+    scenes = world(count, seed)
+    lights = np.stack([reds[:, 0], np.ones(count), reds[:, 1]], axis=1)
+    return [
+        replace(scene, truth=light, image=(scene.image / scene.truth * light).astype(np.float32))
+        for scene, light in zip(scenes, lights, strict=True)
+    ]
+
+
+def test_rare_lights_at_the_end_of_the_range_are_not_wrapped() -> None:
+    # As with the 1Ds Mark III: many lights at one end, few at the other, and more than half a torus in between.
+    rng = np.random.default_rng(2)
+    logs = np.concatenate([rng.uniform(-0.05, 0.05, 80), rng.uniform(1.2, 1.3, 20)])
+    scenes = relit(100, np.exp(np.stack([logs / 3, -logs], axis=1)))
+    method = LEARNER.fit(scenes[::2])
+    found = np.stack([method.estimate(scene.image) for scene in scenes[1::2]])
+    errors = recovery_error(found, np.stack([scene.truth for scene in scenes[1::2]]))
+    assert errors.max() < 12
+    assert np.median(errors) < 3
+
+
+def test_lights_that_span_more_than_the_torus_get_wider_bins() -> None:
+    rng = np.random.default_rng(3)
+    logs = rng.uniform(-1.3, 1.3, 100)
+    scenes = relit(100, np.exp(np.stack([logs, -logs], axis=1)))
+    method = LEARNER.fit(scenes[:80])
+    errors = [float(recovery_error(method.estimate(scene.image), scene.truth)) for scene in scenes[80:]]
+    assert np.median(errors) < 3
+    with pytest.raises(InputError, match=r"span 3\.\d\d natural logarithms .* tells 3"):
+        LEARNER.fit(relit(100, np.exp(np.stack([logs * 1.5, -logs], axis=1))))
+
+
+def hat(mean: tuple[float, float], covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return a normal distribution (1, 64, 64), wrapped by its nearest turn."""
+    bins = np.stack(np.meshgrid(np.arange(BINS), np.arange(BINS), indexing="ij"), axis=-1) - np.array(mean)
+    away = (bins + BINS / 2) % BINS - BINS / 2
+    likely = np.exp(-0.5 * np.einsum("...i,ij,...j", away, np.linalg.inv(covariance), away))
+    return (likely / likely.sum())[None]
+
+
+@pytest.mark.parametrize("mean", [(30.3, 20.0), (0.4, 63.7)])
+def test_moments_of_a_normal_distribution_anywhere_on_the_torus(mean: tuple[float, float]) -> None:
+    covariance = np.array([[6.0, 2.0], [2.0, 3.0]])
+    found = moments(hat(mean, covariance))
+    apart = (found.mean[0] - mean + BINS / 2) % BINS - BINS / 2
+    np.testing.assert_allclose(apart, 0, atol=1e-6)
+    np.testing.assert_allclose(found.covariance[0], [6, 3, 2], rtol=1e-3)
+
+
+def softmax(response: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    likely = np.exp(response - response.max())
+    return likely / likely.sum()
+
+
+@pytest.mark.parametrize("loss", ["likelihood", "cross-entropy"])
+def test_derivatives_are_what_finite_differences_say(loss: str) -> None:
+    rng = np.random.default_rng(0)
+    response = np.log(hat((62.8, 5.2), np.array([[9.0, 2.0], [2.0, 5.0]])) + 1e-4) + rng.normal(0, 0.3, (1, BINS, BINS))
+    place = np.array([[66.0, 3.0]])
+
+    def value(given: npt.NDArray[np.float64]) -> tuple[float, npt.NDArray[np.float64]]:
+        likely = softmax(given)
+        if loss == "cross-entropy":
+            return crossentropy(np.log(likely), likely, place)
+        return likelihood(likely, moments(likely), place, 1.0)
+
+    _, slope = value(response)
+    for _ in range(5):
+        step = rng.normal(0, 1, response.shape)
+        expected = (value(response + 1e-5 * step)[0] - value(response - 1e-5 * step)[0]) / 2e-5
+        assert float((slope * step).sum()) == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_likelihood_is_least_at_the_truth() -> None:
+    likely = hat((20.0, 30.0), np.eye(2) * 1e-3)
+    hit, _ = likelihood(likely, moments(likely), np.array([[20.0, 30.0 + BINS]]), 1.0)
+    miss, _ = likelihood(likely, moments(likely), np.array([[24.0, 30.0]]), 1.0)
+    assert hit == pytest.approx(0, abs=1e-3)
+    assert miss == pytest.approx(8, rel=1e-2)
