@@ -1,16 +1,17 @@
-"""White balance of OpenCV's xphoto as methods: what a program that uses OpenCV gets.
+"""White balance of OpenCV's xphoto as a method: what a program that uses OpenCV gets.
 
-`GrayworldWB` is Gray-world over the pixels that are not too colourful; `LearningBasedWB` is D. Cheng et al., "Effective
-learning-based illuminant estimation using simple features", CVPR 2015, with the model that OpenCV brings, which was
-trained on other cameras. Both correct an image; the light is what they divide by: for each channel the sum before over
-the sum after. Masked and saturated pixels are given to them as black, which both leave out. `SimpleWB` stretches each
-channel between percentiles, offset included, and so is no estimate of a light.
+`GrayworldWB` is Gray-world over the pixels that are not too colourful. It corrects an image; the light is what it
+divides by: for each channel the sum before over the sum after. Masked and saturated pixels are given to it as black.
+
+Two others are left out. `SimpleWB` stretches each channel between percentiles, offset included, and so is no estimate
+of a light. `LearningBasedWB` (D. Cheng et al., CVPR 2015) of OpenCV 5.0 gives one of several lights for the same image
+from one call to the next, degrees apart.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,25 +25,22 @@ _TOP = 16383
 
 
 @dataclass(frozen=True)
-class OpenCvBalance:
-    """A white balance of xphoto.
+class OpenCvGrayWorld:
+    """Gray-world of xphoto.
 
     Attributes
     ----------
     name
         Its name in tables.
-    kind
-        "grayworld" or "learning".
 
     Examples
     --------
     >>> image = np.random.default_rng(0).uniform(0.1, 1, (40, 60, 1)) * [0.5, 1.0, 0.7]
-    >>> OpenCvBalance("Gray-world of OpenCV", "grayworld").estimate(image).round(2)
+    >>> OpenCvGrayWorld().estimate(image).round(2)
     array([0.38, 0.76, 0.53])
     """
 
-    name: str
-    kind: Literal["grayworld", "learning"]
+    name: str = "Gray-world (OpenCV)"
 
     def estimate(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
@@ -61,11 +59,6 @@ class OpenCvBalance:
             return GREY
         scaled = np.where(usable[..., None], prepared.image, 0)[..., ::-1] / peak * _TOP
         given = np.rint(scaled).astype(np.uint16)
-        if self.kind == "grayworld":
-            balance = xphoto.createGrayworldWB()
-        else:
-            balance = xphoto.createLearningBasedWB()
-            balance.setRangeMaxVal(_TOP)
-        after = np.asarray(balance.balanceWhite(given)).reshape(-1, 3).sum(axis=0, dtype=np.float64)
+        after = np.asarray(xphoto.createGrayworldWB().balanceWhite(given)).reshape(-1, 3).sum(axis=0, dtype=np.float64)
         before = given.reshape(-1, 3).sum(axis=0, dtype=np.float64)
         return unit(np.divide(before, after, out=np.zeros(3), where=after > 0)[::-1])

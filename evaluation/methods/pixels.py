@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -81,7 +81,8 @@ def dilate_clipped(
         limit = kind.type(max(0, math.ceil(saturation)))
     else:
         limit = kind.type(saturation)
-    if mark_clipped(cast("Any", np.ascontiguousarray(image)), limit, clipped):
+    native: Any = np.ascontiguousarray(image, dtype=kind.newbyteorder("="))
+    if mark_clipped(native, limit, clipped):
         clipped = cv2.dilate(clipped, np.ones((3, 3), np.uint8))
     return np.asarray(clipped).view(np.bool_)
 

@@ -32,7 +32,7 @@ from evaluation.methods.gray_pixels.grayness import GraynessIndex
 from evaluation.methods.gray_pixels.local_grayness import LocalGraynessIndex
 from evaluation.methods.gray_pixels.mean_shifted import MeanShiftedGrayPixel
 from evaluation.methods.method import LocalMethod, Method
-from evaluation.methods.opencv import OpenCvBalance
+from evaluation.methods.opencv import OpenCvGrayWorld
 from evaluation.methods.patchwise import PatchwiseMethod
 from evaluation.methods.pca import BrightDark
 from evaluation.methods.retinex.color_sparrow import ColorSparrow
@@ -50,7 +50,7 @@ def standard_methods() -> Mapping[str, Method]:
     >>> list(standard_methods())[7:12]
     ['improved-white-patch', 'color-sparrow', 'local-surface-reflectance', 'grayness-index', 'mean-shifted-gray-pixel']
     >>> list(standard_methods())[12:]
-    ['opencv-grayworld', 'opencv-learning']
+    ['opencv-grayworld']
     >>> standard_methods()["gray-edge-1"].name
     '1st-order Gray-Edge'
     """
@@ -67,8 +67,7 @@ def standard_methods() -> Mapping[str, Method]:
         "local-surface-reflectance": SurfaceReflectance(),
         "grayness-index": GraynessIndex(),
         "mean-shifted-gray-pixel": MeanShiftedGrayPixel(),
-        "opencv-grayworld": OpenCvBalance("Gray-world (OpenCV)", "grayworld"),
-        "opencv-learning": OpenCvBalance("Learning-based (OpenCV)", "learning"),
+        "opencv-grayworld": OpenCvGrayWorld(),
     }
 
 

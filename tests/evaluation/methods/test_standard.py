@@ -22,9 +22,8 @@ def grey_scene(seed: int = 0) -> npt.NDArray[np.float64]:
     return grey * LIGHT
 
 
-TOLERANCES = {"opencv-grayworld": 0.01, "opencv-learning": 3.0}
-"""Degrees; OpenCV's see 14 bits, and what is learned is no formula. All others are exact but for float32."""
-LEARNED = "opencv-learning"
+TOLERANCES = {"opencv-grayworld": 0.01}
+"""Degrees; OpenCV's sees 14 bits. All others are exact but for float32."""
 LOOKS_AROUND = ("general-gray-world", "gray-edge-1", "gray-edge-2", "grayness-index", "mean-shifted-gray-pixel")
 """Methods whose filters also see what is left out, as their authors' programs do."""
 APART = (
