@@ -23,6 +23,9 @@ from evaluation.scene import Image
 _TOP = 16383
 """Value that white gets: a quarter of uint16, so that a channel multiplied by up to 4 is not cut off."""
 
+_ROWS = 256
+"""Rows that are scaled at a time, so that no float64 copy of a large image is made."""
+
 
 @dataclass(frozen=True)
 class OpenCvGrayWorld:
@@ -54,11 +57,14 @@ class OpenCvGrayWorld:
 
         xphoto: Any = cv2.xphoto
         usable = prepared.usable(0)
-        peak = float(prepared.image[usable].max(initial=0)) if usable.any() else 0.0
+        peak = float(prepared.moments()[2].max())
         if not peak:
             return GREY
-        scaled = np.where(usable[..., None], prepared.image, 0)[..., ::-1] / peak * _TOP
-        given = np.rint(scaled).astype(np.uint16)
+        given = np.zeros(prepared.image.shape, dtype=np.uint16)
+        for top in range(0, prepared.height, _ROWS):
+            rows = np.s_[top : top + _ROWS]
+            part = np.where(usable[rows][..., None], prepared.image[rows], 0)[..., ::-1]
+            given[rows] = np.rint(part / peak * _TOP)
         after = np.asarray(xphoto.createGrayworldWB().balanceWhite(given)).reshape(-1, 3).sum(axis=0, dtype=np.float64)
         before = given.reshape(-1, 3).sum(axis=0, dtype=np.float64)
         return unit(np.divide(before, after, out=np.zeros(3), where=after > 0)[::-1])
