@@ -88,7 +88,7 @@ def table_part(table: Table) -> Part:
     notes = "".join(f"<p class='note'>{html.escape(note)}</p>\n" for note in table.notes)
     return Part(
         f"<p class='title'>{html.escape(table.title)}</p>\n"
-        f"<div class='scroll' tabindex='0'><table aria-label='{html.escape(table.title, quote=True)}'>"
+        f"<div class='scroll' role='region' tabindex='0' aria-label='{html.escape(table.title, quote=True)}'><table>"
         f"<thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>\n{notes}"
     )
 

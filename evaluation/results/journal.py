@@ -40,11 +40,13 @@ def read_journal(path: Path, identity: dict[str, Any]) -> list[tuple[SceneAnswer
     try:
         content = path.read_bytes() if path.exists() else b""
         whole, lines = _whole_lines(content)
-        if not lines:
+        head: dict[str, Any] = json.loads(lines[0]) if lines else {}
+        same = head == json.loads(json.dumps(identity))
+        if not same and len(lines) <= 1:
+            # Nothing was answered, so nothing is lost: a method that failed on the first image was corrected, say.
             path.write_bytes(_line(identity))
             return []
-        head = json.loads(lines[0])
-        if head != json.loads(json.dumps(identity)):
+        if not same:
             raise InputError(
                 f"{path.parent} holds what another run has made so far: its {_difference(head, identity)} differ; go "
                 "on with that run by its own options, name another place, or remove that folder to begin anew"

@@ -50,7 +50,7 @@ def _draw_bits(figure: Any, found: BitsResult, kind: ErrorKind) -> None:
 
 def sizes_figure(rows: Sequence[SizeRow], method: str) -> bytes:
     """Return a method's median error against the images' side, a line for each data set."""
-    return svg_of(_draw_sizes, rows, method, inches=(6.4, 4.8))
+    return svg_of(_draw_sizes, rows, method, inches=(7.6, 4.8))
 
 
 def _draw_sizes(figure: Any, rows: Sequence[SizeRow], method: str) -> None:

@@ -27,8 +27,8 @@ class TransferPlan:
     Attributes
     ----------
     training
-        For each generated set itself and, where there are pictures, its naive counterparts; images that were left out
-        are in none of them.
+        For each set itself and, where it was generated and there are pictures, its naive counterparts; images that
+        were left out are in none of them.
     sets
         The data sets as they were opened.
     notes
@@ -82,10 +82,15 @@ def plan_transfer(
     notes: list[str] = []
     for some in sets:
         scenes = _trainable(some, test, shared, notes)
-        if pictures is None:
-            training.append(TrainingSet(some.name, "generated", scenes))
+        made = tuple(scene for scene in scenes if isinstance(scene, GeneratedScene))
+        if not made:
+            training.append(TrainingSet(some.name, "other", scenes))
+        elif pictures is None:
+            training.append(TrainingSet(some.name, "generated", made))
         else:
-            training += _with_naive(some, scenes, pictures, matrix, notes)
+            training += _with_naive(some.name, made, pictures, matrix, notes)
+    if pictures is not None and all(each.kind == "other" for each in training):
+        raise InputError("--naive is for sets made by generate, and --train names none; leave it out")
     return TransferPlan(tuple(training), tuple(sets), tuple(notes))
 
 
@@ -120,32 +125,29 @@ def _trainable(some: SceneSet, test: SceneSet, shared: Shared, notes: list[str])
 
 
 def _with_naive(
-    some: SceneSet, scenes: Sequence[Scene], pictures: Path | str, matrix: str | None, notes: list[str]
+    name: str, made: Sequence[GeneratedScene], pictures: Path | str, matrix: str | None, notes: list[str]
 ) -> list[TrainingSet]:
     """Return a generated set's images and their naive counterparts, all of the pictures that were found."""
-    made = [scene for scene in scenes if isinstance(scene, GeneratedScene)]
-    if not made:
-        raise InputError(f"{some.name} was not made by generate and has no naive counterpart; leave out --naive")
     dataset = made[0].dataset
     found, missing = find_sources(dataset, pictures)
     kept = tuple(scene for scene in made if scene.entry.source in found)
     if not kept:
         raise InputError(
-            f"none of the {len(missing)} pictures of {some.name} is in {pictures}, by name and hash: "
+            f"none of the {len(missing)} pictures of {name} is in {pictures}, by name and hash: "
             f"{first_of(missing, 3)}; name the folder that the data set was made from"
         )
     if missing:
         notes.append(
-            f"{some.name}: {len(missing)} of {len(missing) + len(found)} pictures are not in {pictures}: "
+            f"{name}: {len(missing)} of {len(missing) + len(found)} pictures are not in {pictures}: "
             f"{first_of(missing)}; {len(made) - len(kept)} images of them are left out of its every row"
         )
     sets = [
-        TrainingSet(some.name, "generated", kept),
-        TrainingSet(some.name, "naive", naive_scenes(kept, found)),
+        TrainingSet(name, "generated", kept),
+        TrainingSet(name, "naive", naive_scenes(kept, found)),
     ]
-    chosen = _matrix_for(some.name, dataset.description.table.camera, matrix, notes)
+    chosen = _matrix_for(name, dataset.description.table.camera, matrix, notes)
     if chosen is not None:
-        sets.append(TrainingSet(some.name, "naive with matrix", naive_scenes(kept, found, chosen)))
+        sets.append(TrainingSet(name, "naive with matrix", naive_scenes(kept, found, chosen)))
     return sets
 
 

@@ -27,8 +27,9 @@ from evaluation.results.result import Result
 from evaluation.scene import Scene
 from foundation.errors import InputError
 
-Kind = Literal["cross-validation", "generated", "naive", "naive with matrix", "none"]
-"""How a method was trained: on other folds of the real images, on generated ones, on naive ones, or not."""
+Kind = Literal["cross-validation", "generated", "naive", "naive with matrix", "other", "none"]
+"""How a method was trained: on other folds of the test set, on generated images, on their naive counterparts, on a data
+set that was not generated, or not at all."""
 
 NAIVE: Final[tuple[Kind, ...]] = ("naive", "naive with matrix")
 """The kinds of the naive baseline."""
@@ -41,7 +42,7 @@ class TrainingSet:
     Attributes
     ----------
     data
-        Name of the generated data set that they are, or are the counterparts of.
+        Name of the data set that they are, or are the counterparts of.
     kind
         What they are.
     scenes
@@ -89,6 +90,8 @@ class TransferRow:
                 return f"{self.data}: linear sRGB × light"
             case "naive with matrix":
                 return f"{self.data}: matrix × linear sRGB × light"
+            case "other":
+                return f"{self.data}: as it is"
             case "none":
                 return "none"
 

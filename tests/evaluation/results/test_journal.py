@@ -78,3 +78,14 @@ def test_another_run_is_refused_and_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="what another run has made so far: its software and treatment differ"):
         read_journal(path, other)
     assert path.read_bytes() == whole
+
+
+def test_a_run_that_answered_nothing_gives_way(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    assert read_journal(path, IDENTITY) == []
+    other = IDENTITY | {"software": "x 2"}
+    assert read_journal(path, other) == []
+    alone = path.read_bytes()
+    path.unlink()
+    read_journal(path, other)
+    assert path.read_bytes() == alone

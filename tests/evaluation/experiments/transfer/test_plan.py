@@ -107,6 +107,16 @@ def test_the_matrix_that_is_asked_for(maker: Maker, tmp_path: Path) -> None:
     assert "no colour matrix is known for Pinhole" in plan.notes[0]
 
 
+def test_a_set_that_was_not_generated_stands_beside(maker: Maker) -> None:
+    other = _real("y", place="y.npz", seed=1)
+    plan = plan_transfer(_real("x"), [maker.make(), other], maker.pictures, "none")
+    assert [(each.data, each.kind) for each in plan.training] == [
+        ("made", "generated"),
+        ("made", "naive"),
+        ("real", "other"),
+    ]
+
+
 def test_parts_that_are_set_apart_stay_apart(maker: Maker, tmp_path: Path) -> None:
     save_pictures(tmp_path / "many", [f"{number}.png" for number in range(12)], seed=2)
     made = maker.make("divided", pictures=tmp_path / "many", split=(0.5, 0.0, 0.5))
@@ -124,7 +134,7 @@ def test_what_cannot_be_planned_is_said(maker: Maker) -> None:
         plan_transfer(_real("x"), [])
     with pytest.raises(InputError, match="two training sets are called made"):
         plan_transfer(_real("x"), [made, made])
-    with pytest.raises(InputError, match="was not made by generate and has no naive counterpart"):
+    with pytest.raises(InputError, match="--naive is for sets made by generate"):
         plan_transfer(_real("x"), [_real("y", place="y.npz", seed=1)], maker.pictures)
     with pytest.raises(InputError, match="made has no image left"):
         plan_transfer(_real("a", "b", "c"), [made], shared="leave-out")
