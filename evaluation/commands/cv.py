@@ -28,9 +28,10 @@ stand between commas. The constant light, the median of the training lights, alw
 does not beat it has learned nothing from images. Images of one group, such as one picture under several lights, stay
 in one fold.
 
-Folds are the data set's own where its authors made some, else three that --seed draws; --folds takes a number of folds
-to draw, or a CSV file with the columns image,fold. Prints the table of evaluate run; writes nothing unless asked: --out
-writes the results folder of evaluate run with folds.csv, --save-folds the folds alone.
+Reads DATA, a data set of any layout that evaluate run reads. Folds are the data set's own where its authors made some,
+else three that --seed draws; --folds takes a number of folds to draw, or a CSV file with the columns image,fold. Prints
+the table of evaluate run; writes nothing unless asked: --out writes the results folder of evaluate run with folds.csv,
+--save-folds the folds alone.
 
 {EXIT_CODES}
 """

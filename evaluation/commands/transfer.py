@@ -27,12 +27,13 @@ _ALIKE = 2.0
 
 HELP = f"""Train learned methods on generated images and test them on real ones.
 
-Trains each method on each data set of --train and tests it on --test, beside real cross-validation of the same method,
-the constant light (median of the training lights), and statistics methods. With --naive also trained without a table:
-the same pictures, linear sRGB times the same lights, with and without the camera's colour matrix. Prints mean, median,
-trimean, best and worst quarter, their bootstrap intervals, and their ratios to real cross-validation, paired by image.
-Training sets that share pictures with the test set, by name or content, are refused. Writes nothing unless asked with
---out: results.csv, errors.csv (each image), folds, tables.tex, report.html and run.json.
+Reads data sets of any layout that evaluate run reads; trains each method on each one of --train and tests it on --test,
+beside real cross-validation of the same method, the constant light (median of the training lights), and statistics
+methods. With --naive also trained without a table: the same pictures, linear sRGB times the same lights, with and
+without the camera's colour matrix. Prints mean, median, trimean, best and worst quarter, their bootstrap intervals, and
+their ratios to real cross-validation, paired by image. Training sets that share pictures with the test set, by name or
+content, are refused. Writes nothing unless asked with --out: results.csv, errors.csv (each image), folds, tables.tex,
+report.html and run.json.
 
 {EXIT_CODES}
 """
