@@ -9,6 +9,7 @@ on what both happen to have.
 from __future__ import annotations
 
 import csv
+import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -118,9 +119,12 @@ def _stem(image: str) -> str:
 
 
 def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
-    lines = text.split("\n")
+    lines = re.split(r"\r\n|\r|\n", text)
     separator = max(",;\t", key=lines[0].count)
-    rows = list(csv.reader(lines, delimiter=separator))
+    try:
+        rows = list(csv.reader(lines, delimiter=separator, strict=True))
+    except csv.Error as error:
+        raise FormatError(f"{path} is no CSV text: {error}; expected {','.join(_COLUMNS)}") from error
     heads = [head.strip().lower() for head in rows[0]] if rows else []
     headed = all(column in heads for column in _COLUMNS)
     if not headed and not (len(heads) == len(_COLUMNS) and all(map(_is_number, heads[1:]))):
@@ -128,11 +132,19 @@ def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
             f"{path} begins with {lines[0][:80].strip()!r}; expected the columns {','.join(_COLUMNS)}, with or without "
             "a head"
         )
+    twice = [column for column in _COLUMNS if headed and heads.count(column) > 1]
+    if twice:
+        raise FormatError(f"{path} has two columns {twice[0]!r}; name each of {','.join(_COLUMNS)} once")
     places = [heads.index(column) if headed else number for number, column in enumerate(_COLUMNS)]
     found: list[tuple[str, npt.NDArray[np.float64]]] = []
     for number, row in enumerate(rows, start=1):
         if (headed and number == 1) or not any(field.strip() for field in row):
             continue
+        if len(row) > len(heads) and any(field.strip() for field in row[len(heads) :]):
+            raise FormatError(
+                f"{path}, line {number}: {separator.join(row)[:80]!r} has {len(row)} fields under {len(heads)} columns; "
+                "write numbers with a point, and a name that holds a separator in quotes"
+            )
         try:
             image, *light = (row[place].strip() for place in places)
             found.append((image, np.array([float(part) for part in light])))

@@ -24,6 +24,7 @@ def given(tmp_path: Path, text: str) -> Path:
         "image,r,g,b\na/two.png,4,5,6\na/one.png,1,2,3\nthree.v1.png,7,8,9\n",
         "a/one,1,2,3\na/two,4,5,6\nthree.v1,7,8,9",
         "\ufeffB;Image;note;R;G\r\n3;a/one.tiff;x;1;2\r\n6;a/two.tiff;;4;5\r\n\r\n9;three.v1.tiff;;7;8\r\n",
+        "image,r,g,b\ra/one,1,2,3,\ra/two,4,5,6\rthree.v1,7,8,9\r",
         'image\tr\tg\tb\n"a/one.png"\t1e0\t2\t3.0\na/two.png\t4\t5\t6\nthree.v1.png\t7\t8\t9\n',
     ],
 )
@@ -67,6 +68,10 @@ def test_a_name_without_extension_that_two_images_have_is_neither(tmp_path: Path
         ("name,red,green,blue\na,1,1,1", "begins with 'name,red,green,blue'"),
         ("image,r,g,b\na/one,1,1\n", "line 2: 'a/one,1,1'; expected a name and three numbers"),
         ("image,r,g,b\na/one,1,one,1\n", "line 2"),
+        # A decimal comma makes two fields of a number, of which the first three would pass for a light.
+        ("image,r,g,b\na/one,0,25,0,5,0,25\n", "7 fields under 4 columns; write numbers with a point"),
+        ("image,r,g,b,r\na/one,1,2,3,4\n", "has two columns 'r'"),
+        ('image,r,g,b\n"a/one,1,2,3\n', "is no CSV text"),
     ],
 )
 def test_what_is_no_table_is_refused(tmp_path: Path, text: str, message: str) -> None:
