@@ -142,8 +142,8 @@ def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
             continue
         if len(row) > len(heads) and any(field.strip() for field in row[len(heads) :]):
             raise FormatError(
-                f"{path}, line {number}: {separator.join(row)[:80]!r} has {len(row)} fields under {len(heads)} columns; "
-                "write numbers with a point, and a name that holds a separator in quotes"
+                f"{path}, line {number}: {separator.join(row)[:80]!r} has {len(row)} fields under {len(heads)} "
+                "columns; write numbers with a point, and a name that holds a separator in quotes"
             )
         try:
             image, *light = (row[place].strip() for place in places)

@@ -34,7 +34,7 @@ class Returns:
 
     def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> Any:
         value = next(self.values)
-        if isinstance(value, Exception):
+        if isinstance(value, BaseException):
             raise value
         return value
 
@@ -67,6 +67,11 @@ def test_what_is_no_light_is_counted_named_and_taken_as_grey(value: object, caus
         ("red", "returned str, expected three numbers"),
         (KeyError("where"), r"KeyError: 'where' \(test_running\.py, line \d+\)"),
         (ValueError("no good"), r"ValueError: no good \(test_running\.py, line \d+\)"),
+        # Left alone, it would end the command with 0 and without a result.
+        (SystemExit(0), r"SystemExit: 0 \(test_running\.py, line \d+\)"),
+        (np.array([1 + 1j, 1, 1]), "returned ndarray of complex128, expected three numbers"),
+        ([True, True, False], "returned list, expected three numbers"),
+        (np.ma.masked_array([1.0, 1, 1], [0, 0, 1]), "returned MaskedArray of float64, expected three numbers"),
     ],
 )
 def test_a_mistake_in_a_method_ends_the_run_with_its_name(value: object, message: str) -> None:
