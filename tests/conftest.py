@@ -48,6 +48,7 @@ SLOW = (
     "evaluation/learning/test_learners.py",
     "evaluation/commands/test_compare.py",
     "evaluation/commands/test_describe.py",
+    "evaluation/commands/test_paper.py",
     "evaluation/commands/test_transfer.py",
     "evaluation/datasets/test_generated.py",
     "evaluation/experiments/describing/test_against.py",

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator
 
     from evaluation.experiments.paper.reporting import PaperReport
+    from evaluation.scene import SceneSet
     from generator import Lut
     from generator.pictures.sources import Source
 
@@ -144,7 +145,8 @@ def table2(
         str, typer.Option(metavar="PLACE", help="Data set made by generate, to train on.", show_default=False)
     ],
     methods: Annotated[
-        str, typer.Option(metavar="LIST", help="Learned methods, between commas.")
+        str,
+        typer.Option(metavar="LIST", help="Methods that learn, between commas: names, module:Class or file.py:Class."),
     ] = "smart-color-cat,regression-trees,color-beaver",
     folds: Annotated[str, typer.Option(metavar="N|FILE", help="Folds of the cross-validation, or their file.")] = "3",
     error: Kind = "reproduction",
@@ -155,26 +157,23 @@ def table2(
     reading: DataReading,
 ) -> None:
     """Train learned methods on real and on generated images."""
+    from evaluation.commands.choosing import choose_learners
     from evaluation.datasets import open_scenes
-    from evaluation.experiments.folds import draw_folds, read_folds
+    from evaluation.experiments.folds import draw_folds, group_of, read_folds
     from evaluation.experiments.paper.reporting import table2_report
     from evaluation.experiments.paper.table2 import table2 as run
     from evaluation.experiments.paper.table2 import table2_tables
     from evaluation.learning.standard import standard_learners
-    from foundation.errors import InputError
     from foundation.processors import processor_count
 
     _require_free(out)
-    names = [name.strip() for name in methods.split(",") if name.strip()]
-    known = standard_learners()
-    for name in names:
-        if name not in known:
-            raise InputError(f"{name!r} is no learned method; the methods are {', '.join(known)}")
-    learners = {name: known[name] for name in names}
+    asked = [name.strip() for name in methods.split(",") if name.strip()]
+    names = list(dict.fromkeys(key for name in asked for key in (standard_learners() if name == "all" else (name,))))
+    learners = dict(zip(names, choose_learners(names), strict=True))
     real, made = reading.open(data), open_scenes(generated)
     count = len(real.scenes)
     if folds.isdigit():
-        drawn = draw_folds(count, int(folds), seed)
+        drawn = draw_folds(count, int(folds), seed, [group_of(scene) for scene in real.scenes])
     else:
         drawn = read_folds(Path(folds), [scene.name for scene in real.scenes])
     with _progress(2 * count) as step:
@@ -183,6 +182,7 @@ def table2(
     conditions = (
         f"Real: {real.name}, {count} images, {int(drawn.max()) + 1} folds. Generated: {made.name}, {len(made.scenes)} "
         f"images. Seed {seed}. {error.capitalize()} error, degrees.",
+        _treatment(real),
         *(() if is_cube else ("The paper's table is of Cube+, so only its ratios stand beside these.",)),
     )
     _finish(table2_report(table2_tables(found, error, real.name, is_cube), conditions), conditions, out)
@@ -220,7 +220,8 @@ def bits(
     opened = reading.open(data)
     with _progress(len(opened.scenes)) as step:
         found = bits_removed(opened.scenes, bits_methods(sigma), workers=workers or processor_count(), on_scene=step)
-    conditions = (f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px.",)
+    first = f"{opened.name}, {len(opened.scenes)} images. Gray-Edge at a scale of {sigma:g} px."
+    conditions = (first, _treatment(opened))
     _finish(bits_report(found, error, opened.name, conditions), conditions, out)
 
 
@@ -277,6 +278,11 @@ def chromaticities(
     _finish(report, (), out)
     if out is None:
         print("Name a folder with --out for the figure.")
+
+
+def _treatment(data: SceneSet) -> str:
+    """Return what was done to a data set's images before a method sees them, in a sentence."""
+    return f"{'; '.join(f'{what}: {how}' for what, how in data.treatment.items())}."
 
 
 def _finish(report: PaperReport, conditions: Sequence[str], out: Path | None) -> None:

@@ -92,7 +92,7 @@ def test_a_mistake_in_this_suite_keeps_its_traceback(monkeypatch: pytest.MonkeyP
     def broken(*_: object) -> None:
         raise TypeError("ours")
 
-    monkeypatch.setattr(GrayEdge, "estimate", broken)
+    monkeypatch.setattr(GrayEdge, "estimate_prepared", broken)
     with pytest.raises(TypeError, match="ours") as caught:
         evaluate(walls(1), [GRAY_WORLD])
     assert caught.value.__notes__ == ["while Gray-world was on wall 0.png"]
