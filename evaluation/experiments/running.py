@@ -215,7 +215,7 @@ def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[Scen
                 answer = SceneAnswer(answer.light, answer.cause or cause)
         except CropError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             if runner.lock is None:
                 error.add_note(f"while {method.name} was on {scene.name}")
                 raise
@@ -265,7 +265,7 @@ def _map_error(
     return measure_map(estimate, lights, weights, scene.lights, image, scene.saturation, mask)
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: BaseException) -> str:
     """Return an exception as a sentence, with the last line outside this suite's packages and installed libraries."""
     frames = traceback.extract_tb(error.__traceback__)
     foreign = [frame for frame in frames if _HOUSE not in Path(frame.filename).parents]

@@ -34,7 +34,7 @@ class Returns:
 
     def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> Any:
         value = next(self.values)
-        if isinstance(value, Exception):
+        if isinstance(value, BaseException):
             raise value
         return value
 
@@ -64,7 +64,10 @@ def test_what_is_no_light_is_counted_named_and_taken_as_grey(value: object, caus
     [
         ((1, 1), r"shape \(2,\), expected \(3,\)"),
         (np.ones((4, 3)), r"shape \(4, 3\), expected \(3,\)"),
-        ("red", "returned str, expected three numbers"),
+        ("red", "returned str, expected three real numbers"),
+        ((1j, 1, 1), "returned tuple, expected three real numbers"),
+        (np.array([True, True, False]), "returned ndarray, expected three real numbers"),
+        (SystemExit(0), r"SystemExit: 0 \(test_running\.py, line \d+\)"),
         (KeyError("where"), r"KeyError: 'where' \(test_running\.py, line \d+\)"),
         (ValueError("no good"), r"ValueError: no good \(test_running\.py, line \d+\)"),
     ],
