@@ -43,7 +43,6 @@ SLOW = (
     "drivers/test_gphoto2_camera.py",
     "end_to_end",
     "evaluation/commands/test_learning_commands.py",
-    "evaluation/datasets/test_generated.py",
     "evaluation/learning/test_log_chroma.py",
     "evaluation/learning/test_learners.py",
     "evaluation/commands/test_compare.py",

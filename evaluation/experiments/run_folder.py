@@ -7,6 +7,7 @@ that was left alone. When all images are done, the files are written there and t
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -19,13 +20,13 @@ import numpy.typing as npt
 from evaluation.datasets.states import state_of
 from evaluation.experiments.folds import folds_to_csv
 from evaluation.experiments.running import SceneMethod, answer_scenes, ordered_map, truths_of
-from evaluation.learning.model_files import StoredMethod, scenes_sha256
+from evaluation.learning.model_files import StoredMethod
 from evaluation.methods.method import Method
 from evaluation.metrics import ErrorKind
 from evaluation.reports.developed import developed
 from evaluation.reports.latex import table_to_latex
 from evaluation.reports.run_page import MOST_SHOWN, chosen_images, run_page
-from evaluation.results.answers import SceneAnswer, results_of
+from evaluation.results.answers import SceneAnswer, answer_to_json, results_of
 from evaluation.results.errors_file import ERRORS_FILE
 from evaluation.results.journal import JOURNAL_FILE, AnswerJournal, read_journal
 from evaluation.results.method_records import describe_method
@@ -37,6 +38,7 @@ from evaluation.results.tables import table_to_csv
 from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.errors import InputError
 from foundation.files import make_folder, partial_path, publish_folder, require_free, write_whole
+from foundation.hashing import sha256_of
 from foundation.held_folders import LOCK_FILE, held_folder
 from foundation.version import software
 
@@ -99,6 +101,8 @@ def run_methods(
     with held_folder(partial, f"another program works on {folder}; {_WAIT}", of=folder):
         journal = partial / JOURNAL_FILE
         known = read_journal(journal, _identity(run, state_of(data.scenes)))
+        if len(known) > 0:
+            _require_same(data.scenes, methods, known, partial)
         with journal.open("ab", buffering=0) as stream:
             answers = _answers(
                 data.scenes, methods, known, AnswerJournal(stream, len(known), folder), workers, on_scene
@@ -174,7 +178,7 @@ def describe_run(
         layout=data.layout,
         place=data.place,
         treatment=data.treatment,
-        data_sha256=scenes_sha256(data.scenes),
+        data_sha256=_data_sha256(data.scenes),
         truths=np.stack([scene.truth for scene in data.scenes]),
         results=results,
         methods=tuple(methods),
@@ -194,6 +198,39 @@ def _run_of(data: SceneSet, methods: Sequence[Method | SceneMethod]) -> Run:
         if isinstance(method, StoredMethod) and method.provenance and method.provenance.sha256 == run.data_sha256
     )
     return replace(run, notes=notes)
+
+
+def _data_sha256(scenes: Sequence[Scene]) -> str:
+    """Return what `learning.model_files.scenes_sha256` returns, also of lights without a channel."""
+    shares = [scene.truth / scene.truth.sum() for scene in scenes]
+    lines = [
+        f"{scene.name}\t{' '.join(f'{part:.9f}' for part in row)}" for scene, row in zip(scenes, shares, strict=True)
+    ]
+    return sha256_of("\n".join(lines).encode())
+
+
+def _require_same(
+    scenes: Sequence[Scene],
+    methods: Sequence[Method | SceneMethod],
+    known: Sequence[Sequence[SceneAnswer]],
+    place: Path,
+) -> None:
+    """Answer for the first, the middle and the last known image again: pixels and what a method reads may have changed.
+
+    Raises
+    ------
+    InputError
+        An answer is another than before.
+    """
+    again = sorted({0, len(known) // 2, len(known) - 1})
+    for number, answers in zip(again, answer_scenes([scenes[number] for number in again], methods), strict=True):
+        for method, now, before in zip(methods, answers, known[number], strict=True):
+            if json.dumps(answer_to_json(now)) != json.dumps(answer_to_json(before)):
+                raise InputError(
+                    f"{method.name} answers otherwise for {scenes[number].name} than when the run was stopped: the "
+                    "image, or a file that the method reads, has changed, or it answers by chance; remove "
+                    f"{place} to begin anew"
+                )
 
 
 def _identity(run: Run, state: str) -> dict[str, Any]:

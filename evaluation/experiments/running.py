@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from evaluation.methods.method import Learner, LocalMethod, Method
 from evaluation.methods.pixels import GREY
+from evaluation.methods.prepared import PreparedImage, PreparedMethod
 from evaluation.metrics import MapError, measure_map
 from evaluation.results.answers import SceneAnswer, read_light, results_of
 from evaluation.results.result import Result
@@ -198,12 +199,15 @@ def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[Scen
     mixed = isinstance(scene, MixedScene)
     image, mask = (None, None) if blind and not mixed else scene.read()
     truth = (scene.read_truth_map(), scene.read_weights()) if isinstance(scene, MixedScene) else None
+    prepared = None if image is None else PreparedImage(image, scene.saturation, mask)
     answers: list[SceneAnswer] = []
     for runner in runners:
         method = runner.method
         try:
             if isinstance(method, SceneMethod):
                 answer = read_light(runner.call(method.estimate_scene, scene))
+            elif runner.lock is None and prepared is not None and isinstance(method, PreparedMethod):
+                answer = read_light(method.estimate_prepared(prepared))
             else:
                 answer = read_light(runner.call(method.estimate, image, scene.saturation, mask))
             field = None

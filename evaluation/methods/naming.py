@@ -4,6 +4,12 @@
     package.module:Class   a class or value of a module that Python finds, also beside the working folder
     path/file.py:Class     a class or value of a file; what stands beside the file can be imported by it
 
+and any of these with what is done around it:
+
+    gray-edge-2@360        on images shrunk to 360 px along their longer side (`resized.ResizedMethod`)
+    gray-world@patches     by 8 patches along the shorter side, for several lights (`patchwise.PatchwiseMethod`)
+    gray-world@patches=12  by 12
+
 A class is made without arguments; a value is taken as it is. A file of ten lines is enough::
 
     import numpy as np
@@ -24,6 +30,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import re
 import sys
 import traceback
 from hashlib import sha256
@@ -31,11 +38,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, cast
 
-from evaluation.methods.standard import standard_methods
+from evaluation.methods.patchwise import PATCHES, PatchwiseMethod
+from evaluation.methods.resized import ResizedMethod
+from evaluation.methods.standard import local_methods, standard_methods
 from foundation.errors import InputError
 
 if TYPE_CHECKING:
     from evaluation.methods.method import Learner, Method
+
+_MODIFIERS = re.compile(r"(?P<size>[0-9]{1,6})|patches(=(?P<patches>[0-9]{1,6}))?")
 
 _FORMS = "a name of this suite, module:Class or path/file.py:Class"
 
@@ -46,7 +57,8 @@ def find_method(text: str) -> Method | Learner:
     Parameters
     ----------
     text
-        A name of `standard_methods`, "module:Class" or "path/file.py:Class".
+        A name of `standard_methods` or `local_methods`, "module:Class" or "path/file.py:Class", each of them with
+        "@PIXELS", "@patches" or "@patches=COUNT" behind it.
 
     Raises
     ------
@@ -60,11 +72,27 @@ def find_method(text: str) -> Method | Learner:
     'Gray-world'
     >>> find_method("evaluation.methods.pca:BrightDark").name
     'PCA bright and dark'
+    >>> find_method("gray-edge-2@360").name
+    '2nd-order Gray-Edge at 360 px'
+    >>> find_method("gray-world@patches=4").name
+    'Gray-world by patches'
     """
     wanted = text.strip()
+    inner, at, around = wanted.rpartition("@")
+    changed = _MODIFIERS.fullmatch(around) if at else None
+    if changed is not None:
+        method = find_method(inner)
+        if not callable(getattr(method, "estimate", None)):
+            raise InputError(f"{inner} is fitted first, so there is no {wanted}; train it, and give its model instead")
+        number = int(changed["size"] or changed["patches"] or PATCHES)
+        if not number:
+            raise InputError(f"{wanted}: expected a number above 0 after @")
+        if changed["size"]:
+            return ResizedMethod(cast("Method", method), number)
+        return PatchwiseMethod(cast("Method", method), number)
     place, colon, name = wanted.rpartition(":")
     if not colon:
-        known = standard_methods()
+        known = {**standard_methods(), **local_methods()}
         if wanted in known:
             return known[wanted]
         raise InputError(f"{wanted!r} is no method; the methods are {', '.join(known)}, or give module:Class or a file")

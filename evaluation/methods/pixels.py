@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -48,16 +49,10 @@ def usable(
            [1, 1, 1, 1, 1, 1],
            [1, 1, 1, 1, 1, 1]])
     """
-    import cv2
-
     height, width = image.shape[:2]
-    if saturation is None:
-        free = np.ones((height, width), dtype=bool)
-    else:
-        clipped = (
-            (image[..., 0] >= saturation) | (image[..., 1] >= saturation) | (image[..., 2] >= saturation)
-        ).astype(np.uint8)
-        free = cv2.dilate(clipped, np.ones((3, 3), np.uint8)) == 0
+    free = np.ones((height, width), dtype=bool)
+    if saturation is not None:
+        free &= ~dilate_clipped(image, saturation)
     if mask is not None:
         free = free & ~mask
     if border:
@@ -65,6 +60,31 @@ def usable(
         inside[border:-border, border:-border] = True
         free = free & inside
     return np.asarray(free, dtype=bool)
+
+
+def dilate_clipped(
+    image: npt.NDArray[np.integer[Any]] | npt.NDArray[np.floating[Any]], saturation: float
+) -> npt.NDArray[np.bool_]:
+    """Return (H, W) bool, True where a channel is saturated or a neighbour's is.
+
+    The image is (H, W, 3) of any dtype.
+    """
+    import cv2
+
+    from evaluation.methods.filters.loops import mark_clipped
+
+    clipped = np.zeros(image.shape[:2], dtype=np.uint8)
+    kind: Any = image.dtype
+    if kind.kind in "iu":
+        if saturation > np.iinfo(kind).max:
+            return clipped.view(np.bool_)
+        limit = kind.type(max(0, math.ceil(saturation)))
+    else:
+        limit = kind.type(saturation)
+    native: Any = np.ascontiguousarray(image, dtype=kind.newbyteorder("="))
+    if mark_clipped(native, limit, clipped):
+        clipped = cv2.dilate(clipped, np.ones((3, 3), np.uint8))
+    return np.asarray(clipped).view(np.bool_)
 
 
 def unit(estimate: npt.ArrayLike) -> npt.NDArray[np.float64]:

@@ -13,6 +13,9 @@ Where they come from::
     Gray-Edge, order 2  the same                                                2, 1, 1
     PCA                 D. Cheng et al., 2014; see `pca.py`                     -
 
+and, each in its own file with its source and constants: improved White-Patch, Color Sparrow, Local Surface Reflectance
+(`retinex`), grayness index and mean-shifted gray pixel (`gray_pixels`), and what OpenCV offers (`opencv.py`).
+
 The paper's tables have the first three, Shades-of-Gray with p = 2 as here. The other constants are those with which the
 methods stand in the tables of the NUS dataset. Every method of the framework is built from its equation alone, without
 the preprocessing that a source may add (for White-Patch: no median filter).
@@ -25,8 +28,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from evaluation.methods.gray_edge import GrayEdge
-from evaluation.methods.method import Method
+from evaluation.methods.gray_pixels.grayness import GraynessIndex
+from evaluation.methods.gray_pixels.local_grayness import LocalGraynessIndex
+from evaluation.methods.gray_pixels.mean_shifted import MeanShiftedGrayPixel
+from evaluation.methods.method import LocalMethod, Method
+from evaluation.methods.opencv import OpenCvGrayWorld
+from evaluation.methods.patchwise import PatchwiseMethod
 from evaluation.methods.pca import BrightDark
+from evaluation.methods.retinex.color_sparrow import ColorSparrow
+from evaluation.methods.retinex.improved_white_patch import ImprovedWhitePatch
+from evaluation.methods.retinex.surface_reflectance import SurfaceReflectance
 
 
 def standard_methods() -> Mapping[str, Method]:
@@ -34,8 +45,12 @@ def standard_methods() -> Mapping[str, Method]:
 
     Examples
     --------
-    >>> list(standard_methods())
+    >>> list(standard_methods())[:7]
     ['white-patch', 'gray-world', 'shades-of-gray', 'general-gray-world', 'gray-edge-1', 'gray-edge-2', 'pca']
+    >>> list(standard_methods())[7:12]
+    ['improved-white-patch', 'color-sparrow', 'local-surface-reflectance', 'grayness-index', 'mean-shifted-gray-pixel']
+    >>> list(standard_methods())[12:]
+    ['opencv-grayworld']
     >>> standard_methods()["gray-edge-1"].name
     '1st-order Gray-Edge'
     """
@@ -47,4 +62,24 @@ def standard_methods() -> Mapping[str, Method]:
         "gray-edge-1": GrayEdge("1st-order Gray-Edge", 1, 1, 6),
         "gray-edge-2": GrayEdge("2nd-order Gray-Edge", 2, 1, 1),
         "pca": BrightDark(),
+        "improved-white-patch": ImprovedWhitePatch(),
+        "color-sparrow": ColorSparrow(),
+        "local-surface-reflectance": SurfaceReflectance(),
+        "grayness-index": GraynessIndex(),
+        "mean-shifted-gray-pixel": MeanShiftedGrayPixel(),
+        "opencv-grayworld": OpenCvGrayWorld(),
+    }
+
+
+def local_methods() -> Mapping[str, LocalMethod]:
+    """Return methods that give a map of lights by their short names; for images under several lights only.
+
+    Examples
+    --------
+    >>> list(local_methods())
+    ['gray-world-by-patches', 'grayness-index-local']
+    """
+    return {
+        "gray-world-by-patches": PatchwiseMethod(GrayEdge("Gray-world", 0, 1, 0)),
+        "grayness-index-local": LocalGraynessIndex(),
     }

@@ -9,7 +9,6 @@ on what both happen to have.
 from __future__ import annotations
 
 import csv
-import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -119,7 +118,7 @@ def _stem(image: str) -> str:
 
 
 def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
-    lines = re.split(r"\r\n|\r|\n", text)
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     separator = max(",;\t", key=lines[0].count)
     try:
         rows = list(csv.reader(lines, delimiter=separator, strict=True))
@@ -132,18 +131,17 @@ def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
             f"{path} begins with {lines[0][:80].strip()!r}; expected the columns {','.join(_COLUMNS)}, with or without "
             "a head"
         )
-    twice = [column for column in _COLUMNS if headed and heads.count(column) > 1]
-    if twice:
-        raise FormatError(f"{path} has two columns {twice[0]!r}; name each of {','.join(_COLUMNS)} once")
+    if headed and len(set(heads)) < len(heads):
+        raise FormatError(f"{path} has columns of the same name: {separator.join(rows[0])}; expected each once")
     places = [heads.index(column) if headed else number for number, column in enumerate(_COLUMNS)]
     found: list[tuple[str, npt.NDArray[np.float64]]] = []
     for number, row in enumerate(rows, start=1):
         if (headed and number == 1) or not any(field.strip() for field in row):
             continue
-        if len(row) > len(heads) and any(field.strip() for field in row[len(heads) :]):
+        if len(row) != len(heads):
             raise FormatError(
-                f"{path}, line {number}: {separator.join(row)[:80]!r} has {len(row)} fields under {len(heads)} "
-                "columns; write numbers with a point, and a name that holds a separator in quotes"
+                f"{path}, line {number}: {len(row)} fields where the first line has {len(heads)}; expected as many, "
+                "and a point, not a comma, in numbers"
             )
         try:
             image, *light = (row[place].strip() for place in places)

@@ -23,7 +23,7 @@ from foundation.clock import SystemClock
 from foundation.errors import InputError
 from foundation.files import partial_path
 from foundation.held_folders import held_folder
-from tests.evaluation.made_up import MixedWall, as_set, walls
+from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
 
 METHODS = [GrayEdge("Gray-world", 0, 1, 0, 0), GrayEdge("White-Patch", 0, np.inf, 0, 0)]
 LIGHTS = np.array([[2.0, 1, 1], [1, 1, 1]])
@@ -141,6 +141,20 @@ def test_what_another_run_has_made_is_not_taken(
     with pytest.raises(InputError, match=rf"\.out\.partial holds what another run has made so far: its {what} differ"):
         run_methods(data(), methods, folder)
     assert next(partial_path(folder).iterdir()).read_bytes() == before
+
+
+def test_changed_pixels_are_noticed(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    before = _stopped(folder)
+    scenes: list[Any] = list(mixed_set().scenes)
+    scenes[0] = Wall(scenes[0].name, scenes[0].truth, seed=99)
+    with pytest.raises(InputError, match=r"answers otherwise for wall 0\.png than when the run was stopped"):
+        run_methods(as_set(tuple(scenes)), METHODS, folder)
+    assert next(partial_path(folder).iterdir()).read_bytes() == before
+
+
+def test_a_true_light_without_a_channel_is_judged() -> None:
+    run_methods(as_set((Wall("red", np.array([1.0, 0, 0])),)), [METHODS[0]])
 
 
 def test_two_programs_do_not_work_on_one_folder(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod
@@ -18,7 +19,8 @@ from tests.evaluation.learning.made_up_world import constant_light, world
 from tests.evaluation.learning.stories import story
 
 TRAIN, TEST = world(90), world(40, seed=1)
-LEARNERS = dict(standard_learners())
+LEARNERS = {key: learner for key, learner in standard_learners().items() if key != "constant-light"}
+"""All that look at images; the constant light has tests of its own."""
 
 
 @pytest.fixture(scope="module", params=LEARNERS)
@@ -95,11 +97,15 @@ def test_an_image_without_a_usable_pixel_is_marked_and_not_learned_from(learner:
 
 
 def test_large_images_are_reduced(fitted: LearnedMethod) -> None:
-    scene = TEST[1]
-    large = np.kron(scene.image, np.ones((9, 9, 1), np.float32))
-    noisy = large * np.random.default_rng(0).uniform(0.9, 1.1, large.shape).astype(np.float32)
-    small = recovery_error(fitted.estimate(scene.image), scene.truth)
-    assert recovery_error(fitted.estimate(noisy), scene.truth) < small + 2
+    rng = np.random.default_rng(0)
+    small: list[npt.NDArray[np.float64]] = []
+    large: list[npt.NDArray[np.float64]] = []
+    for scene in TEST[:8]:
+        image = np.kron(scene.image, np.ones((9, 9, 1), np.float32))
+        image *= rng.uniform(0.9, 1.1, image.shape).astype(np.float32)
+        small.append(recovery_error(fitted.estimate(scene.image), scene.truth))
+        large.append(recovery_error(fitted.estimate(image), scene.truth))
+    assert np.mean(large) < np.mean(small) + 1.5
 
 
 def test_one_scene_is_enough_to_fit(learner: FeatureLearner) -> None:

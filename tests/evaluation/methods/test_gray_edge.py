@@ -1,18 +1,20 @@
-"""The Gray-Edge framework by hand: Minkowski means, derivatives and kernels."""
+"""The Gray-Edge framework by hand and against formulations of others: means, derivatives, kernels, borders, strips."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
+from scipy import ndimage
 
 from evaluation.methods import GrayEdge
-from evaluation.methods.gray_edge import differentiate, gaussian_kernel
+from evaluation.methods.filters import gaussian
+from evaluation.methods.filters.gaussian import differentiate, gaussian_kernel
+from evaluation.methods.pixels import GREY
+from evaluation.methods.prepared import PreparedImage
 from evaluation.metrics import recovery_error
-
-if TYPE_CHECKING:
-    pass
 
 
 def test_minkowski_means_by_hand() -> None:
@@ -45,3 +47,107 @@ def test_kernels_have_the_authors_size_and_norms(sigma: float) -> None:
 def test_constants_that_make_no_method_are_refused(order: int, p: float, sigma: float) -> None:
     with pytest.raises(ValueError, match="make no method"):
         GrayEdge("", order, p, sigma)
+
+
+def photograph(height: int, width: int) -> npt.NDArray[np.uint16]:
+    """Return smooth colours, edges and noise (height, width, 3) uint16, none saturated below 16000."""
+    random = np.random.default_rng(height + width)
+    y, x = np.mgrid[:height, :width]
+    waves = [2 + np.sin(x / (17 + 5 * one)) + np.cos(y / (23 - 4 * one)) for one in range(3)]
+    edges = 1 + 2.0 * ((x // 61 + y // 47) % 3 == 0)
+    image = np.stack(waves, axis=-1) * edges[..., None] * np.array([400.0, 1000.0, 600.0])
+    noise = np.asarray(np.clip(random.normal(0, 12, (height, width, 3)), -50, 50), dtype=np.float64)
+    return np.asarray(image + noise + 60, dtype=np.uint16)
+
+
+def numpy_norm(values: npt.NDArray[Any], p: float) -> npt.NDArray[np.float64]:
+    """Return the unit light of the p-norms of the channels of (..., 3), as one writes it in NumPy."""
+    flat = values.reshape(-1, 3).astype(np.float64)
+    light = flat.max(axis=0) if np.isinf(p) else ((flat / flat.max()) ** p).mean(axis=0) ** (1 / p)
+    return light / np.linalg.norm(light)
+
+
+@pytest.mark.parametrize("p", [1, 2, 4, 6.5, 20, np.inf])
+@pytest.mark.parametrize("kind", [np.uint16, np.float32, np.float64])
+def test_without_a_filter_the_estimate_is_that_of_a_line_of_numpy(p: float, kind: Any) -> None:
+    image = (photograph(301, 419) * (1 if kind is np.uint16 else 1.37e-5)).astype(kind)
+    np.testing.assert_allclose(GrayEdge("", 0, p, 0).estimate(image), numpy_norm(image, p), rtol=1e-9)
+    mask = np.random.default_rng(1).uniform(size=image.shape[:2]) < 0.02
+    np.testing.assert_allclose(GrayEdge("", 0, p, 0).estimate(image, mask=mask), numpy_norm(image[~mask], p), rtol=1e-9)
+    inner = image[3:-3, 3:-3]
+    np.testing.assert_allclose(GrayEdge("", 0, p, 0, border=3).estimate(image), numpy_norm(inner, p), rtol=1e-9)
+
+
+def test_sums_of_the_largest_values_do_not_overflow() -> None:
+    image = np.full((1100, 4200, 3), 65535, np.uint16)
+    image[..., 1] = 0
+    np.testing.assert_allclose(PreparedImage(image).moments()[0], [65535.0 * 4620000, 0, 65535.0 * 4620000], rtol=0)
+    np.testing.assert_allclose(PreparedImage(image).moments()[1, 0], 65535.0**2 * 4620000, rtol=0)
+
+
+def scipy_kernel(order: int, sigma: float) -> npt.NDArray[np.float64]:
+    """Return scipy's kernel cut at 3σ, to be correlated with, with the gains of the authors' kernels."""
+    reach = int(3 * sigma + 0.5)
+    impulse = np.zeros(2 * reach + 1)
+    impulse[reach] = 1
+    kernel = ndimage.gaussian_filter1d(impulse, sigma, order=order, mode="constant", radius=reach)[::-1]
+    x = np.arange(-reach, reach + 1)
+    if order == 2:
+        kernel = kernel - kernel.mean()
+    return kernel / (kernel.sum(), (x * kernel).sum(), (x**2 / 2 * kernel).sum())[order]
+
+
+def scipy_derivative(image: npt.NDArray[Any], order: int, sigma: float) -> npt.NDArray[np.float64]:
+    """Return the size of the derivative (H, W, 3) in float64."""
+
+    def filtered(down: int, across: int) -> npt.NDArray[np.float64]:
+        values = ndimage.correlate1d(image.astype(np.float64), scipy_kernel(down, sigma), axis=0, mode="nearest")
+        return ndimage.correlate1d(values, scipy_kernel(across, sigma), axis=1, mode="nearest")
+
+    if order == 0:
+        return filtered(0, 0)
+    if order == 1:
+        return np.hypot(filtered(0, 1), filtered(1, 0))
+    return np.sqrt(filtered(0, 2) ** 2 + 4 * filtered(1, 1) ** 2 + filtered(2, 0) ** 2)
+
+
+CASES = [(0, 9, 9), (1, 1, 6), (1, 5, 2), (2, 1, 1), (2, 3, 4), (1, np.inf, 1.3), (0, 1, 2)]
+
+
+@pytest.mark.parametrize(("order", "p", "sigma"), CASES)
+def test_derivatives_of_scipy_give_the_same_light(order: int, p: float, sigma: float) -> None:
+    image = photograph(1200, 1500)
+    border = int(sigma) + 1
+    expected = numpy_norm(scipy_derivative(image, order, sigma)[border:-border, border:-border], p)
+    np.testing.assert_allclose(GrayEdge("", order, p, sigma).estimate(image), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("order", "sigma"), [(0, 9.0), (1, 6.0), (2, 1.0), (1, 0.4)])
+@pytest.mark.parametrize("shape", [(1, 1), (3, 200), (400, 2), (37, 41), (600, 131)])
+def test_derivatives_of_images_of_any_shape(order: int, sigma: float, shape: tuple[int, int]) -> None:
+    image = photograph(*shape)
+    np.testing.assert_allclose(
+        differentiate(image, order, sigma), scipy_derivative(image, order, sigma), rtol=2e-5, atol=2e-3
+    )
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_strips_of_a_large_image_make_the_whole(order: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = photograph(500, 300)
+    whole = differentiate(image, order, 3.0)
+    monkeypatch.setattr(gaussian, "STRIP_NUMBERS", 1)
+    assert len(list(gaussian.differentiated_strips(image, order, 3.0, 1.0))) > 4
+    np.testing.assert_array_equal(differentiate(image, order, 3.0), whole)
+
+
+def test_an_even_image_has_no_edges() -> None:
+    assert GrayEdge("", 1, 1, 2).estimate(np.full((50, 50, 3), (51234, 7, 333), np.uint16)) is GREY
+
+
+def test_the_border_stated() -> None:
+    borders = [GrayEdge("", order, 1, sigma).left_out for order, sigma in ((0, 0), (0, 0.5), (1, 6), (2, 1.9))]
+    assert borders == [0, 1, 7, 2]
+    image = np.ones((30, 30, 3))
+    image[0, 0] = [5, 1, 1]
+    assert recovery_error(GrayEdge("", 0, np.inf, 0).estimate(image), [5, 1, 1]) < 1e-6
+    assert recovery_error(GrayEdge("", 0, np.inf, 0, border=1).estimate(image), [1, 1, 1]) < 1e-6

@@ -9,6 +9,8 @@ import pytest
 
 from evaluation.methods.method import Learner
 from evaluation.methods.naming import find_method
+from evaluation.methods.patchwise import PatchwiseMethod
+from evaluation.methods.resized import ResizedMethod
 from evaluation.methods.standard import standard_methods
 from foundation.errors import InputError
 
@@ -61,9 +63,23 @@ def test_a_class_of_a_module() -> None:
     assert find_method("evaluation.methods.pca:BrightDark").name == "PCA bright and dark"
 
 
+def test_what_is_done_around_a_method(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(TEN_LINES)
+    assert find_method("gray-edge-2@360") == ResizedMethod(standard_methods()["gray-edge-2"], 360)
+    assert find_method("gray-world@patches=5") == PatchwiseMethod(standard_methods()["gray-world"], 5)
+    assert find_method(f"{tmp_path}/own.py:Brightest@90@patches").name == "Brightest pixel at 90 px by patches"
+    odd = tmp_path / "a@b"
+    odd.mkdir()
+    (odd / "own.py").write_text(TEN_LINES)
+    assert find_method(f"{odd}/own.py:Brightest").name == "Brightest pixel"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("gray-world@0", "gray-world@0: expected a number above 0"),
+        ("gray-world@big", "'gray-world@big' is no method"),
+        ("gray-wurld@90", "'gray-wurld' is no method"),
         ("gray-wurld", "'gray-wurld' is no method; the methods are white-patch, gray-world"),
         ("", "is no method"),
         (":Class", "names no method; expected"),

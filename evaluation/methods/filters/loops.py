@@ -1,0 +1,287 @@
+"""Compiled loops over the pixels of an image, in its own dtype: nothing of an image's size is made.
+
+Sums are float64, or whole numbers where the image is: they do not depend on the dtype. `free` is (H, W) bool, True
+where a pixel may be used, or (0, 0) where every one may be; `border` leaves out pixels along every edge.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import uint32, uint64
+
+from foundation.compiled import compiled
+
+if TYPE_CHECKING:
+    from evaluation.scene import Image
+
+BINS = 4096
+"""Of the histogram of projections: the two that hold the limits have some thousand pixels of 18 million."""
+SPAN = 64
+"""Pixels of a row that are added at a time where none is left out: a few vectors in each of three channels."""
+SPANS_OF_A_SUM = 60_000
+"""Values of uint16 that a sum of uint32 holds, less those of one more row of 350 000 px."""
+CHUNK = 256
+"""Pixels whose powers are found at a time, in the nearest cache."""
+MOST_PRODUCTS = 64
+"""Powers up to which products are used."""
+
+
+@compiled
+def mark_clipped(image: Image, saturation: Any, clipped: npt.NDArray[np.uint8]) -> int:
+    """Set `clipped` (H, W) uint8 to 1 where a channel of `image` (H, W, 3) reaches `saturation`, and count them.
+
+    `saturation` has the dtype of the image. Whole rows are compared first, which is done by vectors.
+    """
+    count = 0
+    flat = image.reshape(-1)
+    length = 3 * image.shape[1]
+    for y in range(image.shape[0]):
+        row = flat[y * length : (y + 1) * length]
+        over = 0
+        for at in range(row.size):
+            over |= row[at] >= saturation
+        if not over:
+            continue
+        for x in range(image.shape[1]):
+            if image[y, x, 0] >= saturation or image[y, x, 1] >= saturation or image[y, x, 2] >= saturation:
+                clipped[y, x] = 1
+                count += 1
+    return count
+
+
+@compiled
+def _add_span(
+    span: npt.NDArray[np.uint16],
+    sums: npt.NDArray[np.uint32],
+    squares: npt.NDArray[np.uint64],
+    highs: npt.NDArray[np.uint16],
+) -> None:
+    """Add the values of a span to sums a place; the loops are such as LLVM makes vectors of."""
+    for j in range(3 * SPAN):
+        value = span[j]
+        sums[j] += uint32(value)
+        highs[j] = max(highs[j], value)
+    for j in range(3 * SPAN):
+        wide = uint32(span[j])
+        squares[j] += uint64(uint32(wide * wide))
+
+
+@compiled
+def _count(free: npt.NDArray[np.bool_]) -> int:
+    usable = 0
+    for x in range(free.size):
+        usable += free[x]
+    return usable
+
+
+@compiled
+def whole_moments(
+    image: npt.NDArray[np.uint16], free: npt.NDArray[np.bool_], border: int
+) -> tuple[npt.NDArray[np.uint64], int]:
+    """Return (3, 3) uint64, of red, green and blue of an image (H, W, 3): sum, sum of squares, maximum; and the count.
+
+    Exact for images of fewer than 2³² pixels.
+    """
+    found = np.zeros((3, 3), np.uint64)
+    height, width = image.shape[:2]
+    flat = image.reshape(-1)
+    sums = np.zeros(3 * SPAN, np.uint32)
+    squares = np.zeros(3 * SPAN, np.uint64)
+    highs = np.zeros(3 * SPAN, np.uint16)
+    count, since = 0, 0
+    for y in range(border, height - border):
+        for left in range(border, width - border, SPAN):
+            right = min(width - border, left + SPAN)
+            usable = right - left
+            if free.size:
+                usable = _count(free[y, left:right])
+            count += usable
+            if usable == SPAN:
+                begin = 3 * (y * width + left)
+                _add_span(flat[begin : begin + 3 * SPAN], sums, squares, highs)
+                since += 1
+                continue
+            for x in range(left, right):
+                if not free.size or free[y, x]:
+                    for channel in range(3):
+                        value = uint64(image[y, x, channel])
+                        found[0, channel] += value
+                        found[1, channel] += value * value
+                        found[2, channel] = max(found[2, channel], value)
+        if since >= SPANS_OF_A_SUM or y == height - border - 1:
+            for j in range(sums.size):
+                found[0, j % 3] += uint64(sums[j])
+                sums[j] = 0
+            since = 0
+    for j in range(sums.size):
+        found[1, j % 3] += squares[j]
+        found[2, j % 3] = max(found[2, j % 3], uint64(highs[j]))
+    return found, count
+
+
+@compiled
+def float_moments(
+    image: npt.NDArray[np.float32] | npt.NDArray[np.float64], free: npt.NDArray[np.bool_], border: int, scale: float
+) -> tuple[npt.NDArray[np.float64], int]:
+    """Return (3, 3) float64, of red, green and blue times `scale`: sum, sum of squares, maximum; and the count.
+
+    The image is (H, W, 3). Rows are summed apart, which keeps twelve digits in an image of any size.
+    """
+    found = np.zeros((3, 3), np.float64)
+    height, width = image.shape[:2]
+    count = 0
+    for y in range(border, height - border):
+        row = np.zeros((3, 3), np.float64)
+        for x in range(border, width - border):
+            if free.size and not free[y, x]:
+                continue
+            for channel in range(3):
+                value = image[y, x, channel] * scale
+                row[0, channel] += value
+                row[1, channel] += value * value
+                row[2, channel] = max(row[2, channel], value)
+            count += 1
+        for channel in range(3):
+            found[0, channel] += row[0, channel]
+            found[1, channel] += row[1, channel]
+            found[2, channel] = max(found[2, channel], row[2, channel])
+    return found, count
+
+
+@compiled
+def _raise(factors: npt.NDArray[np.float64], powers: npt.NDArray[np.float64], length: int, p: float) -> None:
+    """Write the powers p of the first numbers of `factors`, which are lost; whole powers by products of vectors."""
+    left = int(p) if p <= MOST_PRODUCTS else 0
+    if left != p:
+        for j in range(length):
+            powers[j] = factors[j] ** p
+        return
+    for j in range(length):
+        powers[j] = 1.0
+    while left:
+        if left & 1:
+            for j in range(length):
+                powers[j] *= factors[j]
+        left >>= 1
+        if left:
+            for j in range(length):
+                factors[j] *= factors[j]
+
+
+@compiled
+def sum_powers(
+    values: Image,
+    free: npt.NDArray[np.bool_],
+    border: int,
+    top: int,
+    height: int,
+    width: int,
+    p: float,
+    scale: float,
+    sums: npt.NDArray[np.float64],
+) -> None:
+    """Add to `sums` (3,) float64 the powers p of the values times `scale` of some rows of an image.
+
+    Parameters
+    ----------
+    values
+        (rows, Q) or longer rows of interleaved pixels; uint16, float32 or float64, not below 0.
+    free
+        (H, W) or (0, 0) bool, see above; that of the whole image.
+    border
+        Pixels left out along every edge.
+    top
+        Row of the image that `values` begin with.
+    height, width
+        Of the image, px.
+    p
+        Power, above 0; infinity takes the maximum.
+    scale
+        Factor that keeps powers from over- and underflowing: 1 over the largest value.
+    sums
+        (3,) float64.
+    """
+    powers = np.empty(3 * CHUNK, np.float64)
+    factors = np.empty(3 * CHUNK, np.float64)
+    for row in range(values.shape[0]):
+        y = top + row
+        if y < border or y >= height - border:
+            continue
+        part = np.zeros(3, np.float64)
+        for left in range(border, width - border, CHUNK):
+            length = min(CHUNK, width - border - left)
+            span = values[row, 3 * left : 3 * (left + length)]
+            for j in range(span.size):
+                factors[j] = span[j] * scale
+            if not np.isinf(p):
+                _raise(factors, powers, 3 * length, p)
+            for x in range(length):
+                if free.size and not free[y, left + x]:
+                    continue
+                for channel in range(3):
+                    if np.isinf(p):
+                        sums[channel] = max(sums[channel], factors[3 * x + channel])
+                    else:
+                        part[channel] += powers[3 * x + channel]
+        for channel in range(3):
+            sums[channel] += part[channel]
+
+
+@compiled
+def count_projections(
+    image: Image, free: npt.NDArray[np.bool_], direction: npt.NDArray[np.float64], step: float
+) -> npt.NDArray[np.int64]:
+    """Return (BINS,) int64, the histogram of the projections of an image's pixels (H, W, 3) on a direction (3,)."""
+    counts = np.zeros(BINS, np.int64)
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            if free.size and not free[y, x]:
+                continue
+            along = image[y, x, 0] * direction[0] + image[y, x, 1] * direction[1] + image[y, x, 2] * direction[2]
+            counts[min(BINS - 1, int(along * step))] += 1
+    return counts
+
+
+@compiled
+def sum_outer_bins(
+    image: Image,
+    free: npt.NDArray[np.bool_],
+    direction: npt.NDArray[np.float64],
+    step: float,
+    low: int,
+    high: int,
+    bordering: npt.NDArray[np.float64],
+) -> npt.NDArray[np.float64]:
+    """Return (3, 3) float64, the sum of x xᵀ over the pixels whose bin is below `low` or above `high`.
+
+    The pixels of the bins `low` and `high` themselves are written to `bordering` (N, 4) float64: red, green, blue and
+    the projection, in reading order. Image and direction are those of `count_projections`.
+    """
+    total = np.zeros((3, 3), np.float64)
+    found = 0
+    for y in range(image.shape[0]):
+        a, b, c, ab, ac, bc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for x in range(image.shape[1]):
+            if free.size and not free[y, x]:
+                continue
+            red, green, blue = float(image[y, x, 0]), float(image[y, x, 1]), float(image[y, x, 2])
+            along = red * direction[0] + green * direction[1] + blue * direction[2]
+            at = min(BINS - 1, int(along * step))
+            if at < low or at > high:
+                a += red * red
+                b += green * green
+                c += blue * blue
+                ab += red * green
+                ac += red * blue
+                bc += green * blue
+            elif at in (low, high):
+                bordering[found, 0] = red
+                bordering[found, 1] = green
+                bordering[found, 2] = blue
+                bordering[found, 3] = along
+                found += 1
+        total += np.array([[a, ab, ac], [ab, b, bc], [ac, bc, c]])
+    return total

@@ -1,0 +1,137 @@
+"""Tune a method's parameters on images whose light nobody knows, by the green stability assumption.
+
+N. Banić, S. Lončarić, "Green stability assumption: unsupervised learning for statistics-based illumination estimation",
+Journal of Imaging 4(11), 2018 (arXiv 1802.00776): lights differ much in red and blue chromaticity and little in green,
+so of several sets of parameters the one whose estimates spread least in green chromaticity is taken to be the best.
+Here the spread is the standard deviation of g / (r + g + b) over the images; that is our reading of the paper, a
+reconstruction. Images for which any of the candidates gives no light are left out for all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.methods.gray_edge import GrayEdge
+from evaluation.methods.method import Method
+from evaluation.methods.pixels import GREY
+from evaluation.methods.prepared import estimate_all
+from evaluation.scene import Scene
+from foundation.errors import InputError
+
+FAMILIES = ("shades-of-gray", "general-gray-world", "gray-edge-1", "gray-edge-2")
+"""The families that `family` makes."""
+
+_FEWEST_IMAGES = 2
+"""Images that a spread is found of."""
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What tuning found.
+
+    Attributes
+    ----------
+    best
+        The candidate with the least spread, the first of equals.
+    candidates
+        All of them.
+    spreads
+        Standard deviation of the green chromaticity of each one's estimates.
+    images
+        Number of images that count.
+    """
+
+    best: Method
+    candidates: tuple[Method, ...]
+    spreads: tuple[float, ...]
+    images: int
+
+
+def tune(candidates: Sequence[Method], scenes: Sequence[Scene], on_scene: Callable[[], None] | None = None) -> Tuned:
+    """Return the candidate whose estimates spread least in green chromaticity; ground truths are not looked at.
+
+    Parameters
+    ----------
+    candidates
+        One method with different parameters, at least two.
+    scenes
+        Images of one camera under many lights, at least two.
+    on_scene
+        Called after each.
+
+    Raises
+    ------
+    InputError
+        There are too few candidates or images, or too few images for which all candidates give a light.
+
+    Examples
+    --------
+    >>> class Wall:
+    ...     name, truth, saturation = "wall", np.ones(3), None
+    ...
+    ...     def __init__(self, light):
+    ...         image = np.full((8, 8, 3), 0.25)
+    ...         image[0, 0] = [1, 0.5, 0.5] if light[0] > 1 else [0.5, 1, 0.5]
+    ...         self.image = image * light
+    ...
+    ...     def read(self):
+    ...         return self.image, None
+    >>> walls = [Wall([2, 1, 1]), Wall([1, 1, 2]), Wall([1.5, 1, 1.5])]
+    >>> tune(family("shades-of-gray"), walls).best.name
+    'Shades-of-Gray (p=1)'
+    """
+    if len(candidates) < 2 or len(scenes) < _FEWEST_IMAGES:
+        raise InputError(f"{len(candidates)} sets of parameters on {len(scenes)} images; expected 2 or more of each")
+    greens: list[npt.NDArray[np.float64]] = []
+    for scene in scenes:
+        image, mask = scene.read()
+        lights = estimate_all(candidates, image, scene.saturation, mask)
+        if all(light is not GREY and np.isfinite(light).all() for light in lights):
+            greens.append(np.array([light[1] / light.sum() for light in lights]))
+        if on_scene:
+            on_scene()
+    if len(greens) < _FEWEST_IMAGES:
+        raise InputError(
+            f"only {len(greens)} of {len(scenes)} images give a light with every set of parameters; expected 2 or "
+            "more: use larger images or smaller scales"
+        )
+    spreads = np.std(np.stack(greens), axis=0)
+    return Tuned(
+        candidates[int(spreads.argmin())],
+        tuple(candidates),
+        tuple(float(spread) for spread in spreads),
+        len(greens),
+    )
+
+
+def family(name: str) -> tuple[GrayEdge, ...]:
+    """Return the candidates of a family, each with its parameters in its name.
+
+    Norms 1 to 15 without a scale; with scales of 1 to 9 px six norms up to 13.
+
+    Raises
+    ------
+    InputError
+        There is no family of that name.
+
+    Examples
+    --------
+    >>> [len(family(name)) for name in FAMILIES]
+    [15, 30, 30, 30]
+    """
+    norms, scales = (1, 2, 4, 6, 9, 13), (1.0, 2.0, 4.0, 6.0, 9.0)
+    if name == "shades-of-gray":
+        return tuple(GrayEdge(f"Shades-of-Gray (p={p})", 0, p, 0) for p in range(1, 16))
+    titles = {
+        "general-gray-world": ("General Gray-world", 0),
+        "gray-edge-1": ("1st-order Gray-Edge", 1),
+        "gray-edge-2": ("2nd-order Gray-Edge", 2),
+    }
+    if name not in titles:
+        raise InputError(f"{name!r} is no family of methods to tune; the families are {', '.join(FAMILIES)}")
+    title, order = titles[name]
+    return tuple(GrayEdge(f"{title} (p={p}, σ={sigma:g})", order, p, sigma) for sigma in scales for p in norms)

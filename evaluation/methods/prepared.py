@@ -1,0 +1,290 @@
+"""An image with what methods share, found once: usable pixels, moments, Gaussian derivatives.
+
+    prepared = PreparedImage(image, saturation, mask)
+    lights = [estimate(method, prepared) for method in methods]
+
+A method that can use it has `estimate_prepared(prepared)`; `estimate` calls it where there is one. Images are read in
+their own dtype, row by row or in strips, so beside the image a method needs:
+
+- one byte a pixel for the usable ones, where something is masked or saturated;
+- for a derivative two strips of at most 16 MB, and 1 MB: 40 MB with the rows that strips share, whatever the size;
+- for images of at most `KEPT_PIXELS`, each derivative that was asked for, which is then kept: 12 bytes a pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol, cast, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluation.methods.method import Method
+from evaluation.methods.pixels import dilate_clipped
+from evaluation.scene import Image
+
+KEPT_PIXELS = 1 << 20
+"""Pixels up to which derivatives are kept for the next method: 12 MB each."""
+
+SAFE_POWER = 16
+"""Norm up to which no power of a value between 1 and 1e-19 of the image's largest leaves the range of float64.
+
+So the largest usable value need not be found first.
+"""
+
+_ALL = np.zeros((0, 0), dtype=bool)
+"""Stands for: every pixel may be used."""
+
+
+@runtime_checkable
+class PreparedMethod(Protocol):
+    """A method that can use what other methods have found of an image."""
+
+    def estimate_prepared(self, prepared: PreparedImage) -> npt.NDArray[np.float64]:
+        """Return what `Method.estimate` returns of the same image: (3,) float64 of length 1, or `pixels.GREY`."""
+        ...
+
+
+class PreparedImage:
+    """An image whose shared parts are found when they are first asked for, and kept; for one thread at a time.
+
+    Parameters
+    ----------
+    image
+        (H, W, 3) uint16, float32 or float64, linear camera RGB ≥ 0; not to be changed as long as this is used. Other
+        dtypes are converted, uint8 to uint16 and all else to float64.
+    saturation
+        Value from which a channel is clipped; None if none is.
+    mask
+        (H, W) bool, True where a pixel must not be used; None if every one may be.
+
+    Examples
+    --------
+    >>> prepared = PreparedImage(np.full((4, 5, 3), [2, 4, 6], np.uint16))
+    >>> prepared.moments(border=0)[0]
+    array([ 40.,  80., 120.])
+    """
+
+    def __init__(
+        self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
+    ) -> None:
+        self.image: Image = _readable(image)
+        self.saturation = saturation
+        self.mask = mask
+        self._free: npt.NDArray[np.bool_] | None = None
+        self._peak: float | None = None
+        self._moments: dict[int, npt.NDArray[np.float64]] = {}
+        self._norms: dict[tuple[int, float, float, int], npt.NDArray[np.float64]] = {}
+        self._derivatives: dict[tuple[int, float], npt.NDArray[np.float32]] = {}
+        self._smaller: dict[int, PreparedImage] = {}
+
+    @property
+    def height(self) -> int:
+        """Rows of the image."""
+        return self.image.shape[0]
+
+    @property
+    def width(self) -> int:
+        """Columns of the image."""
+        return self.image.shape[1]
+
+    @property
+    def peak(self) -> float:
+        """Largest value of the image, of any pixel."""
+        if self._peak is None:
+            self._peak = float(self.image.max(initial=0))
+        return self._peak
+
+    @property
+    def scale(self) -> float:
+        """Power of two that brings the largest value of a float image to 0.5 … 1; 1 for black and for whole numbers.
+
+        So float32 holds what is left, and its square.
+        """
+        if self.image.dtype == np.uint16 or not 0 < self.peak < math.inf:
+            return 1.0
+        return math.ldexp(1.0, -math.frexp(self.peak)[1])
+
+    @property
+    def white(self) -> float:
+        """The value that counts as white where a method needs one: the saturation, else the largest value."""
+        return float(self.saturation) if self.saturation is not None else self.peak
+
+    def free(self) -> npt.NDArray[np.bool_]:
+        """Return (H, W) bool, True where a pixel may be used; (0, 0) where every one may be.
+
+        Left out are masked pixels and those of which a channel is saturated, with their eight neighbours.
+        """
+        if self._free is None:
+            clipped = None
+            if self.saturation is not None and self.peak >= self.saturation:
+                clipped = dilate_clipped(self.image, self.saturation)
+            if clipped is None:
+                self._free = _ALL if self.mask is None or not self.mask.any() else ~self.mask
+            else:
+                self._free = ~clipped if self.mask is None else ~(clipped | self.mask)
+        return self._free
+
+    def usable(self, border: int = 0) -> npt.NDArray[np.bool_]:
+        """Return (H, W) bool, True where a pixel may be used and lies `border` px within every edge."""
+        free = self.free()
+        if not border:
+            return free if free.size else np.ones((self.height, self.width), dtype=bool)
+        inside = np.zeros((self.height, self.width), dtype=bool)
+        core = np.s_[border : max(border, self.height - border), border : max(border, self.width - border)]
+        inside[core] = free[core] if free.size else True
+        return inside
+
+    def moments(self, border: int = 0) -> npt.NDArray[np.float64]:
+        """Return (4, 3) float64 of the usable pixels: sum, sum of squares, maximum of each channel; their count thrice.
+
+        Whole numbers are summed exactly, floats in float64.
+        """
+        if border not in self._moments:
+            from evaluation.methods.filters.loops import float_moments, whole_moments
+
+            if self.image.dtype == np.uint16:
+                whole, count = whole_moments(cast("Any", self.image), self.free(), border)
+                found = whole.astype(np.float64)
+            else:
+                found, count = float_moments(cast("Any", self.image), self.free(), border, self.scale)
+                found = found / np.array([[self.scale], [self.scale**2], [self.scale]])
+            self._moments[border] = np.concatenate([found, np.full((1, 3), float(count))])
+        return self._moments[border]
+
+    def norm(self, order: int, sigma: float, p: float, border: int) -> npt.NDArray[np.float64]:
+        """Return (3,) float64, in an arbitrary unit: the Minkowski p-norm of each channel's Gaussian derivative.
+
+        Parameters
+        ----------
+        order
+            Of the derivative, 0 to 2.
+        sigma
+            Scale of the Gaussian, px; 0 for none.
+        p
+            Norm, from 1; infinity takes the maximum.
+        border
+            Pixels left out along every edge.
+        """
+        if not sigma and p in (1, 2, math.inf):
+            sums, squares, peaks, _ = self.moments(border)
+            return np.sqrt(squares) if p == 2 else sums if p == 1 else peaks
+        key = (order, sigma, p, border)
+        if key not in self._norms:
+            scale = 1.0
+            if not math.isinf(p) and p != 1:
+                if p <= SAFE_POWER and self.peak:
+                    scale = 1 / (self.peak * self.scale) if sigma else 1 / self.peak
+                else:
+                    largest = self.norm(order, sigma, math.inf, border).max()
+                    if not largest:
+                        return np.zeros(3)
+                    scale = 1 / float(largest)
+            sums = self._sum_powers(order, sigma, p, border, scale)
+            self._norms[key] = sums if math.isinf(p) or p == 1 else sums ** (1 / p)
+        return self._norms[key]
+
+    def _sum_powers(self, order: int, sigma: float, p: float, border: int, scale: float) -> npt.NDArray[np.float64]:
+        from evaluation.methods.filters.loops import sum_powers
+
+        sums = np.zeros(3)
+        shape = (self.height, self.width)
+        if not sigma:
+            flat = self.image.reshape(self.height, -1)
+            sum_powers(cast("Any", flat), self.free(), border, 0, *shape, p, scale, sums)
+            return sums
+        for top, rows in self.strips(order, sigma):
+            sum_powers(rows, self.free(), border, top, *shape, p, scale, sums)
+        return sums
+
+    def derivative(self, order: int, sigma: float) -> npt.NDArray[np.float32]:
+        """Return the size of the image's Gaussian derivative, (H, W, 3) float32, in units of 1 / `scale`.
+
+        Order 0 is the smoothed image, 1 the gradient's length, 2 √(f_xx² + 4 f_xy² + f_yy²); edges are continued by
+        their last pixel. Kept for images of at most `KEPT_PIXELS`.
+        """
+        key = (order, float(sigma))
+        if key in self._derivatives:
+            return self._derivatives[key]
+        from evaluation.methods.filters.gaussian import differentiated_strips
+
+        found = np.empty((self.height, self.width, 3), dtype=np.float32)
+        for top, rows in differentiated_strips(self.image, order, sigma, self.scale):
+            found[top : top + len(rows)] = rows[:, : 3 * self.width].reshape(len(rows), self.width, 3)
+        if self.height * self.width <= KEPT_PIXELS:
+            self._derivatives[key] = found
+        return found
+
+    def at_most(self, longest: int) -> PreparedImage:
+        """Return the image, prepared, with its longer side shrunk to so many px; itself where it is no longer.
+
+        The smaller image is float32 and holds means of usable pixels; see `shrinking.shrink`.
+        """
+        if max(self.height, self.width) <= longest:
+            return self
+        if longest not in self._smaller:
+            from evaluation.methods.filters.shrinking import shrink
+
+            image, mask = shrink(self.image, self.usable(0), longest)
+            self._smaller[longest] = PreparedImage(image, None, mask)
+        return self._smaller[longest]
+
+    def strips(self, order: int, sigma: float) -> Iterator[tuple[int, npt.NDArray[np.float32]]]:
+        """Yield the derivative in strips: the first row's number, (rows, Q) float32, good until the next; Q ≥ 3 W."""
+        from evaluation.methods.filters.gaussian import differentiated_strips
+
+        if self.height * self.width <= KEPT_PIXELS:
+            yield 0, self.derivative(order, sigma).reshape(self.height, -1)
+        else:
+            yield from differentiated_strips(self.image, order, sigma, self.scale)
+
+
+def estimate(method: Method, prepared: PreparedImage) -> npt.NDArray[np.float64]:
+    """Return a method's estimate of a prepared image: (3,) float64 of length 1, or `pixels.GREY`.
+
+    Examples
+    --------
+    >>> from evaluation.methods.standard import standard_methods
+    >>> prepared = PreparedImage(np.full((4, 5, 3), [2, 4, 4], np.uint16))
+    >>> [estimate(standard_methods()[name], prepared).round(3).tolist() for name in ("gray-world", "white-patch")]
+    [[0.333, 0.667, 0.667], [0.333, 0.667, 0.667]]
+    """
+    if isinstance(method, PreparedMethod):
+        return method.estimate_prepared(prepared)
+    return method.estimate(prepared.image, prepared.saturation, prepared.mask)
+
+
+def estimate_all(
+    methods: Sequence[Method],
+    image: Image,
+    saturation: float | None = None,
+    mask: npt.NDArray[np.bool_] | None = None,
+) -> list[npt.NDArray[np.float64]]:
+    """Return each method's estimate of one image, (3,) float64; the image is prepared once.
+
+    Parameters
+    ----------
+    methods
+        Any methods; those without `estimate_prepared` get the image as it is.
+    image
+        (H, W, 3) uint16, float32 or float64.
+    saturation, mask
+        See `Method.estimate`; the mask is (H, W) bool.
+    """
+    prepared = PreparedImage(image, saturation, mask)
+    return [
+        method.estimate_prepared(prepared)
+        if isinstance(method, PreparedMethod)
+        else method.estimate(image, saturation, mask)
+        for method in methods
+    ]
+
+
+def _readable(image: npt.NDArray[Any]) -> Any:
+    """Return the image contiguous, in one of the three dtypes and this machine's byte order; itself where it is."""
+    if image.dtype.type in (np.uint16, np.float32, np.float64):
+        kind = image.dtype.newbyteorder("=")
+    else:
+        kind = np.dtype(np.uint16 if image.dtype == np.uint8 else np.float64)
+    return np.ascontiguousarray(image, dtype=kind)

@@ -1,0 +1,1 @@
+"""Methods of the Retinex family: local maxima stand for white."""

@@ -1,0 +1,90 @@
+"""Maps of lights: by patches, and by clusters of gray pixels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from evaluation.methods.gray_pixels.local_grayness import LocalGraynessIndex
+from evaluation.methods.method import LocalMethod
+from evaluation.methods.patchwise import PatchwiseMethod, fill_unknown
+from evaluation.methods.standard import local_methods, standard_methods
+from evaluation.metrics import recovery_error
+
+RED, BLUE = np.array([0.5, 0.3, 0.2]), np.array([0.2, 0.3, 0.5])
+
+
+def two_lights() -> npt.NDArray[np.float64]:
+    """Return nearly grey texture (96, 160, 3) under a red light on the left, a blue one on the right."""
+    random = np.random.default_rng(0)
+    grey = random.uniform(200, 3000, (96, 160, 1)) * random.uniform(0.99, 1.01, (96, 160, 3))
+    image = grey * RED
+    image[:, 80:] = (grey * BLUE)[:, 80:]
+    return image
+
+
+def patches_of(name: str, patches: int = 6) -> PatchwiseMethod:
+    return PatchwiseMethod(standard_methods()[name], patches)
+
+
+@pytest.mark.parametrize("method", [*local_methods().values(), patches_of("gray-edge-1"), patches_of("pca")])
+def test_each_side_gets_its_light(method: LocalMethod) -> None:
+    assert isinstance(method, LocalMethod)
+    lights = method.estimate_map(two_lights())
+    assert lights.dtype == np.float32
+    np.testing.assert_allclose(lights.sum(axis=2), 1, rtol=1e-5)
+    limit = 5 if isinstance(method, LocalGraynessIndex) else 2
+    assert recovery_error(lights[:, :8].reshape(-1, 3), RED).max() < limit
+    assert recovery_error(lights[:, -8:].reshape(-1, 3), BLUE).max() < limit
+    one = recovery_error(np.tile(method.estimate(two_lights()), (2, 1)), np.stack([RED, BLUE]))
+    assert one.min() > 8
+
+
+@pytest.mark.parametrize("method", local_methods().values())
+def test_a_map_keeps_the_contract_of_methods(method: LocalMethod) -> None:
+    image = two_lights()
+    mask = np.zeros(image.shape[:2], dtype=bool)
+    mask[:, 50:90] = True
+    lights = method.estimate_map(image, None, mask)
+    np.testing.assert_array_equal(method.estimate_map(image, None, mask), lights)
+    np.testing.assert_allclose(method.estimate_map(image * 8, None, mask), lights, rtol=1e-5)
+    changed = image.copy()
+    changed[:, 62:78] = 1
+    np.testing.assert_allclose(method.estimate_map(changed, None, mask), lights, rtol=1e-6)
+    blind = method.estimate_map(image, None, np.ones_like(mask))
+    np.testing.assert_allclose(blind, 1 / 3, rtol=1e-6)
+    tiny: Any = np.ones((1, 3, 3), np.uint16)
+    np.testing.assert_allclose(method.estimate_map(tiny), 1 / 3, rtol=1e-6)
+
+
+def test_patches_without_a_usable_pixel_take_their_neighbours() -> None:
+    image = two_lights()
+    mask = np.zeros(image.shape[:2], dtype=bool)
+    mask[:, :32] = True
+    lights = patches_of("gray-world").estimate_map(image, None, mask)
+    assert recovery_error(lights[:, :32].reshape(-1, 3), RED).max() < 0.5
+
+
+def test_saturated_pixels_leave_out_their_neighbours_in_the_next_patch() -> None:
+    image = np.ones((8, 8, 3)) * RED
+    image[:, 3], image[:, 4] = 9, BLUE
+    lights = patches_of("gray-world", 2).estimate_map(image, 8.0)
+    assert recovery_error(lights.reshape(-1, 3), RED).max() < 0.1
+
+
+def test_nearest_known_lights_are_averaged() -> None:
+    lights = np.full((3, 3, 3), np.nan)
+    assert (fill_unknown(lights) == 1 / 3).all()
+    lights[0, 0], lights[2, 2] = RED, BLUE
+    filled = fill_unknown(lights)
+    np.testing.assert_allclose(filled[1, 1], (RED + BLUE) / 2)
+    np.testing.assert_allclose(filled[0, 1], RED)
+
+
+@pytest.mark.parametrize("patches", [0, -3])
+def test_no_patches_are_refused(patches: int) -> None:
+    with pytest.raises(ValueError, match="expected 1 or more"):
+        patches_of("pca", patches)
