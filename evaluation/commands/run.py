@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import sys
+from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -107,7 +109,9 @@ def run(
     _require_free(csv, images, out)
     found = reading.open(data)
     given = choose_estimates(estimates or [], [scene.name for scene in found.scenes])
-    with orderly_end(), progress("images") as advance:
+    # What a method prints must not stand in the JSON.
+    aside = redirect_stdout(sys.stderr) if json else nullcontext()
+    with orderly_end(), aside, progress("images") as advance:
         made = run_methods(found, [*chosen, *given], out, error, workers or processor_count(), advance)
     if json:
         _print_json(made)

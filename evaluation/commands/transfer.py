@@ -129,12 +129,12 @@ def transfer(
     if out is not None:
         require_free(out, "the results")
     threads = workers or processor_count()
-    learners = _learners(methods)
+    learners, left_out = _learners(methods)
     references = _references(statistics)
     tested = reading.open(test)
     plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared)
-    if told := _sizes(tested, plan, side):
-        plan = replace(plan, notes=(*plan.notes, told))
+    told = _sizes(tested, plan, side)
+    plan = replace(plan, notes=(*plan.notes, *([told] if told else []), *left_out))
     drawn = _folds(folds, tested, seeds)
     smallest = min(len(some.scenes) for some in plan.training)
     wanted = smallest if images is None else images
@@ -168,19 +168,24 @@ def transfer(
         save_outcome(outcome, out)
 
 
-def _learners(text: str) -> list[AnyLearner]:
-    """Return the learned methods of a list, built-in ones or classes of the user's own, and the constant light."""
+def _learners(text: str) -> tuple[list[AnyLearner], tuple[str, ...]]:
+    """Return the learned methods of a list and the constant light, and why some of `all` are left out."""
     from evaluation.commands.choosing import choose_learners
     from evaluation.learning.constant_light import ConstantLight
+    from evaluation.learning.feature_learner import what_is_missing
     from foundation.errors import InputError
 
     constant = ConstantLight()
-    chosen = [each for each in choose_learners(text.split(",")) if each.name != constant.name]
+    named = {each.name for each in choose_learners(part for part in text.split(",") if part.strip().lower() != "all")}
+    found = [each for each in choose_learners(text.split(",")) if each.name != constant.name]
+    missing = {each.name: what_is_missing(each) for each in found if each.name not in named}
+    left_out = tuple(f"{name} is left out: {reason}" for name, reason in missing.items() if reason)
+    chosen = [each for each in found if not missing.get(each.name)]
     titles = [each.name for each in chosen]
     for title in titles:
         if titles.count(title) > 1:
             raise InputError(f"two methods are called {title}; give one another name: names head the rows")
-    return [*chosen, constant]
+    return [*chosen, constant], left_out
 
 
 def _references(text: str) -> list[Method]:

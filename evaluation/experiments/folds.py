@@ -93,7 +93,7 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             table = csv.DictReader(stream)
             columns = list(table.fieldnames or ())
-            rows = [(row.get("image") or "", row.get("fold") or "") for row in table]
+            rows = [(row.get("image") or "", (row.get("fold") or "").strip()) for row in table]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FormatError(f"cannot read folds from {path}: {error}; expected CSV, image,fold a line") from error
     if not {"image", "fold"} <= set(columns):

@@ -7,23 +7,26 @@ that was left alone. When all images are done, the files are written there and t
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.datasets.states import state_of
 from evaluation.experiments.folds import folds_to_csv
 from evaluation.experiments.running import SceneMethod, answer_scenes, ordered_map, truths_of
-from evaluation.learning.model_files import StoredMethod, scenes_sha256
+from evaluation.learning.model_files import StoredMethod
 from evaluation.methods.method import Method
 from evaluation.metrics import ErrorKind
 from evaluation.reports.developed import developed
 from evaluation.reports.latex import table_to_latex
 from evaluation.reports.run_page import MOST_SHOWN, chosen_images, run_page
-from evaluation.results.answers import SceneAnswer, results_of
+from evaluation.results.answers import SceneAnswer, answer_to_json, results_of
 from evaluation.results.errors_file import ERRORS_FILE
 from evaluation.results.journal import JOURNAL_FILE, AnswerJournal, read_journal
 from evaluation.results.method_records import describe_method
@@ -35,6 +38,7 @@ from evaluation.results.tables import table_to_csv
 from evaluation.scene import MixedScene, Scene, SceneSet
 from foundation.errors import InputError
 from foundation.files import make_folder, partial_path, publish_folder, require_free, write_whole
+from foundation.hashing import sha256_of
 from foundation.held_folders import LOCK_FILE, held_folder
 from foundation.version import software
 
@@ -83,10 +87,11 @@ def run_methods(
     if twice:
         raise InputError(f"two methods are called {twice[0]!r}; give one another name, or leave one out")
     truths = truths_of(data.scenes, methods)
-    run = _run_of(data, methods, truths, ())
+    # Methods are described before they run: what they keep or import while they do depends on where a run went on.
+    run = _run_of(data, methods)
 
     def finished(answers: Sequence[Sequence[SceneAnswer]]) -> Run:
-        return _run_of(data, methods, truths, results_of(names, truths, answers))
+        return replace(run, results=results_of(names, truths, answers))
 
     if folder is None:
         return finished(_answers(data.scenes, methods, [], None, workers, on_scene))
@@ -95,7 +100,9 @@ def run_methods(
     make_folder(folder.parent, folder)
     with held_folder(partial, f"another program works on {folder}; {_WAIT}", of=folder):
         journal = partial / JOURNAL_FILE
-        known = read_journal(journal, _identity(run))
+        known = read_journal(journal, _identity(run, state_of(data.scenes)))
+        if len(known) > 0:
+            _require_same(data.scenes, methods, known, partial)
         with journal.open("ab", buffering=0) as stream:
             answers = _answers(
                 data.scenes, methods, known, AnswerJournal(stream, len(known), folder), workers, on_scene
@@ -171,7 +178,7 @@ def describe_run(
         layout=data.layout,
         place=data.place,
         treatment=data.treatment,
-        data_sha256=scenes_sha256(data.scenes),
+        data_sha256=_data_sha256(data.scenes),
         truths=np.stack([scene.truth for scene in data.scenes]),
         results=results,
         methods=tuple(methods),
@@ -182,29 +189,61 @@ def describe_run(
     )
 
 
-def _run_of(
-    data: SceneSet,
-    methods: Sequence[Method | SceneMethod],
-    truths: npt.NDArray[np.float64],
-    results: tuple[Result, ...],
-) -> Run:
-    described = [describe_method(method) for method in methods]
-    run = describe_run(data, results, described)
+def _run_of(data: SceneSet, methods: Sequence[Method | SceneMethod]) -> Run:
+    """Return a run before it has any results."""
+    run = describe_run(data, (), [describe_method(method) for method in methods])
     notes = tuple(
         f"{method.name} was trained on these very images: its errors say nothing of others"
         for method in methods
         if isinstance(method, StoredMethod) and method.provenance and method.provenance.sha256 == run.data_sha256
     )
-    return describe_run(data, results, described, notes=notes)
+    return replace(run, notes=notes)
 
 
-def _identity(run: Run) -> dict[str, Any]:
-    """Return what must be the same for a run to go on with what another has made; its keys stand in messages."""
+def _data_sha256(scenes: Sequence[Scene]) -> str:
+    """Return what `learning.model_files.scenes_sha256` returns, also of lights without a channel."""
+    shares = [scene.truth / scene.truth.sum() for scene in scenes]
+    lines = [
+        f"{scene.name}\t{' '.join(f'{part:.9f}' for part in row)}" for scene, row in zip(scenes, shares, strict=True)
+    ]
+    return sha256_of("\n".join(lines).encode())
+
+
+def _require_same(
+    scenes: Sequence[Scene],
+    methods: Sequence[Method | SceneMethod],
+    known: Sequence[Sequence[SceneAnswer]],
+    place: Path,
+) -> None:
+    """Answer for the first, the middle and the last known image again: pixels and what a method reads may have changed.
+
+    Raises
+    ------
+    InputError
+        An answer is another than before.
+    """
+    again = sorted({0, len(known) // 2, len(known) - 1})
+    for number, answers in zip(again, answer_scenes([scenes[number] for number in again], methods), strict=True):
+        for method, now, before in zip(methods, answers, known[number], strict=True):
+            if json.dumps(answer_to_json(now)) != json.dumps(answer_to_json(before)):
+                raise InputError(
+                    f"{method.name} answers otherwise for {scenes[number].name} than when the run was stopped: the "
+                    "image, or a file that the method reads, has changed, or it answers by chance; remove "
+                    f"{place} to begin anew"
+                )
+
+
+def _identity(run: Run, state: str) -> dict[str, Any]:
+    """Return what must be the same for a run to go on with what another has made; its keys stand in messages.
+
+    Names and lights do not tell whether the pixels are the same, so the state of the image files belongs to it.
+    """
     return {
         "data set": {
             "images": len(run.subject.images),
             "sha256": run.data_sha256,
             "several lights": sum(run.subject.mixed),
+            "state": state,
         },
         "treatment": dict(run.treatment),
         "methods": list(run.methods),

@@ -107,7 +107,7 @@ def find_method(text: str) -> Method | Learner:
     if isinstance(found, type):
         try:
             found = cast("object", found())
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise InputError(
                 f"{wanted} cannot be made without arguments: {_told(error)}; give its parameters defaults, or name a "
                 "value of the file instead of the class"
@@ -145,7 +145,11 @@ def checked_method(found: object, place: str) -> Method | Learner:
             f"{place} is no method: it has neither estimate(image, saturation, mask) nor fit(scenes, seed); add the "
             "one that it is to have, see evaluation/methods/method.py"
         )
-    if not isinstance(getattr(found, "name", None), str) or not getattr(found, "name", ""):
+    try:
+        name = getattr(found, "name", None)
+    except Exception as error:
+        raise InputError(f"the name of {place} fails: {_told(error)}; correct it") from error
+    if not isinstance(name, str) or not name:
         raise InputError(f'{place} has no name; add name = "…", the text that stands in the tables')
     return cast("Method | Learner", found)
 
@@ -173,7 +177,7 @@ def _module_of_file(path: Path) -> ModuleType:
         sys.path.append(str(whole.parent))
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
         raise InputError(f"{path} fails while it is loaded: {_told(error, whole)}; correct it") from error
     return module
@@ -191,11 +195,11 @@ def _module_by_name(name: str) -> ModuleType:
                 f"there is no module {name!r}; install it, or give the path of a file that ends in .py"
             ) from error
         raise InputError(f"module {name} needs {missing!r}, which is not installed; install it") from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(f"module {name} fails while it is loaded: {_told(error)}; correct it") from error
 
 
-def _told(error: Exception, file: Path | None = None) -> str:
+def _told(error: BaseException, file: Path | None = None) -> str:
     """Return what went wrong, with the last line of `file` that it went through, or the last line at all."""
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"

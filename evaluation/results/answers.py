@@ -65,9 +65,12 @@ def read_light(given: object, grey: npt.NDArray[np.float64] = GREY) -> SceneAnsw
     if given is None:
         return SceneAnswer(None, "returned None")
     try:
-        light = np.asarray(given, dtype=np.float64)
+        plain = np.asarray(given)  # Of complex, boolean and masked numbers nothing is to be lost silently.
+        if plain.dtype.kind not in "iufO" or hasattr(given, "mask"):
+            raise TypeError(plain.dtype)
+        light = plain.astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"returned {type(given).__name__}, expected three numbers: red, green, blue") from error
+        raise ValueError(f"returned {type(given).__name__}, expected three real numbers: red, green, blue") from error
     if light.shape != (3,):
         raise ValueError(f"returned an array of shape {light.shape}, expected (3,): red, green, blue")
     length = math.hypot(*light)

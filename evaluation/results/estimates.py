@@ -118,9 +118,12 @@ def _stem(image: str) -> str:
 
 
 def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
-    lines = text.split("\n")
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     separator = max(",;\t", key=lines[0].count)
-    rows = list(csv.reader(lines, delimiter=separator))
+    try:
+        rows = list(csv.reader(lines, delimiter=separator, strict=True))
+    except csv.Error as error:
+        raise FormatError(f"{path} is no CSV text: {error}; expected {','.join(_COLUMNS)}") from error
     heads = [head.strip().lower() for head in rows[0]] if rows else []
     headed = all(column in heads for column in _COLUMNS)
     if not headed and not (len(heads) == len(_COLUMNS) and all(map(_is_number, heads[1:]))):
@@ -128,11 +131,18 @@ def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
             f"{path} begins with {lines[0][:80].strip()!r}; expected the columns {','.join(_COLUMNS)}, with or without "
             "a head"
         )
+    if headed and len(set(heads)) < len(heads):
+        raise FormatError(f"{path} has columns of the same name: {separator.join(rows[0])}; expected each once")
     places = [heads.index(column) if headed else number for number, column in enumerate(_COLUMNS)]
     found: list[tuple[str, npt.NDArray[np.float64]]] = []
     for number, row in enumerate(rows, start=1):
         if (headed and number == 1) or not any(field.strip() for field in row):
             continue
+        if len(row) != len(heads):
+            raise FormatError(
+                f"{path}, line {number}: {len(row)} fields where the first line has {len(heads)}; expected as many, "
+                "and a point, not a comma, in numbers"
+            )
         try:
             image, *light = (row[place].strip() for place in places)
             found.append((image, np.array([float(part) for part in light])))

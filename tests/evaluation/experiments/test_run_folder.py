@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from evaluation.datasets import open_scenes
 from evaluation.experiments import run_folder
 from evaluation.experiments.run_folder import describe_run, run_methods, write_run
 from evaluation.experiments.running import evaluate
@@ -22,7 +23,7 @@ from foundation.clock import SystemClock
 from foundation.errors import InputError
 from foundation.files import partial_path
 from foundation.held_folders import held_folder
-from tests.evaluation.made_up import MixedWall, as_set, walls
+from tests.evaluation.made_up import MixedWall, Wall, as_set, walls
 
 METHODS = [GrayEdge("Gray-world", 0, 1, 0, 0), GrayEdge("White-Patch", 0, np.inf, 0, 0)]
 LIGHTS = np.array([[2.0, 1, 1], [1, 1, 1]])
@@ -142,6 +143,20 @@ def test_what_another_run_has_made_is_not_taken(
     assert next(partial_path(folder).iterdir()).read_bytes() == before
 
 
+def test_changed_pixels_are_noticed(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    before = _stopped(folder)
+    scenes: list[Any] = list(mixed_set().scenes)
+    scenes[0] = Wall(scenes[0].name, scenes[0].truth, seed=99)
+    with pytest.raises(InputError, match=r"answers otherwise for wall 0\.png than when the run was stopped"):
+        run_methods(as_set(tuple(scenes)), METHODS, folder)
+    assert next(partial_path(folder).iterdir()).read_bytes() == before
+
+
+def test_a_true_light_without_a_channel_is_judged() -> None:
+    run_methods(as_set((Wall("red", np.array([1.0, 0, 0])),)), [METHODS[0]])
+
+
 def test_two_programs_do_not_work_on_one_folder(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     with held_folder(partial_path(folder), "busy"), pytest.raises(InputError, match="another program works on"):
@@ -202,3 +217,23 @@ def test_a_model_judged_on_what_it_was_trained_on_is_said_to_be() -> None:
     assert run_methods(other, [model]).notes == ()
     (note,) = run_methods(data, [model]).notes
     assert note.startswith(f"{learner.name} (trained on Walls) was trained on these very images")
+
+
+def test_answers_for_other_pixels_of_the_same_images_are_not_taken(tmp_path: Path) -> None:
+    images = np.random.default_rng(0).random((4, 8, 9, 3), np.float32)
+
+    def thumbnails(pixels: npt.NDArray[np.float32]) -> SceneSet:
+        np.savez(tmp_path / "set.npz", images=pixels, gt=np.ones((4, 3)), names=np.array(list("abcd")))
+        return open_scenes(tmp_path / "set.npz")
+
+    def kill(count: int, _: int) -> None:
+        if count == 2:
+            raise Killed
+
+    with pytest.raises(Killed):
+        run_methods(thumbnails(images), METHODS, tmp_path / "out", on_scene=kill)
+    with pytest.raises(InputError, match="its data set differ"):
+        run_methods(thumbnails(images[..., ::-1]), METHODS, tmp_path / "out")
+    run_methods(thumbnails(images), METHODS, tmp_path / "out")
+    run_methods(thumbnails(images), METHODS, tmp_path / "undisturbed")
+    assert content(tmp_path / "out") == content(tmp_path / "undisturbed")

@@ -34,7 +34,7 @@ class Returns:
 
     def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> Any:
         value = next(self.values)
-        if isinstance(value, Exception):
+        if isinstance(value, BaseException):
             raise value
         return value
 
@@ -64,9 +64,15 @@ def test_what_is_no_light_is_counted_named_and_taken_as_grey(value: object, caus
     [
         ((1, 1), r"shape \(2,\), expected \(3,\)"),
         (np.ones((4, 3)), r"shape \(4, 3\), expected \(3,\)"),
-        ("red", "returned str, expected three numbers"),
+        ("red", "returned str, expected three real numbers"),
+        ((1j, 1, 1), "returned tuple, expected three real numbers"),
+        (np.array([True, True, False]), "returned ndarray, expected three real numbers"),
+        (SystemExit(0), r"SystemExit: 0 \(test_running\.py, line \d+\)"),
         (KeyError("where"), r"KeyError: 'where' \(test_running\.py, line \d+\)"),
         (ValueError("no good"), r"ValueError: no good \(test_running\.py, line \d+\)"),
+        (np.array([1 + 1j, 1, 1]), "returned ndarray, expected three real numbers"),
+        ([True, True, False], "returned list, expected three real numbers"),
+        (np.ma.masked_array([1.0, 1, 1], [False, False, True]), "returned MaskedArray, expected three real numbers"),
     ],
 )
 def test_a_mistake_in_a_method_ends_the_run_with_its_name(value: object, message: str) -> None:

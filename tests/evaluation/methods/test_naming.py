@@ -103,6 +103,11 @@ def test_what_is_not_there(text: str, message: str) -> None:
         ("def f(:\n", "fails while it is loaded: line 1: "),
         ("x = 1\nimport no_such_thing\n", "fails while it is loaded: line 2: ModuleNotFoundError: .*no_such_thing"),
         ("x = 1\n\n1 / 0\n", "line 3: ZeroDivisionError"),
+        ("import sys\n\nsys.exit(0)\n", "fails while it is loaded: line 3: SystemExit: 0"),
+        (
+            "class Own:\n    def fit(self, scenes): ...\n\n    @property\n    def name(self):\n        return 1 / 0\n",
+            "the name of .*own.py:Own fails: line 6: ZeroDivisionError",
+        ),
         ("class Own:\n    def __init__(self):\n        raise OSError('no weights')\n", "line 3: OSError: no weights"),
     ],
 )

@@ -14,7 +14,7 @@ IMAGES = ["a/one.png", "a/two.png", "three.v1.png"]
 
 def given(tmp_path: Path, text: str) -> Path:
     path = tmp_path / "other.csv"
-    path.write_text(text, encoding="utf-8")
+    path.write_bytes(text.encode())
     return path
 
 
@@ -24,6 +24,7 @@ def given(tmp_path: Path, text: str) -> Path:
         "image,r,g,b\na/two.png,4,5,6\na/one.png,1,2,3\nthree.v1.png,7,8,9\n",
         "a/one,1,2,3\na/two,4,5,6\nthree.v1,7,8,9",
         "\ufeffB;Image;note;R;G\r\n3;a/one.tiff;x;1;2\r\n6;a/two.tiff;;4;5\r\n\r\n9;three.v1.tiff;;7;8\r\n",
+        "image,r,g,b\ra/two.png,4,5,6\ra/one.png,1,2,3\rthree.v1.png,7,8,9\r",
         'image\tr\tg\tb\n"a/one.png"\t1e0\t2\t3.0\na/two.png\t4\t5\t6\nthree.v1.png\t7\t8\t9\n',
     ],
 )
@@ -65,8 +66,11 @@ def test_a_name_without_extension_that_two_images_have_is_neither(tmp_path: Path
     [
         ("", "begins with ''; expected the columns image,r,g,b"),
         ("name,red,green,blue\na,1,1,1", "begins with 'name,red,green,blue'"),
-        ("image,r,g,b\na/one,1,1\n", "line 2: 'a/one,1,1'; expected a name and three numbers"),
+        ("image,r,g,b\na/one,1,1\n", "line 2: 3 fields where the first line has 4"),
         ("image,r,g,b\na/one,1,one,1\n", "line 2"),
+        ("image,r,g,b\na/one,0,68,0,85,0,22\n", "line 2: 7 fields where the first line has 4"),
+        ("image,r,g,b,r,g,b\na/one,1,1,1,2,2,2\n", "columns of the same name"),
+        ('image,r,g,b\n"a/one,1,2,3\n', "is no CSV text"),
     ],
 )
 def test_what_is_no_table_is_refused(tmp_path: Path, text: str, message: str) -> None:
