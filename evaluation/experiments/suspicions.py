@@ -27,6 +27,9 @@ _LEAST_DEG: Final = 5.0
 _BETTER: Final = 0.5
 """Share of the median error that another way of reading must leave at most; right data never come near it."""
 
+_GOOD_DEG: Final = 8.0
+"""Median error that another way of reading must leave at most: one that is bad too is not how lights were written."""
+
 _FLOOR: Final = 1e-9
 """What replaces a channel at 0, over the largest, where a light is inverted."""
 
@@ -62,7 +65,7 @@ def suspicions(images: Sequence[str], truths: npt.NDArray[np.float64], results: 
             continue
         for how, read in _ways(images).items():
             other = float(np.median(recovery_error(read(result.estimates)[known], truths[known])))
-            if other <= _BETTER * is_now:
+            if other <= min(_BETTER * is_now, _GOOD_DEG):
                 found.setdefault(how, []).append((result.method, other, is_now))
     return tuple(_sentence(how, those, len(results)) for how, those in found.items())
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,9 @@ from evaluation.experiments.running import evaluate
 from evaluation.experiments.suspicions import suspicions
 from evaluation.methods import GrayEdge
 from evaluation.results.result import Result
+from evaluation.scene import Scene
 from tests.data_files import available
+from tests.evaluation.made_up import Wall
 
 Lights = npt.NDArray[np.float64]
 NAMES = [f"{number}.png" for number in range(1, 41)]
@@ -27,20 +28,20 @@ def notes(estimates: Lights, guessed: int = 0, truths: Lights = TRUTHS) -> tuple
     return suspicions(NAMES, truths, [result])
 
 
+BY_TEXT = np.argsort(NAMES)
+WRITTEN: dict[str, Lights] = {
+    "as gains": 1 / TRUTHS,
+    "given to the image before": np.roll(TRUTHS, 1, axis=0),
+    "given to the image after": np.roll(TRUTHS, -1, axis=0),
+    "in the order of names as numbers": TRUTHS[BY_TEXT],
+    "in the order of names as text": TRUTHS[np.argsort(BY_TEXT)],
+}
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.02])
-@pytest.mark.parametrize(
-    ("written", "told"),
-    [
-        (lambda lights: 1 / lights, "as gains"),
-        (lambda lights: np.roll(lights, 1, axis=0), "given to the image before"),
-        (lambda lights: np.roll(lights, -1, axis=0), "given to the image after"),
-        (lambda lights: lights[np.argsort(NAMES)], "in the order of names as numbers"),
-        (lambda lights: lights[np.argsort(np.argsort(NAMES))], "in the order of names as text"),
-    ],
-)
-def test_what_is_written_otherwise_is_named(noise: float, written: Callable[[Lights], Lights], told: str) -> None:
-    estimates = written(TRUTHS * RANDOM.uniform(1 - noise, 1 + noise, TRUTHS.shape))
-    (note,) = notes(estimates)
+@pytest.mark.parametrize("told", WRITTEN)
+def test_what_is_written_otherwise_is_named(noise: float, told: str) -> None:
+    (note,) = notes(WRITTEN[told] * RANDOM.uniform(1 - noise, 1 + noise, TRUTHS.shape))
     assert note.startswith(f"Mine: {told}")
 
 
@@ -59,9 +60,10 @@ def test_nothing_is_said_where_it_would_mean_nothing() -> None:
     assert suspicions(NAMES[:7], TRUTHS[:7], [Result("Mine", 1 / TRUTHS[:7], {}, np.zeros(7, bool))]) == ()
 
 
-@pytest.mark.parametrize("path", available("benchmark/nus_canon_600d_64x64.npz"))
-def test_real_images(path: Path) -> None:
-    scenes = open_scenes(path).scenes
+@pytest.mark.parametrize("path", [None, *available("benchmark/nus_canon_600d_64x64.npz")])
+def test_methods_of_the_suite_on_images(path: Path | None) -> None:
+    made_up: tuple[Scene, ...] = tuple(Wall(name, truth) for name, truth in zip(NAMES, TRUTHS * [2, 1, 1], strict=True))
+    scenes = made_up if path is None else open_scenes(path).scenes
     truths, names = np.stack([scene.truth for scene in scenes]), [scene.name for scene in scenes]
     results = evaluate(scenes, [GrayEdge("Gray-world", 0, 1, 0), GrayEdge("White-Patch", 0, np.inf, 0)])
     assert suspicions(names, truths, results) == ()

@@ -185,7 +185,7 @@ def test_what_python_cannot_unpack_is_refused(saved: Path) -> None:
     content[content.index(b"PK\x03\x04") + 6] |= 1 << 5
     content[content.index(b"PK\x01\x02") + 8] |= 1 << 5
     saved.write_bytes(content)
-    with pytest.raises(FormatError, match="is no whole model file: .*patched data"):
+    with pytest.raises(FormatError, match=r"is no whole model file: .*patched data"):
         load_model(saved)
 
 

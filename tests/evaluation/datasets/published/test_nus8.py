@@ -175,9 +175,7 @@ def test_text_files_that_agree_are_said_and_the_table_is_applied(copy: Path) -> 
 
 def test_text_files_that_have_the_chart_elsewhere_are_an_error_naming_both(copy: Path) -> None:
     write_masks(copy, "2.2,5.7,2.2,4.2", "1,1,0.4,7")  # Rows and columns in each other's place.
-    with pytest.raises(
-        FormatError, match=r"columns 2 to 4, but CC_coords of .*, row 1, in"
-    ) as told:
+    with pytest.raises(FormatError, match=r"columns 2 to 4, but CC_coords of .*, row 1, in") as told:
         open_scenes(copy)
     for name in ("SonyA57_0001_mask.txt", "SonyA57_gt.mat"):
         assert name in str(told.value)
