@@ -149,7 +149,7 @@ def _folds(data: SceneSet, text: str | None, seed: int) -> tuple[npt.NDArray[np.
     """Return the fold of each image, (N,) int64, and where the folds come from."""
     import numpy as np
 
-    from evaluation.experiments.folds import draw_folds, group_of, read_folds
+    from evaluation.experiments.folds import draw_scene_folds, group_of, read_folds
     from foundation.errors import InputError
 
     if text is None and data.folds is not None:
@@ -162,4 +162,4 @@ def _folds(data: SceneSet, text: str | None, seed: int) -> tuple[npt.NDArray[np.
     groups = [group_of(scene) for scene in data.scenes]
     alone = len(set(groups)) == len(groups)
     origin = f"drawn by seed {seed}" + ("" if alone else f", {len(set(groups))} groups of images kept together")
-    return draw_folds(len(groups), number, seed, None if alone else groups), origin
+    return draw_scene_folds(data.scenes, number, seed), origin

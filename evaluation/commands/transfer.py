@@ -198,14 +198,13 @@ def _folds(text: str | None, test: SceneSet, seeds: int) -> tuple[npt.NDArray[np
     """Return the folds of each seed: drawn by it, or the same for all where they are given."""
     import numpy as np
 
-    from evaluation.experiments.folds import draw_folds, group_of, read_folds
+    from evaluation.experiments.folds import draw_scene_folds, read_folds
 
     if text is None and test.folds is not None:
         return (np.array(test.folds, dtype=np.int64),) * seeds
     wanted = text or _FOLDS
     if wanted.isdecimal():
-        groups = [group_of(scene) for scene in test.scenes]
-        return tuple(draw_folds(len(groups), int(wanted), seed, groups) for seed in range(seeds))
+        return tuple(draw_scene_folds(test.scenes, int(wanted), seed) for seed in range(seeds))
     return (read_folds(Path(wanted), [scene.name for scene in test.scenes]),) * seeds
 
 

@@ -71,6 +71,19 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
     return chosen[member].astype(np.int64)
 
 
+def draw_scene_folds(scenes: Sequence[Scene], folds: int, seed: int = 0) -> npt.NDArray[np.int64]:
+    """Return the fold of each scene, (N,) int64 from 0, groups kept together: the same for all commands.
+
+    Raises
+    ------
+    InputError
+        As `draw_folds`.
+    """
+    groups = [group_of(scene) for scene in scenes]
+    # Names would be dealt in another order than numbers, and data sets without groups have none but their names.
+    return draw_folds(len(groups), folds, seed, None if len(set(groups)) == len(groups) else groups)
+
+
 def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     """Return the fold of each image, (N,) int64 from 0, as a CSV file has them: `image,fold`, a line an image.
 

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from evaluation.datasets.states import state_of
 from evaluation.experiments.folds import folds_to_csv
 from evaluation.experiments.running import SceneMethod, answer_scenes, ordered_map, truths_of
+from evaluation.experiments.suspicions import suspicions
 from evaluation.learning.model_files import StoredMethod
 from evaluation.methods.method import Method
 from evaluation.metrics import ErrorKind
@@ -91,7 +92,8 @@ def run_methods(
     run = _run_of(data, methods)
 
     def finished(answers: Sequence[Sequence[SceneAnswer]]) -> Run:
-        return replace(run, results=results_of(names, truths, answers))
+        results = results_of(names, truths, answers)
+        return replace(run, results=results, notes=(*run.notes, *suspicions(run.subject.images, truths, results)))
 
     if folder is None:
         return finished(_answers(data.scenes, methods, [], None, workers, on_scene))
@@ -192,12 +194,18 @@ def describe_run(
 def _run_of(data: SceneSet, methods: Sequence[Method | SceneMethod]) -> Run:
     """Return a run before it has any results."""
     run = describe_run(data, (), [describe_method(method) for method in methods])
-    notes = tuple(
-        f"{method.name} was trained on these very images: its errors say nothing of others"
-        for method in methods
-        if isinstance(method, StoredMethod) and method.provenance and method.provenance.sha256 == run.data_sha256
-    )
-    return replace(run, notes=notes)
+    notes: list[str] = []
+    for method in methods:
+        if not isinstance(method, StoredMethod) or not method.provenance:
+            continue
+        if method.provenance.sha256 == run.data_sha256:
+            notes.append(f"{method.name} was trained on these very images: its errors say nothing of others")
+        elif method.provenance.data_name == data.name:
+            notes.append(
+                f"{method.name} was trained on {method.provenance.scenes} images of a data set of the same name: "
+                "whether these are among them is not known"
+            )
+    return replace(run, notes=tuple(notes))
 
 
 def _data_sha256(scenes: Sequence[Scene]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -214,7 +215,9 @@ def test_a_model_judged_on_what_it_was_trained_on_is_said_to_be() -> None:
     record = provenance_of(data, 0, SystemClock())
     learner = standard_learners()["regression-trees"]
     model = StoredMethod(learner, Flat(), data.name, record)
-    assert run_methods(other, [model]).notes == ()
+    # Neither names nor lights tell whether a part of a data set was trained on.
+    assert "trained on 3 images of a data set of the same name" in run_methods(other, [model]).notes[0]
+    assert run_methods(replace(other, name="Others"), [model]).notes == ()
     (note,) = run_methods(data, [model]).notes
     assert note.startswith(f"{learner.name} (trained on Walls) was trained on these very images")
 
