@@ -110,7 +110,11 @@ def cv(
         with progress("images") as advance:
             steps = iter(range(1, count + 1))
             results = cross_validate(found.scenes, learners, parts, seed, threads, lambda: advance(next(steps), count))
-        notes = (f"cross-validated in {len(set(parts.tolist()))} folds, {origin}; seed {seed}", *left_out)
+        notes = (
+            f"cross-validated in {len(set(parts.tolist()))} folds, {origin}; seed {seed}",
+            *left_out,
+            *_parted_copies(found, parts),
+        )
         described = [describe_method(learner) for learner in learners]
         made = describe_run(found, results, described, {"seed": seed, "folds": origin}, parts, notes)
         if out is not None:
@@ -122,6 +126,25 @@ def cv(
         print(note)
     for what, how in made.treatment.items():
         print(f"{what}: {how}")
+
+
+def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
+    """Return a sentence where images (N,) int64 by their folds are copies of images of other folds."""
+    from evaluation.datasets.states import first_copies
+    from foundation.errors import first_of
+
+    names = [scene.name for scene in data.scenes]
+    apart = [
+        f"{names[place]} of {names[first]}"
+        for place, first in enumerate(first_copies(data.scenes))
+        if folds[place] != folds[first]
+    ]
+    if not apart:
+        return []
+    return [
+        f"{len(apart)} images are copies of images of other folds ({first_of(apart)}): they are tested on what was "
+        "trained on"
+    ]
 
 
 def _chosen(text: str) -> tuple[list[Learner], list[str]]:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.datasets.states import first_copies
 from evaluation.scene import Scene
 from foundation.errors import FormatError, InputError, first_of
 
@@ -72,7 +73,7 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
 
 
 def draw_scene_folds(scenes: Sequence[Scene], folds: int, seed: int = 0) -> npt.NDArray[np.int64]:
-    """Return the fold of each scene, (N,) int64 from 0, groups kept together: the same for all commands.
+    """Return the fold of each scene, (N,) int64 from 0, groups and copies kept together: the same for all commands.
 
     Raises
     ------
@@ -80,6 +81,8 @@ def draw_scene_folds(scenes: Sequence[Scene], folds: int, seed: int = 0) -> npt.
         As `draw_folds`.
     """
     groups = [group_of(scene) for scene in scenes]
+    if len(set(groups)) == len(groups):
+        groups = [groups[first] for first in first_copies(scenes)]
     # Names would be dealt in another order than numbers, and data sets without groups have none but their names.
     return draw_folds(len(groups), folds, seed, None if len(set(groups)) == len(groups) else groups)
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from evaluation.datasets import open_scenes
-from evaluation.datasets.states import state_of
+from evaluation.datasets.states import first_copies, state_of
+from evaluation.experiments.folds import draw_scene_folds
 from tests.evaluation.datasets.made_up import image_of, write_png
 
 
@@ -41,3 +42,19 @@ def test_of_files(tmp_path: Path, changed: str) -> None:
         write_png(tmp_path / "a.png", image_of(8, 5))
         os.utime(tmp_path / "a.png", ns=(found.st_atime_ns, found.st_mtime_ns))
         assert state(tmp_path) != before
+
+
+def test_copies_are_found_among_thumbnails_and_among_files(tmp_path: Path) -> None:
+    images = np.random.default_rng(0).random((4, 4, 5, 3), np.float32)
+    images[2] = images[0]
+    np.savez(tmp_path / "one.npz", images=images, gt=np.ones((4, 3)), names=np.array(list("abcd")))
+    assert first_copies(open_scenes(tmp_path / "one.npz").scenes) == [0, 1, 0, 3]
+    folder = tmp_path / "files"
+    folder.mkdir()
+    for name, image in zip("abcd", images, strict=True):
+        np.save(folder / f"{name}.npy", image)
+    (folder / "gt.csv").write_text("image,r,g,b\n" + "".join(f"{name},1,1,1\n" for name in "abcd"))
+    assert first_copies(open_scenes(folder).scenes) == [0, 1, 0, 3]
+    folds = [draw_scene_folds(open_scenes(folder).scenes, 3, seed) for seed in range(20)]
+    assert all(fold[0] == fold[2] for fold in folds)
+    assert any(fold[0] != fold[1] for fold in folds)
