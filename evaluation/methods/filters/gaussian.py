@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +17,6 @@ from evaluation.scene import Image
 
 STRIP_NUMBERS = 1 << 22
 """Numbers of a strip, 16 MB of float32: a whole image of 1 megapixel, 128 rows and more of one of 45."""
-_TILE_ROWS = 500
-"""Rows of intermediate results, of all that an order needs, that fit a core's cache beside each other (0.8 MB)."""
 _FEWEST_ROWS = 64
 """Rows of a strip at least, for images that are wider than any."""
 
@@ -105,31 +104,38 @@ def differentiated_strips(
         The number of the strip's first row; (rows, Q) float32, interleaved pixels, of which the first 3 W numbers of a
         row count. The array is written anew for the next strip.
     """
-    from evaluation.methods.filters.convolution import BLOCK, TILE, filter_strip
+    from evaluation.methods.filters.convolution import CHUNK, GROUP, LANES, OUTPUTS, filter_columns, filter_rows
 
     height, width = image.shape[:2]
+    flat: Any = image.reshape(height, -1)
     kernels = [gaussian_kernel(sigma, one) for one in range(3)]
     reach = len(kernels[0]) // 2
     weights = np.stack([kernel[reach:] for kernel in kernels]).astype(np.float32)
-    pitch = -(-3 * width // BLOCK) * BLOCK
-    most = min(_TILE_ROWS // (order + 1) - 2 * reach, STRIP_NUMBERS // (3 * width))
-    most = min(max(most, _FEWEST_ROWS), height)
-    strip = np.zeros((most + 2 * reach, pitch + 6 * reach), dtype=np.float32)
-    scratch = _aligned((order + 1, most + 2 * reach, TILE))
+    pitch = -(-width // CHUNK) * 3 * CHUNK
+    most = min(max(STRIP_NUMBERS // pitch // (order + 2), _FEWEST_ROWS), height)
+    most = -(-most // GROUP) * GROUP
+    lines, turned = _aligned((GROUP, pitch)), _aligned((pitch + 6 * reach, LANES))
+    chunk = _aligned((order + 1, 3 * CHUNK, LANES))
+    columns = _aligned((order + 1, pitch // LANES, most + 2 * reach + GROUP, LANES))
     out = _aligned((most, pitch))
+    lines[:, 3 * width :] = 0
+    done = 0  # rows of the image that are filtered along x
     for top in range(0, height, most):
         rows = min(most, height - top)
-        first, last = max(0, top - reach), min(height, top + rows + reach)
-        body = strip[: rows + 2 * reach, 3 * reach : 3 * (reach + width)].reshape(rows + 2 * reach, width, 3)
-        above = first - (top - reach)
-        below = above + last - first
-        body[above:below] = image[first:last] if scale == 1 else image[first:last] * image.dtype.type(scale)
-        body[:above] = body[above]
-        body[below:] = body[below - 1]
-        strip[: rows + 2 * reach, : 3 * reach].reshape(rows + 2 * reach, reach, 3)[:] = body[:, :1]
-        right = strip[: rows + 2 * reach, 3 * (reach + width) : 3 * (2 * reach + width)]
-        right.reshape(rows + 2 * reach, reach, 3)[:] = body[:, -1:]
-        filter_strip(strip, weights, order, reach, rows, scratch, out)
+        start = top - reach  # row of the image that row 0 of `columns` holds
+        if top:
+            kept = done - start
+            columns[:, :, :kept] = columns[:, :, most : most + kept].copy()
+        last = min(height, top + rows + reach)
+        if done < last:
+            done = filter_rows(flat, scale, done, last, weights, order, lines, turned, chunk, columns, done - start)
+        if not top:
+            columns[:, :, :reach] = columns[:, :, reach : reach + 1]
+        # Beyond the last row there are copies of it, down to what the last four rows need.
+        below = -(-rows // OUTPUTS) * OUTPUTS + 2 * reach
+        if done - start < below:
+            columns[:, :, done - start : below] = columns[:, :, done - start - 1, None]
+        filter_columns(columns, weights, order, rows, out)
         yield top, out[:rows]
 
 
