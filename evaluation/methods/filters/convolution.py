@@ -1,4 +1,4 @@
-"""Separable filters of image strips, with sums and neighbours kept in registers.
+"""Separable filters of tiles of images, with sums and neighbours kept in registers.
 
 Vectors lie one after the other along the axis that is filtered, so that every load is aligned: rows are filtered in
 groups of 16 that are transposed first, which costs 4 shuffles a vector, where loads that begin between two cache lines
@@ -8,8 +8,8 @@ multiplications, not loads. Taps that lie symmetrically are combined before they
 constant whole numbers is exactly zero.
 
 Rows filtered along x stand in columns of 16 numbers: (columns, rows, 16), one cache line a row, which is what the
-filter along y reads from top to bottom. They are kept from strip to strip: nothing is filtered twice, and the rows
-above the first and below the last are copies.
+filter along y reads from top to bottom. An image is filtered in tiles whose columns fit a core's cache, from top to
+bottom; the rows that a tile shares with the one above are kept, and those beyond the image are copies.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ GROUP: Final = LANES
 """Rows that are filtered along x at a time: one a lane."""
 CHUNK: Final = 16
 """Pixels of a row that are filtered before they are transposed back: three whole vectors of 16 numbers."""
+STRETCH: Final = 4 * 3 * CHUNK
+"""Numbers of a row that are converted before they are transposed: 16 rows of them take 12 KB of the nearest cache."""
 _BYTES: Final = 4
 """Of a float32."""
 _PIXEL: Final = 3 * LINE
@@ -255,20 +257,61 @@ def _transpose(typing: Any, source: Any, pitch: Any, target: Any) -> Any:
 
 
 @compiled
+def _turn_rows(
+    image: npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64],
+    scale: float,
+    top: int,
+    left: int,
+    lines: npt.NDArray[np.float32],
+    turned: npt.NDArray[np.float32],
+) -> None:
+    """Write 16 rows of an image (H, 3 W) from `top` on, times `scale`, transposed to `turned` (3 P + 16, 16) float32.
+
+    Its P pixels begin with pixel `left`; beyond the image stand copies of its first and last pixels and of its last
+    row. `lines` (16, STRETCH) float32 is scratch.
+    """
+    height, length = image.shape
+    begin = max(0, 3 * left)
+    end = min(length, 3 * left + turned.shape[0] - LANES)
+    before = begin - 3 * left
+    for start in range(begin, end, STRETCH):
+        count = min(STRETCH, end - start)
+        for row in range(GROUP):
+            values = image[min(top + row, height - 1), start : start + count]
+            line = lines[row, :count]
+            if scale == 1:
+                for j in range(count):
+                    line[j] = np.float32(values[j])
+            else:
+                for j in range(count):
+                    line[j] = np.float32(values[j] * scale)
+        for at in range(0, count, LANES):
+            target = turned.ctypes.data + (start - 3 * left + at) * LINE
+            _transpose(lines.ctypes.data + at * _BYTES, STRETCH * _BYTES, target)
+    for at in range(before):
+        turned[at] = turned[before + at % 3]
+    for at in range(end - 3 * left, turned.shape[0]):
+        turned[at] = turned[at - 3]
+
+
+@compiled
 def filter_rows(
     image: npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64],
     scale: float,
-    first: int,
-    last: int,
+    top: int,
+    left: int,
+    rows: int,
+    done: int,
     weights: npt.NDArray[np.float32],
     order: int,
     lines: npt.NDArray[np.float32],
     turned: npt.NDArray[np.float32],
     chunk: npt.NDArray[np.float32],
     columns: npt.NDArray[np.float32],
-    place: int,
 ) -> int:
-    """Filter some rows of an image along x, and return the number of the first row that is not.
+    """Filter the rows of an image along x that a tile needs and the tile above it has not left.
+
+    Returns the first row of the image that is not filtered, `done` of the tile below.
 
     Parameters
     ----------
@@ -276,52 +319,49 @@ def filter_rows(
         (H, 3 W) uint16, float32 or float64, rows of interleaved pixels.
     scale
         Factor for values that float32 does not hold.
-    first, last
-        Rows to filter, last excluded; as many more as fill the last group of 16, copies of row H - 1 beyond the image.
+    top, left
+        First row and pixel of the tile.
+    rows
+        Of a tile, a multiple of 16; the tile above began so many rows before.
+    done
+        What the call for the tile above returned; 0 where there is none.
     weights
         (3, reach + 1) float32: the halves of the kernels of order 0, 1 and 2 from their centres on.
     order
         Of the derivative: order + 1 filters are applied, of order 0 on.
     lines
-        (16, Q) float32, scratch; Q = 48 ⌈W / 16⌉.
+        (16, STRETCH) float32, scratch.
     turned
-        (Q + 6 reach, 16) float32, scratch, its first number at a cache line.
+        (Q + 6 reach + 16, 16) float32, scratch, its first number at a cache line; Q, numbers of a row of the tile, is
+        a multiple of 48.
     chunk
         (order + 1, 48, 16) float32, scratch, its first number at a cache line.
     columns
-        (order + 1, Q / 16, R, 16) float32: the filtered rows in columns of 16 numbers; its first number at a cache
-        line.
-    place
-        Row of `columns` that row `first` is written to.
+        (order + 1, Q / 16, rows + 2 reach + 16, 16) float32: the filtered rows in columns of 16 numbers, from row
+        top - reach on; its first number at a cache line. What stands there of the tile above is used.
     """
     reach = weights.shape[1] - 1
-    height, length = image.shape
-    pitch = lines.shape[1]
+    height = image.shape[0]
+    start = top - reach
     even = weights.ctypes.data
     odd = even + weights.shape[1] * _BYTES
     bend = odd + weights.shape[1] * _BYTES
-    body = turned.ctypes.data + 3 * reach * LINE
     plane = chunk.shape[1] * LINE
     kept = chunk.ctypes.data
     column = columns.shape[2] * LINE
     field = columns.shape[1] * column
-    for top in range(first, last, GROUP):
-        for row in range(GROUP):
-            values = image[min(top + row, height - 1)]
-            line = lines[row]
-            for j in range(length):
-                line[j] = np.float32(values[j] * scale)
-        for at in range(0, pitch, LANES):
-            _transpose(lines.ctypes.data + at * _BYTES, pitch * _BYTES, body + at * LINE)
-        for at in range(3 * reach):
-            turned[at] = turned[3 * reach + at % 3]
-        for at in range(3 * reach + length, turned.shape[0]):
-            turned[at] = turned[at - 3]
-        to = columns.ctypes.data + (place + top - first) * LINE
-        for at in range(0, pitch, 3 * CHUNK):
+    if top:
+        for one in range(order + 1):
+            for at in range(columns.shape[1]):
+                for row in range(done - start):
+                    columns[one, at, row] = columns[one, at, row + rows]
+    while done < min(height, top + rows + reach):
+        _turn_rows(image, scale, done, left - reach, lines, turned)
+        to = columns.ctypes.data + (done - start) * LINE
+        for at in range(0, columns.shape[1], 3):
             for channel in range(3):
                 for pixel in range(0, CHUNK, OUTPUTS):
-                    source = body + (at + 3 * pixel + channel) * LINE
+                    source = turned.ctypes.data + (3 * reach + at * LANES + 3 * pixel + channel) * LINE
                     smooth = kept + (3 * pixel + channel) * LINE
                     if order == 0:
                         _across_even(source, reach, even, smooth)
@@ -331,9 +371,16 @@ def filter_rows(
                         _across_all(source, reach, even, odd, bend, smooth, smooth + plane, smooth + 2 * plane)
             for one in range(order + 1):
                 for part in range(3):
-                    target = to + one * field + (at // LANES + part) * column
-                    _transpose(kept + one * plane + part * LANES * LINE, LINE, target)
-    return first + -(-(last - first) // GROUP) * GROUP
+                    _transpose(kept + one * plane + part * LANES * LINE, LINE, to + one * field + (at + part) * column)
+        done += GROUP
+    for one in range(order + 1):
+        for at in range(columns.shape[1]):
+            if not top:
+                for row in range(reach):
+                    columns[one, at, row] = columns[one, at, reach]
+            for row in range(done - start, rows + 2 * reach):
+                columns[one, at, row] = columns[one, at, row - 1]
+    return done
 
 
 @compiled
@@ -357,7 +404,7 @@ def filter_columns(
     rows
         Rows to write, rounded up to fours.
     out
-        (rows, Q) or more float32, its first number at a cache line.
+        (rows, Q) or longer float32, its first number at a cache line.
     """
     reach = weights.shape[1] - 1
     even = weights.ctypes.data
