@@ -9,8 +9,10 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from docutils import nodes
 from sphinx.application import Sphinx
@@ -72,18 +74,24 @@ def help_of(module: str, words: list[str]) -> str:
     return "\n".join(line.rstrip() for line in done.stdout.strip("\n").splitlines())
 
 
+def words_of(name: str, command: Any) -> Iterator[list[str]]:
+    """Yield the words that call a command and each one below it, at any depth."""
+    yield [name]
+    for below, found in getattr(command, "commands", {}).items():
+        yield from ([name, *words] for words in words_of(below, found))
+
+
 def write_commands(app: Sphinx) -> None:
-    """Write the pages of the commands: the help of each and of its subcommands."""
+    """Write the pages of the commands: the help of each and of all below it."""
     folder = Path(app.srcdir) / "reference" / "commands"
     folder.mkdir(parents=True, exist_ok=True)
     sys.path.insert(0, str(ROOT))
     for command, place in COMMANDS.items():
         module = place.split(":")[0]
-        below = getattr(get_command(import_module(module).app), "commands", {})
-        parts = [f"# {command}\n", f"```text\n{help_of(module, [command, '--help'])}\n```\n"]
-        for name in below:
-            text = help_of(module, [command, name, "--help"])
-            parts += [f"## {command} {name}\n", f"```text\n{text}\n```\n"]
+        parts: list[str] = []
+        for words in words_of(command, get_command(import_module(module).app)):
+            text = help_of(module, [*words, "--help"])
+            parts += [f"{'#' * len(words)} {' '.join(words)}\n", f"```text\n{text}\n```\n"]
         (folder / f"{command}.md").write_text("\n".join(parts), encoding="utf-8")
 
 

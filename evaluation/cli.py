@@ -14,6 +14,7 @@ from evaluation.commands import paper as paper_command
 from evaluation.commands import run as run_command
 from evaluation.commands import train as train_command
 from evaluation.commands import transfer as transfer_command
+from evaluation.commands import tune as tune_command
 from foundation.console import EXIT_CODES, run
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ app.command("train", help=train_command.HELP)(train_command.train)
 app.command("cv", help=cv_command.HELP)(cv_command.cv)
 app.command("describe", help=describe_command.HELP)(describe_command.describe)
 app.command("transfer", help=transfer_command.HELP)(transfer_command.transfer)
+app.command("tune", help=tune_command.HELP)(tune_command.tune)
 
 
 @app.callback()

@@ -76,7 +76,8 @@ class SceneSet:
         Its images, in the data set's own order; at least one.
     treatment
         Stated with every result: "black level", "saturation", "mask" and "ground truth", each with a sentence that
-        gives the value applied and its source.
+        gives the value applied and its source. "reader" stands beside them where the layout's reader was never tried
+        on a published copy.
     folds
         The fold of each scene, counted from 0, where the data set's authors divide it; else None.
     """

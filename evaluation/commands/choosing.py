@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from evaluation.results.estimates import GivenEstimates
 
 METHOD_HELP = (
-    "Method: a name of --methods, a model file (MODEL.npz of evaluate train), module:Class, or file.py:Class for a "
-    "class of your own. Give it more than once for several."
+    "Method: a name of --methods, also with parameters (shades-of-gray:p=4, gray-edge-1:p=4:sigma=2), a model file "
+    "(MODEL.npz of evaluate train), module:Class, or file.py:Class for a class of your own. Give it more than once for "
+    "several."
 )
 """Help of the option --method."""
 

@@ -71,7 +71,12 @@ def compare(
     runs = [read_errors(place) for place in results]
     pairs = _of_one(runs[0], results[0], method, error) if len(runs) == 1 else _of_two(runs, results, method, error)
     comparisons = comparing.compare(pairs, seed, level)
-    notes = (*comparison_report.notes_of(comparisons), *_unchecked(runs, results), *_guessed(runs, results))
+    notes = (
+        *comparison_report.notes_of(comparisons),
+        *_unchecked(runs, results),
+        *_unlike(results),
+        *_guessed(runs, results),
+    )
     for note in notes:
         print(note)
     for made in comparisons:
@@ -160,6 +165,31 @@ def _unchecked(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]
         for run, place in zip(runs, places, strict=True)
         if len(runs) == 2 and any(method.truths is None for method in run.values())
     ]
+
+
+def _unlike(places: Sequence[str]) -> list[str]:
+    """Return a sentence for each thing that two runs did otherwise to the images: not only the methods then differ."""
+    found = [_record(place) for place in places]
+    if len(found) < 2 or not all(found):
+        return []
+    one, other = found
+    differing = [what for what in one if what in other and one[what] != other[what]]
+    return [
+        f"the runs differ in their {what}: {one[what]} in the first, {other[what]} in the second" for what in differing
+    ]
+
+
+def _record(place: str) -> dict[str, str]:
+    """Return where the images of a results folder came from and what was done to them; nothing if it does not say."""
+    import json
+
+    path = Path(place)
+    try:
+        content = json.loads((path if path.is_dir() else path.parent).joinpath("run.json").read_text(encoding="utf-8"))
+        treatment = content["treatment"]
+        return {"images": str(content["data_set"]["place"]), **{str(what): str(treatment[what]) for what in treatment}}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
 
 
 def _guessed(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]) -> list[str]:

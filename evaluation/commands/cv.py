@@ -28,9 +28,10 @@ stand between commas. The constant light, the median of the training lights, alw
 does not beat it has learned nothing from images. Images of one group, such as one picture under several lights, stay
 in one fold.
 
-Folds are the data set's own where its authors made some, else three that --seed draws; --folds takes a number of folds
-to draw, or a CSV file with the columns image,fold. Prints the table of evaluate run; writes nothing unless asked: --out
-writes the results folder of evaluate run with folds.csv, --save-folds the folds alone.
+Reads DATA, a data set of any layout that evaluate run reads. Folds are the data set's own where its authors made some,
+else three that --seed draws; --folds takes a number of folds to draw, or a CSV file with the columns image,fold. Prints
+the table of evaluate run; writes nothing unless asked: --out writes the results folder of evaluate run with folds.csv,
+--save-folds the folds alone.
 
 {EXIT_CODES}
 """
@@ -109,7 +110,11 @@ def cv(
         with progress("images") as advance:
             steps = iter(range(1, count + 1))
             results = cross_validate(found.scenes, learners, parts, seed, threads, lambda: advance(next(steps), count))
-        notes = (f"cross-validated in {len(set(parts.tolist()))} folds, {origin}; seed {seed}", *left_out)
+        notes = (
+            f"cross-validated in {len(set(parts.tolist()))} folds, {origin}; seed {seed}",
+            *left_out,
+            *_parted_copies(found, parts),
+        )
         described = [describe_method(learner) for learner in learners]
         made = describe_run(found, results, described, {"seed": seed, "folds": origin}, parts, notes)
         if out is not None:
@@ -121,6 +126,25 @@ def cv(
         print(note)
     for what, how in made.treatment.items():
         print(f"{what}: {how}")
+
+
+def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
+    """Return a sentence where images (N,) int64 by their folds are copies of images of other folds."""
+    from evaluation.datasets.states import first_copies
+    from foundation.errors import first_of
+
+    names = [scene.name for scene in data.scenes]
+    apart = [
+        f"{names[place]} of {names[first]}"
+        for place, first in enumerate(first_copies(data.scenes))
+        if folds[place] != folds[first]
+    ]
+    if not apart:
+        return []
+    return [
+        f"{len(apart)} images are copies of images of other folds ({first_of(apart)}): they are tested on what was "
+        "trained on"
+    ]
 
 
 def _chosen(text: str) -> tuple[list[Learner], list[str]]:
@@ -148,7 +172,7 @@ def _folds(data: SceneSet, text: str | None, seed: int) -> tuple[npt.NDArray[np.
     """Return the fold of each image, (N,) int64, and where the folds come from."""
     import numpy as np
 
-    from evaluation.experiments.folds import draw_folds, group_of, read_folds
+    from evaluation.experiments.folds import draw_scene_folds, group_of, read_folds
     from foundation.errors import InputError
 
     if text is None and data.folds is not None:
@@ -161,4 +185,4 @@ def _folds(data: SceneSet, text: str | None, seed: int) -> tuple[npt.NDArray[np.
     groups = [group_of(scene) for scene in data.scenes]
     alone = len(set(groups)) == len(groups)
     origin = f"drawn by seed {seed}" + ("" if alone else f", {len(set(groups))} groups of images kept together")
-    return draw_folds(len(groups), number, seed, None if alone else groups), origin
+    return draw_scene_folds(data.scenes, number, seed), origin

@@ -15,9 +15,12 @@ LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, co
 
 HELP = f"""Train a method on every image of a data set and write what it has learned to a model file.
 
-METHOD is {LEARNERS_HELP}. MODEL.npz is a new file of plain arrays with the story of their training: data set, number of
-images and a hash of their names and lights, what was done to the images, settings, seed, software and date. evaluate
-run DATA --method MODEL.npz estimates with it, on the same camera or another; the tables say what it was trained on.
+METHOD is {LEARNERS_HELP}.
+
+Reads DATA, a data set of any layout that evaluate run reads. Writes MODEL.npz, a new file of plain arrays with the
+story of their training: data set, number of images and a hash of their names and lights, what was done to the images,
+settings, seed, software and date. evaluate run DATA --method MODEL.npz estimates with it, on the same camera or
+another; the tables say what it was trained on.
 
 {EXIT_CODES}
 """

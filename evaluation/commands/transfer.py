@@ -27,12 +27,13 @@ _ALIKE = 2.0
 
 HELP = f"""Train learned methods on generated images and test them on real ones.
 
-Trains each method on each data set of --train and tests it on --test, beside real cross-validation of the same method,
-the constant light (median of the training lights), and statistics methods. With --naive also trained without a table:
-the same pictures, linear sRGB times the same lights, with and without the camera's colour matrix. Prints mean, median,
-trimean, best and worst quarter, their bootstrap intervals, and their ratios to real cross-validation, paired by image.
-Training sets that share pictures with the test set, by name or content, are refused. Writes nothing unless asked with
---out: results.csv, errors.csv (each image), folds, tables.tex, report.html and run.json.
+Reads data sets of any layout that evaluate run reads; trains each method on each one of --train and tests it on --test,
+beside real cross-validation of the same method, the constant light (median of the training lights), and statistics
+methods. With --naive also trained without a table: the same pictures, linear sRGB times the same lights, with and
+without the camera's colour matrix. Prints mean, median, trimean, best and worst quarter, their bootstrap intervals, and
+their ratios to real cross-validation, paired by image. Training sets that share pictures with the test set, by name or
+content, are refused. Writes nothing unless asked with --out: results.csv, errors.csv (each image), folds, tables.tex,
+report.html and run.json.
 
 {EXIT_CODES}
 """
@@ -197,14 +198,13 @@ def _folds(text: str | None, test: SceneSet, seeds: int) -> tuple[npt.NDArray[np
     """Return the folds of each seed: drawn by it, or the same for all where they are given."""
     import numpy as np
 
-    from evaluation.experiments.folds import draw_folds, group_of, read_folds
+    from evaluation.experiments.folds import draw_scene_folds, read_folds
 
     if text is None and test.folds is not None:
         return (np.array(test.folds, dtype=np.int64),) * seeds
     wanted = text or _FOLDS
     if wanted.isdecimal():
-        groups = [group_of(scene) for scene in test.scenes]
-        return tuple(draw_folds(len(groups), int(wanted), seed, groups) for seed in range(seeds))
+        return tuple(draw_scene_folds(test.scenes, int(wanted), seed) for seed in range(seeds))
     return (read_folds(Path(wanted), [scene.name for scene in test.scenes]),) * seeds
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from evaluation.datasets.ffcc import is_ffcc, open_ffcc
@@ -47,6 +47,8 @@ class Layout:
         The fields of `DataOptions` that have a meaning for it.
     general
         Whether it is no particular data set's, and asked only where no other matches.
+    unverified
+        Whether it is others' and its reader was never tried on a copy that they published; results then say so.
     """
 
     title: str
@@ -55,6 +57,11 @@ class Layout:
     open: Callable[[str, DataOptions, Folder | None], SceneSet]
     options: tuple[str, ...] = ()
     general: bool = False
+    unverified: bool = False
+
+
+_UNVERIFIED = "not verified against a published copy; compare one image with the authors' program"
+"""What is stated with results of a data set whose reader has met made-up copies only."""
 
 
 LAYOUTS: Mapping[str, Layout] = {
@@ -67,13 +74,16 @@ LAYOUTS: Mapping[str, Layout] = {
     "thumbnails": Layout(
         "thumbnails in a NumPy archive", "a file .npz", lambda _: False, lambda place, _, __: open_thumbnails(place)
     ),
-    "cube-plus": Layout("Cube+, or Cube", "cube+_gt.txt", is_cube_plus, open_cube_plus, ("truth", *_LEVELS, "partial")),
+    "cube-plus": Layout(
+        "Cube+, or Cube", "cube+_gt.txt", is_cube_plus, open_cube_plus, ("truth", *_LEVELS, "partial"), unverified=True
+    ),
     "cube++": Layout(
         "Cube++",
         "gt.csv with left_r",
         is_cube_plus_plus,
         open_cube_plus_plus,
         ("truth", *_LEVELS, "partial"),
+        unverified=True,
     ),
     "simple-cube++": Layout(
         "SimpleCube++",
@@ -81,9 +91,15 @@ LAYOUTS: Mapping[str, Layout] = {
         is_simple_cube,
         open_simple_cube,
         ("subset", *_LEVELS, "partial"),
+        unverified=True,
     ),
     "nus8": Layout(
-        "NUS 8 cameras, or one of them", "CAMERA_gt.mat", is_nus8, open_nus8, ("camera", *_LEVELS, "partial")
+        "NUS 8 cameras, or one of them",
+        "CAMERA_gt.mat",
+        is_nus8,
+        open_nus8,
+        ("camera", *_LEVELS, "partial"),
+        unverified=True,
     ),
     "gehler-shi": Layout(
         "Gehler's ColorChecker data set as Shi and Funt processed it",
@@ -91,6 +107,7 @@ LAYOUTS: Mapping[str, Layout] = {
         is_gehler_shi,
         open_gehler_shi,
         ("camera", "truth", *_LEVELS, "partial"),
+        unverified=True,
     ),
     "intel-tau": Layout(
         "INTEL-TAU, processed to 1080p",
@@ -98,6 +115,7 @@ LAYOUTS: Mapping[str, Layout] = {
         is_intel_tau,
         open_intel_tau,
         ("camera", "subset", *_LEVELS, "partial"),
+        unverified=True,
     ),
     "lsmi": Layout(
         "LSMI, several lights",
@@ -105,9 +123,16 @@ LAYOUTS: Mapping[str, Layout] = {
         is_lsmi,
         open_lsmi,
         ("camera", "subset", *_LEVELS, "partial"),
+        unverified=True,
     ),
     "ffcc": Layout(
-        "FFCC's thumbnails", "NAME.png beside NAME.txt", is_ffcc, open_ffcc, (*_LEVELS, "partial"), general=True
+        "FFCC's thumbnails",
+        "NAME.png beside NAME.txt",
+        is_ffcc,
+        open_ffcc,
+        (*_LEVELS, "partial"),
+        general=True,
+        unverified=True,
     ),
     "folder": Layout(
         "images of your own",
@@ -152,7 +177,8 @@ def open_scenes(place: Path | str, layout: str | None = None, options: DataOptio
         raise InputError(
             f"--{idle[0]} has no meaning for {text}, {known.title} ({name}); it has one for {', '.join(able)}"
         )
-    return known.open(text, chosen, names)
+    data = known.open(text, chosen, names)
+    return replace(data, treatment={**data.treatment, "reader": _UNVERIFIED}) if known.unverified else data
 
 
 def layout_of(place: str) -> str:

@@ -106,6 +106,7 @@ def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = 
     missing: list[str] = []
     seen: set[str] = set()
     given: set[str] = set()
+    paths: dict[str, str] = {}
     listings: dict[str, _Listing] = {"": _Listing(listed)} if listed else {}
     for where, row in read_rows(path, COLUMNS):
         name = row["image"].strip()
@@ -117,6 +118,8 @@ def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = 
         if image is None:
             missing.append(name)
             continue
+        if (before := paths.setdefault(os.path.normpath(image), name)) != name:
+            raise FormatError(f"{where}: {name} is the file of {before} too, expected each image once; take one away")
         given.update(column for column in ("black", "saturation", "mask", "fold") if row.get(column, "").strip())
         scenes.append(_scene(folder, name, image, light, row, where, options))
         folds.append(_fold(row, where))

@@ -6,6 +6,7 @@ The archive (`.npz`) holds `images` (N, H, W, 3), float32 or uint16, linear came
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,17 +68,34 @@ def open_thumbnails(path: Path | str) -> SceneSet:
         raise FormatError(
             f"{path} has images of {images.dtype}, expected uint16, float32 or float64: linear camera RGB"
         )
-    for name, truth in zip(names, truths, strict=True):
+    titles = [name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names.tolist()]
+    twice = next((name for name, times in Counter(titles).items() if times > 1), None)
+    unprintable = next((name for name in titles if not name.isprintable()), None)
+    if twice is not None or unprintable is not None:
+        raise FormatError(
+            f"{path} has "
+            + (f"two images named {twice!r}" if twice is not None else f"an image named {unprintable!r}")
+            + "; give each image a name of its own, on one line"
+        )
+    below = 0
+    for name, truth, image in zip(titles, truths, images, strict=True):
         check_light(truth.tolist(), f"{path}, gt of {name}")
+        if not np.isfinite(image).all():
+            raise FormatError(
+                f"{path}: {name} has pixels that are not finite; make them 0 in every channel, which masks them"
+            )
+        below += int((image < 0).sum())
     return SceneSet(
         name=Path(path).stem,
         layout="thumbnails",
         place=str(path),
         scenes=tuple(
-            Thumbnail(str(name), truth, image) for name, truth, image in zip(names, truths, images, strict=True)
+            Thumbnail(name, truth, np.maximum(image, 0) if below else image)
+            for name, truth, image in zip(titles, truths, images, strict=True)
         ),
         treatment={
-            "black level": "0: subtracted when the thumbnails were made",
+            "black level": "0: subtracted when the thumbnails were made"
+            + (f"; {below} values below it are taken as 0" if below else ""),
             "saturation": "none: averaged pixels do not show what was clipped",
             "mask": "pixels that are zero in every channel",
             "ground truth": "gt of the archive",

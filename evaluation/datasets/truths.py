@@ -122,6 +122,9 @@ def read_rows(path: Path, needed: Sequence[str]) -> Iterator[tuple[str, Mapping[
                     f"{path} has the columns {','.join(head) or 'of an empty file'}, expected "
                     f"{','.join(needed)} among them; {','.join(lacking)} is missing"
                 )
+            twice = [name for name in needed if head.count(name) > 1]
+            if twice:
+                raise FormatError(f"{path} has two columns {twice[0]!r}, expected each once; take one away")
             for row in rows:
                 where = f"{path}, line {rows.line_num}"
                 if not row:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.experiments.folds import require_apart
+from evaluation.experiments.running import answer_scenes, fit_anew
 from evaluation.learning.feature_learner import (
     FeatureLearner,
     Features,
@@ -107,12 +108,9 @@ def _by_features(
 def _by_scenes(learner: Learner, scenes: Sequence[Scene], folds: npt.NDArray[np.int64], seed: int) -> list[SceneAnswer]:
     answers = [SceneAnswer(None, NO_PIXEL)] * len(scenes)
     for fold in sorted(set(folds.tolist())):
-        method = learner.fit([scene for scene, where in zip(scenes, folds, strict=True) if where != fold], seed)
-        for place, scene in enumerate(scenes):
-            if folds[place] == fold:
-                image, mask = scene.read()
-                try:
-                    answers[place] = read_light(method.estimate(image, scene.saturation, mask))
-                except ValueError as error:
-                    raise InputError(f"{method.name} on {scene.name}: {error}; correct the method") from error
+        train = [scene for scene, where in zip(scenes, folds, strict=True) if where != fold]
+        held = np.flatnonzero(folds == fold).tolist()
+        method = fit_anew(learner, train, seed)
+        for place, (answer,) in zip(held, answer_scenes([scenes[place] for place in held], [method]), strict=True):
+            answers[place] = answer
     return answers

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.datasets.states import first_copies
 from evaluation.scene import Scene
 from foundation.errors import FormatError, InputError, first_of
 
@@ -71,6 +72,21 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
     return chosen[member].astype(np.int64)
 
 
+def draw_scene_folds(scenes: Sequence[Scene], folds: int, seed: int = 0) -> npt.NDArray[np.int64]:
+    """Return the fold of each scene, (N,) int64 from 0, groups and copies kept together: the same for all commands.
+
+    Raises
+    ------
+    InputError
+        As `draw_folds`.
+    """
+    groups = [group_of(scene) for scene in scenes]
+    if len(set(groups)) == len(groups):
+        groups = [groups[first] for first in first_copies(scenes)]
+    # Names would be dealt in another order than numbers, and data sets without groups have none but their names.
+    return draw_folds(len(groups), folds, seed, None if len(set(groups)) == len(groups) else groups)
+
+
 def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     """Return the fold of each image, (N,) int64 from 0, as a CSV file has them: `image,fold`, a line an image.
 
@@ -93,7 +109,7 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             table = csv.DictReader(stream)
             columns = list(table.fieldnames or ())
-            rows = [(row.get("image") or "", row.get("fold") or "") for row in table]
+            rows = [(row.get("image") or "", (row.get("fold") or "").strip()) for row in table]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FormatError(f"cannot read folds from {path}: {error}; expected CSV, image,fold a line") from error
     if not {"image", "fold"} <= set(columns):

@@ -10,14 +10,17 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.datasets.states import state_of
 from evaluation.experiments.folds import folds_to_csv
 from evaluation.experiments.running import SceneMethod, answer_scenes, ordered_map, truths_of
+from evaluation.experiments.suspicions import suspicions
 from evaluation.learning.model_files import StoredMethod
 from evaluation.methods.method import Method
 from evaluation.metrics import ErrorKind
@@ -85,10 +88,12 @@ def run_methods(
     if twice:
         raise InputError(f"two methods are called {twice[0]!r}; give one another name, or leave one out")
     truths = truths_of(data.scenes, methods)
-    run = _run_of(data, methods, truths, ())
+    # Methods are described before they run: what they keep or import while they do depends on where a run went on.
+    run = _run_of(data, methods)
 
     def finished(answers: Sequence[Sequence[SceneAnswer]]) -> Run:
-        return _run_of(data, methods, truths, results_of(names, truths, answers))
+        results = results_of(names, truths, answers)
+        return replace(run, results=results, notes=(*run.notes, *suspicions(run.subject.images, truths, results)))
 
     if folder is None:
         return finished(_answers(data.scenes, methods, [], None, workers, on_scene))
@@ -97,7 +102,7 @@ def run_methods(
     make_folder(folder.parent, folder)
     with held_folder(partial, f"another program works on {folder}; {_WAIT}", of=folder):
         journal = partial / JOURNAL_FILE
-        known = read_journal(journal, _identity(run))
+        known = read_journal(journal, _identity(run, state_of(data.scenes)))
         if len(known) > 0:
             _require_same(data.scenes, methods, known, partial)
         with journal.open("ab", buffering=0) as stream:
@@ -186,20 +191,21 @@ def describe_run(
     )
 
 
-def _run_of(
-    data: SceneSet,
-    methods: Sequence[Method | SceneMethod],
-    truths: npt.NDArray[np.float64],
-    results: tuple[Result, ...],
-) -> Run:
-    described = [describe_method(method) for method in methods]
-    run = describe_run(data, results, described)
-    notes = tuple(
-        f"{method.name} was trained on these very images: its errors say nothing of others"
-        for method in methods
-        if isinstance(method, StoredMethod) and method.provenance and method.provenance.sha256 == run.data_sha256
-    )
-    return describe_run(data, results, described, notes=notes)
+def _run_of(data: SceneSet, methods: Sequence[Method | SceneMethod]) -> Run:
+    """Return a run before it has any results."""
+    run = describe_run(data, (), [describe_method(method) for method in methods])
+    notes: list[str] = []
+    for method in methods:
+        if not isinstance(method, StoredMethod) or not method.provenance:
+            continue
+        if method.provenance.sha256 == run.data_sha256:
+            notes.append(f"{method.name} was trained on these very images: its errors say nothing of others")
+        elif method.provenance.data_name == data.name:
+            notes.append(
+                f"{method.name} was trained on {method.provenance.scenes} images of a data set of the same name: "
+                "whether these are among them is not known"
+            )
+    return replace(run, notes=tuple(notes))
 
 
 def _data_sha256(scenes: Sequence[Scene]) -> str:
@@ -235,13 +241,17 @@ def _require_same(
                 )
 
 
-def _identity(run: Run) -> dict[str, Any]:
-    """Return what must be the same for a run to go on with what another has made; its keys stand in messages."""
+def _identity(run: Run, state: str) -> dict[str, Any]:
+    """Return what must be the same for a run to go on with what another has made; its keys stand in messages.
+
+    Names and lights do not tell whether the pixels are the same, so the state of the image files belongs to it.
+    """
     return {
         "data set": {
             "images": len(run.subject.images),
             "sha256": run.data_sha256,
             "several lights": sum(run.subject.mixed),
+            "state": state,
         },
         "treatment": dict(run.treatment),
         "methods": list(run.methods),

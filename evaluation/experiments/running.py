@@ -8,6 +8,7 @@ run with the name of the method and the image, and the line of the method's file
 
 from __future__ import annotations
 
+import copy
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,7 +21,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.methods.method import LocalMethod, Method
+from evaluation.methods.method import Learner, LocalMethod, Method
 from evaluation.methods.pixels import GREY
 from evaluation.methods.prepared import PreparedImage, PreparedMethod
 from evaluation.metrics import MapError, measure_map
@@ -226,6 +227,40 @@ def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[Scen
             answer = SceneAnswer(answer.light, answer.cause, _map_error(scene, answer, field, truth, image, mask))
         answers.append(answer)
     return tuple(answers)
+
+
+def fit_anew(learner: Learner, scenes: Sequence[Scene], seed: int) -> Method:
+    """Return the method that a copy of a learner has learned from scenes.
+
+    The learner itself stays as it is: one that keeps in itself what it learns would take it along from fold to fold,
+    and with it the images that it is tested on.
+
+    Raises
+    ------
+    InputError
+        The learner cannot be copied, fails, or returns what cannot estimate; the message names it, and the line.
+    """
+    try:
+        fresh = copy.deepcopy(learner)
+    except Exception as error:
+        raise InputError(
+            f"{learner.name} cannot be copied ({error}), so that it would begin each training with what it learned in "
+            "the one before; let its constructor keep plain values, and open files and models in fit"
+        ) from error
+    try:
+        method = fresh.fit(scenes, seed)
+    except CropError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise InputError(
+            f"{learner.name} fails to learn from {len(scenes)} images: {_reason(error)}; correct it and run again"
+        ) from error
+    if not callable(getattr(method, "estimate", None)):
+        raise InputError(
+            f"{learner.name} returns {type(method).__name__} from fit, expected a method with estimate(image, "
+            "saturation, mask); a class that keeps what it has learned in itself returns itself"
+        )
+    return method
 
 
 def _field(given: object, image: Any) -> tuple[npt.NDArray[np.floating[Any]], str]:

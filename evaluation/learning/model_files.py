@@ -166,7 +166,10 @@ def load_model(path: Path) -> StoredMethod:
         model = learner.restore(arrays)
     except KeyError as error:
         raise _refused(path, f"it lacks {error}") from error
-    except (OSError, ValueError, TypeError, AttributeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+    except (
+        *(OSError, ValueError, TypeError, AttributeError, EOFError, zlib.error, zipfile.BadZipFile),
+        *(RuntimeError, NotImplementedError),  # What is encrypted, or packed in a way that Python does not know.
+    ) as error:
         raise _refused(path, str(error).splitlines()[0] if str(error) else type(error).__name__) from error
     return StoredMethod(learner, model, provenance.data_name, provenance)
 

@@ -146,6 +146,8 @@ class RegressionTrees(FeatureLearner):
         shape = found["split"].shape
         if len(shape) != 4 or shape[1:3] != (_FEATURES, _TARGETS) or any(a.shape != shape for a in found.values()):
             raise ValueError(f"trees of the shapes {[a.shape for a in found.values()]}")
+        if any(found[name].dtype.kind != "i" for name in ("split", "left", "right")):
+            raise ValueError("trees with branches that are no whole numbers")
         inside = all(((found[name] >= -2) & (found[name] < shape[3])).all() for name in ("left", "right"))
         if not inside or not ((found["split"] >= -2) & (found["split"] < 2)).all():
             raise ValueError("trees with branches that lead nowhere")

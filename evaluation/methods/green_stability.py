@@ -84,27 +84,94 @@ def tune(candidates: Sequence[Method], scenes: Sequence[Scene], on_scene: Callab
     >>> tune(family("shades-of-gray"), walls).best.name
     'Shades-of-Gray (p=1)'
     """
-    if len(candidates) < 2 or len(scenes) < _FEWEST_IMAGES:
-        raise InputError(f"{len(candidates)} sets of parameters on {len(scenes)} images; expected 2 or more of each")
-    greens: list[npt.NDArray[np.float64]] = []
+    require_enough(len(candidates), len(scenes))
+    lights: list[npt.NDArray[np.float64]] = []
     for scene in scenes:
-        image, mask = scene.read()
-        lights = estimate_all(candidates, image, scene.saturation, mask)
-        if all(light is not GREY and np.isfinite(light).all() for light in lights):
-            greens.append(np.array([light[1] / light.sum() for light in lights]))
+        lights.append(lights_of(candidates, scene))
         if on_scene:
             on_scene()
-    if len(greens) < _FEWEST_IMAGES:
+    return choose(candidates, np.stack(lights))
+
+
+def lights_of(candidates: Sequence[Method], scene: Scene) -> npt.NDArray[np.float64]:
+    """Return the candidates' estimates of a scene, (C, 3) float64; NaN for one that gives no light.
+
+    The scene's ground truth is not looked at.
+    """
+    image, mask = scene.read()
+    lights = estimate_all(candidates, image, scene.saturation, mask)
+    return np.array([np.full(3, np.nan) if light is GREY else light for light in lights])
+
+
+def choose(candidates: Sequence[Method], lights: npt.NDArray[np.float64]) -> Tuned:
+    """Return the candidate whose estimates spread least in green chromaticity.
+
+    Parameters
+    ----------
+    candidates
+        The methods, C ≥ 2.
+    lights
+        (N, C, 3) float64, camera RGB of any length: the estimates of `lights_of` for N images.
+
+    Raises
+    ------
+    InputError
+        There are too few candidates or images, or too few images for which all candidates give a light.
+
+    Examples
+    --------
+    >>> steady, loose = [1.0, 2.0, 1.0], [1.0, 1.0, 1.0]
+    >>> choose(family("shades-of-gray")[:2], np.array([[steady, steady], [steady, loose]])).spreads
+    (0.0, 0.0833...)
+    """
+    require_enough(len(candidates), len(lights))
+    given = lights[counted(lights)]
+    if len(given) < _FEWEST_IMAGES:
         raise InputError(
-            f"only {len(greens)} of {len(scenes)} images give a light with every set of parameters; expected 2 or "
+            f"only {len(given)} of {len(lights)} images give a light with every set of parameters; expected 2 or "
             "more: use larger images or smaller scales"
         )
-    spreads = np.std(np.stack(greens), axis=0)
+    spreads = np.std(given[:, :, 1] / given.sum(axis=2), axis=0)
     return Tuned(
         candidates[int(spreads.argmin())],
         tuple(candidates),
         tuple(float(spread) for spread in spreads),
-        len(greens),
+        len(given),
+    )
+
+
+def counted(lights: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Return (N,) bool, True for an image that counts: each of its C estimates (N, C, 3) float64 is a light."""
+    return np.asarray(np.isfinite(lights).all(axis=(1, 2)))
+
+
+def require_enough(candidates: int, images: int) -> None:
+    """Raise where so many candidates and images are too few to choose by.
+
+    Raises
+    ------
+    InputError
+        There are fewer than two of one.
+    """
+    if candidates < 2 or images < _FEWEST_IMAGES:
+        raise InputError(f"{candidates} sets of parameters on {images} images; expected 2 or more of each")
+
+
+def family_names(name: str) -> tuple[str, ...]:
+    """Return what `naming.find_method` takes for each candidate of a family, in the order of `family`.
+
+    Raises
+    ------
+    InputError
+        There is no family of that name.
+
+    Examples
+    --------
+    >>> family_names("shades-of-gray")[:2], family_names("gray-edge-1")[-1]
+    (('shades-of-gray:p=1', 'shades-of-gray:p=2'), 'gray-edge-1:p=13:sigma=9')
+    """
+    return tuple(
+        f"{name}:p={member.p:g}" + (f":sigma={member.sigma:g}" if member.sigma else "") for member in family(name)
     )
 
 

@@ -1,6 +1,7 @@
 """Find a method by what a user types: a name of this suite, a class of an installed module, or a class in a file.
 
     gray-edge-1            a method of `standard.standard_methods`
+    gray-edge-1:p=4:sigma=2, shades-of-gray:p=6      the same with other parameters, of the Gray-Edge framework
     package.module:Class   a class or value of a module that Python finds, also beside the working folder
     path/file.py:Class     a class or value of a file; what stands beside the file can be imported by it
 
@@ -30,6 +31,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import math
 import re
 import sys
 import traceback
@@ -38,6 +40,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, cast
 
+from evaluation.methods.gray_edge import GrayEdge
+from evaluation.methods.green_stability import FAMILIES
 from evaluation.methods.patchwise import PATCHES, PatchwiseMethod
 from evaluation.methods.resized import ResizedMethod
 from evaluation.methods.standard import local_methods, standard_methods
@@ -47,6 +51,9 @@ if TYPE_CHECKING:
     from evaluation.methods.method import Learner, Method
 
 _MODIFIERS = re.compile(r"(?P<size>[0-9]{1,6})|patches(=(?P<patches>[0-9]{1,6}))?")
+
+LARGEST_SIGMA = 1000
+"""Scale of a Gaussian that a text may ask for, px: no image has structure beyond, and the filter's width is bounded."""
 
 _FORMS = "a name of this suite, module:Class or path/file.py:Class"
 
@@ -58,13 +65,14 @@ def find_method(text: str) -> Method | Learner:
     ----------
     text
         A name of `standard_methods` or `local_methods`, "module:Class" or "path/file.py:Class", each of them with
-        "@PIXELS", "@patches" or "@patches=COUNT" behind it.
+        "@PIXELS", "@patches" or "@patches=COUNT" behind it. A name of `green_stability.FAMILIES` may have ":p=NUMBER",
+        ":sigma=NUMBER" or both behind it; what is not given stays as in `standard_methods`.
 
     Raises
     ------
     InputError
-        There is no such name, module, file or class; it fails while it is loaded or made; it has no `name`, or neither
-        `estimate` nor `fit`. The message says which, and in which line of the user's file.
+        There is no such name, module, file or class; parameters make no method; it fails while it is loaded or made; it
+        has no `name`, or neither `estimate` nor `fit`. The message says which, and in which line of the user's file.
 
     Examples
     --------
@@ -74,6 +82,8 @@ def find_method(text: str) -> Method | Learner:
     'PCA bright and dark'
     >>> find_method("gray-edge-2@360").name
     '2nd-order Gray-Edge at 360 px'
+    >>> find_method("gray-edge-1:p=4:sigma=2").name
+    '1st-order Gray-Edge (p=4, σ=2)'
     >>> find_method("gray-world@patches=4").name
     'Gray-world by patches'
     """
@@ -90,6 +100,9 @@ def find_method(text: str) -> Method | Learner:
         if changed["size"]:
             return ResizedMethod(cast("Method", method), number)
         return PatchwiseMethod(cast("Method", method), number)
+    family, colon, given = wanted.partition(":")
+    if colon and family in standard_methods():
+        return _with_parameters(family, given)
     place, colon, name = wanted.rpartition(":")
     if not colon:
         known = {**standard_methods(), **local_methods()}
@@ -107,12 +120,40 @@ def find_method(text: str) -> Method | Learner:
     if isinstance(found, type):
         try:
             found = cast("object", found())
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise InputError(
                 f"{wanted} cannot be made without arguments: {_told(error)}; give its parameters defaults, or name a "
                 "value of the file instead of the class"
             ) from error
     return checked_method(found, wanted)
+
+
+def _with_parameters(family: str, given: str) -> Method:
+    """Return a method of the Gray-Edge framework with the parameters of a text: "p=4:sigma=2", in either order."""
+    standard = standard_methods()[family]
+    if family not in FAMILIES or not isinstance(standard, GrayEdge):
+        raise InputError(f"{family} takes no parameters; those that do are {', '.join(FAMILIES)}")
+    known = ("p", "sigma") if standard.sigma else ("p",)
+    values: dict[str, float] = {}
+    for part in given.split(":"):
+        name, _, text = part.partition("=")
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if name not in known or name in values or math.isnan(value):
+            expected = " and ".join(f"{name}=NUMBER" for name in known)
+            raise InputError(f"{family}:{given}: {part!r} is no parameter, expected {expected}, once each, between :")
+        values[name] = value
+    p, sigma = values.get("p", standard.p), values.get("sigma", standard.sigma)
+    if p < 1 or sigma > LARGEST_SIGMA or (standard.sigma and sigma <= 0):
+        raise InputError(
+            f"{family}:{given}: p {p:g} and sigma {sigma:g} make no method, expected p from 1 and sigma above 0, up to "
+            f"{LARGEST_SIGMA} px"
+        )
+    title = standard.name.partition(" (")[0]
+    scale = f", σ={sigma:g}" if standard.sigma else ""
+    return GrayEdge(f"{title} (p={p:g}{scale})", standard.order, p, sigma)
 
 
 def checked_method(found: object, place: str) -> Method | Learner:
@@ -145,7 +186,11 @@ def checked_method(found: object, place: str) -> Method | Learner:
             f"{place} is no method: it has neither estimate(image, saturation, mask) nor fit(scenes, seed); add the "
             "one that it is to have, see evaluation/methods/method.py"
         )
-    if not isinstance(getattr(found, "name", None), str) or not getattr(found, "name", ""):
+    try:
+        name = getattr(found, "name", None)
+    except Exception as error:
+        raise InputError(f"the name of {place} fails: {_told(error)}; correct it") from error
+    if not isinstance(name, str) or not name:
         raise InputError(f'{place} has no name; add name = "…", the text that stands in the tables')
     return cast("Method | Learner", found)
 
@@ -173,7 +218,7 @@ def _module_of_file(path: Path) -> ModuleType:
         sys.path.append(str(whole.parent))
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
         raise InputError(f"{path} fails while it is loaded: {_told(error, whole)}; correct it") from error
     return module
@@ -191,11 +236,11 @@ def _module_by_name(name: str) -> ModuleType:
                 f"there is no module {name!r}; install it, or give the path of a file that ends in .py"
             ) from error
         raise InputError(f"module {name} needs {missing!r}, which is not installed; install it") from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(f"module {name} fails while it is loaded: {_told(error)}; correct it") from error
 
 
-def _told(error: Exception, file: Path | None = None) -> str:
+def _told(error: BaseException, file: Path | None = None) -> str:
     """Return what went wrong, with the last line of `file` that it went through, or the last line at all."""
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"

@@ -18,6 +18,9 @@ from evaluation.reports.style import CSS_VARIABLES
 if TYPE_CHECKING:
     from evaluation.results.tables import Table
 
+_INTERVAL = re.compile(r"(?<=\d) – (?=[-−]?\d)")
+"""What stands between the ends of an interval in a table's cell."""
+
 _STYLE = f"""
 {CSS_VARIABLES}
 * {{ box-sizing: border-box }}
@@ -33,6 +36,7 @@ th, td {{ padding: .25rem .8rem .25rem 0; border-bottom: 1px solid var(--grid); 
   text-align: left }}
 th {{ font-weight: 600; vertical-align: bottom }} .number {{ text-align: right; padding: .25rem 0 .25rem .9rem;
   font-variant-numeric: tabular-nums; white-space: nowrap }} th.number {{ white-space: normal }}
+.number + :not(.number) {{ padding-left: 1.6rem }}
 .note, figcaption {{ color: var(--faint); font-size: .9rem }}
 figure {{ margin: .8rem 0; overflow-x: auto }} figure > svg {{ min-width: 36rem }}
 figure > img, figure > svg {{ display: block; max-width: 100%; height: auto }}
@@ -82,7 +86,7 @@ def table_part(table: Table) -> Part:
         f"<th{mark} scope='col'>{html.escape(head)}</th>" for mark, head in zip(marks, table.columns, strict=True)
     )
     rows = "".join(
-        f"<tr>{''.join(f'<td{mark}>{html.escape(text)}</td>' for mark, text in zip(marks, row, strict=True))}</tr>\n"
+        f"<tr>{''.join(f'<td{mark}>{_cell(text)}</td>' for mark, text in zip(marks, row, strict=True))}</tr>\n"
         for row in table.texts()
     )
     notes = "".join(f"<p class='note'>{html.escape(note)}</p>\n" for note in table.notes)
@@ -91,6 +95,11 @@ def table_part(table: Table) -> Part:
         f"<div class='scroll' role='region' tabindex='0' aria-label='{html.escape(table.title, quote=True)}'><table>"
         f"<thead><tr>{heads}</tr></thead>\n<tbody>{rows}</tbody></table></div>\n{notes}"
     )
+
+
+def _cell(text: str) -> str:
+    """Return a cell's text, escaped; an interval of numbers is not broken over two lines."""
+    return _INTERVAL.sub("\u00a0–\u00a0", html.escape(text))
 
 
 def figure_part(picture: bytes, caption: str, alt: str | None = None) -> Part:

@@ -120,7 +120,10 @@ def _stem(image: str) -> str:
 def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     separator = max(",;\t", key=lines[0].count)
-    rows = list(csv.reader(lines, delimiter=separator))
+    try:
+        rows = list(csv.reader(lines, delimiter=separator, strict=True))
+    except csv.Error as error:
+        raise FormatError(f"{path} is no CSV text: {error}; expected {','.join(_COLUMNS)}") from error
     heads = [head.strip().lower() for head in rows[0]] if rows else []
     headed = all(column in heads for column in _COLUMNS)
     if not headed and not (len(heads) == len(_COLUMNS) and all(map(_is_number, heads[1:]))):

@@ -4,6 +4,8 @@
                               all_image_names (N,)
     CAMERA/CAMERA_0001.PNG    16 bits, demosaiced raw; also in CAMERA/PNG, or for all cameras in images/ and the .mat
                               files in ground_truth/
+    CAMERA/CHECKER            the chart's box as text, see `nus8_charts`; used where there are no CC_coords, else
+                              held against them
 
 D. Cheng, D. Prasad, M. Brown, "Illuminant estimation for color constancy: why spatial-domain methods work and the role
 of the color distribution", JOSA A 31(5), 2014; its page, cvil.eecs.yorku.ca/projects/public_html/illuminant. Levels
@@ -14,17 +16,15 @@ chart, counted from 1, as internal/ReadImage.m of github.com/google/ffcc uses th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
-
-import numpy as np
-import numpy.typing as npt
+from typing import Final
 
 from evaluation.datasets.names import Folder, present
 from evaluation.datasets.options import DataOptions, choose, stated
 from evaluation.datasets.published.matlab import read_mat, scalar, strings, table
+from evaluation.datasets.published.nus8_charts import Box, charts
 from evaluation.datasets.raw_scene import Mask, RawScene, box_mask
 from evaluation.datasets.truths import check_light
 from evaluation.scene import Image, SceneSet
@@ -57,7 +57,7 @@ class ChartScene(RawScene):
         First and last row, first and last column of the chart, counted from 1.
     """
 
-    box: tuple[int, int, int, int] = (1, 1, 1, 1)
+    box: Box = (1, 1, 1, 1)
 
     def mask(self, image: Image) -> Mask:
         """Return (H, W) bool, True in the box of the chart, of an image (H, W, 3).
@@ -73,7 +73,7 @@ class ChartScene(RawScene):
         if over > _OVER or not (0 < bottom >= top <= height and 0 < right >= left <= width):
             raise FormatError(
                 f"{self.path} is {width} × {height}, but its chart is in rows {top} to {bottom} and columns {left} to "
-                f"{right} of CC_coords; use the original files"
+                f"{right}; use the original files"
             )
         return box_mask((height, width), slice(max(top - 1, 0), bottom), slice(max(left - 1, 0), right))
 
@@ -101,14 +101,16 @@ def open_nus8(place: str, options: DataOptions, listed: Folder | None = None) ->
     scenes: list[RawScene] = []
     notes: list[str] = []
     levels: list[str] = []
+    sources: dict[str, list[str]] = {}
     for name, path in tables.items():
         if camera in (None, name):
-            found, note, level = _open_camera(folder, name, path, options)
+            found, note, level, source = _open_camera(folder, name, path, options)
             scenes.extend(found)
             published = _PUBLISHED.get(name, len(found))
             of = "" if len(found) == published else f" (published: {published})"
             notes.append(f"{name} {note}{of}")
             levels.append(f"{name} {level}")
+            sources.setdefault(source, []).append(name)
     black = "darkness_level of the camera's .mat, subtracted: " + ", ".join(level.split("/")[0] for level in levels)
     white = "from saturation_level of the camera's .mat: " + ", ".join(
         f"{level.split(' ')[0]} {level.split('/')[1]}" for level in levels
@@ -122,7 +124,8 @@ def open_nus8(place: str, options: DataOptions, listed: Folder | None = None) ->
             "images": ", ".join(notes),
             "black level": stated(options.black, black),
             "saturation": stated(options.saturation, white),
-            "mask": "the chart: CC_coords of the .mat, rows and columns counted from 1, both ends included",
+            "mask": "the chart: "
+            + "; ".join(f"of {', '.join(of)} by {how}" if len(sources) > 1 else how for how, of in sources.items()),
             "ground truth": "groundtruth_illuminants of the .mat",
         },
     )
@@ -134,13 +137,10 @@ def _tables(folder: Folder) -> Iterator[Path]:
         yield from (place.path / name for name in place.files if name.endswith(_ENDING) and len(name) > len(_ENDING))
 
 
-def _open_camera(root: Folder, camera: str, path: Path, options: DataOptions) -> tuple[list[RawScene], str, str]:
-    """Return the scenes of a camera, a note on their number, and "black/white" of its levels."""
+def _open_camera(root: Folder, camera: str, path: Path, options: DataOptions) -> tuple[list[RawScene], str, str, str]:
+    """Return the scenes of a camera, a note on their number, "black/white" of its levels, and the charts' source."""
     content = read_mat(path)
     lights = table(content, "groundtruth_illuminants", path, 3)
-    boxes = _boxes(content, path)
-    if len(boxes) != len(lights):
-        raise FormatError(f"{path} has {len(lights)} lights and {len(boxes)} CC_coords, expected as many; restore it")
     folder, images = _images(root, camera, path)
     names = strings(content, "all_image_names", path)
     if names is None:
@@ -151,6 +151,7 @@ def _open_camera(root: Folder, camera: str, path: Path, options: DataOptions) ->
             "without all_image_names in the .mat the images are taken in the order of their names; complete the copy"
         )
     kept, note = present(names, images, path.name, folder, options.partial)
+    boxes, source = charts(content, path, names, kept, root)
     black = scalar(content, "darkness_level", path) if options.black is None else options.black
     white = scalar(content, "saturation_level", path) if options.saturation is None else options.saturation
     if white <= black:
@@ -166,12 +167,7 @@ def _open_camera(root: Folder, camera: str, path: Path, options: DataOptions) ->
         )
         for number in kept
     ]
-    return scenes, note, f"{black:g}/{white:g}"
-
-
-def _boxes(content: Mapping[str, Any], path: Path) -> list[tuple[int, int, int, int]]:
-    rows: npt.NDArray[np.int64] = table(content, "CC_coords", path, 4).astype(np.int64)
-    return [(int(top), int(bottom), int(left), int(right)) for top, bottom, left, right in rows]
+    return scenes, note, f"{black:g}/{white:g}", source
 
 
 def _images(root: Folder, camera: str, path: Path) -> tuple[Path, dict[str, str]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.running import answer_scenes
+from evaluation.experiments.running import answer_scenes, fit_anew
 from evaluation.experiments.transfer.thumbnails import make_small
 from evaluation.learning.feature_learner import (
     FeatureLearner,
@@ -22,7 +22,6 @@ from evaluation.methods.method import Learner, Method
 from evaluation.results.answers import NO_PIXEL, SceneAnswer, read_light, results_of
 from evaluation.results.result import Result
 from evaluation.scene import Scene
-from foundation.errors import CropError, InputError
 
 Places = npt.NDArray[np.int64]
 """(P,) int64: which scenes of a data set, from 0."""
@@ -109,15 +108,7 @@ def fit_on(learner: AnyLearner, number: int, material: Material, places: Places,
     if isinstance(learner, FeatureLearner) and features is not None:
         return fit_extracted(learner, [features[place] for place in _list(places)], material.truths[places], seed)
     scenes = [material.scenes[place] for place in _list(places)]
-    try:
-        return learner.fit(scenes, seed)
-    except CropError:
-        raise
-    except Exception as error:
-        raise InputError(
-            f"{learner.name} fails to learn from {len(scenes)} images: {type(error).__name__}: {error}; correct it and "
-            "run the same command again"
-        ) from error
+    return fit_anew(learner, scenes, seed)
 
 
 def estimate_on(method: Method, number: int, material: Material, places: Places) -> list[SceneAnswer]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
@@ -122,3 +123,14 @@ def test_images_without_a_light_are_told(runs: tuple[str, str], capsys: pytest.C
     path.write_text("\n".join([*lines[:-1], lines[-1][:-1] + "1"]) + "\n")
     assert main(["compare", runs[0]]) == 0
     assert f"B <i> of {runs[0]} gave no light for 1 of 30 images; grey stands in" in capsys.readouterr().out
+
+
+def test_what_two_runs_did_otherwise_to_the_images_is_said(
+    runs: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for place, black in zip(runs, ("0", "500"), strict=True):
+        record = {"data_set": {"place": "photos"}, "treatment": {"black level": black, "mask": "none"}}
+        (Path(place) / "run.json").write_text(json.dumps(record))
+    assert main(["compare", *runs]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if "the runs differ in" in line]
+    assert told == ["the runs differ in their black level: 0 in the first, 500 in the second"]

@@ -131,3 +131,15 @@ def test_images_of_one_picture_stay_in_one_fold(
     with (tmp_path / "folds.csv").open() as stream:
         folds = [row["fold"] for row in csv.DictReader(stream)]
     assert len(set(zip(groups, folds, strict=True))) == 8
+
+
+def test_copies_in_several_folds_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images = np.random.default_rng(0).random((6, 8, 8, 3), np.float32)
+    images[4] = images[1]
+    names = [f"{number}.png" for number in range(6)]
+    np.savez(tmp_path / "set.npz", images=images, gt=np.ones((6, 3)), names=names)
+    (tmp_path / "folds.csv").write_text("image,fold\n" + "".join(f"{n}.png,{n % 2}\n" for n in range(6)))
+    assert main(["cv", "constant-light", f"{tmp_path}/set.npz", "--folds", f"{tmp_path}/folds.csv"]) == 0
+    assert "1 images are copies of images of other folds (4.png of 1.png)" in capsys.readouterr().out
+    assert main(["cv", "constant-light", f"{tmp_path}/set.npz", "--folds", "2"]) == 0
+    assert "copies" not in capsys.readouterr().out

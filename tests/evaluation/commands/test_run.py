@@ -104,3 +104,16 @@ def test_the_published_figures_of_plain_methods(capsys: pytest.CaptureFixture[st
         assert main(["run", str(path), "--methods", "shades-of-gray", "--error", "recovery", "--json"]) == 0
         row = next(row for row in json.loads(capsys.readouterr().out)["errors"] if row["error"] == "recovery")
         assert (row["mean"], row["median"]) == pytest.approx((4.51, 3.37), abs=0.06)
+
+
+def test_what_a_method_prints_is_no_part_of_the_json(
+    thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "chatty.py").write_text(
+        "class Chatty:\n    name = 'Chatty'\n\n    def estimate(self, image, saturation=None, mask=None):\n"
+        "        print('here')\n        return [1, 1, 1]\n"
+    )
+    assert main(["run", str(thumbnails), "--method", f"{tmp_path}/chatty.py:Chatty", "--json"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["errors"][0]["method"] == "Chatty"
+    assert printed.err.count("here") == 9

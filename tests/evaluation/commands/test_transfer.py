@@ -112,6 +112,17 @@ def test_the_same_command_gives_the_same_bytes(place: Path) -> None:
         assert path.read_bytes() == (place / "two" / path.name).read_bytes(), path.name
 
 
+def test_real_cross_validation_is_that_of_the_command_cv(place: Path) -> None:
+    assert main([*BASIC, "--out", "out"]) == 0
+    assert main(["cv", "own.py:Map", "real.npz", "--out", "cv"]) == 0
+    assert (place / "out" / "folds_0.csv").read_text() == (place / "cv" / "folds.csv").read_text()
+    ours, theirs = read_errors(place / "out"), read_errors(place / "cv")
+    for name in ("Map of the mean", "Constant light"):
+        np.testing.assert_allclose(
+            ours[f"{name}, real, cross-validated"].errors["recovery"], theirs[name].errors["recovery"], atol=2e-6
+        )
+
+
 def test_folds_are_read(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (place / "folds.csv").write_text("image,fold\n" + "".join(f"real_{n:02d},{n % 2}\n" for n in range(30)))
     assert main([*BASIC, "--folds", "folds.csv", "--out", "out", "--statistics", "none"]) == 0

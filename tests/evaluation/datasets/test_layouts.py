@@ -54,6 +54,19 @@ def test_a_generated_dataset_keeps_the_contract(dataset: Path) -> None:
     contract.check(open_scenes(dataset))
 
 
+OWN = {"generated", "thumbnails", "folder"}
+"""Layouts whose readers have met more than made-up copies, or that are the user's own."""
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_what_was_never_tried_on_a_published_copy_is_said_with_results(name: str, place_of: Place) -> None:
+    data = open_scenes(place_of(name), options=options_of(COPIES[name]))
+    if data.layout in OWN:
+        assert "reader" not in data.treatment
+    else:
+        assert data.treatment["reader"].startswith("not verified against a published copy; compare one image")
+
+
 def test_every_layout_has_a_copy() -> None:
     assert {copy.layout for copy in COPIES.values()} == set(LAYOUTS) - {"generated"}
 

@@ -135,3 +135,16 @@ def test_an_image_with_an_ending_left_out_must_be_one(copy: Path) -> None:
     write_table(copy, "a,1,1,1")
     with pytest.raises(FormatError, match=r"a\.png and a\.npy|a\.npy and a\.png"):
         open_scenes(copy)
+
+
+def test_two_names_of_one_file_are_refused(copy: Path) -> None:
+    # As two images they would come to lie in two folds: tested on what was trained on.
+    write_table(copy, "a,1,1,1", "./a.png,1,1,1")
+    with pytest.raises(FormatError, match=r"\./a\.png is the file of a too"):
+        open_scenes(copy)
+
+
+def test_two_columns_of_one_name_are_refused(copy: Path) -> None:
+    write_table(copy, "a,1,1,1,2", head="image,r,g,b,r")
+    with pytest.raises(FormatError, match="two columns 'r'"):
+        open_scenes(copy)

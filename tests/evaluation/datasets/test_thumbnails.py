@@ -38,6 +38,9 @@ def test_values(tmp_path: Path) -> None:
         ({"images": np.ones((2, 4, 5))}, r"images \(2, 4, 5\)"),
         ({"names": ["a"]}, r"names \(1,\)"),
         ({"gt": [["a", "b", "c"]] * 2}, "is no archive of thumbnails"),
+        ({"names": ["a", "a"]}, "has two images named 'a'"),
+        ({"names": ["a", "b\n"]}, r"has an image named 'b\\n'"),
+        ({"images": np.full((2, 4, 5, 3), np.nan, np.float32)}, "a has pixels that are not finite"),
     ],
 )
 def test_what_is_no_such_archive(tmp_path: Path, change: dict[str, npt.ArrayLike], message: str) -> None:
@@ -46,6 +49,16 @@ def test_what_is_no_such_archive(tmp_path: Path, change: dict[str, npt.ArrayLike
     )
     with pytest.raises(FormatError, match=message):
         open_scenes(tmp_path / "set.npz")
+
+
+def test_values_below_black_are_black_and_counted(tmp_path: Path) -> None:
+    images = np.ones((2, 4, 5, 3), np.float32)
+    images[1, 0, 0] = [-1, 2, 3]
+    np.savez(tmp_path / "set.npz", images=images, gt=SOME["gt"], names=[b"a", b"b"])
+    found = open_scenes(tmp_path / "set.npz")
+    assert [scene.name for scene in found.scenes] == ["a", "b"]
+    assert found.scenes[1].read()[0][0, 0].tolist() == [0, 2, 3]
+    assert "1 values below it are taken as 0" in found.treatment["black level"]
 
 
 @pytest.mark.parametrize("path", available("benchmark/nus_canon_600d_64x64.npz"))

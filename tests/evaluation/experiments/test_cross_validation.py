@@ -99,3 +99,64 @@ def test_what_cannot_be_validated_is_refused() -> None:
     dark = replace(SCENES[7], truth=np.array([0.0, 1, 1]))
     with pytest.raises(InputError, match="the ground truth of scene 7 is 0 1 1"):
         cross_validate([*SCENES[:7], dark, *SCENES[8:]], [Memory()], FOLDS)
+
+
+class Hoarder:
+    """A class that keeps everything that it was ever fitted to in itself, and returns itself."""
+
+    name = "Hoarder"
+
+    def __init__(self) -> None:
+        self.known: dict[bytes, Any] = {}
+
+    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Hoarder:
+        self.known |= {np.asarray(scene.read()[0]).tobytes(): scene.truth for scene in scenes}
+        return self
+
+    def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> Any:
+        return self.known.get(np.asarray(image).tobytes())
+
+
+def test_a_class_that_returns_itself_begins_each_fold_anew() -> None:
+    hoarder = Hoarder()
+    (result,) = cross_validate(SCENES, [hoarder], FOLDS)
+    assert result.guessed.all()
+    assert not hoarder.known
+
+
+class Answers:
+    """Learns nothing and answers what it is told to."""
+
+    name = "Answers"
+
+    def __init__(self, value: object) -> None:
+        self.value = value
+
+    def fit(self, scenes: Sequence[Scene], seed: int = 0) -> Any:
+        if isinstance(self.value, BaseException):
+            raise self.value
+        return None if self.value == "no method" else self
+
+    def estimate(self, image: Any, saturation: float | None = None, mask: Any = None) -> Any:
+        image[:] = 0
+        return self.value
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (1.0, "Answers fails on .*returned an array of shape"),
+        ("no method", "Answers returns NoneType from fit, expected a method"),
+        (RuntimeError("no data"), "Answers fails to learn from 16 images: RuntimeError: no data"),
+        (SystemExit(0), "Answers fails to learn from 16 images: SystemExit: 0"),
+    ],
+)
+def test_what_a_class_does_wrong_is_told_with_its_name(value: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        cross_validate(SCENES, [Answers(value)], FOLDS)
+
+
+def test_no_light_is_grey_and_the_images_stay_as_they_are() -> None:
+    (result,) = cross_validate(SCENES, [Answers((-1, 1, 1))], FOLDS)
+    assert result.guessed.all()
+    assert SCENES[0].image.any()

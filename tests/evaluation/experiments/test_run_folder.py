@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from evaluation.datasets import open_scenes
 from evaluation.experiments import run_folder
 from evaluation.experiments.run_folder import describe_run, run_methods, write_run
 from evaluation.experiments.running import evaluate
@@ -213,6 +215,28 @@ def test_a_model_judged_on_what_it_was_trained_on_is_said_to_be() -> None:
     record = provenance_of(data, 0, SystemClock())
     learner = standard_learners()["regression-trees"]
     model = StoredMethod(learner, Flat(), data.name, record)
-    assert run_methods(other, [model]).notes == ()
+    # Neither names nor lights tell whether a part of a data set was trained on.
+    assert "trained on 3 images of a data set of the same name" in run_methods(other, [model]).notes[0]
+    assert run_methods(replace(other, name="Others"), [model]).notes == ()
     (note,) = run_methods(data, [model]).notes
     assert note.startswith(f"{learner.name} (trained on Walls) was trained on these very images")
+
+
+def test_answers_for_other_pixels_of_the_same_images_are_not_taken(tmp_path: Path) -> None:
+    images = np.random.default_rng(0).random((4, 8, 9, 3), np.float32)
+
+    def thumbnails(pixels: npt.NDArray[np.float32]) -> SceneSet:
+        np.savez(tmp_path / "set.npz", images=pixels, gt=np.ones((4, 3)), names=np.array(list("abcd")))
+        return open_scenes(tmp_path / "set.npz")
+
+    def kill(count: int, _: int) -> None:
+        if count == 2:
+            raise Killed
+
+    with pytest.raises(Killed):
+        run_methods(thumbnails(images), METHODS, tmp_path / "out", on_scene=kill)
+    with pytest.raises(InputError, match="its data set differ"):
+        run_methods(thumbnails(images[..., ::-1]), METHODS, tmp_path / "out")
+    run_methods(thumbnails(images), METHODS, tmp_path / "out")
+    run_methods(thumbnails(images), METHODS, tmp_path / "undisturbed")
+    assert content(tmp_path / "out") == content(tmp_path / "undisturbed")

@@ -70,6 +70,9 @@ def test_what_is_no_light_is_counted_named_and_taken_as_grey(value: object, caus
         (SystemExit(0), r"SystemExit: 0 \(test_running\.py, line \d+\)"),
         (KeyError("where"), r"KeyError: 'where' \(test_running\.py, line \d+\)"),
         (ValueError("no good"), r"ValueError: no good \(test_running\.py, line \d+\)"),
+        (np.array([1 + 1j, 1, 1]), "returned ndarray, expected three real numbers"),
+        ([True, True, False], "returned list, expected three real numbers"),
+        (np.ma.masked_array([1.0, 1, 1], [False, False, True]), "returned MaskedArray, expected three real numbers"),
     ],
 )
 def test_a_mistake_in_a_method_ends_the_run_with_its_name(value: object, message: str) -> None:

@@ -177,3 +177,19 @@ def test_an_archive_with_other_members_is_refused(saved: Path) -> None:
     saved.write_bytes(content.getvalue())
     with pytest.raises(FormatError):
         load_model(saved)
+
+
+def test_what_python_cannot_unpack_is_refused(saved: Path) -> None:
+    content = bytearray(saved.read_bytes())
+    # Bit 5 of the flags of the first file, in its head and in the directory: compressed patched data.
+    content[content.index(b"PK\x03\x04") + 6] |= 1 << 5
+    content[content.index(b"PK\x01\x02") + 8] |= 1 << 5
+    saved.write_bytes(content)
+    with pytest.raises(FormatError, match=r"is no whole model file: .*patched data"):
+        load_model(saved)
+
+
+def test_branches_that_are_no_whole_numbers_are_refused(saved: Path) -> None:
+    rewrite(saved, lambda arrays, _: arrays.update(left=arrays["left"].astype(np.float32)))
+    with pytest.raises(FormatError, match="branches that are no whole numbers"):
+        load_model(saved)

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evaluation.methods.gray_edge import GrayEdge
+from evaluation.methods.green_stability import FAMILIES, family, family_names
 from evaluation.methods.method import Learner
 from evaluation.methods.naming import find_method
 from evaluation.methods.patchwise import PatchwiseMethod
@@ -63,6 +65,23 @@ def test_a_class_of_a_module() -> None:
     assert find_method("evaluation.methods.pca:BrightDark").name == "PCA bright and dark"
 
 
+@pytest.mark.parametrize("name", FAMILIES)
+def test_settings_of_a_family_are_found_by_their_names(name: str) -> None:
+    assert [find_method(text) for text in family_names(name)] == list(family(name))
+
+
+def test_parameters_in_a_name() -> None:
+    assert find_method("gray-edge-1:sigma=2.5") == GrayEdge("1st-order Gray-Edge (p=1, σ=2.5)", 1, 1, 2.5)
+    assert find_method("gray-edge-1:sigma=2:p=4") == find_method("gray-edge-1:p=4:sigma=2")
+    assert find_method("shades-of-gray:p=inf").name == "Shades-of-Gray (p=inf)"
+    assert find_method("general-gray-world:p=2@90").name == "General Gray-world (p=2, σ=9) at 90 px"
+    image = np.random.default_rng(1).uniform(0, 1, (20, 30, 3))
+    found = find_method("shades-of-gray:p=6")
+    assert not isinstance(found, Learner)
+    light = (image**6).mean(axis=(0, 1)) ** (1 / 6)
+    np.testing.assert_allclose(found.estimate(image), light / np.linalg.norm(light))
+
+
 def test_what_is_done_around_a_method(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(TEN_LINES)
     assert find_method("gray-edge-2@360") == ResizedMethod(standard_methods()["gray-edge-2"], 360)
@@ -80,6 +99,15 @@ def test_what_is_done_around_a_method(tmp_path: Path) -> None:
         ("gray-world@0", "gray-world@0: expected a number above 0"),
         ("gray-world@big", "'gray-world@big' is no method"),
         ("gray-wurld@90", "'gray-wurld' is no method"),
+        ("gray-world:p=2", "gray-world takes no parameters; those that do are shades-of-gray, general-gray-world"),
+        ("shades-of-gray:p=4:sigma=2", "'sigma=2' is no parameter, expected p=NUMBER, once each"),
+        ("gray-edge-1:p=4,sigma=2", "'p=4,sigma=2' is no parameter, expected p=NUMBER and sigma=NUMBER"),
+        ("gray-edge-1:p=4:p=5", "'p=5' is no parameter"),
+        ("gray-edge-1:", "'' is no parameter"),
+        ("gray-edge-1:p=nan", "'p=nan' is no parameter"),
+        ("gray-edge-1:p=0.5", "p 0.5 and sigma 6 make no method"),
+        ("gray-edge-1:sigma=0", "p 1 and sigma 0 make no method"),
+        ("gray-edge-1:sigma=inf", "up to 1000 px"),
         ("gray-wurld", "'gray-wurld' is no method; the methods are white-patch, gray-world"),
         ("", "is no method"),
         (":Class", "names no method; expected"),
@@ -103,6 +131,11 @@ def test_what_is_not_there(text: str, message: str) -> None:
         ("def f(:\n", "fails while it is loaded: line 1: "),
         ("x = 1\nimport no_such_thing\n", "fails while it is loaded: line 2: ModuleNotFoundError: .*no_such_thing"),
         ("x = 1\n\n1 / 0\n", "line 3: ZeroDivisionError"),
+        ("import sys\n\nsys.exit(0)\n", "fails while it is loaded: line 3: SystemExit: 0"),
+        (
+            "class Own:\n    def fit(self, scenes): ...\n\n    @property\n    def name(self):\n        return 1 / 0\n",
+            "the name of .*own.py:Own fails: line 6: ZeroDivisionError",
+        ),
         ("class Own:\n    def __init__(self):\n        raise OSError('no weights')\n", "line 3: OSError: no weights"),
     ],
 )

@@ -78,3 +78,9 @@ def test_figures_take_the_page_s_colours_and_are_the_same_each_time() -> None:
 def test_what_is_no_picture_is_refused() -> None:
     with pytest.raises(ValueError, match="expected PNG, JPEG or SVG"):
         figure_part(b"GIF89a", "")
+
+
+def test_an_interval_is_not_broken_over_two_lines() -> None:
+    shown = table_part(Table("Intervals", ("Method", "Mean"), (("a – b", "2.30 – 3.41"),))).html
+    assert "2.30\u00a0–\u00a03.41" in shown
+    assert "a – b" in shown

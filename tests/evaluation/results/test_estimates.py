@@ -70,6 +70,7 @@ def test_a_name_without_extension_that_two_images_have_is_neither(tmp_path: Path
         ("image,r,g,b\na/one,1,one,1\n", "line 2"),
         ("image,r,g,b\na/one,0,68,0,85,0,22\n", "line 2: 7 fields where the first line has 4"),
         ("image,r,g,b,r,g,b\na/one,1,1,1,2,2,2\n", "columns of the same name"),
+        ('image,r,g,b\n"a/one,1,2,3\n', "is no CSV text"),
     ],
 )
 def test_what_is_no_table_is_refused(tmp_path: Path, text: str, message: str) -> None:

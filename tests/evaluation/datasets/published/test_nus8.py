@@ -103,7 +103,7 @@ def test_a_chart_outside_of_the_image_is_refused(copy: Path) -> None:
         ({"darkness_level": None}, "expected darkness_level among them"),
         ({"saturation_level": [[1, 2]]}, r"saturation_level is \[\[1, 2\]\], expected one number"),
         ({"saturation_level": [[100]]}, "saturation 100 is not above black 128"),
-        ({"CC_coords": np.ones((3, 4))}, "2 lights and 3 CC_coords"),
+        ({"CC_coords": np.ones((3, 4))}, "2 images and 3 CC_coords"),
         ({"groundtruth_illuminants": np.ones((2, 2))}, r"groundtruth_illuminants is \(2, 2\), expected"),
         ({"groundtruth_illuminants": np.zeros((2, 3))}, "row 1 of groundtruth_illuminants: 0 0 0 is no light"),
         ({"all_image_names": np.ones((2, 1))}, "all_image_names holds .*, expected names of images"),
@@ -120,4 +120,78 @@ def test_what_is_wrong_in_a_table_is_named(copy: Path, variables: dict[str, obje
 def test_a_damaged_table(copy: Path) -> None:
     (copy / "SonyA57" / "SonyA57_gt.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
     with pytest.raises(FormatError, match=r"SonyA57_gt\.mat cannot be read"):
+        open_scenes(copy)
+
+
+PATCHES = "\n1.5,3.5,3.5,1.5\n1.5,1.5,2.5,2.5" * 24
+"""Corners of 24 patches, which stand below the box of the chart."""
+
+
+def write_masks(copy: Path, first: str, second: str) -> Path:
+    folder = copy / "SonyA57" / "CHECKER"
+    folder.mkdir()
+    for number, text in ((1, first), (3, second)):
+        (folder / f"SonyA57_{number:04d}_mask.txt").write_text(text + PATCHES)
+        (folder / f"SonyA57_{number:04d}_color.txt").write_text("1,2,3\n" * 24)
+    return folder
+
+
+def test_text_files_give_the_chart_where_the_table_does_not(copy: Path) -> None:
+    change(copy / "SonyA57" / "SonyA57_gt.mat", CC_coords=None)
+    # x from 5.7 to 9.9 and y from 2.2 to 4.4, counted from 1: columns 6 to 10 and rows 2 to 4.
+    write_masks(copy, "5.7,2.2,4.2,2.2", "1,1,0.4,7")
+    data = open_scenes(copy)
+    first, second = (scene.read()[1] for scene in data.scenes[2:])
+    assert first is not None
+    assert second is not None
+    expected = np.zeros((8, 10), bool)
+    expected[1:4, 5:10] = True
+    np.testing.assert_array_equal(first, expected)
+    assert np.argwhere(second).tolist() == [[row, 0] for row in range(8)]
+    assert data.treatment["mask"] == (
+        "the chart: of NikonD5200 by CC_coords of the .mat, rows and columns counted from 1, both ends included; of "
+        "SonyA57 by CHECKER/…_mask.txt, first line, as the .mat has no CC_coords"
+    )
+
+
+def test_without_any_chart_nothing_is_opened(copy: Path) -> None:
+    change(copy / "SonyA57" / "SonyA57_gt.mat", CC_coords=None)
+    folder = write_masks(copy, "5.7,2.2,4.2,2.2", "1,1,0.4,7")
+    (folder / "SonyA57_0003_mask.txt").unlink()
+    with pytest.raises(FormatError, match=r"no CC_coords, and 1 of its images have no CHECKER.*\(SonyA57_0003\)"):
+        open_scenes(copy)
+    (copy / "SonyA57" / "SonyA57_0003.PNG").unlink()  # Of an image that is not there no chart is needed.
+    assert len(open_scenes(copy, options=DataOptions(partial=True)).scenes) == 3
+
+
+def test_text_files_that_agree_are_said_and_the_table_is_applied(copy: Path) -> None:
+    write_masks(copy, "5.7,2.2,3.2,2.2", "1,1,0.4,7")
+    data = open_scenes(copy / "SonyA57")
+    mask = data.scenes[0].read()[1]
+    assert mask is not None
+    assert mask.sum() == 3 * 5  # The table's: the text file ends a column earlier.
+    assert "(2 of 2 held against CHECKER/…_mask.txt: edges at most 1 px apart)" in data.treatment["mask"]
+
+
+def test_text_files_that_have_the_chart_elsewhere_are_an_error_naming_both(copy: Path) -> None:
+    write_masks(copy, "2.2,5.7,2.2,4.2", "1,1,0.4,7")  # Rows and columns in each other's place.
+    with pytest.raises(FormatError, match=r"columns 2 to 4, but CC_coords of .*, row 1, in") as told:
+        open_scenes(copy)
+    for name in ("SonyA57_0001_mask.txt", "SonyA57_gt.mat"):
+        assert name in str(told.value)
+
+
+def test_text_files_of_all_cameras_in_one_folder(copy: Path) -> None:
+    change(copy / "SonyA57" / "SonyA57_gt.mat", CC_coords=None)
+    write_masks(copy, "6,2,4,2", "1,1,0.4,7").rename(copy / "CHECKER")
+    mask = open_scenes(copy).scenes[2].read()[1]
+    assert mask is not None
+    assert mask.sum() == 3 * 5
+
+
+@pytest.mark.parametrize("text", ["", "1,2,3", "1,2,0,4", "1,2,nan,4", "1e308,1,1e308,4", "left,right"])
+def test_a_damaged_text_file_is_named(copy: Path, text: str) -> None:
+    folder = write_masks(copy, "5.7,2.2,3.2,2.2", "1,1,0.4,7")
+    (folder / "SonyA57_0003_mask.txt").write_text(text)
+    with pytest.raises(FormatError, match=r"SonyA57_0003_mask\.txt, line 1: "):
         open_scenes(copy)

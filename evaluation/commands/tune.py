@@ -1,0 +1,84 @@
+"""`evaluate tune`: parameters of a statistics method for the images of a data set, without their ground truths."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from evaluation.commands.data_options import DataReading, with_data_options
+from foundation.console import EXIT_CODES
+
+FAMILIES_HELP = "shades-of-gray, general-gray-world, gray-edge-1 or gray-edge-2"
+"""The families, for the help."""
+
+HELP = f"""Choose a method's parameters on images whose lights nobody knows, by the green stability assumption.
+
+Reads DATA, a data set of any layout that evaluate run reads: images of one camera under many lights. Lights differ much
+in red and blue chromaticity and little in green, so the parameters are taken whose estimates spread least in green
+(Banić, Lončarić 2018; a reconstruction). FAMILY is {FAMILIES_HELP}; with @PIXELS behind it on images shrunk to that
+size: gray-edge-2@360.
+
+Ground truths have no part in the choice; --errors shows errors beside it. Prints every setting, the chosen one first;
+evaluate run DATA --method SETTING evaluates one. Writes nothing unless asked with --out.
+
+{EXIT_CODES}
+"""
+
+
+@with_data_options
+def tune(
+    family: Annotated[str, typer.Argument(metavar="FAMILY", help=f"{FAMILIES_HELP}, or one of these with @PIXELS.")],
+    data: Annotated[
+        str, typer.Argument(metavar="DATA", help="Folder or file of the data set, or its URL.", show_default=False)
+    ],
+    *,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.csv", help="Write the settings to this new file.", show_default=False),
+    ] = None,
+    errors: Annotated[
+        Literal["reproduction", "recovery"] | None,
+        typer.Option(help="Show these errors beside the criterion; the choice stays without them.", show_default=False),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Threads, one image each; no number depends on it. \\[default: one a processor]",
+            min=1,
+            show_default=False,
+        ),
+    ] = None,
+    reading: DataReading,
+) -> None:
+    """Choose a method's parameters on a data set."""
+    from evaluation.experiments.tuning import settings_of, tune_family, tuning_rows, tuning_table
+    from evaluation.reports.terminal import print_table
+    from evaluation.results.tables import table_to_csv
+    from foundation.console import orderly_end, progress
+    from foundation.files import require_free_file, write_whole
+    from foundation.processors import processor_count
+
+    settings_of(family)  # A family that is none is told before a data set is opened.
+    if out is not None:
+        require_free_file(out, "the settings")
+    found = reading.open(data)
+    count, threads = len(found.scenes), workers or processor_count()
+    with orderly_end(), progress("images") as advance:
+        steps = iter(range(1, count + 1))
+        tuned = tune_family(family, found.name, found.scenes, errors, threads, lambda: advance(next(steps), count))
+    if out is not None:
+        write_whole(out, table_to_csv(tuning_rows(tuned)))
+    print_table(tuning_table(tuned))
+    best = tuned.settings[0]
+    print(f"chosen: {best.text}, whose estimates spread least in green chromaticity ({best.spread:.5f})")
+    print(
+        "ground truths: not used for the choice"
+        + (", shown beside it only" if errors else "")
+        + "; on other images the setting is evaluated as --method "
+        + best.text
+    )
+    for what, how in found.treatment.items():
+        print(f"{what}: {how}")
