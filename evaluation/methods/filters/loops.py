@@ -189,8 +189,8 @@ def sum_powers(
     Parameters
     ----------
     values
-        (rows, Q) uint16, float32 or float64, not below 0: rows of interleaved pixels, or parts of them; those beyond the
-        image do not count.
+        (rows, Q) uint16, float32 or float64, not below 0: rows of interleaved pixels, or parts of them. What lies
+        beyond the image does not count.
     free
         (H, W) or (0, 0) bool, see above; that of the whole image.
     border
