@@ -23,7 +23,9 @@ METHOD_HELP = (
 
 
 def choose_methods(texts: Iterable[str]) -> list[Method]:
-    """Return the methods that texts name, each once, in their order; `all` are those of `standard_methods`.
+    """Return the methods that texts name, each once, in their order.
+
+    `standard` are the seven of `STANDARD`, `all` every one of `standard_methods`.
 
     Raises
     ------
@@ -37,11 +39,12 @@ def choose_methods(texts: Iterable[str]) -> list[Method]:
     >>> [method.name for method in choose_methods(["gray-world", "white-patch", "gray-world"])]
     ['Gray-world', 'White-Patch']
     """
-    from evaluation.methods.standard import standard_methods
+    from evaluation.methods.standard import STANDARD, standard_methods
 
+    groups = {"standard": STANDARD, "all": tuple(standard_methods())}
     wanted: list[str] = []
     for text in texts:
-        wanted += standard_methods() if text.strip().lower() == "all" else [text.strip()]
+        wanted += groups.get(text.strip().lower(), (text.strip(),))
     return [_method(text) for text in dict.fromkeys(wanted)]
 
 

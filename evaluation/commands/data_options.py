@@ -1,6 +1,6 @@
 """The options of every command that reads a data set: which layout, which part of it, which levels.
 
-A command has one parameter `reading: DataReading`, and `@with_data_options` puts the options in its place:
+A command has one parameter `reading: DataReading`, and `@with_data_options` puts the options in its place::
 
     @with_data_options
     def run(dataset: Annotated[str, typer.Argument()], *, reading: DataReading) -> None:

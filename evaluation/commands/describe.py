@@ -18,8 +18,8 @@ HELP = f"""Describe the images and lights of a data set, and hold them beside an
 Reads DATA, a data set of any layout that evaluate run reads, or a STATS.json written by --out. Figures: luminance
 percentiles, exposure, clipping, chroma spread, near-grey share, grey-world offsets, edges, noise, and the distribution
 of the lights. Scenes are seen at 64 x 64 cells at most and with the light divided out, so sets of different sizes and
-units compare. Masked and clipped pixels are left out. The options of reading are DATA's: where the other set needs some
-too, write its STATS.json first and give that to --against.
+units compare. Masked and clipped pixels are left out. The options of reading are DATA's, the --against ones the other
+set's; where that needs levels of its own, write its STATS.json first and give that to --against.
 
 Prints tables, and with --against one sentence for each figure: within 25 % or not. Writes nothing unless asked with
 --out or --report.
@@ -49,6 +49,18 @@ def describe(
     against_layout: Annotated[
         str | None, typer.Option(metavar="NAME", help="Layout of the data set beside it.", show_default=False)
     ] = None,
+    against_camera: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Camera of the data set beside it.", show_default=False)
+    ] = None,
+    against_subset: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Part of the data set beside it.", show_default=False)
+    ] = None,
+    against_truth: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Ground truth of the data set beside it.", show_default=False)
+    ] = None,
+    against_partial: Annotated[
+        bool, typer.Option("--against-partial", help="Take what is there of the data set beside it.")
+    ] = False,
     cells: Annotated[int, typer.Option(help="Cells a side that images are reduced to; 0: none.", min=0)] = 64,
     seed: Annotated[int, typer.Option(help="Of the bootstrap.", min=0)] = 0,
     workers: Annotated[
@@ -64,6 +76,7 @@ def describe(
     from evaluation.experiments.describing.against import compare_figures, sentence
     from evaluation.experiments.describing.statistics_json import statistics_to_json
     from evaluation.reports.terminal import print_table
+    from foundation.errors import InputError
     from foundation.files import require_free_file, write_whole
     from foundation.processors import processor_count
 
@@ -71,8 +84,13 @@ def describe(
         if path is not None:
             require_free_file(path, what)
     threads = workers or processor_count()
+    beside = DataReading(against_layout, against_camera, against_subset, against_truth, partial=against_partial)
+    if against is None and beside != DataReading():
+        raise InputError(
+            "options of --against are given, but no data set beside DATA; add --against, or leave them out"
+        )
     one = _described(data, reading, cells, threads)
-    other = None if against is None else _described(against, DataReading(against_layout), cells, threads)
+    other = None if against is None else _described(against, beside, cells, threads)
     if other is not None and one.name == other.name:
         one, other = (replace(made, name=f"{made.name} ({place})") for made, place in ((one, data), (other, against)))
     if other is None:
@@ -98,8 +116,14 @@ def _described(place: str, reading: DataReading, cells: int, workers: int) -> Da
 
     from evaluation.experiments.describing import describe
     from evaluation.experiments.describing.statistics_json import read_statistics
+    from foundation.errors import InputError
 
     if reading.layout is None and place.endswith(".json") and Path(place).is_file():
+        if reading != DataReading():
+            raise InputError(
+                f"{place} is a description, whose images were read already, so --{reading.options.given[0]} has no "
+                "meaning for it; leave the option out, or name the data set"
+            )
         return read_statistics(place)
     data = reading.open(place)
     with Progress(console=Console(stderr=True)) as progress:

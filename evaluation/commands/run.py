@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 HELP = f"""Estimate the light of every image of a data set and sum up the errors.
 
 Reads DATA: a dataset made by generate (folder or URL), or a real data set in the layout of its authors. Methods are the
-suite's own, classes of yours, trained models, and estimates that any other program has made; with none named, all of
-the suite's. Prints a table in the paper's order: mean, median, trimean, best 25 %, worst 25 % and Avg., their geometric
-mean, all in degrees; where several lights fall on images, the errors by pixel and region too; and what was done to the
-images. Writes nothing unless asked with --out, --csv or --images.
+suite's own, classes of yours, trained models, and estimates that any other program has made; with none named, the
+seven standard ones. Prints a table in the paper's order: mean, median, trimean, best 25 %, worst 25 % and Avg., their
+geometric mean, all in degrees; where several lights fall on images, the errors by pixel and region too; and what was
+done to the images. Writes nothing unless asked with --out, --csv or --images.
 
 A run with --out that was stopped goes on when the same command is given again.
 
@@ -42,8 +42,10 @@ def run(
         str | None,
         typer.Option(
             metavar="LIST",
-            help="Methods between commas, or all: white-patch, gray-world, shades-of-gray, general-gray-world, "
-            "gray-edge-1, gray-edge-2, pca. \\[default: all, unless --method or --estimates is given]",
+            help="Methods between commas. standard: white-patch, gray-world, shades-of-gray, general-gray-world, "
+            "gray-edge-1, gray-edge-2, pca. all: these and improved-white-patch, color-sparrow, "
+            "local-surface-reflectance, grayness-index, mean-shifted-gray-pixel, opencv-grayworld, of which some take "
+            "seconds on large images. \\[default: standard, unless --method or --estimates is given]",
             show_default=False,
         ),
     ] = None,
@@ -104,7 +106,7 @@ def run(
 
     listed = [text.strip() for text in methods.split(",")] if methods is not None else []
     if methods is None and not method and not estimates:
-        listed = ["all"]
+        listed = ["standard"]
     chosen = choose_methods([*listed, *(method or [])])
     _require_free(csv, images, out)
     found = reading.open(data)

@@ -11,11 +11,14 @@ from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
     import numpy.typing as npt
 
     from evaluation.experiments.transfer.material import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
+    from evaluation.experiments.transfer.rows import TransferRow
     from evaluation.methods.method import Method
     from evaluation.scene import SceneSet
 
@@ -145,6 +148,7 @@ def transfer(
             *(tested.scenes, plan.training, learners, drawn, wanted, references),
             *(side, threads, lambda: advance(next(steps), count)),
         )
+    plan = replace(plan, notes=(*plan.notes, *_suspicions(tested, rows)))
     figures = figures_of(rows, error)
     settings: dict[str, Any] = {
         "methods": [describe_method(learner) for learner in learners],
@@ -206,6 +210,18 @@ def _folds(text: str | None, test: SceneSet, seeds: int) -> tuple[npt.NDArray[np
     if wanted.isdecimal():
         return tuple(draw_scene_folds(test.scenes, int(wanted), seed) for seed in range(seeds))
     return (read_folds(Path(wanted), [scene.name for scene in test.scenes]),) * seeds
+
+
+def _suspicions(test: SceneSet, rows: Sequence[TransferRow]) -> tuple[str, ...]:
+    """Return what the reader is told where training and test images have their channels in another order."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from evaluation.experiments.suspicions import suspicions
+
+    results = [replace(row.results[0], method=f"{row.method}, {row.training}") for row in rows]
+    return suspicions([scene.name for scene in test.scenes], np.stack([scene.truth for scene in test.scenes]), results)
 
 
 def _sizes(test: SceneSet, plan: TransferPlan, side: int | None) -> str:

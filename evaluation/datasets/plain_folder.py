@@ -1,5 +1,7 @@
 """A user's own images: a folder with a table of their lights.
 
+It lies so::
+
     gt.csv              image,r,g,b: one row an image; its path from the table's folder, with or without the ending
                         columns black, saturation: levels of the image, in the units of its file, optional
                         column mask: a picture that is not 0 where a pixel must not be used, optional

@@ -1,5 +1,7 @@
 """LSMI: 7486 images of 2700 scenes under one, two or three lights, with three cameras, and the share of each light.
 
+It lies so::
+
     galaxy/meta.json         of each place: NumOfLights, MCCCoord (mcc1 … mcc3: four corners), Light1 … (r, 1, b)
     galaxy/split.json        places by part: two_illum_train, two_illum_val, two_illum_test, three_illum_…
     galaxy/Place1/Place1_12.tiff   the place under lights 1 and 2: 16 bits, half-size raw, black not subtracted

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
+from evaluation.cli import main
 from evaluation.commands.choosing import choose_estimates, choose_learners, choose_methods
 from evaluation.learning.standard import standard_learners
 from evaluation.methods import standard_methods
+from evaluation.methods.standard import STANDARD
 from foundation.errors import FormatError, InputError
 
 
@@ -19,6 +22,26 @@ def test_all_are_all_and_each_is_chosen_once() -> None:
     assert [learner.name for learner in choose_learners(["all"])] == [
         learner.name for learner in standard_learners().values()
     ]
+
+
+def test_the_standard_ones_are_seven_and_what_a_run_takes_unasked(
+    dataset: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chosen = choose_methods([" Standard"])
+    assert [method.name for method in chosen] == [standard_methods()[name].name for name in STANDARD]
+    assert len(chosen) == 7
+    assert len(choose_methods(["standard", "all", "pca"])) == len(standard_methods())
+    assert main(["run", str(dataset), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["errors"]
+    assert list(dict.fromkeys(row["method"] for row in rows)) == [method.name for method in chosen]
+
+
+def test_the_help_names_every_method(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("COLUMNS", "1000")
+    assert main(["run", "--help"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert f"standard: {', '.join(STANDARD)}. all: these and " in printed
+    assert ", ".join(name for name in standard_methods() if name not in STANDARD) in printed
 
 
 LEARNER = """

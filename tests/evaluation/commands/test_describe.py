@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from evaluation.cli import main
+from tests.evaluation.datasets.made_up import nus8
 
 
 @pytest.fixture
@@ -66,6 +67,34 @@ def test_sets_of_one_name_are_told_apart(thumbnails: str, capsys: pytest.Capture
     printed = capsys.readouterr().out
     assert f"in real [1] ({thumbnails}), " in printed
     assert f"in real [1] ({stats}): 1.00 times as much" in printed
+
+
+def test_options_of_the_set_beside(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    nus8(tmp_path / "nus")
+    place = str(tmp_path / "nus")
+    (tmp_path / "nus" / "SonyA57" / "SonyA57_0003.PNG").unlink()
+    assert main(["describe", str(dataset), "--against", place, "--against-camera", "SonyA57"]) == 2
+    assert "SonyA57_0003" in capsys.readouterr().err
+    options = ["--against-camera", "SonyA57", "--against-partial"]
+    assert main(["describe", str(dataset), "--against", place, *options]) == 0
+    printed = capsys.readouterr().out
+    assert "│ made        │     16 │" in printed
+    assert "│ NUS SonyA57 │      1 │" in printed  # Neither Nikon's two images nor the one that is missing.
+    assert main(["describe", str(dataset), "--against", str(dataset), "--against-subset", "test"]) == 2
+    assert "--subset has no meaning for" in capsys.readouterr().err
+
+
+def test_options_that_nothing_is_read_by_are_refused(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["describe", str(dataset), "--against-subset", "test"]) == 2
+    assert "no data set beside DATA; add --against" in capsys.readouterr().err
+    stats = tmp_path / "stats.json"
+    assert main(["describe", str(dataset), "--out", str(stats)]) == 0
+    for words in (["--camera", "1D"], ["--against", str(stats), "--against-camera", "1D"]):
+        place = str(stats) if words[0] == "--camera" else str(dataset)
+        assert main(["describe", place, *words]) == 2
+        assert "so --camera has no meaning for it" in capsys.readouterr().err
 
 
 def test_sets_seen_at_different_detail_are_warned_of(thumbnails: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -184,3 +184,18 @@ def test_test_images_that_were_printed_are_refused(place: Path, capsys: pytest.C
     assert main([*wish, "--shared", "leave-out", "--out", "out"]) == 0
     assert json.loads((place / "out" / "run.json").read_text())["training"][0]["images"] == 10
     assert len(open_generated("made").scenes) == 12
+
+
+@pytest.mark.parametrize(("last", "told"), [(3, False), (None, True)])
+def test_training_images_that_are_blue_first_are_told(
+    place: Path, capsys: pytest.CaptureFixture[str], last: int | None, told: bool
+) -> None:
+    random = np.random.default_rng(2)
+    for name, order in (("test", slice(0, 3)), ("train", slice(0, 3) if last else slice(None, None, -1))):
+        lights = random.dirichlet([120, 60, 20], 30)
+        images = (random.uniform(0.5, 1, (30, 8, 8, 3)) * lights[:, None, None]).astype(np.float32)
+        names = np.array([f"{name} {number}" for number in range(30)])
+        np.savez(place / f"{name}.npz", images=images, gt=lights[:, order], names=names)
+    wish = ("transfer", "--train", "train.npz", "--test", "test.npz", "--methods", "own.py:Map", "--statistics", "none")
+    assert main(wish) == 0
+    assert ("Map of the mean, train: as it is: with red and blue exchanged" in capsys.readouterr().out) == told
