@@ -159,11 +159,13 @@ def table2(
     """Train learned methods on real and on generated images."""
     from evaluation.commands.choosing import choose_learners
     from evaluation.datasets import open_scenes
-    from evaluation.experiments.folds import draw_folds, group_of, read_folds
+    from evaluation.experiments.folds import draw_scene_folds, read_folds
     from evaluation.experiments.paper.reporting import table2_report
     from evaluation.experiments.paper.table2 import table2 as run
     from evaluation.experiments.paper.table2 import table2_tables
+    from evaluation.experiments.transfer.overlap import shared_images
     from evaluation.learning.standard import standard_learners
+    from foundation.errors import InputError, first_of
     from foundation.processors import processor_count
 
     _require_free(out)
@@ -172,8 +174,14 @@ def table2(
     learners = dict(zip(names, choose_learners(names), strict=True))
     real, made = reading.open(data), open_scenes(generated)
     count = len(real.scenes)
+    if common := shared_images(made, real):
+        raise InputError(
+            f"{len(common)} of {len(made.scenes)} images of {made.name} are also in {real.name}, by {common[0].by}: "
+            f"{first_of([one.name for one in common], 3)}; what is tested must be unseen: evaluate transfer with "
+            "--shared leave-out trains without them"
+        )
     if folds.isdigit():
-        drawn = draw_folds(count, int(folds), seed, [group_of(scene) for scene in real.scenes])
+        drawn = draw_scene_folds(real.scenes, int(folds), seed)
     else:
         drawn = read_folds(Path(folds), [scene.name for scene in real.scenes])
     with _progress(2 * count) as step:

@@ -192,7 +192,8 @@ def decode_image(path: str, eight_bits: bool = False) -> Image:
         if not eight_bits:
             raise FormatError(
                 f"{path} has 8 bits a channel, as pictures for the eye (sRGB) have, expected linear camera RGB of 16 "
-                "bits; develop the raw file to a linear 16-bit PNG or TIFF (dcraw -4 -T)"
+                "bits; make a linear TIFF of the raw file with dcraw -h -D -4 -T, which neither balances white nor "
+                "subtracts black: its black level is for you to give"
             )
         return image.astype(np.uint16)
     if image.dtype.name not in ("uint16", "float32", "float64"):

@@ -4,11 +4,11 @@
     lights = [estimate(method, prepared) for method in methods]
 
 A method that can use it has `estimate_prepared(prepared)`; `estimate` calls it where there is one. Images are read in
-their own dtype, row by row or in strips, so beside the image a method needs:
+their own dtype, row by row or in tiles, so beside the image a method needs:
 
 - one byte a pixel for the usable ones, where something is masked or saturated;
-- for a derivative two strips of at most 16 MB, and 1 MB: 40 MB with the rows that strips share, whatever the size;
-- for images of at most `KEPT_PIXELS`, each derivative that was asked for, which is then kept: 12 bytes a pixel.
+- for a derivative one tile and what its filters need, 2 MB, whatever the size;
+- for images of at most `KEPT_PIXELS`, each derivative that was asked for twice, which is then kept: 12 bytes a pixel.
 """
 
 from __future__ import annotations
@@ -77,6 +77,7 @@ class PreparedImage:
         self._moments: dict[int, npt.NDArray[np.float64]] = {}
         self._norms: dict[tuple[int, float, float, int], npt.NDArray[np.float64]] = {}
         self._derivatives: dict[tuple[int, float], npt.NDArray[np.float32]] = {}
+        self._asked: set[tuple[int, float]] = set()
         self._smaller: dict[int, PreparedImage] = {}
 
     @property
@@ -192,10 +193,10 @@ class PreparedImage:
         shape = (self.height, self.width)
         if not sigma:
             flat = self.image.reshape(self.height, -1)
-            sum_powers(cast("Any", flat), self.free(), border, 0, *shape, p, scale, sums)
+            sum_powers(cast("Any", flat), self.free(), border, 0, 0, *shape, p, scale, sums)
             return sums
-        for top, rows in self.strips(order, sigma):
-            sum_powers(rows, self.free(), border, top, *shape, p, scale, sums)
+        for top, left, tile in self.tiles(order, sigma):
+            sum_powers(tile, self.free(), border, top, left, *shape, p, scale, sums)
         return sums
 
     def derivative(self, order: int, sigma: float) -> npt.NDArray[np.float32]:
@@ -207,11 +208,11 @@ class PreparedImage:
         key = (order, float(sigma))
         if key in self._derivatives:
             return self._derivatives[key]
-        from evaluation.methods.filters.gaussian import differentiated_strips
+        from evaluation.methods.filters.gaussian import differentiated_tiles, put_tile
 
         found = np.empty((self.height, self.width, 3), dtype=np.float32)
-        for top, rows in differentiated_strips(self.image, order, sigma, self.scale):
-            found[top : top + len(rows)] = rows[:, : 3 * self.width].reshape(len(rows), self.width, 3)
+        for top, left, tile in differentiated_tiles(self.image, order, sigma, self.scale):
+            put_tile(found, top, left, tile)
         if self.height * self.width <= KEPT_PIXELS:
             self._derivatives[key] = found
         return found
@@ -230,14 +231,19 @@ class PreparedImage:
             self._smaller[longest] = PreparedImage(image, None, mask)
         return self._smaller[longest]
 
-    def strips(self, order: int, sigma: float) -> Iterator[tuple[int, npt.NDArray[np.float32]]]:
-        """Yield the derivative in strips: the first row's number, (rows, Q) float32, good until the next; Q ≥ 3 W."""
-        from evaluation.methods.filters.gaussian import differentiated_strips
+    def tiles(self, order: int, sigma: float) -> Iterator[tuple[int, int, npt.NDArray[np.float32]]]:
+        """Yield the derivative in tiles: first row and pixel, (rows, Q) float32, good until the next.
 
-        if self.height * self.width <= KEPT_PIXELS:
-            yield 0, self.derivative(order, sigma).reshape(self.height, -1)
+        A row may go on beyond the image. Most derivatives are wanted once: only what is asked for again is kept.
+        """
+        from evaluation.methods.filters.gaussian import differentiated_tiles
+
+        key = (order, float(sigma))
+        if key in self._asked and self.height * self.width <= KEPT_PIXELS:
+            yield 0, 0, self.derivative(order, sigma).reshape(self.height, -1)
         else:
-            yield from differentiated_strips(self.image, order, sigma, self.scale)
+            self._asked.add(key)
+            yield from differentiated_tiles(self.image, order, sigma, self.scale)
 
 
 def estimate(method: Method, prepared: PreparedImage) -> npt.NDArray[np.float64]:

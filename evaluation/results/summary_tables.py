@@ -140,7 +140,7 @@ def _several(subject: Subject, results: Sequence[Result]) -> Table:
         ),
         tuple(rows),
         notes=(
-            "Each column is the mean over images, and beside it their median",
+            "Each column is the mean over images, that by region over all regions; beside it the median",
             "MAE_illum and MAE_rgb: by pixel, averaged over pixels and then over images, as LSMI defines them (Kim et "
             "al., ICCV 2021)",
             "By region: against the light that gives more than half of a pixel's light; every region counts the same",

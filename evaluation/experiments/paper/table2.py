@@ -18,7 +18,7 @@ import numpy.typing as npt
 from evaluation.experiments.cross_validation import cross_validate
 from evaluation.experiments.paper.published import TABLE2
 from evaluation.experiments.paper.table1 import NUMBERS
-from evaluation.experiments.running import evaluate
+from evaluation.experiments.running import evaluate, fit_anew
 from evaluation.metrics import ErrorKind
 from evaluation.results.tables import Table
 from foundation.errors import InputError
@@ -90,7 +90,7 @@ def table2(
         raise InputError(f"{len(learners)} learners and {len(generated)} generated images: name at least one of each")
     chosen = list(learners.values())
     crossed = cross_validate(real, chosen, folds, seed, workers, on_scene)
-    fitted = [learner.fit(generated, seed) for learner in chosen]
+    fitted = [fit_anew(learner, generated, seed) for learner in chosen]
     moved = evaluate(real, fitted, workers, on_scene)
     return tuple(Trained(name, *both) for name, *both in zip(learners, crossed, moved, strict=True))
 

@@ -1,1 +1,1 @@
-"""Loops over pixels and filters of images, compiled, in strips: what the methods are made of."""
+"""Loops over pixels and filters of images, compiled, in tiles: what the methods are made of."""

@@ -1,11 +1,15 @@
-"""Separable filters of image strips, with sums kept in registers.
+"""Separable filters of tiles of images, with sums and neighbours kept in registers.
 
-A block of 32 neighbouring numbers is filtered at a time: for each tap two vectors are loaded, added or subtracted, and
-multiplied into an accumulator that stays in a register. So a Gaussian derivative costs less than half of OpenCV's two
-`sepFilter2D`, whose result it equals but for the last digit. Taps that lie symmetrically are combined before they are
-multiplied: a derivative of constant whole numbers is exactly zero.
+Vectors lie one after the other along the axis that is filtered, so that every load is aligned: rows are filtered in
+groups of 16 that are transposed first, which costs 4 shuffles a vector, where loads that begin between two cache lines
+would cost 2 cycles a tap. `OUTPUTS` neighbouring vectors are found at a time. From tap to tap the neighbours they need
+move on by one, so a tap loads two vectors, not two for each of them: what bounds the loop is additions and
+multiplications, not loads. Taps that lie symmetrically are combined before they are multiplied: a derivative of
+constant whole numbers is exactly zero.
 
-Strips are interleaved rows of float32, padded by the caller.
+Rows filtered along x stand in columns of 16 numbers: (columns, rows, 16), one cache line a row, which is what the
+filter along y reads from top to bottom. An image is filtered in tiles whose columns fit a core's cache, from top to
+bottom; the rows that a tile shares with the one above are kept, and those beyond the image are copies.
 """
 
 from __future__ import annotations
@@ -20,14 +24,20 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from foundation.compiled import compiled
-from generator.kernels.vector import ADDRESS, F32, FLOATS, I64, LANES, broadcast, load, store, void
+from generator.kernels.vector import ADDRESS, F32, FLOATS, I32, I64, LANES, LINE, broadcast, constant, load, store, void
 
-BLOCK: Final = 2 * LANES
-"""Numbers that are filtered at a time: two vectors an accumulator hide the latency of a multiplication."""
-TILE: Final = 12 * BLOCK
-"""Numbers of a row in a tile: with 128 + 2 · 18 rows of two intermediate results 0.5 MB, which a core's cache holds."""
+OUTPUTS: Final = 4
+"""Vectors that are found at a time: as many sums as a multiplication takes cycles, so that none waits for another."""
+GROUP: Final = LANES
+"""Rows that are filtered along x at a time: one a lane."""
+CHUNK: Final = 16
+"""Pixels of a row that are filtered before they are transposed back: three whole vectors of 16 numbers."""
+STRETCH: Final = 4 * 3 * CHUNK
+"""Numbers of a row that are converted before they are transposed: 16 rows of them take 12 KB of the nearest cache."""
 _BYTES: Final = 4
 """Of a float32."""
+_PIXEL: Final = 3 * LINE
+"""Bytes from pixel to pixel of 16 rows."""
 
 EVEN, ODD, BEND = 0, 1, 2
 """Kinds of kernels: Σ w(k) (x(k) + x(-k)) + w(0) x(0); Σ w(k) (x(k) - x(-k)); Σ w(k) (x(k) + x(-k) - 2 x(0)).
@@ -55,205 +65,361 @@ def _root(builder: Any, value: Any) -> Any:
 def _emit(
     builder: Any, source: Any, step: Any, weights: Sequence[Any], reach: Any, kinds: Sequence[int]
 ) -> list[list[Any]]:
-    """Return the filtered block at `source` for each kind, two vectors a kind.
+    """Return the `OUTPUTS` filtered vectors at `source` and after for each kind.
 
-    Tap k lies `step` bytes times k away; `weights` are addresses of reach + 1 float32 a kind.
+    Neighbours lie `step` bytes apart; `weights` are addresses of reach + 1 float32 a kind. Read are `reach` neighbours
+    before the first and after the last vector.
     """
-    vectors = range(BLOCK // LANES)
-    centre = [load(builder, source, _BYTES * LANES * at, FLOATS) for at in vectors]
-    slots: list[list[Any]] = []
+
+    def slot_of(value: Any) -> Any:
+        slot = cgutils.alloca_once(builder, FLOATS)
+        builder.store(value, slot)
+        return slot
+
+    def times(number: Any, count: int) -> Any:
+        return builder.mul(number, ir.Constant(I64, count))
+
+    outputs = range(OUTPUTS)
+    centre = [load(builder, builder.add(source, times(step, at)), 0, FLOATS) for at in outputs]
+    sums: list[list[Any]] = []
     for kind, table in zip(kinds, weights, strict=True):
         first = broadcast(builder, load(builder, table, 0, F32), FLOATS)
-        slots.append([])
-        for at in vectors:
-            slot = cgutils.alloca_once(builder, FLOATS)
-            start = builder.fmul(centre[at], first) if kind == EVEN else ir.Constant(FLOATS, [0.0] * LANES)
-            builder.store(start, slot)
-            slots[-1].append(slot)
+        zero = ir.Constant(FLOATS, [0.0] * LANES)
+        sums.append([slot_of(builder.fmul(one, first) if kind == EVEN else zero) for one in centre])
     doubled = [builder.fadd(one, one) for one in centre] if BEND in kinds else []
+    lows, highs = [slot_of(one) for one in centre], [slot_of(one) for one in centre]
+    last = builder.add(source, times(step, OUTPUTS - 1))
     with cgutils.for_range(builder, reach) as loop:
         tap = builder.add(loop.index, ir.Constant(I64, 1))
         offset = builder.mul(tap, step)
-        before, after = builder.sub(source, offset), builder.add(source, offset)
+        below, above = builder.sub(source, offset), builder.add(last, offset)
+        low = [load(builder, below, 0, FLOATS), *[builder.load(slot) for slot in lows[:-1]]]
+        high = [*[builder.load(slot) for slot in highs[1:]], load(builder, above, 0, FLOATS)]
+        for slots, values in ((lows, low), (highs, high)):
+            for slot, value in zip(slots, values, strict=True):
+                builder.store(value, slot)
         factors = [
-            broadcast(
-                builder, load(builder, builder.add(table, builder.mul(tap, ir.Constant(I64, _BYTES))), 0, F32), FLOATS
-            )
+            broadcast(builder, load(builder, builder.add(table, times(tap, _BYTES)), 0, F32), FLOATS)
             for table in weights
         ]
-        for at in vectors:
-            low, high = (load(builder, place, _BYTES * LANES * at, FLOATS) for place in (before, after))
-            both = builder.fadd(low, high) if EVEN in kinds or BEND in kinds else None
-            for kind, factor, slot in zip(kinds, factors, slots, strict=True):
+        for at in outputs:
+            both = builder.fadd(low[at], high[at]) if EVEN in kinds or BEND in kinds else None
+            for kind, factor, slots in zip(kinds, factors, sums, strict=True):
                 if kind == EVEN:
                     part = both
                 elif kind == ODD:
-                    part = builder.fsub(high, low)
+                    part = builder.fsub(high[at], low[at])
                 else:
                     part = builder.fsub(both, doubled[at])
-                builder.store(_fused(builder, part, factor, builder.load(slot[at])), slot[at])
-    return [[builder.load(one) for one in slot] for slot in slots]
+                builder.store(_fused(builder, part, factor, builder.load(slots[at])), slots[at])
+    return [[builder.load(slot) for slot in slots] for slots in sums]
 
 
-def _rows(kinds: Sequence[int]) -> Any:
-    """Return what numba wants of an intrinsic that filters the block at `source` by each of some kinds."""
+def _write(builder: Any, values: Sequence[Any], target: Any, step: Any) -> None:
+    for at, value in enumerate(values):
+        store(builder, value, builder.add(target, builder.mul(step, ir.Constant(I64, at))), 0)
+
+
+def _across(kinds: Sequence[int]) -> Any:
+    """Return what numba wants of an intrinsic that filters `OUTPUTS` pixels of 16 rows by each of some kinds."""
     count = len(kinds)
 
-    def emit(builder: Any, source: Any, step: Any, reach: Any, *places: Any) -> None:
+    def emit(builder: Any, source: Any, reach: Any, *places: Any) -> None:
+        step = ir.Constant(I64, _PIXEL)
         found = _emit(builder, source, step, places[:count], reach, kinds)
-        for parts, target in zip(found, places[count:], strict=True):
-            for at, part in enumerate(parts):
-                store(builder, part, target, _BYTES * LANES * at)
+        for values, target in zip(found, places[count:], strict=True):
+            _write(builder, values, target, step)
 
-    return void(emit, *[ADDRESS] * (3 + 2 * count))
-
-
-@intrinsic
-def _filter_even(typing: Any, source: Any, step: Any, reach: Any, even: Any, target: Any) -> Any:
-    """Write the block at `source`, smoothed, to `target`."""
-    del typing, source, step, reach, even, target
-    return _rows((EVEN,))
+    return void(emit, *[ADDRESS] * (2 + 2 * count))
 
 
 @intrinsic
-def _filter_even_odd(
-    typing: Any, source: Any, step: Any, reach: Any, even: Any, odd: Any, smooth: Any, slope: Any
+def _across_even(typing: Any, source: Any, reach: Any, even: Any, target: Any) -> Any:
+    """Write four pixels of 16 rows from `source` on, smoothed along x, to `target`."""
+    del typing, source, reach, even, target
+    return _across((EVEN,))
+
+
+@intrinsic
+def _across_even_odd(typing: Any, source: Any, reach: Any, even: Any, odd: Any, smooth: Any, slope: Any) -> Any:
+    """Write four pixels of 16 rows, smoothed and derived once."""
+    del typing, source, reach, even, odd, smooth, slope
+    return _across((EVEN, ODD))
+
+
+@intrinsic
+def _across_all(
+    typing: Any, source: Any, reach: Any, even: Any, odd: Any, bend: Any, smooth: Any, slope: Any, curve: Any
 ) -> Any:
-    """Write the block at `source`, smoothed and derived once."""
-    del typing, source, step, reach, even, odd, smooth, slope
-    return _rows((EVEN, ODD))
+    """Write four pixels of 16 rows, smoothed, derived once and derived twice."""
+    del typing, source, reach, even, odd, bend, smooth, slope, curve
+    return _across((EVEN, ODD, BEND))
 
 
 @intrinsic
-def _filter_all(
-    typing: Any,
-    source: Any,
-    step: Any,
-    reach: Any,
-    even: Any,
-    odd: Any,
-    bend: Any,
-    smooth: Any,
-    slope: Any,
-    curve: Any,
+def _down_even(typing: Any, smooth: Any, reach: Any, even: Any, target: Any, pitch: Any) -> Any:
+    """Write four rows of 16 numbers, smoothed along y, `pitch` bytes apart."""
+    del typing, smooth, reach, even, target, pitch
+
+    def emit(builder: Any, smooth: Any, reach: Any, even: Any, target: Any, pitch: Any) -> None:
+        (found,) = _emit(builder, smooth, ir.Constant(I64, LINE), (even,), reach, (EVEN,))
+        _write(builder, found, target, pitch)
+
+    return void(emit, *[ADDRESS] * 5)
+
+
+@intrinsic
+def _down_gradient(
+    typing: Any, smooth: Any, slope: Any, reach: Any, even: Any, odd: Any, target: Any, pitch: Any
 ) -> Any:
-    """Write the block at `source`, smoothed, derived once and derived twice."""
-    del typing, source, step, reach, even, odd, bend, smooth, slope, curve
-    return _rows((EVEN, ODD, BEND))
-
-
-@intrinsic
-def _gradient(typing: Any, smooth: Any, slope: Any, step: Any, reach: Any, even: Any, odd: Any, target: Any) -> Any:
     """Write the gradient's length from rows smoothed and derived along x."""
-    del typing, smooth, slope, step, reach, even, odd, target
+    del typing, smooth, slope, reach, even, odd, target, pitch
 
-    def emit(builder: Any, smooth: Any, slope: Any, step: Any, reach: Any, even: Any, odd: Any, target: Any) -> None:
+    def emit(builder: Any, smooth: Any, slope: Any, reach: Any, even: Any, odd: Any, target: Any, pitch: Any) -> None:
+        step = ir.Constant(I64, LINE)
         (along_x,) = _emit(builder, slope, step, (even,), reach, (EVEN,))
         (along_y,) = _emit(builder, smooth, step, (odd,), reach, (ODD,))
-        for at, (x, y) in enumerate(zip(along_x, along_y, strict=True)):
-            length = _root(builder, _fused(builder, x, x, builder.fmul(y, y)))
-            store(builder, length, target, _BYTES * LANES * at)
+        lengths = [
+            _root(builder, _fused(builder, x, x, builder.fmul(y, y))) for x, y in zip(along_x, along_y, strict=True)
+        ]
+        _write(builder, lengths, target, pitch)
 
     return void(emit, *[ADDRESS] * 7)
 
 
 @intrinsic
-def _curvature(
+def _down_curvature(
     typing: Any,
     smooth: Any,
     slope: Any,
     curve: Any,
-    step: Any,
     reach: Any,
     even: Any,
     odd: Any,
     bend: Any,
     target: Any,
+    pitch: Any,
 ) -> Any:
     """Write √(f_xx² + 4 f_xy² + f_yy²) from rows smoothed, derived once, and derived twice along x."""
-    del typing, smooth, slope, curve, step, reach, even, odd, bend, target
+    del typing, smooth, slope, curve, reach, even, odd, bend, target, pitch
 
     def emit(
         builder: Any,
         smooth: Any,
         slope: Any,
         curve: Any,
-        step: Any,
         reach: Any,
         even: Any,
         odd: Any,
         bend: Any,
         target: Any,
+        pitch: Any,
     ) -> None:
+        step = ir.Constant(I64, LINE)
         (xx,) = _emit(builder, curve, step, (even,), reach, (EVEN,))
         (xy,) = _emit(builder, slope, step, (odd,), reach, (ODD,))
         (yy,) = _emit(builder, smooth, step, (bend,), reach, (BEND,))
-        for at, (a, b, c) in enumerate(zip(xx, xy, yy, strict=True)):
+        sizes: list[Any] = []
+        for a, b, c in zip(xx, xy, yy, strict=True):
             mixed = builder.fadd(b, b)
             total = _fused(builder, a, a, _fused(builder, mixed, mixed, builder.fmul(c, c)))
-            store(builder, _root(builder, total), target, _BYTES * LANES * at)
+            sizes.append(_root(builder, total))
+        _write(builder, sizes, target, pitch)
 
     return void(emit, *[ADDRESS] * 9)
 
 
+@intrinsic
+def _transpose(typing: Any, source: Any, pitch: Any, target: Any) -> Any:
+    """Write the 16 x 16 numbers whose rows stand `pitch` bytes apart, transposed, to 16 cache lines at `target`."""
+    del typing, source, pitch, target
+
+    def emit(builder: Any, source: Any, pitch: Any, target: Any) -> None:
+        rows = [
+            load(builder, builder.add(source, builder.mul(pitch, ir.Constant(I64, row))), 0, FLOATS)
+            for row in range(LANES)
+        ]
+        size = LANES // 2
+        while size:
+            # Squares of `size` numbers change places across the diagonal.
+            upper = [lane if not lane & size else LANES + lane - size for lane in range(LANES)]
+            lower = [lane + size if not lane & size else LANES + lane for lane in range(LANES)]
+            for row in range(LANES):
+                if not row & size:
+                    pair = rows[row], rows[row + size]
+                    for at, lanes in ((row, upper), (row + size, lower)):
+                        rows[at] = builder.shuffle_vector(*pair, constant(ir.VectorType(I32, LANES), lanes))
+            size //= 2
+        for row, value in enumerate(rows):
+            store(builder, value, target, LINE * row)
+
+    return void(emit, *[ADDRESS] * 3)
+
+
 @compiled
-def filter_strip(
-    strip: npt.NDArray[np.float32],
+def _turn_rows(
+    image: npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64],
+    scale: float,
+    top: int,
+    left: int,
+    lines: npt.NDArray[np.float32],
+    turned: npt.NDArray[np.float32],
+) -> None:
+    """Write 16 rows of an image (H, 3 W) from `top` on, times `scale`, transposed to `turned` (3 P + 16, 16) float32.
+
+    Its P pixels begin with pixel `left`; beyond the image stand copies of its first and last pixels and of its last
+    row. `lines` (16, STRETCH) float32 is scratch.
+    """
+    height, length = image.shape
+    begin = max(0, 3 * left)
+    end = min(length, 3 * left + turned.shape[0] - LANES)
+    before = begin - 3 * left
+    for start in range(begin, end, STRETCH):
+        count = min(STRETCH, end - start)
+        for row in range(GROUP):
+            values = image[min(top + row, height - 1), start : start + count]
+            line = lines[row, :count]
+            if scale == 1:
+                for j in range(count):
+                    line[j] = np.float32(values[j])
+            else:
+                for j in range(count):
+                    line[j] = np.float32(values[j] * scale)
+        for at in range(0, count, LANES):
+            target = turned.ctypes.data + (start - 3 * left + at) * LINE
+            _transpose(lines.ctypes.data + at * _BYTES, STRETCH * _BYTES, target)
+    for at in range(before):
+        turned[at] = turned[before + at % 3]
+    for at in range(end - 3 * left, turned.shape[0]):
+        turned[at] = turned[at - 3]
+
+
+@compiled
+def filter_rows(
+    image: npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64],
+    scale: float,
+    top: int,
+    left: int,
+    rows: int,
+    done: int,
     weights: npt.NDArray[np.float32],
     order: int,
-    reach: int,
-    rows: int,
-    scratch: npt.NDArray[np.float32],
-    out: npt.NDArray[np.float32],
-) -> None:
-    """Write the size of the Gaussian derivative of a padded strip to `out`.
+    lines: npt.NDArray[np.float32],
+    turned: npt.NDArray[np.float32],
+    chunk: npt.NDArray[np.float32],
+    columns: npt.NDArray[np.float32],
+) -> int:
+    """Filter the rows of an image along x that a tile needs and the tile above it has not left.
+
+    Returns the first row of the image that is not filtered, `done` of the tile below.
 
     Parameters
     ----------
-    strip
-        (rows + 2 reach, P) float32, rows of interleaved pixels with `reach` pixels on either side; P reaches at least
-        6 · reach numbers beyond the pitch of `out`.
+    image
+        (H, 3 W) uint16, float32 or float64, rows of interleaved pixels.
+    scale
+        Factor for values that float32 does not hold.
+    top, left
+        First row and pixel of the tile.
+    rows
+        Of a tile, a multiple of 16; the tile above began so many rows before.
+    done
+        What the call for the tile above returned; 0 where there is none.
+    weights
+        (3, reach + 1) float32: the halves of the kernels of order 0, 1 and 2 from their centres on.
+    order
+        Of the derivative: order + 1 filters are applied, of order 0 on.
+    lines
+        (16, STRETCH) float32, scratch.
+    turned
+        (Q + 6 reach + 16, 16) float32, scratch, its first number at a cache line; Q, numbers of a row of the tile, is
+        a multiple of 48.
+    chunk
+        (order + 1, 48, 16) float32, scratch, its first number at a cache line.
+    columns
+        (order + 1, Q / 16, rows + 2 reach + 16, 16) float32: the filtered rows in columns of 16 numbers, from row
+        top - reach on; its first number at a cache line. What stands there of the tile above is used.
+    """
+    reach = weights.shape[1] - 1
+    height = image.shape[0]
+    start = top - reach
+    even = weights.ctypes.data
+    odd = even + weights.shape[1] * _BYTES
+    bend = odd + weights.shape[1] * _BYTES
+    plane = chunk.shape[1] * LINE
+    kept = chunk.ctypes.data
+    column = columns.shape[2] * LINE
+    field = columns.shape[1] * column
+    if top:
+        for one in range(order + 1):
+            for at in range(columns.shape[1]):
+                for row in range(done - start):
+                    columns[one, at, row] = columns[one, at, row + rows]
+    while done < min(height, top + rows + reach):
+        _turn_rows(image, scale, done, left - reach, lines, turned)
+        to = columns.ctypes.data + (done - start) * LINE
+        for at in range(0, columns.shape[1], 3):
+            for channel in range(3):
+                for pixel in range(0, CHUNK, OUTPUTS):
+                    source = turned.ctypes.data + (3 * reach + at * LANES + 3 * pixel + channel) * LINE
+                    smooth = kept + (3 * pixel + channel) * LINE
+                    if order == 0:
+                        _across_even(source, reach, even, smooth)
+                    elif order == 1:
+                        _across_even_odd(source, reach, even, odd, smooth, smooth + plane)
+                    else:
+                        _across_all(source, reach, even, odd, bend, smooth, smooth + plane, smooth + 2 * plane)
+            for one in range(order + 1):
+                for part in range(3):
+                    _transpose(kept + one * plane + part * LANES * LINE, LINE, to + one * field + (at + part) * column)
+        done += GROUP
+    for one in range(order + 1):
+        for at in range(columns.shape[1]):
+            if not top:
+                for row in range(reach):
+                    columns[one, at, row] = columns[one, at, reach]
+            for row in range(done - start, rows + 2 * reach):
+                columns[one, at, row] = columns[one, at, row - 1]
+    return done
+
+
+@compiled
+def filter_columns(
+    columns: npt.NDArray[np.float32],
+    weights: npt.NDArray[np.float32],
+    order: int,
+    rows: int,
+    out: npt.NDArray[np.float32],
+) -> None:
+    """Write the size of the Gaussian derivative of rows that are filtered along x to `out`.
+
+    Parameters
+    ----------
+    columns
+        (order + 1, Q / 16, R, 16) float32, what `filter_rows` wrote: R ≥ rows + 2 reach, rows rounded up to fours.
     weights
         (3, reach + 1) float32: the halves of the kernels of order 0, 1 and 2 from their centres on.
     order
         0: smoothed, 1: length of the gradient, 2: √(f_xx² + 4 f_xy² + f_yy²).
-    reach
-        Of the kernels, px.
     rows
-        Rows to write.
-    scratch
-        (3, rows + 2 reach, TILE) float32; for order 0 and 1 the first axis may have as few as order + 1.
+        Rows to write, rounded up to fours.
     out
-        (rows, Q) float32, Q a multiple of `BLOCK`.
+        (rows, Q) or longer float32, its first number at a cache line.
     """
-    pitch = strip.shape[1] * _BYTES
-    line = TILE * _BYTES
-    plane = scratch.shape[1] * line
+    reach = weights.shape[1] - 1
     even = weights.ctypes.data
     odd = even + weights.shape[1] * _BYTES
     bend = odd + weights.shape[1] * _BYTES
-    first = scratch.ctypes.data
-    for left in range(0, out.shape[1], TILE):
-        width = min(TILE, out.shape[1] - left)
-        source = strip.ctypes.data + (left + 3 * reach) * _BYTES
-        for y in range(rows + 2 * reach):
-            for x in range(0, width, BLOCK):
-                at = source + y * pitch + x * _BYTES
-                to = first + y * line + x * _BYTES
-                if order == 0:
-                    _filter_even(at, 3 * _BYTES, reach, even, to)
-                elif order == 1:
-                    _filter_even_odd(at, 3 * _BYTES, reach, even, odd, to, to + plane)
-                else:
-                    _filter_all(at, 3 * _BYTES, reach, even, odd, bend, to, to + plane, to + 2 * plane)
-        for y in range(rows):
-            target = out.ctypes.data + (y * out.shape[1] + left) * _BYTES
-            for x in range(0, width, BLOCK):
-                smooth = first + (y + reach) * line + x * _BYTES
-                to = target + x * _BYTES
-                if order == 0:
-                    _filter_even(smooth, line, reach, even, to)
-                elif order == 1:
-                    _gradient(smooth, smooth + plane, line, reach, even, odd, to)
-                else:
-                    _curvature(smooth, smooth + plane, smooth + 2 * plane, line, reach, even, odd, bend, to)
+    column = columns.shape[2] * LINE
+    field = columns.shape[1] * column
+    pitch = out.shape[1] * _BYTES
+    for at in range(columns.shape[1]):
+        for y in range(0, rows, OUTPUTS):
+            smooth = columns.ctypes.data + at * column + (y + reach) * LINE
+            target = out.ctypes.data + y * pitch + at * LINE
+            if order == 0:
+                _down_even(smooth, reach, even, target, pitch)
+            elif order == 1:
+                _down_gradient(smooth, smooth + field, reach, even, odd, target, pitch)
+            else:
+                _down_curvature(smooth, smooth + field, smooth + 2 * field, reach, even, odd, bend, target, pitch)

@@ -1,4 +1,4 @@
-"""Gaussian derivatives of images of any size, in strips.
+"""Gaussian derivatives of images of any size, in tiles.
 
 Filters follow the program of the authors of the Gray-Edge framework (J. van de Weijer et al., 2007): Gaussian kernels
 cut at 3σ, normalised on the grid of pixels, edges continued by their last pixel, order 2 as √(f_xx² + 4 f_xy² + f_yy²).
@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from evaluation.scene import Image
 
-STRIP_NUMBERS = 1 << 22
-"""Numbers of a strip, 16 MB of float32: a whole image of 1 megapixel, 128 rows and more of one of 45."""
-_TILE_ROWS = 500
-"""Rows of intermediate results, of all that an order needs, that fit a core's cache beside each other (0.8 MB)."""
-_FEWEST_ROWS = 64
-"""Rows of a strip at least, for images that are wider than any."""
+TILE_WIDTH = 256
+"""Pixels of a tile's width at most, a multiple of 16: narrower, and more of a row is neighbours of the tile."""
+TILE_ROWS = 64
+"""Rows of a tile, a multiple of 16: with the widest standard kernels a tile's intermediate results take 0.8 MB at most,
+which a core's cache holds."""
 
 _ALIGNMENT = 64
 """Bytes of a cache line: aligned buffers make a third of the difference between two loads and three."""
@@ -80,15 +80,21 @@ def differentiate(image: Image, order: int, sigma: float) -> npt.NDArray[np.floa
         return np.asarray(image, dtype=np.float32)
     height, width = image.shape[:2]
     found = np.empty((height, width, 3), dtype=np.float32)
-    for top, rows in differentiated_strips(image, order, sigma, 1.0):
-        found[top : top + len(rows)] = rows[:, : 3 * width].reshape(len(rows), width, 3)
+    for top, left, rows in differentiated_tiles(image, order, sigma, 1.0):
+        put_tile(found, top, left, rows)
     return found
 
 
-def differentiated_strips(
+def put_tile(found: npt.NDArray[np.float32], top: int, left: int, tile: npt.NDArray[np.float32]) -> None:
+    """Write a tile of `differentiated_tiles`, (rows, Q) float32, to its place in an image (H, W, 3) float32."""
+    wide = min(tile.shape[1] // 3, found.shape[1] - left)
+    found[top : top + len(tile), left : left + wide] = tile[:, : 3 * wide].reshape(len(tile), wide, 3)
+
+
+def differentiated_tiles(
     image: Image, order: int, sigma: float, scale: float
-) -> Iterator[tuple[int, npt.NDArray[np.float32]]]:
-    """Yield the Gaussian derivative of an image times `scale` in strips from top to bottom.
+) -> Iterator[tuple[int, int, npt.NDArray[np.float32]]]:
+    """Yield the Gaussian derivative of an image times `scale` in tiles, from top to bottom and then from left to right.
 
     Parameters
     ----------
@@ -101,36 +107,31 @@ def differentiated_strips(
 
     Yields
     ------
-    tuple of int and ndarray
-        The number of the strip's first row; (rows, Q) float32, interleaved pixels, of which the first 3 W numbers of a
-        row count. The array is written anew for the next strip.
+    tuple of int, int and ndarray
+        The tile's first row and pixel; (rows, Q) float32, interleaved pixels, of which those within the image count.
+        The array is written anew for the next tile.
     """
-    from evaluation.methods.filters.convolution import BLOCK, TILE, filter_strip
+    from evaluation.methods.filters.convolution import CHUNK, GROUP, LANES, STRETCH, filter_columns, filter_rows
 
     height, width = image.shape[:2]
+    flat: Any = image.reshape(height, -1)
     kernels = [gaussian_kernel(sigma, one) for one in range(3)]
     reach = len(kernels[0]) // 2
     weights = np.stack([kernel[reach:] for kernel in kernels]).astype(np.float32)
-    pitch = -(-3 * width // BLOCK) * BLOCK
-    most = min(_TILE_ROWS // (order + 1) - 2 * reach, STRIP_NUMBERS // (3 * width))
-    most = min(max(most, _FEWEST_ROWS), height)
-    strip = np.zeros((most + 2 * reach, pitch + 6 * reach), dtype=np.float32)
-    scratch = _aligned((order + 1, most + 2 * reach, TILE))
+    across = -(-width // TILE_WIDTH)  # tiles of equal width
+    wide = -(-width // (across * CHUNK)) * CHUNK
+    pitch = 3 * wide
+    most = min(TILE_ROWS, -(-height // GROUP) * GROUP)
+    lines, turned = np.zeros((GROUP, STRETCH), np.float32), _aligned((pitch + 6 * reach + LANES, LANES))
+    chunk = _aligned((order + 1, 3 * CHUNK, LANES))
+    columns = _aligned((order + 1, pitch // LANES, most + 2 * reach + GROUP, LANES))
     out = _aligned((most, pitch))
-    for top in range(0, height, most):
-        rows = min(most, height - top)
-        first, last = max(0, top - reach), min(height, top + rows + reach)
-        body = strip[: rows + 2 * reach, 3 * reach : 3 * (reach + width)].reshape(rows + 2 * reach, width, 3)
-        above = first - (top - reach)
-        below = above + last - first
-        body[above:below] = image[first:last] if scale == 1 else image[first:last] * image.dtype.type(scale)
-        body[:above] = body[above]
-        body[below:] = body[below - 1]
-        strip[: rows + 2 * reach, : 3 * reach].reshape(rows + 2 * reach, reach, 3)[:] = body[:, :1]
-        right = strip[: rows + 2 * reach, 3 * (reach + width) : 3 * (2 * reach + width)]
-        right.reshape(rows + 2 * reach, reach, 3)[:] = body[:, -1:]
-        filter_strip(strip, weights, order, reach, rows, scratch, out)
-        yield top, out[:rows]
+    for left in range(0, width, wide):
+        done = 0
+        for top in range(0, height, most):
+            done = filter_rows(flat, scale, top, left, most, done, weights, order, lines, turned, chunk, columns)
+            filter_columns(columns, weights, order, most, out)
+            yield top, left, out[: height - top]
 
 
 def _aligned(shape: tuple[int, ...]) -> npt.NDArray[np.float32]:

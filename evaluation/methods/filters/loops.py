@@ -177,6 +177,7 @@ def sum_powers(
     free: npt.NDArray[np.bool_],
     border: int,
     top: int,
+    first: int,
     height: int,
     width: int,
     p: float,
@@ -188,13 +189,14 @@ def sum_powers(
     Parameters
     ----------
     values
-        (rows, Q) or longer rows of interleaved pixels; uint16, float32 or float64, not below 0.
+        (rows, Q) uint16, float32 or float64, not below 0: rows of interleaved pixels, or parts of them. What lies
+        beyond the image does not count.
     free
         (H, W) or (0, 0) bool, see above; that of the whole image.
     border
         Pixels left out along every edge.
-    top
-        Row of the image that `values` begin with.
+    top, first
+        Row and pixel of the image that `values` begin with.
     height, width
         Of the image, px.
     p
@@ -204,30 +206,42 @@ def sum_powers(
     sums
         (3,) float64.
     """
-    powers = np.empty(3 * CHUNK, np.float64)
     factors = np.empty(3 * CHUNK, np.float64)
+    powers = np.empty(3 * CHUNK, np.float64)
+    found = np.zeros(3 * CHUNK, np.float64)
+    right = min(width - border, first + values.shape[1] // 3)
     for row in range(values.shape[0]):
         y = top + row
         if y < border or y >= height - border:
             continue
-        part = np.zeros(3, np.float64)
-        for left in range(border, width - border, CHUNK):
-            length = min(CHUNK, width - border - left)
-            span = values[row, 3 * left : 3 * (left + length)]
+        for left in range(max(border, first), right, CHUNK):
+            length = min(CHUNK, right - left)
+            span = values[row, 3 * (left - first) : 3 * (left - first + length)]
+            usable = length
+            if free.size:
+                usable = _count(free[y, left : left + length])
+            if p == 1 and usable == length:
+                for j in range(span.size):
+                    found[j] += span[j] * scale
+                continue
             for j in range(span.size):
                 factors[j] = span[j] * scale
-            if not np.isinf(p):
-                _raise(factors, powers, 3 * length, p)
-            for x in range(length):
-                if free.size and not free[y, left + x]:
-                    continue
-                for channel in range(3):
-                    if np.isinf(p):
-                        sums[channel] = max(sums[channel], factors[3 * x + channel])
-                    else:
-                        part[channel] += powers[3 * x + channel]
-        for channel in range(3):
-            sums[channel] += part[channel]
+            if usable < length:
+                for x in range(length):
+                    if not free[y, left + x]:
+                        factors[3 * x : 3 * x + 3] = 0.0
+            if np.isinf(p):
+                for j in range(span.size):
+                    found[j] = max(found[j], factors[j])
+                continue
+            _raise(factors, powers, span.size, p)
+            for j in range(span.size):
+                found[j] += powers[j]
+    for j in range(found.size):
+        if np.isinf(p):
+            sums[j % 3] = max(sums[j % 3], found[j])
+        else:
+            sums[j % 3] += found[j]
 
 
 @compiled

@@ -109,6 +109,10 @@ def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys
     assert float(ratio["In the paper, on Cube+"]) == pytest.approx(1.66 / 0.89)
     assert main(["paper", "table2", str(thumbnails), "--generated", str(made), "--methods", "magic"]) == 2
     assert "'magic' is no method that learns" in capsys.readouterr().err
+    copy = thumbnails.with_name("copy.npz")
+    copy.write_bytes(thumbnails.read_bytes())
+    assert main(["paper", "table2", str(thumbnails), "--generated", str(copy)]) == 2
+    assert "9 of 9 images of copy are also in photos" in capsys.readouterr().err
 
 
 def test_bits(thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import imagecodecs
 import numpy as np
 import pytest
+import rawpy
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -14,6 +18,7 @@ from hypothesis.extra.numpy import arrays
 from evaluation.datasets.names import Folder, natural, present
 from evaluation.datasets.raw_scene import decode_image, polygon_mask, subtract_black
 from foundation.errors import FormatError
+from tests.data_files import shipped
 from tests.evaluation.datasets.made_up import image_of, write_png, write_tiff
 
 IMAGES = arrays(np.uint16, st.tuples(st.integers(1, 5), st.integers(1, 5), st.just(3)))
@@ -98,3 +103,26 @@ def test_a_file_for_a_folder_is_told(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("")
     with pytest.raises(FormatError, match="a cannot be read"):
         _ = Folder(tmp_path / "a").files
+
+
+def test_the_advice_for_a_picture_of_eight_bits_gives_the_colours_of_the_mosaic(tmp_path: Path) -> None:
+    # Without -D the same program writes white-balanced sRGB of 16 bits, which nothing tells from camera RGB afterwards.
+    write_png(tmp_path / "eight.png", image_of(4, 4).astype(np.uint8))
+    with pytest.raises(FormatError) as told:
+        decode_image(str(tmp_path / "eight.png"))
+    advice = re.search(r"dcraw((?: -\w)+)", str(told.value))
+    assert advice is not None
+    assert advice[0] in (Path(__file__).parents[3] / "docs" / "reference" / "datasets.md").read_text(encoding="utf-8")
+    assert advice[1].split() == ["-h", "-D", "-4", "-T"]
+    dcraw = shutil.which("dcraw")
+    if dcraw is None:
+        return
+    raw, made = str(shipped("raw/canon_eos_550d_colorchart.dng")), tmp_path / "made.tiff"
+    done = subprocess.run([dcraw, "-c", *advice[1].split(), raw], check=True, capture_output=True, timeout=60)
+    made.write_bytes(done.stdout)
+    means = subtract_black(decode_image(str(made)), 2056).mean(axis=(0, 1))
+    with rawpy.imread(raw) as opened:
+        levels, colours = opened.raw_image_visible.astype(float) - 2056, opened.raw_colors_visible
+        red, green, blue, second = (np.maximum(levels[colours == colour], 0).mean() for colour in range(4))
+    expected = np.array([red, (green + second) / 2, blue])
+    np.testing.assert_allclose(means / means.sum(), expected / expected.sum(), atol=1e-3)

@@ -131,13 +131,37 @@ def test_derivatives_of_images_of_any_shape(order: int, sigma: float, shape: tup
     )
 
 
-@pytest.mark.parametrize("order", [1, 2])
-def test_strips_of_a_large_image_make_the_whole(order: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_tiles_of_a_large_image_make_the_whole(order: int, monkeypatch: pytest.MonkeyPatch) -> None:
     image = photograph(500, 300)
+    monkeypatch.setattr(gaussian, "TILE_WIDTH", 304)
+    monkeypatch.setattr(gaussian, "TILE_ROWS", 512)
+    assert len(list(gaussian.differentiated_tiles(image, order, 3.0, 1.0))) == 1
     whole = differentiate(image, order, 3.0)
-    monkeypatch.setattr(gaussian, "STRIP_NUMBERS", 1)
-    assert len(list(gaussian.differentiated_strips(image, order, 3.0, 1.0))) > 4
+    monkeypatch.setattr(gaussian, "TILE_WIDTH", 64)
+    monkeypatch.setattr(gaussian, "TILE_ROWS", 16)
+    assert len(list(gaussian.differentiated_tiles(image, order, 3.0, 1.0))) == 32 * 5
     np.testing.assert_array_equal(differentiate(image, order, 3.0), whole)
+
+
+@pytest.mark.parametrize("p", [1, 3, 6.5, 20, np.inf])
+def test_what_is_left_out_of_tiles_is_what_is_left_out_of_the_whole(p: float) -> None:
+    image = photograph(150, 600)
+    mask = np.random.default_rng(2).uniform(size=image.shape[:2]) < 0.001
+    mask[40:80, 250:262] = True  # across the edges of tiles
+    image[60, 255] = 65535  # masked, but seen by the filter beside it
+    for border in (0, 5, 70):
+        inner = np.s_[border : 150 - border, border : 600 - border]
+        expected = numpy_norm(scipy_derivative(image, 1, 2.0)[inner][~mask[inner]], p)
+        method = GrayEdge("", 1, p, 2.0, border)
+        np.testing.assert_allclose(method.estimate(image, mask=mask), expected, rtol=1e-6)
+
+
+def test_a_derivative_that_is_kept_gives_the_same_sums() -> None:
+    prepared = PreparedImage(photograph(300, 310))
+    norms = [prepared.norm(1, 2.0, p, 3) for p in (1, 2, 4)]
+    alone = [PreparedImage(prepared.image).norm(1, 2.0, p, 3) for p in (1, 2, 4)]
+    np.testing.assert_allclose(norms, alone, rtol=1e-12)
 
 
 def test_an_even_image_has_no_edges() -> None:
