@@ -133,7 +133,7 @@ def cv(
 def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
     """Return a sentence where images (N,) int64 by their folds are copies of images of other folds."""
     from evaluation.datasets.states import first_copies
-    from foundation.errors import first_of
+    from foundation.errors import counted, first_of
 
     names = [scene.name for scene in data.scenes]
     apart = [
@@ -144,8 +144,8 @@ def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
     if not apart:
         return []
     return [
-        f"{len(apart)} images are copies of images of other folds ({first_of(apart)}): they are tested on what was "
-        "trained on"
+        f"{counted(len(apart), 'image is a copy', 'images are copies')} of images of other folds ({first_of(apart)}): "
+        "tested on what was trained on"
     ]
 
 
