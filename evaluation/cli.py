@@ -48,7 +48,8 @@ def evaluate() -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with `argv`, by default the process's own, and return one of `foundation.console.EXIT_CODES`."""
     given = list(sys.argv[1:] if argv is None else argv)
-    return run(lambda: app(_with_command(given), prog_name="evaluate"))
+    whole = _with_command(given)
+    return run(lambda: app(whole, prog_name="evaluate"), keeps=_keeps(whole))
 
 
 def _with_command(given: Sequence[str]) -> list[str]:
@@ -56,6 +57,11 @@ def _with_command(given: Sequence[str]) -> list[str]:
     commands = {command.name for command in app.registered_commands} | {group.name for group in app.registered_groups}
     short = bool(given) and given[0] not in commands and given[0] not in ("-h", "--help")
     return [*(["run"] if short else []), *given]
+
+
+def _keeps(given: Sequence[str]) -> bool:
+    """Whether an interrupted command goes on where it was: `run` does with a results folder, which has a journal."""
+    return given[:1] == ["run"] and any(text == "--out" or text.startswith("--out=") for text in given)
 
 
 if __name__ == "__main__":

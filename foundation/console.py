@@ -28,9 +28,17 @@ def say_error(message: str) -> None:
         print(f"error: {message}", file=sys.stderr)
 
 
-def run(command: Callable[[], object]) -> int:
-    """Call `command` and return the exit code; a foreseeable fault is one line on stderr, no traceback."""
-    code = _outcome(command)
+def run(command: Callable[[], object], *, keeps: bool = True) -> int:
+    """Call `command` and return the exit code; a foreseeable fault is one line on stderr, no traceback.
+
+    Parameters
+    ----------
+    command
+        What is to be done.
+    keeps
+        Whether it goes on, called again after an interruption, with what it had done; the user is told which.
+    """
+    code = _outcome(command, keeps)
     try:
         # What is still to be printed fails here, where it can be judged, and not while the interpreter ends.
         sys.stdout.flush()
@@ -43,14 +51,14 @@ def run(command: Callable[[], object]) -> int:
     return code
 
 
-def _outcome(command: Callable[[], object]) -> int:
+def _outcome(command: Callable[[], object], keeps: bool) -> int:
     try:
         command()
     except CropError as error:
         say_error(str(error))
         return error.exit_code
     except KeyboardInterrupt:
-        return _interrupted()
+        return _interrupted(keeps)
     except BrokenPipeError:
         _abandon_stdout()
         return 0
@@ -68,7 +76,7 @@ def _outcome(command: Callable[[], object]) -> int:
         return InputError.exit_code
     except SystemExit as error:
         if error.code == EXIT_INTERRUPTED:
-            return _interrupted()
+            return _interrupted(keeps)
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     return 0
 
@@ -78,8 +86,8 @@ def _abandon_stdout() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _interrupted() -> int:
-    say_error("interrupted; run the same command again to go on")
+def _interrupted(keeps: bool) -> int:
+    say_error(f"interrupted; {'run the same command again to go on' if keeps else 'nothing of it was kept'}")
     return EXIT_INTERRUPTED
 
 

@@ -88,6 +88,7 @@ def cv(
     reading: DataReading,
 ) -> None:
     """Cross-validate methods on a data set."""
+    from evaluation.commands.choosing import require_order
     from evaluation.experiments.cross_validation import cross_validate
     from evaluation.experiments.folds import folds_to_csv
     from evaluation.experiments.run_folder import describe_run, write_run
@@ -98,6 +99,7 @@ def cv(
     from foundation.files import require_free, require_free_file, write_whole
     from foundation.processors import processor_count
 
+    require_order("cv", method, data)
     learners, left_out = _chosen(method)
     if out is not None:
         require_free(out, "the results")

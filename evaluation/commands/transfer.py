@@ -51,7 +51,13 @@ def transfer(
     test: Annotated[str, typer.Option(metavar="REAL", help="Data set to test on.", show_default=False)],
     methods: Annotated[str, typer.Option(metavar="LIST", help="Learned methods between commas, or all.")] = "all",
     statistics: Annotated[
-        str, typer.Option(metavar="LIST", help="Statistics methods for reference between commas, all or none.")
+        str,
+        typer.Option(
+            metavar="LIST",
+            help="Statistics methods for reference between commas, all or none. "
+            "\\[default: gray-world, shades-of-gray, gray-edge-1]",
+            show_default=False,
+        ),
     ] = "gray-world,shades-of-gray,gray-edge-1",
     folds: Annotated[
         str | None,
@@ -120,7 +126,7 @@ def transfer(
     from evaluation.datasets import open_scenes
     from evaluation.experiments.transfer.figures import figures_of
     from evaluation.experiments.transfer.outcome import TransferOutcome, save_outcome
-    from evaluation.experiments.transfer.plan import plan_transfer
+    from evaluation.experiments.transfer.plan import is_generated, plan_transfer
     from evaluation.experiments.transfer.rows import count_images
     from evaluation.experiments.transfer.rows import transfer as run_transfer
     from evaluation.reports.terminal import print_table
@@ -147,6 +153,7 @@ def transfer(
         rows = run_transfer(
             *(tested.scenes, plan.training, learners, drawn, wanted, references),
             *(side, threads, lambda: advance(next(steps), count)),
+            generated=tested.name if is_generated(tested) else "",
         )
     plan = replace(plan, notes=(*plan.notes, *_suspicions(tested, rows)))
     figures = figures_of(rows, error)

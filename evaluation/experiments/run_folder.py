@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.datasets.identities import known_again
 from evaluation.datasets.states import state_of
 from evaluation.experiments.folds import folds_to_csv
 from evaluation.experiments.running import SceneMethod, answer_scenes, ordered_map, truths_of
 from evaluation.experiments.suspicions import suspicions
-from evaluation.learning.model_files import StoredMethod
+from evaluation.learning.model_files import StoredMethod, TrainingRecord
 from evaluation.methods.method import Method
 from evaluation.metrics import ErrorKind
 from evaluation.reports.developed import developed
@@ -37,7 +38,7 @@ from evaluation.results.run_files import errors_csv, run_json, several_lights_cs
 from evaluation.results.summary_tables import Subject, lights_tables, statistics_rows, summary_table
 from evaluation.results.tables import table_to_csv
 from evaluation.scene import MixedScene, Scene, SceneSet
-from foundation.errors import InputError
+from foundation.errors import InputError, first_of
 from foundation.files import make_folder, partial_path, publish_folder, require_free, write_whole
 from foundation.hashing import sha256_of
 from foundation.held_folders import LOCK_FILE, held_folder
@@ -198,14 +199,27 @@ def _run_of(data: SceneSet, methods: Sequence[Method | SceneMethod]) -> Run:
     for method in methods:
         if not isinstance(method, StoredMethod) or not method.provenance:
             continue
-        if method.provenance.sha256 == run.data_sha256:
-            notes.append(f"{method.name} was trained on these very images: its errors say nothing of others")
-        elif method.provenance.data_name == data.name:
-            notes.append(
-                f"{method.name} was trained on {method.provenance.scenes} images of a data set of the same name: "
-                "whether these are among them is not known"
-            )
+        note = _seen_before(method.name, method.provenance, data, run.data_sha256)
+        notes += [note] if note else []
     return replace(run, notes=tuple(notes))
+
+
+def _seen_before(name: str, record: TrainingRecord, data: SceneSet, sha256: str) -> str:
+    """Return what the reader is told where a model was, or may have been, trained on images of a data set."""
+    if record.sha256 == sha256:
+        return f"{name} was trained on these very images: its errors say nothing of others"
+    common = known_again(data.scenes, record.images)
+    if common:
+        return (
+            f"{name}: {len(common)} of {len(data.scenes)} images were trained on, by name and light or by source "
+            f"picture: {first_of(common, 3)}; their errors say nothing of images that it has not seen"
+        )
+    if record.data_name != data.name:
+        return ""
+    told = f"{name} was trained on {record.scenes} images of a data set of the same name: "
+    if len(record.images):
+        return f"{told}none of these has the name and light, or the source picture, of one of them"
+    return f"{told}whether these are among them is not known"
 
 
 def _data_sha256(scenes: Sequence[Scene]) -> str:

@@ -12,13 +12,14 @@ import json
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.datasets.identities import identities
 from evaluation.learning.feature_learner import FeatureLearner, LearnedMethod, truths_of
 from evaluation.learning.standard import standard_learners
 from evaluation.methods.method import Method
@@ -31,6 +32,11 @@ from foundation.version import software
 
 _FORMAT = "croplab model 1"
 _ABOUT = "about"
+_TRAINED = "trained_on"
+
+
+def _unknown() -> npt.NDArray[np.uint64]:
+    return np.empty((0, 2), np.uint64)
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,9 @@ class TrainingRecord:
         Name and version of what trained it.
     date
         ISO 8601, UTC.
+    images
+        (N, 2) uint64, by what each image is known again, see `datasets.identities`; no row in a file that was made
+        before model files had them.
     """
 
     data_name: str
@@ -67,6 +76,7 @@ class TrainingRecord:
     seed: int
     software: str
     date: str
+    images: npt.NDArray[np.uint64] = field(default_factory=_unknown, compare=False)
 
     def sentence(self) -> str:
         """Return in one line what the model was trained on."""
@@ -102,6 +112,7 @@ def provenance_of(data: SceneSet, seed: int, clock: Clock, part: str = "all") ->
         seed=seed,
         software=software(),
         date=clock.now().isoformat(timespec="seconds"),
+        images=identities(data.scenes),
     )
 
 
@@ -134,13 +145,19 @@ def save_model(path: Path, method: Method, provenance: TrainingRecord) -> None:
             "keeps what it has learned by its own means, and is trained and evaluated by evaluate cv"
         )
     require_free_file(path, "the model")
+    told = asdict(provenance)
+    trained = told.pop("images")
     about = {
         "format": _FORMAT,
         "method": method.learner.key,
         "settings": settings_of(method.learner),
-        "provenance": asdict(provenance),
+        "provenance": told,
     }
-    arrays: dict[str, Any] = {_ABOUT: np.array(json.dumps(about, indent=1, sort_keys=True)), **method.model.arrays()}
+    arrays: dict[str, Any] = {
+        _ABOUT: np.array(json.dumps(about, indent=1, sort_keys=True)),
+        _TRAINED: trained,
+        **method.model.arrays(),
+    }
     with whole_file(path) as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays)
 
@@ -162,7 +179,7 @@ def load_model(path: Path) -> StoredMethod:
         if about["method"] not in known:
             raise ValueError(f"it holds {about['method']!r}; known are {', '.join(known)}")
         learner = _with_settings(known[about["method"]], about["settings"])
-        provenance = _provenance(about["provenance"])
+        provenance = _provenance(about["provenance"], arrays.pop(_TRAINED, _unknown()))
         model = learner.restore(arrays)
     except (FileNotFoundError, IsADirectoryError) as error:
         what = "a folder" if path.is_dir() else "not there"
@@ -212,8 +229,10 @@ def _with_settings(learner: FeatureLearner, settings: Mapping[str, Any]) -> Feat
     return type(learner)(**settings)
 
 
-def _provenance(given: Mapping[str, Any]) -> TrainingRecord:
-    expected = {each.name for each in dataclasses.fields(TrainingRecord)}
+def _provenance(given: Mapping[str, Any], images: npt.NDArray[Any]) -> TrainingRecord:
+    expected = {each.name for each in dataclasses.fields(TrainingRecord)} - {"images"}
     if set(given) != expected:
         raise ValueError(f"its provenance has {', '.join(sorted(given))}; expected {', '.join(sorted(expected))}")
-    return TrainingRecord(**given)
+    if images.dtype != np.uint64 or images.shape not in ((0, 2), (given["scenes"], 2)):
+        raise ValueError(f"its {_TRAINED} is {images.dtype} of the shape {images.shape}, expected uint64, (images, 2)")
+    return TrainingRecord(**given, images=images)

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.reports.style import FAINT, GRID, SERIES, svg_of
+from evaluation.reports.style import FAINT, GRID, SERIES, legend_label, svg_of
 
 _FAINTEST: Final = 0.4
 """Power of a share of cells at which it is drawn: rare colours stay visible beside frequent greys."""
@@ -34,7 +34,9 @@ def luminance_figure(names: Sequence[str], shares: Sequence[npt.NDArray[np.float
         axes = figure.add_subplot()
         for number, (name, share) in enumerate(zip(names, shares, strict=True)):
             # The first bin holds all that is darker.
-            axes.stairs(100 * share, np.power(10.0, edges), label=name, color=SERIES[number], linewidth=1.5)
+            axes.stairs(
+                100 * share, np.power(10.0, edges), label=legend_label(name), color=SERIES[number], linewidth=1.5
+            )
         axes.set(xscale="log", xlabel="luminance over its 99th percentile in the image", ylabel="cells, %")
         axes.xaxis.set_major_formatter("{x:g}")
         axes.set_ylim(bottom=0)
@@ -94,7 +96,9 @@ def lights_figure(names: Sequence[str], lights: Sequence[npt.NDArray[np.float64]
         axes = figure.add_subplot()
         for number, (name, given) in enumerate(zip(names, lights, strict=True)):
             some = given[:: -(-len(given) // _POINTS)]
-            axes.scatter(some[:, 0], some[:, 2], s=9, alpha=0.5, linewidths=0, color=SERIES[number], label=name)
+            axes.scatter(
+                some[:, 0], some[:, 2], s=9, alpha=0.5, linewidths=0, color=SERIES[number], label=legend_label(name)
+            )
         axes.set(xlabel="r = R / (R + G + B)", ylabel="b = B / (R + G + B)", aspect="equal")
         axes.legend(loc="upper right")
 
@@ -124,7 +128,7 @@ def noise_figure(
     def draw(figure: Any) -> None:
         axes = figure.add_subplot()
         for number, (name, levels, curve) in enumerate(zip(names, measured, curves, strict=True)):
-            axes.plot(levels[:, 0], levels[:, 1], "o", markersize=4, color=SERIES[number], label=name)
+            axes.plot(levels[:, 0], levels[:, 1], "o", markersize=4, color=SERIES[number], label=legend_label(name))
             if curve is not None:
                 signal = np.exp(np.linspace(np.log(levels[0, 0]), np.log(levels[-1, 0]), 100, dtype=np.float64))
                 axes.plot(signal, np.sqrt(curve[0] ** 2 + curve[1] * signal), color=SERIES[number], linewidth=1)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.metrics import ErrorKind, percentiles
-from evaluation.reports.style import FAINT, series_style, svg_of
+from evaluation.reports.style import FAINT, legend_label, series_style, svg_of
 from evaluation.results.result import Result
 
 _SHOWN_PERCENTILE = 98
@@ -48,7 +48,7 @@ def _draw_curves(figure: Any, results: Sequence[Result], kind: ErrorKind) -> Non
         # The k-th of n sorted errors is reached by k of n images.
         places = np.ceil(shares / 100 * len(errors)).astype(int) - 1
         reached = np.where(places < 0, 0.0, errors[np.maximum(places, 0)])
-        axes.plot(reached, shares, label=result.method, linewidth=1.6, **series_style(number))
+        axes.plot(reached, shares, label=legend_label(result.method), linewidth=1.6, **series_style(number))
     axes.set(xlim=(0, end), ylim=(0, 100), xlabel=f"{kind} angular error, degrees", ylabel="images up to it, %")
     figure.legend(loc="outside lower left", ncols=2, handlelength=3)
 

@@ -105,8 +105,13 @@ def _curves_caption(results: Sequence[Result], kind: ErrorKind) -> str:
 
 
 def _planes_caption(results: Sequence[Result]) -> str:
-    more = f" The first 12 of {len(results)} methods." if len(results) > 12 else ""
-    return f"Each point is the true light of an image; its colour is the method's error on it.{more}"
+    return f"Each point is the true light of an image; its colour is the method's error on it.{_left_out(results)}"
+
+
+def _left_out(results: Sequence[Result]) -> str:
+    """Return the sentence on the methods after the first `MOST_SHOWN`, of which nothing is shown."""
+    names = [result.method for result in results[MOST_SHOWN:]]
+    return f" Shown are the first {MOST_SHOWN} of {len(results)} methods, without {', '.join(names)}." if names else ""
 
 
 def _images(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> list[Part]:
@@ -117,6 +122,7 @@ def _images(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]
         paragraph(
             "From left to right: as recorded, corrected by the estimate, corrected by the truth. Linear camera RGB "
             "without a colour matrix, the same exposure in each row, the curve of sRGB; masked pixels are grey."
+            + _left_out(run.results)
         ),
     ]
     for number, result in enumerate(run.results[:MOST_SHOWN]):

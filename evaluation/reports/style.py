@@ -50,11 +50,23 @@ def series_style(number: int) -> dict[str, str]:
     return {"color": SERIES[number % len(SERIES)], "linestyle": DASHES[number // len(SERIES) % len(DASHES)]}
 
 
+def legend_label(name: str) -> str:
+    """Return a name as Matplotlib's legends show it, which leave out what begins with an underscore.
+
+    Examples
+    --------
+    >>> legend_label("_mine"), legend_label("Gray-world")
+    (' _mine', 'Gray-world')
+    """
+    return f" {name}" if name.startswith("_") else name
+
+
 def svg_of(draw: Callable[..., None], *arguments: Any, inches: tuple[float, float] = (7.2, 4.0)) -> bytes:
     """Return the SVG of a figure that `draw(figure, *arguments)` fills, with Matplotlib; the same bytes every time.
 
     `INK`, `FAINT`, `GRID` and `PAPER` in it become the page's colours of that name, which a dark screen exchanges, so
-    the SVG is to stand in a page (`page.figure_part`). Text stays text. No window is opened and no state left behind.
+    the SVG is to stand in a page (`page.figure_part`). Text stays text, as it is written: "$" begins no mathematics.
+    Logarithmic axes have plain numbers. No window is opened and no state left behind.
 
     Parameters
     ----------
@@ -90,6 +102,8 @@ def svg_of(draw: Callable[..., None], *arguments: Any, inches: tuple[float, floa
         "grid.color": GRID,
         "legend.frameon": False,
         "svg.fonttype": "none",
+        # Names of methods, images and data sets are the user's.
+        "text.parse_math": False,
         # Names of parts come from a hash; without a salt of its own each run draws another.
         "svg.hashsalt": "crop",
     }
@@ -98,9 +112,28 @@ def svg_of(draw: Callable[..., None], *arguments: Any, inches: tuple[float, floa
         figure: Any = Figure(figsize=inches, layout="constrained")
         FigureCanvasSVG(figure)
         draw(figure, *arguments)
+        _write_plain_numbers(figure)
         stream = BytesIO()
         figure.savefig(stream, format="svg", dpi=_RASTER_DPI, metadata={"Date": None})
     text = stream.getvalue().decode()
     for colour, name in _NAMES.items():
         text = re.sub(re.escape(colour), f"var(--{name})", text, flags=re.IGNORECASE)
     return text.encode()
+
+
+def _write_plain_numbers(figure: Any) -> None:
+    """Give logarithmic axes numbers: Matplotlib writes powers of ten in mathematics, which is not set here."""
+    from matplotlib.ticker import LogFormatter
+
+    class PlainLogFormatter(LogFormatter):
+        """Numbers where Matplotlib's own formatter has them."""
+
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            return f"{x:g}" if super().__call__(x, pos) else ""
+
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if axis.get_scale() == "log" and isinstance(axis.get_major_formatter(), LogFormatter):
+                axis.set_major_formatter(PlainLogFormatter())
+            if axis.get_scale() == "log" and isinstance(axis.get_minor_formatter(), LogFormatter):
+                axis.set_minor_formatter(PlainLogFormatter())

@@ -131,3 +131,28 @@ def test_what_cannot_be_done_is_one_sentence(
     assert main([*arguments]) == 2
     assert message in capsys.readouterr().err
     assert {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")} == before
+
+
+@pytest.mark.parametrize(
+    ("given", "promised"),
+    [
+        (["DATA", "--out", "results"], True),
+        (["run", "DATA", "--out=results"], True),
+        (["DATA"], False),
+        (["cv", "regression-trees", "DATA", "--out", "results"], False),
+        (["transfer", "--train", "A", "--test", "B", "--out", "results"], False),
+        (["describe", "DATA", "--out", "stats.json"], False),
+    ],
+)
+def test_going_on_is_promised_only_by_what_keeps_its_work(
+    given: list[str], promised: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[bool] = []
+
+    def run(_command: Callable[[], object], *, keeps: bool) -> int:
+        told.append(keeps)
+        return 0
+
+    monkeypatch.setattr("evaluation.cli.run", run)
+    main(given)
+    assert told == [promised]

@@ -62,6 +62,8 @@ def test_interruption_is_130(capsys: pytest.CaptureFixture[str]) -> None:
 
     assert run(interrupt) == 130
     assert capsys.readouterr().err == "error: interrupted; run the same command again to go on\n"
+    assert run(interrupt, keeps=False) == 130
+    assert capsys.readouterr().err == "error: interrupted; nothing of it was kept\n"
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from evaluation.experiments.paper.chromaticities import TableLights, rb_of
 from evaluation.experiments.paper.table1 import block_title
-from evaluation.reports.style import CSS_VARIABLES, FAINT, INK, series_style, svg_of
+from evaluation.reports.style import CSS_VARIABLES, FAINT, INK, legend_label, series_style, svg_of
 
 if TYPE_CHECKING:
     from evaluation.experiments.paper.bits import BitsResult
@@ -39,7 +39,7 @@ def _draw_bits(figure: Any, found: BitsResult, kind: ErrorKind) -> None:
     for place, raw in enumerate(found.raw):
         style = series_style(place)
         medians = [results[place].summary(kind).median for results in found.reduced.values()]
-        axes.plot(counts, medians, marker=_MARKERS[place % len(_MARKERS)], label=raw.method, **style)
+        axes.plot(counts, medians, marker=_MARKERS[place % len(_MARKERS)], label=legend_label(raw.method), **style)
         axes.axhline(raw.summary(kind).median, color=style["color"], linewidth=0.8, linestyle=":")
     axes.set_xlabel("bits of each sRGB code set to zero (dotted: the linear image as it is)")
     axes.set_ylabel(f"median {kind} error, degrees")
@@ -61,7 +61,7 @@ def _draw_sizes(figure: Any, rows: Sequence[SizeRow], method: str) -> None:
             [row.side for row in of_cell],
             [row.medians[method] for row in of_cell],
             marker=_MARKERS[place % len(_MARKERS)],
-            label=block_title(cell),
+            label=legend_label(block_title(cell)),
             **series_style(place),
         )
     sides = sorted({row.side for row in rows})
@@ -103,7 +103,9 @@ def _draw_chromaticities(
             points = rb_of(truths)
             _, first = np.unique((points / _SEEN).round(), axis=0, return_index=True)
             seen = points[first]
-            axes.scatter(*seen.T, s=5, color=style["color"], linewidths=0, alpha=0.6, label=name, zorder=3)
+            axes.scatter(
+                *seen.T, s=5, color=style["color"], linewidths=0, alpha=0.6, label=legend_label(name), zorder=3
+            )
         if len(bodies):
             axes.scatter(
                 *bodies.T,

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from evaluation.experiments.folds import folds_to_csv
 from evaluation.experiments.transfer.figures import TransferFigures
-from evaluation.experiments.transfer.plan import TransferPlan
+from evaluation.experiments.transfer.plan import TransferPlan, is_generated
 from evaluation.experiments.transfer.rows import TransferRow
 from evaluation.experiments.transfer.tables import (
     errors_table,
@@ -109,9 +109,9 @@ def report_page(outcome: TransferOutcome) -> str:
     test = outcome.test
     parts = [
         paragraph(
-            f"Learned methods trained on generated images and tested on {len(test.scenes)} images of {test.name}, "
-            "beside the same methods cross-validated on these images and trained without a table. Each row "
-            "was trained on as many images as its column says."
+            f"Learned methods trained on {_training_sets(outcome)} and tested on {len(test.scenes)} images of "
+            f"{test.name}{' (generated)' if is_generated(test) else ''}, beside the same methods cross-validated on "
+            "these images. Each row was trained on as many images as its column says."
         ),
         *(table_part(table) for table in outcome.tables()),
     ]
@@ -120,8 +120,9 @@ def report_page(outcome: TransferOutcome) -> str:
         parts.append(
             figure_part(
                 picture,
-                "Median error in parts of the same method's real cross-validation, with 95 % intervals; the vertical "
-                "line is real data. Left of it generated images train better than real ones do.",
+                f"Median error in parts of the same method's cross-validation on {test.name}, with 95 % intervals; the "
+                "vertical line is that cross-validation. Left of it a row's images train better than the test set's "
+                "own do.",
             )
         )
     parts += [table_part(paper_ratios_table()), heading("Conditions")]
@@ -129,6 +130,13 @@ def report_page(outcome: TransferOutcome) -> str:
     parts += [paragraph(f"{test.name}, {what}: {sentence}.") for what, sentence in test.treatment.items()]
     parts.append(paragraph(f"Settings: {json.dumps(dict(outcome.settings), ensure_ascii=False)}. {software()}."))
     return page(f"Transfer to {test.name}", parts)
+
+
+def _training_sets(outcome: TransferOutcome) -> str:
+    """Return the names of what was trained on, each said to be generated where it was."""
+    named = {some.data: some.kind for some in reversed(outcome.plan.training)}
+    listed = [f"{name} ({'not generated' if named[name] == 'other' else 'generated'})" for name in sorted(named)]
+    return ", ".join(listed)
 
 
 def _draw_ratios(figure: Any, found: TransferFigures) -> None:

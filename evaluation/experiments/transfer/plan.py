@@ -40,6 +40,11 @@ class TransferPlan:
     notes: tuple[str, ...]
 
 
+def is_generated(some: SceneSet) -> bool:
+    """Return whether images of a set were made by `generate`."""
+    return any(isinstance(scene, GeneratedScene) for scene in some.scenes)
+
+
 def plan_transfer(
     test: SceneSet,
     sets: Sequence[SceneSet],
@@ -80,11 +85,14 @@ def plan_transfer(
         )
     training: list[TrainingSet] = []
     notes: list[str] = []
+    if is_generated(test):
+        notes.append(f"The test set {test.name} was made by generate: nothing here says what is reached on real images")
     for some in sets:
         scenes = _trainable(some, test, shared, notes)
         made = tuple(scene for scene in scenes if isinstance(scene, GeneratedScene))
         if not made:
             training.append(TrainingSet(some.name, "other", scenes))
+            notes.append(f"{some.name} was not made by generate: its rows say nothing of generated images")
         elif pictures is None:
             training.append(TrainingSet(some.name, "generated", made))
         else:

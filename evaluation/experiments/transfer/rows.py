@@ -65,7 +65,7 @@ class TransferRow:
     kind
         How it was trained.
     data
-        Name of the data set that it was trained on.
+        Name of the data set that it was trained on; of cross-validation only where the test set was generated.
     images
         Training images: of cross-validation those of the smallest training part; 0 where nothing is learned.
     results
@@ -83,7 +83,7 @@ class TransferRow:
         """How the method was trained, for a column of tables."""
         match self.kind:
             case "cross-validation":
-                return "real, cross-validated"
+                return f"cross-validated on {self.data} (generated)" if self.data else "real, cross-validated"
             case "generated":
                 return f"{self.data}: generated"
             case "naive":
@@ -138,6 +138,7 @@ def transfer(
     side: int | None = None,
     workers: int = 1,
     on_scene: Callable[[], None] | None = None,
+    generated: str = "",
 ) -> tuple[TransferRow, ...]:
     """Return the rows of every learner: cross-validated on the test set, and trained on each training set.
 
@@ -164,6 +165,8 @@ def transfer(
         Threads that read images; no number depends on it.
     on_scene
         Called after each image that is read, test and training images alike, once for all learners and seeds.
+    generated
+        Name of the test set if it was generated, so that no row calls it real; else empty.
 
     Returns
     -------
@@ -186,7 +189,9 @@ def transfer(
     drawn = [_drawn(some, len(folds), images) for some in training]
     trials = gather(test, learners, side, workers, on_scene)
     parts = [
-        TransferRow(learner.name, "cross-validation", "", _least(folds), _crossed(learner, number, trials, folds))
+        TransferRow(
+            *(learner.name, "cross-validation", generated, _least(folds)), _crossed(learner, number, trials, folds)
+        )
         for number, learner in enumerate(learners)
     ]
     for some, wanted in zip(training, drawn, strict=True):

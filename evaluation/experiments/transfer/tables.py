@@ -55,12 +55,15 @@ def intervals_table(found: TransferFigures, name: str) -> Table:
 
 
 def real_ratios_table(found: TransferFigures, name: str) -> Table:
-    """Return every row in parts of the same method's cross-validation on real images."""
+    """Return every row in parts of the same method's cross-validation on the test images, real ones or not."""
+    made = any(one.base.data for one in found.to_real)
+    base = f"cross-validation on {name} (generated)" if made else "real cross-validation"
+    good = "as good as images of the test set, which are generated, not real" if made else "as good as real images"
     return Table(
-        f"{name}: errors in parts of the same method's real cross-validation",
+        f"{name}: errors in parts of the same method's {base}",
         ("Method", "Trained on", *HEADS),
         tuple((one.row.method, one.row.training, *_ratio_cells(one)) for one in found.to_real),
-        notes=(f"With {LEVEL * 100:.0f} % intervals, paired by test image. 1: as good as real images.",),
+        notes=(f"With {LEVEL * 100:.0f} % intervals, paired by test image. 1: {good}.",),
     )
 
 

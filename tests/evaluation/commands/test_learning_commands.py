@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import sys
 from pathlib import Path
 
@@ -44,6 +45,21 @@ def test_a_model_is_trained_saved_and_used(data: Path, tmp_path: Path, capsys: p
     assert main(["train", "smart-color-cat", str(data), "--out", str(model)]) == 2
     assert "already exists" in capsys.readouterr().err
     assert model.read_bytes() == before
+
+
+def test_a_model_is_tested_on_a_part_of_what_it_was_trained_on(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with np.load(data) as content:
+        half = {name: content[name][::2] for name in content.files}
+    np.savez(tmp_path / "half.npz", **half)
+    for taught, tested, told in ((data, "half", "15 of 15"), (tmp_path / "half.npz", "world", "15 of 30")):
+        model, out = tmp_path / f"{tested}_model.npz", tmp_path / f"{tested}_results"
+        assert main(["train", "smart-color-cat", str(taught), "--out", str(model)]) == 0
+        assert main(["run", str(tmp_path / f"{tested}.npz"), "--method", str(model), "--out", str(out)]) == 0
+        assert f": {told} images were trained on, by name and light" in " ".join(capsys.readouterr().out.split())
+        (note,) = json.loads((out / "run.json").read_text())["notes"]
+        assert f": {told} images were trained on" in note
 
 
 def test_cross_validation_prints_and_writes(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -97,6 +97,28 @@ def test_tables_and_files(place: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert (out / "tables.tex").read_text().count("\\begin{tab") >= 4
 
 
+def test_nothing_is_called_real_or_generated_that_is_not(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wish = ("--methods", "own.py:Map", "--statistics", "none", "--out", "out")
+    assert main(["transfer", "--train", "real.npz", "--test", "made", *wish]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    tables, told = printed[: printed.index("The test set")], printed[printed.index("The test set") :]
+    assert "in parts of the same method's cross-validation on made (generated)" in tables
+    assert "cross-validated on made (generated)" in tables
+    assert "real: as it is" in tables
+    assert "real cross-validation" not in tables
+    assert "real, cross-validated" not in tables
+    assert "as good as real" not in tables
+    assert "real: generated" not in tables
+    assert "The test set made was made by generate: nothing here says what is reached on real images" in told
+    assert "real was not made by generate: its rows say nothing of generated images" in told
+    page = (place / "out" / "report.html").read_text()
+    assert "trained on real (not generated) and tested on 12 images of made (generated)" in page
+    assert "trained on generated images" not in page
+    assert {row["data"] for row in csv.DictReader((place / "out" / "results.csv").read_text().splitlines())} == {
+        *("made", "real")
+    }
+
+
 def test_the_results_can_be_compared(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*BASIC, "--out", "out"]) == 0
     capsys.readouterr()

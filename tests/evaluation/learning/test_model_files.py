@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evaluation.datasets.identities import known_again
 from evaluation.learning.feature_learner import LearnedMethod
 from evaluation.learning.model_files import load_model, save_model, scenes_sha256
 from evaluation.learning.regression_trees import RegressionTrees
@@ -73,6 +74,22 @@ def test_the_hash_knows_names_lights_and_order() -> None:
     }
     assert len(hashes) == 4
     assert scenes_sha256(world(12)) == scenes_sha256(SCENES)
+
+
+def test_the_images_are_known_again(saved: Path) -> None:
+    record = load_model(saved).provenance
+    assert record is not None
+    assert known_again([*world(14)[10:], *SCENES[:1]], record.images) == tuple(
+        scene.name for scene in (*SCENES[10:], SCENES[0])
+    )
+
+
+def test_a_file_without_its_images_is_read(saved: Path) -> None:
+    rewrite(saved, lambda arrays, _: arrays.pop("trained_on"))
+    record = load_model(saved).provenance
+    assert record is not None
+    assert record.scenes == 12
+    assert record.images.shape == (0, 2)
 
 
 def test_nothing_is_overwritten(saved: Path, fitted: LearnedMethod) -> None:
@@ -162,6 +179,8 @@ def tell(**changes: Any) -> Change:
 UNFIT: list[tuple[Change, str]] = [
     (drop("value"), "lacks 'value'"),
     (put("value", np.zeros((2, 2))), "trees of the shapes"),
+    (put("trained_on", np.zeros((11, 2), np.uint64)), "trained_on is uint64 of the shape"),
+    (put("trained_on", np.zeros((12, 2))), "trained_on is float64"),
     (lambda arrays, _: arrays["value"].fill(np.nan), "not finite"),
     (lambda arrays, _: arrays["left"].fill(200), "lead nowhere"),
     (tell(format="croplab model 9"), "croplab model 9"),
