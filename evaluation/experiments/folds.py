@@ -111,7 +111,8 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
             columns = list(table.fieldnames or ())
             rows = [(row.get("image") or "", (row.get("fold") or "").strip()) for row in table]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FormatError(f"cannot read folds from {path}: {error}; expected CSV, image,fold a line") from error
+        reason = (isinstance(error, OSError) and error.strerror) or str(error)
+        raise FormatError(f"cannot read folds from {path}: {reason}; expected CSV, image,fold a line") from error
     if not {"image", "fold"} <= set(columns):
         raise FormatError(f"{path} has the columns {','.join(columns)}; expected image,fold; correct its first line")
     given = dict(rows)
