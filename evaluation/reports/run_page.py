@@ -24,6 +24,7 @@ from evaluation.results.result import Result
 from evaluation.results.run import Run
 from evaluation.results.summary_tables import lights_tables, summary_table
 from evaluation.results.tables import Table
+from foundation.errors import counted
 
 WORST, MIDDLE = 3, 2
 """Images shown of each method: its largest errors, and those nearest to its median."""
@@ -72,7 +73,7 @@ def run_page(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes
     # What is said of images without a light holds for both tables.
     tables[1] = Table(tables[1].title, tables[1].columns, tables[1].rows)
     parts = [
-        paragraph(f"{len(run.subject.images)} images, read from {run.place} (layout {run.layout})."),
+        paragraph(f"{counted(len(run.subject.images), 'image')}, read from {run.place} (layout {run.layout})."),
         *map(paragraph, run.notes),
         *map(table_part, tables),
         *map(table_part, lights_tables(run.subject, run.results, kind)),
