@@ -96,6 +96,17 @@ class StorageError(CropError):
     exit_code = 5
 
 
+def counted(number: int, what: str, plural: str | None = None) -> str:
+    """Return a number with what is counted, in the plural but for one.
+
+    Examples
+    --------
+    >>> counted(1, "image"), counted(0, "image"), counted(2, "is left", "are left")
+    ('1 image', '0 images', '2 are left')
+    """
+    return f"{number} {what if number == 1 else plural or what + 's'}"
+
+
 def first_of(things: Sequence[object], most: int = 10) -> str:
     """Return things between commas as a message names them: the first ones, and an ellipsis where there are more."""
     return ", ".join(map(str, things[:most])) + (" …" if len(things) > most else "")

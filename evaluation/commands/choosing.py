@@ -69,6 +69,33 @@ def choose_learners(texts: Iterable[str]) -> list[Learner]:
     return [_learner(text) for text in dict.fromkeys(wanted)]
 
 
+def require_order(command: str, method: str, data: str) -> None:
+    """Refuse METHOD and DATA of `evaluate cv` and `evaluate train` in the wrong order.
+
+    Raises
+    ------
+    InputError
+        `method` is the place of a data set, and `data` names methods.
+
+    Examples
+    --------
+    >>> require_order("cv", ".", "regression-trees")
+    Traceback (most recent call last):
+        ...
+    foundation.errors.InputError: . is a data set and regression-trees a method: the method comes first: evaluate cv \
+regression-trees .
+    """
+    from evaluation.learning.standard import standard_learners
+    from foundation.errors import InputError
+
+    names = {*standard_learners(), "all"}
+    is_method = all(part.strip() in names or ".py:" in part for part in data.split(","))
+    if is_method and not Path(data).exists() and (Path(method).exists() or "://" in method):
+        raise InputError(
+            f"{method} is a data set and {data} a method: the method comes first: evaluate {command} {data} {method}"
+        )
+
+
 def choose_estimates(texts: Sequence[str], images: Sequence[str]) -> list[GivenEstimates]:
     """Return the files of estimates that texts name, as FILE.csv or NAME=FILE.csv, for the images of a data set.
 
@@ -100,7 +127,7 @@ def _method(text: str) -> Method:
         )
     found = _found(text)
     if not callable(getattr(found, "estimate", None)):
-        raise InputError(f"{text} has no estimate(image, saturation, mask): it learns first; see evaluate train and cv")
+        raise InputError(f"{text} has no estimate(image, saturation, mask): it learns first: give it to evaluate cv")
     return cast("Method", found)
 
 

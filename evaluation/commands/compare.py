@@ -16,14 +16,18 @@ if TYPE_CHECKING:
     from evaluation.metrics import ErrorKind
     from evaluation.results.errors_file import MethodErrors
 
+_FEW = 3
+"""Comparisons of which everything is printed unasked: of more, one would have to look for what they come to."""
+
 HELP = f"""Compare two methods on the same images, or a method in two runs, image by image.
 
 Reads one or two RESULTS: results folders, or the errors.csv in them. Of one, every two of its methods are compared; of
 two, each method that both have. Images are matched by their names; images that one of them lacks are named and left
 out, and ground truths that differ are refused.
 
-Prints Wilcoxon's signed-rank test, and each statistic's difference and ratio with bootstrap intervals. Writes nothing
-unless asked with --out.
+Prints Wilcoxon's signed-rank test and a sentence for each comparison; of up to three comparisons, and with --images of
+all, also each statistic's difference and ratio with bootstrap intervals, and the images that differ most. Writes
+nothing unless asked with --out.
 
 {EXIT_CODES}
 """
@@ -38,8 +42,8 @@ def compare(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Method to compare; give it more than once for several. With two RESULTS, FIRST=SECOND compares "
-            "methods of different names. \\[default: all]",
+            help="Method to compare, as the tables call it or by its name for evaluate run; give it more than once for "
+            "several. With two RESULTS, FIRST=SECOND compares methods of different names. \\[default: all]",
             show_default=False,
         ),
     ] = None,
@@ -54,6 +58,9 @@ def compare(
             show_default=False,
         ),
     ] = None,
+    images: Annotated[
+        bool, typer.Option("--images", help="Print statistics and largest differences of more than three comparisons.")
+    ] = False,
     level: Annotated[float, typer.Option(help="Confidence of the intervals.", min=0.5, max=0.999)] = 0.95,
     seed: Annotated[int, typer.Option(help="Of the bootstrap.", min=0)] = 0,
 ) -> None:
@@ -66,6 +73,10 @@ def compare(
 
     if len(results) > 2:
         raise InputError(f"{len(results)} results; compare two, or the methods of one")
+    if len(results) == 2 and len({_errors_file(place) for place in results}) == 1:
+        raise InputError(
+            f"{results[0]} and {results[1]} are the same results; evaluate compare {results[0]} compares its methods"
+        )
     if out is not None:
         require_free(out, "the comparison")
     runs = [read_errors(place) for place in results]
@@ -79,12 +90,15 @@ def compare(
     )
     for note in notes:
         print(note)
-    for made in comparisons:
-        print_table(comparison_report.statistics_table(made, level))
-        print_table(comparison_report.images_table(made, 5))
     print_table(comparison_report.tests_table(comparisons))
     for made in comparisons:
         print(comparing.verdict(made, level))
+    if images or len(comparisons) <= _FEW:
+        for made in comparisons:
+            print_table(comparison_report.statistics_table(made, level))
+            print_table(comparison_report.images_table(made, 5))
+    elif out is None:
+        print("Statistics and images of each comparison: --images prints them, --out writes them, --method chooses.")
     if out is not None:
         comparison_report.write_comparisons(out, comparisons, notes, level)
         print(f"written to {out}: report.html, tests.csv, statistics.csv, images.csv, tables.tex")
@@ -140,10 +154,30 @@ def _named(run: Mapping[str, MethodErrors], name: str, place: str) -> str:
 
     if name in run:
         return name
-    alike = [known for known in run if known.lower() == name.lower()]
+    alike = [known for known in run if known.lower() in (name.lower(), _title(name).lower())]
     if len(alike) != 1:
         raise InputError(f"{place} has no method {name!r}; it has {', '.join(run)}")
     return alike[0]
+
+
+def _title(name: str) -> str:
+    """Return how tables call a method of this suite that has a short name: "pca"; any other name as it is."""
+    import re
+
+    from evaluation.learning.standard import standard_learners
+    from evaluation.methods.naming import find_method
+    from evaluation.methods.standard import local_methods, standard_methods
+
+    learners = standard_learners()
+    if name in learners:
+        return learners[name].name
+    known = {*standard_methods(), *local_methods()}
+    return find_method(name).name if re.split("[:@]", name)[0] in known else name
+
+
+def _errors_file(place: str) -> Path:
+    path = Path(place).resolve()
+    return path / "errors.csv" if path.is_dir() else path
 
 
 def _labels(places: Sequence[str]) -> tuple[str, str]:
@@ -194,8 +228,11 @@ def _record(place: str) -> dict[str, str]:
 
 def _guessed(runs: Sequence[Mapping[str, MethodErrors]], places: Sequence[str]) -> list[str]:
     """Return a sentence for each method that gave no light for some images."""
+    from foundation.errors import counted
+
     return [
-        f"{name} of {place} gave no light for {method.guessed.sum()} of {len(method.images)} images; grey stands in"
+        f"{name} of {place} gave no light for {method.guessed.sum()} of {counted(len(method.images), 'image')}; "
+        "grey stands in"
         for run, place in zip(runs, places, strict=True)
         for name, method in run.items()
         if method.guessed.any()

@@ -88,6 +88,7 @@ def cv(
     reading: DataReading,
 ) -> None:
     """Cross-validate methods on a data set."""
+    from evaluation.commands.choosing import require_order
     from evaluation.experiments.cross_validation import cross_validate
     from evaluation.experiments.folds import folds_to_csv
     from evaluation.experiments.run_folder import describe_run, write_run
@@ -98,6 +99,7 @@ def cv(
     from foundation.files import require_free, require_free_file, write_whole
     from foundation.processors import processor_count
 
+    require_order("cv", method, data)
     learners, left_out = _chosen(method)
     if out is not None:
         require_free(out, "the results")
@@ -131,7 +133,7 @@ def cv(
 def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
     """Return a sentence where images (N,) int64 by their folds are copies of images of other folds."""
     from evaluation.datasets.states import first_copies
-    from foundation.errors import first_of
+    from foundation.errors import counted, first_of
 
     names = [scene.name for scene in data.scenes]
     apart = [
@@ -142,8 +144,8 @@ def _parted_copies(data: SceneSet, folds: npt.NDArray[np.int64]) -> list[str]:
     if not apart:
         return []
     return [
-        f"{len(apart)} images are copies of images of other folds ({first_of(apart)}): they are tested on what was "
-        "trained on"
+        f"{counted(len(apart), 'image is a copy', 'images are copies')} of images of other folds ({first_of(apart)}): "
+        "tested on what was trained on"
     ]
 
 
@@ -168,6 +170,14 @@ def _chosen(text: str) -> tuple[list[Learner], list[str]]:
     return chosen, left_out
 
 
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def _folds(data: SceneSet, text: str | None, seed: int) -> tuple[npt.NDArray[np.int64], str]:
     """Return the fold of each image, (N,) int64, and where the folds come from."""
     import numpy as np
@@ -178,7 +188,7 @@ def _folds(data: SceneSet, text: str | None, seed: int) -> tuple[npt.NDArray[np.
     if text is None and data.folds is not None:
         return np.asarray(data.folds, dtype=np.int64), "the data set's own"
     if text is not None and not text.lstrip("+-").isdigit():
-        if not Path(text).suffix:
+        if not Path(text).suffix or _is_number(text):
             raise InputError(f"--folds is {text!r}, expected a number from 2, or a CSV file with image,fold")
         return read_folds(Path(text), [scene.name for scene in data.scenes]), f"from {text}"
     number = _FOLDS if text is None else int(text)

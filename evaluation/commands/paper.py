@@ -153,7 +153,12 @@ def table2(
     ],
     methods: Annotated[
         str,
-        typer.Option(metavar="LIST", help="Methods that learn, between commas: names, module:Class or file.py:Class."),
+        typer.Option(
+            metavar="LIST",
+            help="Methods that learn, between commas: names, module:Class or file.py:Class. "
+            "\\[default: smart-color-cat, regression-trees, color-beaver]",
+            show_default=False,
+        ),
     ] = "smart-color-cat,regression-trees,color-beaver",
     folds: Annotated[str, typer.Option(metavar="N|FILE", help="Folds of the cross-validation, or their file.")] = "3",
     error: Kind = "reproduction",

@@ -49,7 +49,7 @@ def train(
     reading: DataReading,
 ) -> None:
     """Train a method on a data set."""
-    from evaluation.commands.choosing import choose_learners
+    from evaluation.commands.choosing import choose_learners, require_order
     from evaluation.learning.feature_learner import (
         FeatureLearner,
         extract,
@@ -64,6 +64,7 @@ def train(
     from foundation.files import require_free_file
     from foundation.processors import processor_count
 
+    require_order("train", method, data)
     learners = choose_learners([method])
     if len(learners) != 1:
         raise InputError(f"{method} are {len(learners)} methods, a model file holds one; name one")

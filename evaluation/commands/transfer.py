@@ -51,7 +51,13 @@ def transfer(
     test: Annotated[str, typer.Option(metavar="REAL", help="Data set to test on.", show_default=False)],
     methods: Annotated[str, typer.Option(metavar="LIST", help="Learned methods between commas, or all.")] = "all",
     statistics: Annotated[
-        str, typer.Option(metavar="LIST", help="Statistics methods for reference between commas, all or none.")
+        str,
+        typer.Option(
+            metavar="LIST",
+            help="Statistics methods for reference between commas, all or none. "
+            "\\[default: gray-world, shades-of-gray, gray-edge-1]",
+            show_default=False,
+        ),
     ] = "gray-world,shades-of-gray,gray-edge-1",
     folds: Annotated[
         str | None,

@@ -132,7 +132,7 @@ def natural(name: str) -> list[str | int]:
 
 
 def present(
-    names: Sequence[str], images: Mapping[str, str], source: str, folder: Path, partial: bool
+    names: Sequence[str], images: Mapping[str, str], source: str, folder: Path | str, partial: bool
 ) -> tuple[list[int], str]:
     """Return which of the images that a data set should have are there, and a sentence on their number.
 

@@ -49,6 +49,8 @@ class Layout:
         Whether it is no particular data set's, and asked only where no other matches.
     unverified
         Whether it is others' and its reader was never tried on a copy that they published; results then say so.
+    takes
+        "folder" or "file", which a place must be; None if it may be either, or a URL.
     """
 
     title: str
@@ -58,6 +60,7 @@ class Layout:
     options: tuple[str, ...] = ()
     general: bool = False
     unverified: bool = False
+    takes: str | None = "folder"
 
 
 _UNVERIFIED = "not verified against a published copy; compare one image with the authors' program"
@@ -70,9 +73,14 @@ LAYOUTS: Mapping[str, Layout] = {
         "dataset.json",
         lambda folder: folder.has("dataset.json"),
         lambda place, _, __: open_generated(place),
+        takes=None,
     ),
     "thumbnails": Layout(
-        "thumbnails in a NumPy archive", "a file .npz", lambda _: False, lambda place, _, __: open_thumbnails(place)
+        "thumbnails in a NumPy archive",
+        "a file .npz",
+        lambda _: False,
+        lambda place, _, __: open_thumbnails(place),
+        takes="file",
     ),
     "cube-plus": Layout(
         "Cube+, or Cube", "cube+_gt.txt", is_cube_plus, open_cube_plus, ("truth", *_LEVELS, "partial"), unverified=True
@@ -141,6 +149,7 @@ LAYOUTS: Mapping[str, Layout] = {
         open_plain_folder,
         (*_LEVELS, "partial"),
         general=True,
+        takes=None,
     ),
 }
 """By the names that the command takes."""
@@ -171,6 +180,8 @@ def open_scenes(place: Path | str, layout: str | None = None, options: DataOptio
     if name not in LAYOUTS:
         raise InputError(f"{name!r} is no layout; the layouts are {', '.join(LAYOUTS)}")
     known = LAYOUTS[name]
+    if layout is not None and known.takes is not None:
+        _require_kind(text, name, known)
     idle = [option for option in chosen.given if option not in known.options]
     if idle:
         able = [other for other, it in LAYOUTS.items() if idle[0] in it.options]
@@ -194,6 +205,27 @@ def layout_of(place: str) -> str:
     return _recognise(place)[0]
 
 
+def _require_kind(place: str, name: str, known: Layout) -> None:
+    """Refuse what is a file where the layout is a folder, the other way round, or not there."""
+    path = Path(place)
+    if not path.exists():
+        raise FormatError(f"{place} is not there, expected a {known.takes} of {known.title} ({name}); name that")
+    if path.is_dir() != (known.takes == "folder"):
+        raise FormatError(
+            f"{place} is a {'folder' if path.is_dir() else 'file'}, expected a {known.takes} of {known.title} "
+            f"({name}); name that, or leave out --layout to have the layout told by the place"
+        )
+
+
+def _refuse_results(folder: Path, place: str) -> None:
+    """Refuse a folder that holds results of `evaluate`, whose errors.csv has the columns of a table of images."""
+    if (folder / "run.json").is_file() and any((folder / name).is_file() for name in ("errors.csv", "results.csv")):
+        raise FormatError(
+            f"{place} is a results folder of evaluate, expected a data set; name the data that its run.json tells, or "
+            "compare results with evaluate compare"
+        )
+
+
 def _recognise(place: str) -> tuple[str, Folder | None]:
     """Return the layout of a place, and the names in its folder if it is one."""
     if "://" in place:
@@ -201,11 +233,14 @@ def _recognise(place: str) -> tuple[str, Folder | None]:
     path = Path(place)
     if path.is_file():
         by_ending = {".npz": "thumbnails", ".csv": "folder"}
+        if path.name in ("errors.csv", "results.csv"):
+            _refuse_results(path.parent, place)
         if path.suffix.lower() in by_ending:
             return by_ending[path.suffix.lower()], None
         raise FormatError(f"{place} is a file, expected a folder, an archive .npz or a table .csv; name one of these")
     if not path.is_dir():
         raise FormatError(f"{place} is no dataset: it does not exist; name its folder, file or URL")
+    _refuse_results(path, place)
     folder = Folder(path)
     found = [name for name, known in LAYOUTS.items() if not known.general and known.matches(folder)]
     found = found or [name for name, known in LAYOUTS.items() if known.general and known.matches(folder)]

@@ -7,15 +7,17 @@ It lies so::
                         column mask: a picture that is not 0 where a pixel must not be used, optional
                         column fold: whole numbers from 0 for cross-validation, optional
     photo1.png …        linear camera RGB, red first: PNG or TIFF of 16 bits, TIFF of floats, or NumPy files
+    photo1_mask.png     the mask of photo1 where column mask names none, optional
 
-The table is the folder's only .csv with those columns, or is named itself. Pictures for the eye are refused: JPEG, and
+The table is the folder's only .csv with those columns, or is named itself. An image beside them that has no row is
+refused, so that none is left out unseen. Pictures for the eye are refused: JPEG, and
 8 bits a channel, are sRGB, whose values are not proportional to light.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +36,8 @@ COLUMNS = ("image", "r", "g", "b")
 
 _PICTURES = (".jpg", ".jpeg", ".webp", ".heic", ".gif", ".bmp")
 _RAWS = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef", ".srw", ".crw")
+_MASK = "_mask"
+_MASK_ENDINGS = (".png", ".tif", ".tiff")
 _MOST = 50
 """Tables of a folder whose heads are read to find the one with the lights."""
 
@@ -99,13 +103,15 @@ def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = 
     InputError
         There are several tables.
     FormatError
-        There is no table, it is damaged, or an image is missing, named twice or a picture for the eye.
+        There is no table, it is damaged, or an image is missing, named twice, a picture for the eye or without a row.
     """
     path = _table_of(Path(place), listed)
     folder = path.parent
     scenes: list[OwnScene] = []
     folds: list[int] = []
     missing: list[str] = []
+    refused: str | None = None
+    masks: set[str] = set()
     seen: set[str] = set()
     given: set[str] = set()
     paths: dict[str, str] = {}
@@ -119,13 +125,20 @@ def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = 
         light = light_of(row, COLUMNS[1:], where)
         if image is None:
             missing.append(name)
+            refused = refused or _unusable(folder, name, where, listings)
             continue
         if (before := paths.setdefault(os.path.normpath(image), name)) != name:
             raise FormatError(f"{where}: {name} is the file of {before} too, expected each image once; take one away")
         given.update(column for column in ("black", "saturation", "mask", "fold") if row.get(column, "").strip())
-        scenes.append(_scene(folder, name, image, light, row, where, options))
+        beside = _mask_beside(name, image, listings)
+        scenes.append(_scene(folder, name, image, beside, light, row, where, options))
+        if scenes[-1].mask_path:
+            masks.add(os.path.normpath(scenes[-1].mask_path))
+        given.update(("mask beside",) if beside and scenes[-1].mask_path == beside else ())
         folds.append(_fold(row, where))
     if not scenes or (missing and not options.partial):
+        if refused:
+            raise FormatError(refused)
         remedy = "complete the folder" + (", or take what is there with --partial" if scenes else "")
         raise FormatError(
             f"{folder} lacks {len(missing)} of the {len(seen)} images of {path.name} "
@@ -133,22 +146,33 @@ def open_plain_folder(place: str, options: DataOptions, listed: Folder | None = 
         )
     if "fold" in given and min(folds) < 0:
         raise FormatError(f"{path}: some rows have a fold and others none, expected one in each; complete the column")
+    if both := sorted(masks & paths.keys()):
+        raise FormatError(f"{path} has a row for {first_of(both)}, which is a mask too; rename one of the two")
+    left_out = _without_row(Path(place), path, listings, paths.keys(), masks, options.partial)
     return SceneSet(
         name=folder.resolve().name,
         layout="folder",
         place=place,
         scenes=tuple(scenes),
         treatment={
-            "images": str(len(scenes)) + (f"; {len(missing)} more of {path.name} are not there" if missing else ""),
+            "images": str(len(scenes))
+            + (f"; {len(missing)} more of {path.name} are not there" if missing else "")
+            + (f"; {left_out}" if left_out else ""),
             "black level": _stated("black", given, path, options.black, "0: assumed, as neither a column black nor "
             "--black gives it"),
             "saturation": _stated("saturation", given, path, options.saturation, "none: neither a column saturation "
             "nor --saturation gives it, so clipped pixels are used"),
-            "mask": f"column mask of {path.name}: where the picture is not 0" if "mask" in given else "none",
+            "mask": _mask_stated(given, path, len(masks), len(scenes)),
             "ground truth": f"r, g, b of {path.name}",
         },
         folds=tuple(folds) if "fold" in given else None,
     )  # fmt: skip
+
+
+def _mask_stated(given: set[str], path: Path, masks: int, count: int) -> str:
+    of = ((f"column mask of {path.name}", "mask"), ("NAME_mask beside the image", "mask beside"))
+    sources = " or ".join(text for text, key in of if key in given)
+    return f"{sources}: where the picture is not 0; {masks} of {count} images have one" if sources else "none"
 
 
 def _stated(column: str, given: set[str], path: Path, option: float | None, otherwise: str) -> str:
@@ -198,31 +222,124 @@ class _Listing:
     def images(self) -> Mapping[str, str]:
         return self.folder.images(IMAGE_ENDINGS) if self.files else {}
 
+    @cached_property
+    def masks(self) -> Mapping[str, str]:
+        """Files that are masks by their names, by the names of the images that they belong to, without ending."""
+        found: dict[str, str] = {}
+        for known in (_PICTURES, _MASK_ENDINGS):
+            for file in sorted(self.files, reverse=True):
+                stem = file.rpartition(".")[0]
+                if stem.endswith(_MASK) and _ending(file) in known:
+                    found[stem[: -len(_MASK)]] = file
+        return found
+
+    @cached_property
+    def unusable(self) -> Mapping[str, str]:
+        """Pictures for the eye and raw files by their names without ending."""
+        return {Path(file).stem: file for file in self.files if _ending(file) in (*_PICTURES, *_RAWS)}
+
+
+def _ending(file: str) -> str:
+    return f".{file.rpartition('.')[2].lower()}"
+
 
 def _find(folder: Path, name: str, where: str, listings: dict[str, _Listing]) -> str | None:
     """Return the path of an image that a table names with or without its ending; None if it is not there."""
     below, _, file = name.rpartition("/")
-    ending = f".{file.rpartition('.')[2].lower()}"
-    if ending in _PICTURES:
-        raise FormatError(
-            f"{where}: {name} is a picture for the eye (sRGB), whose values are not proportional to light; expected "
-            f"linear camera RGB ({', '.join(IMAGE_ENDINGS)})"
-        )
-    if ending in _RAWS:
-        raise FormatError(
-            f"{where}: {name} is a raw file, whose mosaic has yet to be interpolated; make a linear 16-bit file of it, "
-            "for instance with dcraw -h -D -4 -T or rawpy, and name that"
-        )
+    if why := _no_image(file):
+        raise FormatError(f"{where}: {name} is {why}")
     if below not in listings:
         listings[below] = _Listing(Folder(folder / below))
     listing = listings[below]
-    if ending in IMAGE_ENDINGS:
+    if _ending(file) in IMAGE_ENDINGS:
         return f"{listing.folder.path}{os.sep}{file}" if file in listing.files else None
     return listing.images.get(file)
 
 
+def _no_image(file: str) -> str:
+    """Return why a file of that name holds no linear camera RGB; "" if it may."""
+    if _ending(file) in _PICTURES:
+        kind = "JPEG, " if _ending(file) in (".jpg", ".jpeg") else ""
+        return (
+            f"{kind}a picture for the eye (sRGB), whose values are not proportional to light; expected linear camera "
+            f"RGB ({', '.join(IMAGE_ENDINGS)})"
+        )
+    if _ending(file) in _RAWS:
+        return (
+            "a raw file, whose mosaic has yet to be interpolated; make a linear 16-bit file of it, for instance with "
+            "dcraw -h -D -4 -T, and name that"
+        )
+    return ""
+
+
+def _unusable(folder: Path, name: str, where: str, listings: Mapping[str, _Listing]) -> str | None:
+    """Return why a file that has the name of a missing image is refused; None if there is no such file."""
+    below, _, file = name.rpartition("/")
+    stem = Path(file).stem if _ending(file) in IMAGE_ENDINGS else file
+    found = listings[below].unusable.get(stem)
+    return found and f"{where}: of {name} there is only {folder / below / found}: {_no_image(found)}"
+
+
+def _mask_beside(name: str, image: str, listings: Mapping[str, _Listing]) -> str:
+    """Return the path of the mask that belongs to an image by its name; "" if there is none."""
+    listing = listings[name.rpartition("/")[0]]
+    file = listing.masks.get(Path(image).stem)
+    return f"{listing.folder.path}{os.sep}{file}" if file else ""
+
+
+def _without_row(
+    place: Path,
+    path: Path,
+    listings: Mapping[str, _Listing],
+    images: Collection[str],
+    masks: Collection[str],
+    partial: bool,
+) -> str:
+    """Return a sentence on the images that the table does not name; "" if there are none.
+
+    Where a table was named and has others beside it, it is a choice of the images; else one without a row is an error.
+
+    Raises
+    ------
+    FormatError
+        An image lies among those of the table and has no row.
+    """
+    folders = {file.rpartition(os.sep)[0] or "." for file in images}
+    root = Folder(path.parent)
+    among: list[str] = []
+    elsewhere: list[str] = []
+    for folder in {os.path.normpath(each.path): each for each in (*_folders_of(listings), *root.within(1))}.values():
+        at = os.path.normpath(folder.path)
+        files = [os.path.normpath(f"{at}{os.sep}{file}") for file in folder.files if _ending(file) in IMAGE_ENDINGS]
+        (among if at in folders else elsewhere).extend(
+            file for file in files if file not in images and file not in masks
+        )
+    # A mask without a row is its image's affair, unless it lies there alone.
+    among = [file for file in among if not Path(file).stem.endswith(_MASK)] or among
+    chosen = place.is_file() and len(_tables(root)) > 1
+    if among and not (partial or chosen):
+        raise FormatError(
+            f"{path} has no row for {len(among)} of the images beside those that it names "
+            f"({first_of([os.path.relpath(file, root.path) for file in among])}), expected one for each; add what is "
+            "missing, take the files away, or leave them out with --partial"
+        )
+    notes = ((among, "beside them"), (elsewhere, "in other folders there"))
+    return ", ".join(f"{len(files)} {what} without a row in {path.name} left out" for files, what in notes if files)
+
+
+def _folders_of(listings: Mapping[str, _Listing]) -> Iterator[Folder]:
+    return (listing.folder for listing in listings.values() if listing.files)
+
+
 def _scene(
-    folder: Path, name: str, image: str, light: Light, row: Mapping[str, str], where: str, options: DataOptions
+    folder: Path,
+    name: str,
+    image: str,
+    beside: str,
+    light: Light,
+    row: Mapping[str, str],
+    where: str,
+    options: DataOptions,
 ) -> OwnScene:
     black = _level(row, "black", where, options.black)
     white = _level(row, "saturation", where, options.saturation)
@@ -231,7 +348,9 @@ def _scene(
     mask = row.get("mask", "").strip()
     if mask and not (folder / mask).is_file():
         raise FormatError(f"{where}: there is no mask {folder / mask}; restore it, or leave the field empty")
-    return OwnScene(name, image, light, black or 0.0, white, str(folder / mask) if mask else "")
+    if not mask and _ending(beside) in _PICTURES:
+        raise FormatError(f"{where}: the mask {beside} is no {' or '.join(_MASK_ENDINGS)}; make it again as PNG")
+    return OwnScene(name, image, light, black or 0.0, white, str(folder / mask) if mask else beside)
 
 
 def _level(row: Mapping[str, str], column: str, where: str, otherwise: float | None) -> float | None:

@@ -19,7 +19,7 @@ from evaluation.experiments.bootstrap import Compared, paired
 from evaluation.metrics import ErrorKind
 from evaluation.results.errors_file import MethodErrors
 from foundation.angles import angles_deg
-from foundation.errors import InputError
+from foundation.errors import InputError, counted
 
 _SAME_TRUTH_DEG: Final = 0.01
 """Truths that differ by less are the same light written with few digits; six decimals are good to .0001 degrees."""
@@ -222,18 +222,19 @@ def verdict(comparison: Comparison, level: float = 0.95) -> str:
     """Return in one sentence what a comparison says, and whether chance would explain it."""
     matched, test = comparison.matched, comparison.test
     one, other = matched.names
-    counted = f"{one} errs less than {other} on {test.wins} of {len(matched.images)} images, more on {test.losses}"
-    counted += f", the same on {test.ties}" if test.ties else ""
+    images = counted(len(matched.images), "image")
+    told = f"{one} errs less than {other} on {test.wins} of {images}, more on {test.losses}"
+    told += f", the same on {test.ties}" if test.ties else ""
     if comparison.p_holm > 1 - level:
-        return f"{counted}: not significant (Holm-corrected p = {comparison.p_holm:.2g})."
+        return f"{told}: not significant (Holm-corrected p = {comparison.p_holm:.2g})."
     better = one if test.effect < 0 else other
-    return f"{counted}: {better} errs less (Holm-corrected p = {comparison.p_holm:.2g}, effect {test.effect:+.2f})."
+    return f"{told}: {better} errs less (Holm-corrected p = {comparison.p_holm:.2g}, effect {test.effect:+.2f})."
 
 
 def missing_images(matched: Matched) -> tuple[str, ...]:
     """Return a sentence for each of the two that lacks images of the other."""
     return tuple(
-        f"{name} lacks {len(lacking)} images of {whose}, which are left out: {_listed(lacking)}"
+        f"{name} lacks {counted(len(lacking), 'image')} of {whose}, left out here: {_listed(lacking)}"
         for name, whose, lacking in zip(matched.names, reversed(matched.names), matched.missing, strict=True)
         if lacking
     )

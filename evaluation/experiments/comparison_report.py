@@ -7,6 +7,7 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
+from evaluation.experiments.bootstrap import STATISTICS
 from evaluation.experiments.comparing import (
     Comparison,
     largest_differences,
@@ -16,8 +17,13 @@ from evaluation.experiments.comparing import (
 from evaluation.reports.latex import tables_to_latex
 from evaluation.reports.page import Part, figure_part, heading, page, paragraph, row_part, table_part
 from evaluation.reports.scatter import FLOOR_DEG, error_scatter
+from evaluation.results.summary_tables import PAPER_COLUMNS
 from evaluation.results.tables import Table, table_to_csv
+from foundation.errors import counted
 from foundation.files import whole_folder
+
+_HEADS = dict(zip(STATISTICS, PAPER_COLUMNS[1:], strict=True))
+"""Statistics as every other table heads them; files keep the short names."""
 
 _LABELLED = 5
 """Images labelled in a scatter: more names would cover one another."""
@@ -56,11 +62,12 @@ def tests_table(comparisons: Sequence[Comparison]) -> Table:
 def statistics_table(comparison: Comparison, level: float) -> Table:
     """Return every statistic of one comparison, with difference and ratio."""
     one, other = comparison.matched.names
+    images = counted(len(comparison.matched.images), "image")
     return Table(
-        f"{one} against {other}: {comparison.matched.kind} errors of {len(comparison.matched.images)} images, degrees",
+        f"{one} against {other}: {comparison.matched.kind} errors of {images}, degrees",
         ("Statistic", "First", "Second", "Difference", "from", "to", "Ratio", "ratio from", "ratio to"),
         tuple(
-            (made.statistic, made.one, made.other, *made.difference, *(_known(number) for number in made.ratio))
+            (_HEADS[made.statistic], made.one, made.other, *made.difference, *(_known(number) for number in made.ratio))
             for made in comparison.statistics
         ),
         digits=3,

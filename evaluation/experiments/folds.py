@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from evaluation.datasets.states import first_copies
 from evaluation.scene import Scene
-from foundation.errors import FormatError, InputError, first_of
+from foundation.errors import FormatError, InputError, counted, first_of
 
 _LEAST = 2
 """Folds: with one there is nothing left to train on."""
@@ -61,7 +61,7 @@ def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | No
     kinds, member, sizes = np.unique(names, return_inverse=True, return_counts=True)
     if not _LEAST <= folds <= len(kinds):
         told = f"{count} images" + ("" if groups is None else f" in {len(kinds)} groups that stay together")
-        raise InputError(f"{folds} folds of {told}: expected 2 to {len(kinds)} folds")
+        raise InputError(f"{counted(folds, 'fold')} of {told}: expected 2 to {len(kinds)} folds")
     order = np.random.default_rng(seed).permutation(len(kinds))
     # The largest groups first, each into the emptiest fold: sizes then differ by less than the largest group.
     order = order[np.argsort(-sizes[order], kind="stable")]
@@ -111,7 +111,8 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
             columns = list(table.fieldnames or ())
             rows = [(row.get("image") or "", (row.get("fold") or "").strip()) for row in table]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FormatError(f"cannot read folds from {path}: {error}; expected CSV, image,fold a line") from error
+        reason = (isinstance(error, OSError) and error.strerror) or str(error)
+        raise FormatError(f"cannot read folds from {path}: {reason}; expected CSV, image,fold a line") from error
     if not {"image", "fold"} <= set(columns):
         raise FormatError(f"{path} has the columns {','.join(columns)}; expected image,fold; correct its first line")
     given = dict(rows)

@@ -220,9 +220,7 @@ def _answer(scene: Scene, runners: Sequence[_Runner], blind: bool) -> tuple[Scen
             if runner.lock is None:
                 error.add_note(f"while {method.name} was on {scene.name}")
                 raise
-            raise InputError(
-                f"{method.name} fails on {scene.name}: {_reason(error)}; correct it and run again"
-            ) from error
+            raise InputError(f"{method.name} fails on {scene.name}: {_reason(error)}; {_remedy(method)}") from error
         if truth is not None and isinstance(scene, MixedScene) and image is not None:
             answer = SceneAnswer(answer.light, answer.cause, _map_error(scene, answer, field, truth, image, mask))
         answers.append(answer)
@@ -308,6 +306,13 @@ def _reason(error: BaseException) -> str:
     place = f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
     name = type(error).__name__
     return f"{error}{place}" if isinstance(error, ValueError) and not own else f"{name}: {error}{place}"
+
+
+def _remedy(method: object) -> str:
+    """Return what to do about a method that fails; one that has `fit` lacks, more often than not, what that learns."""
+    if callable(getattr(method, "fit", None)):
+        return "it has fit: if it learns first, give it to evaluate cv, which trains it; else correct it and run again"
+    return "correct it and run again"
 
 
 def _light(scene: Scene) -> npt.NDArray[np.float64]:

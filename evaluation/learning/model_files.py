@@ -181,14 +181,22 @@ def load_model(path: Path) -> StoredMethod:
         learner = _with_settings(known[about["method"]], about["settings"])
         provenance = _provenance(about["provenance"], arrays.pop(_TRAINED, _unknown()))
         model = learner.restore(arrays)
+    except (FileNotFoundError, IsADirectoryError) as error:
+        what = "a folder" if path.is_dir() else "not there"
+        raise FormatError(f"{path} is {what}, expected a model file; name one that evaluate train has made") from error
     except KeyError as error:
         raise _refused(path, f"it lacks {error}") from error
     except (
         *(OSError, ValueError, TypeError, AttributeError, EOFError, zlib.error, zipfile.BadZipFile),
         *(RuntimeError, NotImplementedError),  # What is encrypted, or packed in a way that Python does not know.
     ) as error:
-        raise _refused(path, str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+        raise _refused(path, _reason(error)) from error
     return StoredMethod(learner, model, provenance.data_name, provenance)
+
+
+def _reason(error: Exception) -> str:
+    told = (isinstance(error, OSError) and error.strerror) or str(error)
+    return told.splitlines()[0] if told else type(error).__name__
 
 
 def _refused(path: Path, why: str) -> FormatError:

@@ -182,6 +182,11 @@ def checked_method(found: object, place: str) -> Method | Learner:
     foundation.errors.InputError: own.py:Nameless has no name; add name = "…", the text that stands in the tables
     """
     if not callable(getattr(found, "estimate", None)) and not callable(getattr(found, "fit", None)):
+        if callable(getattr(found, "estimate_map", None)):
+            raise InputError(
+                f"{place} has estimate_map alone; add estimate(image, saturation, mask) beside it, the light of the "
+                "whole image, by which it is measured on images under one light"
+            )
         raise InputError(
             f"{place} is no method: it has neither estimate(image, saturation, mask) nor fit(scenes, seed); add the "
             "one that it is to have, see evaluation/methods/method.py"
@@ -241,10 +246,14 @@ def _module_by_name(name: str) -> ModuleType:
 
 
 def _told(error: BaseException, file: Path | None = None) -> str:
-    """Return what went wrong, with the last line of `file` that it went through, or the last line at all."""
+    """Return what went wrong, with the last line of `file` that it went through, or the last file and line at all.
+
+    The lines of this file, which called what failed, are of no use to who wrote it: without others there is none.
+    """
     if isinstance(error, SyntaxError) and error.lineno:
         return f"line {error.lineno}: {error.msg}"
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if file is None or frame.filename == str(file)]
-    place = f"line {own[-1].lineno}: " if own else ""
+    own = [frame for frame in frames if frame.filename == str(file) or (file is None and frame.filename != __file__)]
+    whose = f"{Path(own[-1].filename).name}, " if own and file is None else ""
+    place = f"{whose}line {own[-1].lineno}: " if own else ""
     return f"{place}{type(error).__name__}: {error}"

@@ -24,6 +24,7 @@ from evaluation.results.result import Result
 from evaluation.results.run import Run
 from evaluation.results.summary_tables import lights_tables, summary_table
 from evaluation.results.tables import Table
+from foundation.errors import counted
 
 WORST, MIDDLE = 3, 2
 """Images shown of each method: its largest errors, and those nearest to its median."""
@@ -72,7 +73,7 @@ def run_page(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes
     # What is said of images without a light holds for both tables.
     tables[1] = Table(tables[1].title, tables[1].columns, tables[1].rows)
     parts = [
-        paragraph(f"{len(run.subject.images)} images, read from {run.place} (layout {run.layout})."),
+        paragraph(f"{counted(len(run.subject.images), 'image')}, read from {run.place} (layout {run.layout})."),
         *map(paragraph, run.notes),
         *map(table_part, tables),
         *map(table_part, lights_tables(run.subject, run.results, kind)),
@@ -105,8 +106,13 @@ def _curves_caption(results: Sequence[Result], kind: ErrorKind) -> str:
 
 
 def _planes_caption(results: Sequence[Result]) -> str:
-    more = f" The first 12 of {len(results)} methods." if len(results) > 12 else ""
-    return f"Each point is the true light of an image; its colour is the method's error on it.{more}"
+    return f"Each point is the true light of an image; its colour is the method's error on it.{_left_out(results)}"
+
+
+def _left_out(results: Sequence[Result]) -> str:
+    """Return the sentence on the methods after the first `MOST_SHOWN`, of which nothing is shown."""
+    names = [result.method for result in results[MOST_SHOWN:]]
+    return f" Shown are the first {MOST_SHOWN} of {len(results)} methods, without {', '.join(names)}." if names else ""
 
 
 def _images(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]) -> list[Part]:
@@ -117,6 +123,7 @@ def _images(run: Run, kind: ErrorKind, pictures: Mapping[tuple[int, int], bytes]
         paragraph(
             "From left to right: as recorded, corrected by the estimate, corrected by the truth. Linear camera RGB "
             "without a colour matrix, the same exposure in each row, the curve of sRGB; masked pixels are grey."
+            + _left_out(run.results)
         ),
     ]
     for number, result in enumerate(run.results[:MOST_SHOWN]):

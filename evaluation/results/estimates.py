@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.scene import Scene
-from foundation.errors import FormatError, InputError, first_of
+from foundation.errors import FormatError, InputError, counted, first_of
 from foundation.hashing import sha256_of
 
 _COLUMNS = ("image", "r", "g", "b")
@@ -91,16 +91,16 @@ def read_estimates(path: Path, images: Sequence[str], name: str | None = None) -
             found[image] = light
     missing = [image for image in images if image not in found]
     faults = [
-        f"{len(those)} {what} ({first_of(those)})"
-        for those, what in (
-            (missing, "images of the data set are missing"),
-            (unknown, "lines are of no image of the data set"),
-            (twice, "images stand there twice"),
+        f"{counted(len(those), one, several)} ({first_of(those)})"
+        for those, one, several in (
+            (missing, "image of the data set is missing", "images of the data set are missing"),
+            (unknown, "line is of no image of the data set", "lines are of no image of the data set"),
+            (twice, "image stands there twice", "images stand there twice"),
         )
         if those
     ]
     if faults:
-        raise InputError(f"{path}: {'; '.join(faults)}; expected one line for each of {len(images)} images")
+        raise InputError(f"{path}: {'; '.join(faults)}; expected one line for each of {counted(len(images), 'image')}")
     return GivenEstimates(path.stem if name is None else name, path.name, sha256_of(content), found)
 
 

@@ -78,9 +78,8 @@ def open_cube_plus(place: str, options: DataOptions, listed: Folder | None = Non
     lights = read_lights(truths[truth])
     parts = [part for part_name, part in folder.folders.items() if part_name.upper().startswith("PNG")]
     images = gather([folder, *parts])
-    kept, note = present(
-        [str(number) for number in range(1, len(lights) + 1)], images, file, folder.path, options.partial
-    )
+    looked = f"{folder.path} (itself and its folders PNG…: {', '.join(part.path.name for part in parts) or 'none'})"
+    kept, note = present([str(number) for number in range(1, len(lights) + 1)], images, file, looked, options.partial)
     black = BLACK if options.black is None else options.black
     peaks = Peaks()
     return SceneSet(

@@ -17,6 +17,7 @@ from evaluation.experiments.describing.lights import log_chroma
 from evaluation.experiments.describing.measuring import CHROMA_EDGES, LUMINANCE_EDGES, measure_scene
 from evaluation.experiments.describing.noise import NoiseCurve, photon_transfer
 from evaluation.experiments.describing.quantities import QUANTITIES, Summed
+from evaluation.experiments.folds import group_of
 from evaluation.scene import MixedScene, SceneSet
 from foundation.errors import InputError
 
@@ -55,6 +56,8 @@ class DataDescription:
         Unit of the photon-transfer curves: "saturation" or "99th percentile of green".
     noise
         The curves of red, green and blue.
+    groups
+        Pictures, places or whatever else several images share, with those that share nothing; None if not known.
     """
 
     name: str
@@ -72,6 +75,7 @@ class DataDescription:
     chroma: npt.NDArray[np.float64]
     noise_unit: str
     noise: tuple[NoiseCurve, ...]
+    groups: int | None = None
 
 
 def describe(
@@ -134,6 +138,7 @@ def describe(
         chroma=chroma / max(chroma.sum(), 1e-300),
         noise_unit="saturation" if scaled else "99th percentile of green",
         noise=photon_transfer([part.astype(np.float64) for part in blocks]),
+        groups=len(set(map(group_of, data.scenes))),
     )
 
 

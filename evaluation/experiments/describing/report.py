@@ -124,10 +124,10 @@ def seen_notes(one: DataDescription, other: DataDescription) -> tuple[str, ...]:
         if any(min(width, height) < made.side for width, height, _ in made.sizes)
     ]
     notes += [
-        f"Images of {made.name} may be of one picture under several lights; they count as independent, and "
-        "intervals are too narrow."
+        f"The {len(made.images)} images of {made.name} are of {made.groups} pictures or places; they count as "
+        "independent, and intervals are too narrow."
         for made in (one, other)
-        if made.layout == "generated"
+        if made.groups is not None and made.groups < len(made.images)
     ]
     unknown = {
         quantity.title for quantity in QUANTITIES if _is_known(one, quantity.value) != _is_known(other, quantity.value)

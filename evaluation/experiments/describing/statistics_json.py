@@ -52,6 +52,7 @@ def statistics_to_json(description: DataDescription) -> str:
             "place": description.place,
             "images": len(description.images),
             "mixed": description.mixed,
+            "groups": description.groups,
             "treatment": dict(description.treatment),
         },
         "cells": description.side,
@@ -138,6 +139,7 @@ def _description(content: Mapping[str, Any]) -> DataDescription:
         chroma=chroma,
         noise_unit=noise["unit"],
         noise=tuple(_curve(noise[channel]) for channel in _CHANNELS),
+        groups=None if data.get("groups") is None else int(data["groups"]),
     )
 
 

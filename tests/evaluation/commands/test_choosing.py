@@ -86,3 +86,44 @@ def test_names_of_estimates(tmp_path: Path) -> None:
         (tmp_path / name).write_text("one,1,1,1\n")
     given = [f"{tmp_path}/a.csv", f"My own={tmp_path}/a.csv", f"{tmp_path}/b=c.csv"]
     assert [found.name for found in choose_estimates(given, ["one"])] == ["a", "My own", "b=c"]
+
+
+@pytest.mark.parametrize("command", [["cv"], ["train", "--out", "model.npz"]])
+def test_data_before_the_method_is_said(dataset: Path, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    for method in ("regression-trees", "nowhere/own.py:Own"):
+        assert main([*command, str(dataset), method]) == 2
+        said = capsys.readouterr().err
+        assert f"the method comes first: evaluate {command[0]} {method} {dataset}" in said
+    assert main([*command, "nowhere", "regression-trees"]) == 2
+    assert "the method comes first" not in capsys.readouterr().err
+
+
+def test_a_class_that_has_to_learn_before_it_estimates_is_sent_to_cv(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "own.py"
+    file.write_text(
+        "class Own:\n    name = 'Own'\n\n    def fit(self, scenes, seed=0):\n        self.light = scenes[0].truth\n"
+        "        return self\n\n    def estimate(self, image, saturation=None, mask=None):\n        return self.light\n"
+    )
+    assert main(["run", str(dataset), "--method", f"{file}:Own"]) == 2
+    said = capsys.readouterr().err
+    assert "AttributeError" in said
+    assert "give it to evaluate cv" in said
+
+
+@pytest.mark.parametrize(
+    ("command", "whole"),
+    [
+        (["transfer"], "gray-world, shades-of-gray, gray-edge-1"),
+        (["paper", "table2"], "smart-color-cat, regression-trees, color-beaver"),
+    ],
+)
+def test_defaults_are_whole_in_a_narrow_help(
+    command: list[str], whole: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERMINAL_WIDTH", "80")
+    assert main([*command, "--help"]) == 0
+    printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert whole in printed

@@ -34,7 +34,7 @@ def runs(tmp_path: Path) -> tuple[str, str]:
 def test_two_runs(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", *runs]) == 0
     printed = capsys.readouterr().out
-    assert "A (second) lacks 1 images of A (first), which are left out: im 29" in printed
+    assert "A (second) lacks 1 image of A (first), left out here: im 29" in printed
     assert "A (first) errs less than A (second) on 0 of 29 images, more on 29: A (second) errs less" in printed
     assert "B <i> (first) errs less than B <i> (second) on 0 of 29 images, more on 0, the same on 29: not" in printed
     assert "corrected for the 2 comparisons" in printed
@@ -47,8 +47,35 @@ def test_two_methods_of_one_run_and_of_two(runs: tuple[str, str], capsys: pytest
     printed = capsys.readouterr().out
     assert "A (first) errs less than B <i> (second) on 29 of 29 images" in printed
     assert "recovery errors of 29 images" in printed
-    assert main(["compare", runs[0], runs[0]]) == 0
-    assert "A (1) errs less than A (2) on 0 of 30 images, more on 0, the same on 30" in capsys.readouterr().out
+
+
+def test_results_beside_themselves_are_refused(runs: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", runs[0], f"{runs[0]}/../first/errors.csv"]) == 2
+    assert f"are the same results; evaluate compare {runs[0]} compares its methods" in capsys.readouterr().err
+
+
+def test_many_methods_by_their_short_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ("Gray-world", "PCA bright and dark", "Shades-of-Gray (p=4)", "Own")
+    lines = [
+        f"im {number},{name},1,2,1,1.5,{1 + place + number / 10},0\n"
+        for number in range(9)
+        for place, name in enumerate(names)
+    ]
+    (tmp_path / "errors.csv").write_text(HEAD + "".join(lines))
+    assert main(["compare", str(tmp_path)]) == 0
+    few = capsys.readouterr().out
+    assert few.count(" errs less than ") == 6
+    assert "largest differences" not in few
+    assert "--images" in few
+    assert main(["compare", str(tmp_path), "--images"]) == 0
+    every = capsys.readouterr().out
+    assert every.count(": the largest differences") == 6
+    assert every.index("Own on 9 of 9") < every.index("largest differences")
+    assert main(["compare", str(tmp_path), "--method", "pca", "--method", "shades-of-gray:p=4"]) == 0
+    chosen = capsys.readouterr().out
+    assert "PCA bright and dark errs less than Shades-of-Gray (p=4) on 9 of 9 images" in chosen
+    assert "Best 25%" in chosen
+    assert "best25" not in chosen
 
 
 def test_files(runs: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

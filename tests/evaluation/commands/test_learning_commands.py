@@ -117,6 +117,7 @@ def test_all_leaves_out_what_is_not_installed_and_says_why(
     [
         (["cv", "oracle", "DATA"], "'oracle' is no method that learns"),
         (["cv", "smart-color-cat", "DATA", "--folds", "31"], "31 folds of 30 images: expected 2 to 30"),
+        (["cv", "smart-color-cat", "DATA", "--folds", "0.5"], "'0.5', expected a number from 2, or a CSV file"),
         (["cv", "smart-color-cat", "DATA", "--folds", "three"], "'three', expected a number from 2, or a CSV file"),
         (["cv", "smart-color-cat", "DATA", "--folds", "none.csv"], "none.csv"),
         (["train", "all", "DATA", "--out", "x.npz"], "a model file holds one"),
@@ -156,6 +157,6 @@ def test_copies_in_several_folds_are_told(tmp_path: Path, capsys: pytest.Capture
     np.savez(tmp_path / "set.npz", images=images, gt=np.ones((6, 3)), names=names)
     (tmp_path / "folds.csv").write_text("image,fold\n" + "".join(f"{n}.png,{n % 2}\n" for n in range(6)))
     assert main(["cv", "constant-light", f"{tmp_path}/set.npz", "--folds", f"{tmp_path}/folds.csv"]) == 0
-    assert "1 images are copies of images of other folds (4.png of 1.png)" in capsys.readouterr().out
+    assert "1 image is a copy of images of other folds (4.png of 1.png)" in capsys.readouterr().out
     assert main(["cv", "constant-light", f"{tmp_path}/set.npz", "--folds", "2"]) == 0
     assert "copies" not in capsys.readouterr().out

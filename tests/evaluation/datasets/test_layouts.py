@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -128,6 +129,28 @@ def test_what_is_not_there_or_no_folder_is_told(tmp_path: Path) -> None:
     (tmp_path / "set.zip").write_bytes(b"PK")
     with pytest.raises(FormatError, match=r"set\.zip is a file, expected a folder"):
         open_scenes(tmp_path / "set.zip")
+
+
+@pytest.mark.parametrize("layout", [name for name, known in LAYOUTS.items() if known.takes == "folder"])
+def test_a_file_for_a_layout_of_folders_is_told(layout: str, place_of: Place, tmp_path: Path) -> None:
+    archive = place_of("thumbnails")
+    with pytest.raises(
+        FormatError, match=rf"\.npz is a file, expected a folder of .*\({re.escape(layout)}\); name that"
+    ):
+        open_scenes(archive, layout)
+    with pytest.raises(FormatError, match=r"nowhere is not there, expected a folder of"):
+        open_scenes(tmp_path / "nowhere", layout)
+    with pytest.raises(FormatError, match=r"is a folder, expected a file of thumbnails"):
+        open_scenes(tmp_path, "thumbnails")
+
+
+def test_a_results_folder_is_told_from_a_data_set(tmp_path: Path) -> None:
+    # Its errors.csv has the columns of a table of images.
+    (tmp_path / "errors.csv").write_text("image,method,r,g,b\na,grey,1,1,1\na,white,1,1,1\n")
+    (tmp_path / "run.json").write_text("{}")
+    for place in (tmp_path, tmp_path / "errors.csv"):
+        with pytest.raises(FormatError, match="is a results folder of evaluate, expected a data set; name the data"):
+            open_scenes(place)
 
 
 def test_a_layout_that_is_none_is_told(tmp_path: Path) -> None:

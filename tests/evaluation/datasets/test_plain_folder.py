@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -54,7 +55,8 @@ def test_levels_of_the_user_serve_where_the_table_has_none(copy: Path) -> None:
 
 def test_what_is_not_given_is_stated(copy: Path) -> None:
     write_table(copy, "a,0.2,0.5,0.3")
-    data = open_scenes(copy)
+    (copy / "a_mask.png").unlink()
+    data = open_scenes(copy, options=DataOptions(partial=True))
     assert data.treatment["black level"].startswith("0: assumed")
     assert data.treatment["saturation"].startswith("none: neither")
     assert data.treatment["mask"] == "none"
@@ -64,7 +66,7 @@ def test_what_is_not_given_is_stated(copy: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("a.jpg,1,1,1", r"gt\.csv, line 2: a\.jpg is a picture for the eye \(sRGB\)"),
+        ("a.jpg,1,1,1", r"gt\.csv, line 2: a\.jpg is JPEG, a picture for the eye \(sRGB\)"),
         ("a.CR2,1,1,1", r"a\.CR2 is a raw file, whose mosaic has yet to be interpolated"),
         ("a,1,1", "line 2 has 3 fields, expected 4"),
         ("a,1,1,-1", "line 2: 1 1 -1 is no light"),
@@ -104,11 +106,13 @@ def test_an_image_twice_and_a_fold_too_few(copy: Path) -> None:
 
 
 def test_a_copy_that_lacks_images(copy: Path) -> None:
-    write_table(copy, "a,1,1,1", "z,1,1,1")
-    with pytest.raises(FormatError, match=r"lacks 1 of the 2 images of gt\.csv \(z\); .*--partial"):
+    write_table(copy, "a,1,1,1", "c,1,1,1", "z,1,1,1")
+    with pytest.raises(FormatError, match=r"lacks 1 of the 3 images of gt\.csv \(z\); .*--partial"):
         open_scenes(copy)
     data = open_scenes(copy, options=DataOptions(partial=True))
-    assert data.treatment["images"] == "1; 1 more of gt.csv are not there"
+    assert data.treatment["images"] == (
+        "2; 1 more of gt.csv are not there; 1 in other folders there without a row in gt.csv left out"
+    )
 
 
 def test_several_tables_must_be_named(copy: Path) -> None:
@@ -116,14 +120,16 @@ def test_several_tables_must_be_named(copy: Path) -> None:
     (copy / "notes.csv").write_text("who,what\n")
     with pytest.raises(InputError, match=r"several tables of lights \(gt\.csv, other\.csv\)"):
         open_scenes(copy)
-    assert [scene.name for scene in open_scenes(copy / "other.csv").scenes] == ["c"]
+    chosen = open_scenes(copy / "other.csv")
+    assert [scene.name for scene in chosen.scenes] == ["c"]
+    assert chosen.treatment["images"].startswith("1; 1 beside them without a row in other.csv left out")
 
 
 def test_an_image_of_eight_bits_and_a_mask_of_another_size(copy: Path) -> None:
     write_png(copy / "eight.png", np.full((4, 4, 3), 9, np.uint8))
     write_png(copy / "small.png", image_of(4, 4))
     write_table(copy, "eight,1,1,1,", "small,1,1,1,a_mask.png", head="image,r,g,b,mask")
-    eight, small = open_scenes(copy).scenes
+    eight, small = open_scenes(copy, options=DataOptions(partial=True)).scenes
     with pytest.raises(FormatError, match="has 8 bits a channel"):
         eight.read()
     with pytest.raises(FormatError, match=r"a_mask\.png is 10 × 8, expected 4 × 4"):
@@ -148,3 +154,72 @@ def test_two_columns_of_one_name_are_refused(copy: Path) -> None:
     write_table(copy, "a,1,1,1,2", head="image,r,g,b,r")
     with pytest.raises(FormatError, match="two columns 'r'"):
         open_scenes(copy)
+
+
+def test_a_mask_beside_its_image_is_used_without_a_column(copy: Path) -> None:
+    # As the reference draws it; not used, the chart stays in the picture.
+    write_table(copy, "a,1,1,1", "c.npy,1,1,1")
+    data = open_scenes(copy)
+    with_mask, without = (scene.read()[1] for scene in data.scenes)
+    assert with_mask is not None
+    assert without is None
+    assert with_mask.sum() == 6
+    assert with_mask[5:, :2].all()
+    assert data.treatment["mask"] == ("NAME_mask beside the image: where the picture is not 0; 1 of 2 images have one")
+
+
+def test_the_column_goes_before_the_mask_beside_and_that_is_not_lost(copy: Path) -> None:
+    (copy / "masks").mkdir()
+    whole = np.full((8, 10), 255, np.uint8)
+    assert cv2.imwrite(str(copy / "masks" / "all.png"), whole)
+    rows = ("a,1,1,1,masks/all.png", "c,1,1,1,")
+    write_table(copy, *rows, head="image,r,g,b,mask")
+    with pytest.raises(FormatError, match=r"has no row for 1 of the images .*\(a_mask\.png\)"):
+        open_scenes(copy)
+    (copy / "a_mask.png").rename(copy / "c_mask.png")
+    data = open_scenes(copy)
+    sums = [0 if mask is None else mask.sum() for _, mask in (scene.read() for scene in data.scenes)]
+    assert sums == [80, 6]
+    assert data.treatment["mask"].startswith("column mask of gt.csv or NAME_mask beside the image: ")
+
+
+def test_a_mask_that_cannot_be_one_is_named(copy: Path) -> None:
+    (copy / "a_mask.png").rename(copy / "a_mask.jpg")
+    write_table(copy, "a,1,1,1", "c,1,1,1")
+    with pytest.raises(FormatError, match=r"line 2: the mask .*a_mask\.jpg is no \.png or .*make it again as PNG"):
+        open_scenes(copy)
+    (copy / "a_mask.jpg").rename(copy / "a_mask.png")
+    write_table(copy, "a,1,1,1", "c,1,1,1", "a_mask,1,1,1")
+    with pytest.raises(FormatError, match=r"has a row for .*a_mask\.png, which is a mask too"):
+        open_scenes(copy)
+
+
+def test_an_image_without_a_row_is_refused_or_said_to_be_left_out(copy: Path) -> None:
+    write_png(copy / "d.png", image_of(8, 10))
+    write_png(copy / "d_mask.png", np.full((8, 10), 9, np.uint8))
+    write_png(copy / "more" / "e.png", image_of(8, 10))
+    with pytest.raises(FormatError, match=r"gt\.csv has no row for 2 .*\(d\.png, more/e\.png\).*with --partial"):
+        open_scenes(copy)
+    data = open_scenes(copy, options=DataOptions(partial=True))
+    assert [scene.name for scene in data.scenes] == ["a.png", "more/b", "c"]
+    assert data.treatment["images"] == "3; 2 beside them without a row in gt.csv left out"
+
+
+def test_images_of_a_folder_that_the_table_does_not_name_are_counted(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_png(copy / "day2" / "e.png", image_of(8, 10))
+    monkeypatch.chdir(copy)
+    for place in (".", str(copy), "gt.csv"):
+        assert open_scenes(place).treatment["images"] == "3; 1 in other folders there without a row in gt.csv left out"
+
+
+@pytest.mark.parametrize(
+    ("ending", "why"), [("jpg", r"a\.jpg: JPEG, a picture for the eye"), ("CR2", r"a\.CR2: a raw file")]
+)
+def test_names_without_ending_of_files_that_are_refused_say_why(tmp_path: Path, ending: str, why: str) -> None:
+    for name in "ab":
+        (tmp_path / f"{name}.{ending}").write_bytes(b"")
+    write_table(tmp_path, "a,1,1,1", "b,1,1,1")
+    with pytest.raises(FormatError, match=rf"gt\.csv, line 2: of a there is only .*{why}"):
+        open_scenes(tmp_path)

@@ -38,8 +38,8 @@ def test_images_are_matched_by_name() -> None:
     assert made.other.tolist() == [20, 30, 40]
     assert made.missing == (("x",), ("a",))
     assert missing_images(made) == (
-        "one lacks 1 images of other, which are left out: x",
-        "other lacks 1 images of one, which are left out: a",
+        "one lacks 1 image of other, left out here: x",
+        "other lacks 1 image of one, left out here: a",
     )
     assert match(errors("ab", [1, 2]), errors("ab", [3, 4]), ("", ""), "recovery").one.tolist() == [0.5, 1]
 

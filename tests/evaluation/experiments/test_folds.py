@@ -76,7 +76,7 @@ def test_a_bad_file_of_folds_is_refused(tmp_path: Path, text: str, why: str) -> 
 
 
 def test_a_missing_file_of_folds_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"none\.csv"):
+    with pytest.raises(FormatError, match=r"from .*none\.csv: No such file or directory; expected CSV"):
         read_folds(tmp_path / "none.csv", NAMES)
 
 

@@ -112,7 +112,7 @@ class Payload:
         return (pytest.fail, ("a pickle was loaded",))
 
 
-@pytest.mark.parametrize("kind", ["missing", "text", "empty", "pickle", "pickled array", "thumbnails"])
+@pytest.mark.parametrize("kind", ["text", "empty", "pickle", "pickled array", "thumbnails"])
 def test_foreign_files_are_refused(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "model.npz"
     match kind:
@@ -130,6 +130,16 @@ def test_foreign_files_are_refused(tmp_path: Path, kind: str) -> None:
             pass
     with pytest.raises(FormatError, match=r"model\.npz is no whole model file: .*; name a file that evaluate train"):
         load_model(path)
+
+
+def test_a_model_that_is_not_there_or_a_folder_is_told(tmp_path: Path) -> None:
+    with pytest.raises(
+        FormatError, match=r"none\.npz is not there, expected a model file; name one that evaluate train"
+    ):
+        load_model(tmp_path / "none.npz")
+    (tmp_path / "some.npz").mkdir()
+    with pytest.raises(FormatError, match=r"some\.npz is a folder, expected a model file"):
+        load_model(tmp_path / "some.npz")
 
 
 def test_any_damage_is_found(saved: Path) -> None:

@@ -127,6 +127,11 @@ def test_what_is_not_there(text: str, message: str) -> None:
     ("source", "message"),
     [
         ("class Own:\n    name = 'own'\n", "is no method: it has neither estimate"),
+        (
+            "class Own:\n    name = 'own'\n    def estimate_map(self, image): ...\n",
+            "has estimate_map alone; add estimate",
+        ),
+        ("class Own:\n    def __init__(self, p): ...\n", "without arguments: TypeError: .*'p'; give"),
         ("class Own:\n    def estimate(self, image, saturation=None, mask=None): ...\n", 'has no name; add name = "…"'),
         ("def f(:\n", "fails while it is loaded: line 1: "),
         ("x = 1\nimport no_such_thing\n", "fails while it is loaded: line 2: ModuleNotFoundError: .*no_such_thing"),
@@ -134,9 +139,12 @@ def test_what_is_not_there(text: str, message: str) -> None:
         ("import sys\n\nsys.exit(0)\n", "fails while it is loaded: line 3: SystemExit: 0"),
         (
             "class Own:\n    def fit(self, scenes): ...\n\n    @property\n    def name(self):\n        return 1 / 0\n",
-            "the name of .*own.py:Own fails: line 6: ZeroDivisionError",
+            "the name of .*own.py:Own fails: own.py, line 6: ZeroDivisionError",
         ),
-        ("class Own:\n    def __init__(self):\n        raise OSError('no weights')\n", "line 3: OSError: no weights"),
+        (
+            "class Own:\n    def __init__(self):\n        raise OSError('no weights')\n",
+            "own.py, line 3: OSError: no weights",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_file(tmp_path: Path, source: str, message: str) -> None:

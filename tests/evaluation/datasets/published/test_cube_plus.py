@@ -89,3 +89,13 @@ def test_an_image_of_eight_bits_is_refused(copy: Path) -> None:
     write_png(copy / "1.PNG", np.zeros((1060, 2060, 3), np.uint8))
     with pytest.raises(FormatError, match=r"1\.PNG has 8 bits a channel.*expected linear camera RGB of 16 bits"):
         open_scenes(copy).scenes[0].read()
+
+
+def test_images_in_a_folder_that_is_not_looked_into_are_told_where_they_should_be(copy: Path) -> None:
+    (copy / "images").mkdir()
+    for path in copy.rglob("*.PNG"):
+        path.rename(copy / "images" / path.name)
+    with pytest.raises(
+        FormatError, match=r"\(itself and its folders PNG…: [^)]*\) lacks 3 of the 3 images of cube\+_gt"
+    ):
+        open_scenes(copy)
