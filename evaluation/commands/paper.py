@@ -52,8 +52,8 @@ _TABLE1 = f"""Plain methods on eight generated data sets (table 1).
 
 Reads LUTs, the pictures and the ground truths. Generates, in memory, two sets of scenes, the pictures and as many of
 random codes, under two choices of lights for each LUT: the nearest to the ground truths, and lights drawn at random.
-Prints each method's six numbers for each of the data sets, the paper's below those of C1 and of random ones. Writes nothing unless asked with
---out.
+Prints each method's six numbers for each of the data sets, the paper's below those of C1 and of random ones.
+Writes nothing unless asked with --out.
 
 {EXIT_CODES}
 """

@@ -62,7 +62,7 @@ def test_table1(
     assert "C1 illuminations" not in printed
     assert "its numbers stand beside" in " ".join(printed.split())
     rows = rows_of(out / "table1.csv")
-    assert len(rows) == 8 * 3 * 3
+    assert len(rows) == 8 * 3 * 2 + 2 * 3
     paper = [row for row in rows if row["error"] == "paper"]
     assert len(paper) == 2 * 3
     assert paper[0]["median"] == "2.15"
