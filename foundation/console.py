@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Generator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 
 from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
 from foundation.files import remedy_of
@@ -126,7 +126,7 @@ def orderly_end() -> Generator[None]:
 
 @contextmanager
 def progress(unit: str) -> Generator[Callable[[int, int], None]]:
-    """Show a progress bar with the time left on stderr while the block runs.
+    """Show a progress bar with the time left on stderr, from the first number told to the end of the block.
 
     Parameters
     ----------
@@ -157,6 +157,14 @@ def progress(unit: str) -> Generator[Callable[[int, int], None]]:
         TimeRemainingColumn(),
     )
     # What is printed meanwhile appears above the bar, but not on the terminal where standard output goes elsewhere.
-    with Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()) as bar:
-        task = bar.add_task(unit, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+    bar = Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty())
+    task = bar.add_task(unit, total=None)
+    with ExitStack() as shown:
+
+        def tell(done: int, total: int) -> None:
+            # What is refused before there is anything to count gets no bar.
+            if not bar.live.is_started:
+                shown.enter_context(bar)
+            bar.update(task, completed=done, total=total)
+
+        yield tell

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from foundation import errors
-from foundation.console import EXIT_CODES, orderly_end, run
+from foundation.console import EXIT_CODES, orderly_end, progress, run
 
 
 def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
@@ -249,3 +249,12 @@ def test_nobody_reads_the_error_any_more(monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setattr(sys, "stderr", Gone())
     assert run(refuse) == 2
+
+
+def test_no_bar_before_there_is_something_to_count(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress("images"):
+        pass
+    assert capsys.readouterr().err == ""
+    with progress("images") as tell:
+        tell(1, 2)
+    assert "1/2 images" in capsys.readouterr().err
