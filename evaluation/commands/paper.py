@@ -43,13 +43,17 @@ Workers = Annotated[
     int | None, typer.Option(metavar="N", help="Threads. \\[default: one a processor]", min=1, show_default=False)
 ]
 
+_NOT_C1 = (
+    "The paper's pictures and ground truths are C1, the 259 images of the Canon 1Ds Mark III of NUS; its numbers stand "
+    "beside data sets of C1 or random scenes under lights like those of C1 or random ones only."
+)
 
 _TABLE1 = f"""Plain methods on eight generated data sets (table 1).
 
 Reads LUTs, the pictures and the ground truths. Generates, in memory, two sets of scenes, the pictures and as many of
 random codes, under two choices of lights for each LUT: the nearest to the ground truths, and lights drawn at random.
-Prints each method's six numbers for each of the data sets, the paper's below them. Writes nothing unless asked with
---out.
+Prints each method's six numbers for each of the data sets, the paper's below those of C1 and of random ones.
+Writes nothing unless asked with --out.
 
 {EXIT_CODES}
 """
@@ -103,6 +107,7 @@ def table1(
 ) -> None:
     """Run plain methods on eight generated data sets."""
     from evaluation.experiments.paper.hot import hot_rows
+    from evaluation.experiments.paper.published import cell_name
     from evaluation.experiments.paper.reporting import table1_report
     from evaluation.experiments.paper.scenes.truths import read_truths
     from evaluation.experiments.paper.table1 import settings, size_dependence
@@ -112,17 +117,19 @@ def table1(
     sides, shares = [int(side) for side in _numbers(sizes, "side of an image, px", 65535)], _numbers(hot, "share", 1e6)
     _require_free(out)
     opened = _open(luts)
-    scenes, says = _pictures(pictures, matrix)
+    scenes, says, called = _pictures(pictures, matrix)
     truths = read_truths(lights_like)
-    chosen = settings(opened, scenes, truths.lights, side, seed)
+    names = cell_name(called, [scene.name for scene in scenes]), cell_name(truths.name, truths.images)
+    chosen = settings(opened, scenes, truths.lights, side, seed, names)
     threads = workers or processor_count()
     with _progress(sum(len(part.scenes) for part in chosen)) as step:
         blocks = run(chosen, threads, step)
-    found = size_dependence(opened, scenes, truths.lights, sides, seed, threads)
+    found = size_dependence(opened, scenes, truths.lights, sides, seed, threads, names)
     raised = hot_rows(chosen, shares, seed, threads)
     conditions = (
         f"Pictures: {says}. Images: longest side {side} px. Lights like those of {truths.name}. Seed {seed}.",
         f"Tables: {'; '.join(f'{lut.provenance.camera}, {len(lut.white)} lights, {lut.folder}' for lut in opened)}.",
+        *(() if names == ("C1", "C1") else (_NOT_C1,)),
     )
     _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out)
 
@@ -319,8 +326,8 @@ def _open(folders: Sequence[Path]) -> list[Lut]:
     return [open_lut(folder) for folder in folders]
 
 
-def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str]:
-    """Return the source pictures at a place, and what was done to get them."""
+def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
+    """Return the source pictures at a place, what was done to get them, and their name."""
     from evaluation.datasets import open_scenes
     from evaluation.datasets.opening import layout_of
     from evaluation.experiments.paper.scenes.developing import developed
@@ -337,12 +344,12 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str]:
         if chosen is not None:
             raise InputError(f"--matrix {matrix} is for a data set of raw images; {place} is none")
         found = find_pictures(place)
-        return found, f"{len(found)} of {place}"
+        return found, f"{len(found)} of {place}", Path(place).resolve().name
     if layout == "generated":
         raise InputError(f"{place} was made by generate; name photographs, or a data set of real raw images")
     data = open_scenes(place, layout)
     how = f"with the colour matrix of {chosen.name}" if chosen else "without a colour matrix"
-    return developed(data, chosen), f"{len(data.scenes)} of {data.name}, developed to sRGB {how}"
+    return developed(data, chosen), f"{len(data.scenes)} of {data.name}, developed to sRGB {how}", data.name
 
 
 def _numbers(text: str, what: str, most: float) -> list[float]:

@@ -10,8 +10,10 @@ So the commands give both kinds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
+from pathlib import PurePosixPath
 from typing import Final, Literal
 
 
@@ -77,6 +79,38 @@ TABLE1: Final[Mapping[Cell, Mapping[str, PublishedRow]]] = {
     },
 }
 """Table 1: by data set and method, in the paper's order. C1 is the Canon 1Ds Mark III of the NUS data set."""
+
+_C1_NAME: Final = re.compile(r"Canon1DsMkIII_\d{4}")
+"""Names of C1's images in every copy of the data set, without folder and ending."""
+_C1_IMAGES: Final = 259
+"""Images of C1: a part of them has other numbers than the whole."""
+
+
+def is_c1(images: Sequence[str]) -> bool:
+    """Return whether names of images are those of the whole of C1, in any order.
+
+    Examples
+    --------
+    >>> whole = [f"Canon1DsMkIII/Canon1DsMkIII_{number:04d}.PNG" for number in range(1, 260)]
+    >>> is_c1(whole), is_c1(whole[:20]), is_c1(["Canon600D_0001"] * 259)
+    (True, False, False)
+    """
+    stems = {PurePosixPath(name).stem for name in images}
+    return len(images) == len(stems) == _C1_IMAGES and all(_C1_NAME.fullmatch(stem) for stem in stems)
+
+
+def cell_name(name: str, images: Sequence[str]) -> str:
+    """Return what pictures or lights are called in the first table: C1 only if they are.
+
+    Examples
+    --------
+    >>> cell_name("600D", ["Canon600D_0001"]), cell_name("C1", ["a"]), cell_name("Random", ["a"])
+    ('600D', '"C1"', '"Random"')
+    """
+    if is_c1(images):
+        return "C1"
+    return f'"{name}"' if name in ("C1", "Random") else name
+
 
 TABLE2: Final[Mapping[Literal["real", "generated"], Mapping[str, PublishedRow]]] = {
     "real": {

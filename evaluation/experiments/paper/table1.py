@@ -50,6 +50,9 @@ among 64, and every image of 1024 px is drawn for each of them."""
 SENSORS: Final[Mapping[str, str]] = {"Canon EOS 550D": "550D", "Canon EOS 6D Mark II": "6D"}
 """The paper's names of its cameras, by those that tables have."""
 
+OWN: Final = ("Given", "Given")
+"""Names of pictures and of ground truths of which nothing is said: the paper has no numbers of them."""
+
 NUMBERS: Final = ("Mean", "Med.", "Tri.", "Best 25%", "Worst 25%", "Avg.")
 """Heads of the six numbers of a summary, as in the paper."""
 
@@ -65,7 +68,8 @@ class Block:
     Attributes
     ----------
     cell
-        Scenes, sensor and illuminations, as the paper names them: ``("C1", "6D", "Random")``.
+        Scenes, sensor and illuminations, as the paper names them: ``("C1", "6D", "Random")``; the paper's numbers are
+        found by it, so other scenes and lights have names of their own.
     images
         Number of images.
     lights
@@ -95,7 +99,12 @@ def sensor_of(lut: Lut) -> str:
 
 
 def settings(
-    luts: Sequence[Lut], pictures: Sequence[Source], truths: npt.NDArray[np.float64], side: int = SIDE, seed: int = 0
+    luts: Sequence[Lut],
+    pictures: Sequence[Source],
+    truths: npt.NDArray[np.float64],
+    side: int = SIDE,
+    seed: int = 0,
+    names: tuple[str, str] = OWN,
 ) -> tuple[Setting, ...]:
     """Return the data sets of the table in the paper's order: scenes, then tables, then lights.
 
@@ -112,6 +121,8 @@ def settings(
         Longest side of every image, px.
     seed
         0 … 2⁶⁴ − 1; chooses random codes, random lights and samples.
+    names
+        Of the pictures and of the ground truths, see `published.cell_name`.
 
     Raises
     ------
@@ -122,14 +133,14 @@ def settings(
     if not count:
         raise InputError("there is no picture to print; name some")
     sets: dict[str, Sequence[Source]] = {
-        "C1": [ScaledSource(picture, side) for picture in pictures],
+        names[0]: [ScaledSource(picture, side) for picture in pictures],
         "Random": random_scenes(count, side, side, seed),
     }
     found: list[Setting] = []
     for scenes, sources in sets.items():
         for lut in luts:
             choices: dict[str, ChosenLights] = {
-                "C1": lights_like(lut, truths, count),
+                names[1]: lights_like(lut, truths, count),
                 "Random": lights_at_random(lut, count, seed),
             }
             found += [
@@ -246,12 +257,13 @@ def size_dependence(
     sides: Sequence[int],
     seed: int = 0,
     workers: int = 1,
+    names: tuple[str, str] = OWN,
 ) -> tuple[SizeRow, ...]:
     """Return the methods' median reproduction errors for images of several sizes, of `STUDIED` pictures at most.
 
     Parameters
     ----------
-    luts, pictures, seed
+    luts, pictures, seed, names
         As of `settings`.
     truths
         (N, 3) float64, as of `settings`.
@@ -262,7 +274,7 @@ def size_dependence(
     """
     rows: list[SizeRow] = []
     for side in sides:
-        for block in table1(settings(luts, thinned(pictures), truths, side, seed), workers):
+        for block in table1(settings(luts, thinned(pictures), truths, side, seed, names), workers):
             medians = {result.method: result.summary("reproduction").median for result in block.results}
             rows.append(SizeRow(block.cell, side, medians))
     return tuple(rows)

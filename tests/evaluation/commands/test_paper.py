@@ -57,11 +57,15 @@ def test_table1(
     assert main(["paper", "table1", *tables, *given, *wish]) == 0
     printed = capsys.readouterr().out
     assert "9 of photos, developed to sRGB with the colour matrix of Canon EOS 550D" in printed
-    assert printed.count("sensor, C1 illuminations\n┏") == 4
+    assert printed.count("sensor, A illuminations\n┏") == 4
+    assert "C1 scenes" not in printed
+    assert "C1 illuminations" not in printed
+    assert "its numbers stand beside" in " ".join(printed.split())
     rows = rows_of(out / "table1.csv")
-    assert len(rows) == 8 * 3 * 3
+    assert len(rows) == 8 * 3 * 2 + 2 * 3
     paper = [row for row in rows if row["error"] == "paper"]
-    assert paper[0]["median"] == "2.59"
+    assert len(paper) == 2 * 3
+    assert paper[0]["median"] == "2.15"
     # What is printed is what the file holds.
     first = rows[0]
     assert re.search(rf"White-Patch +│ +{float(first['mean']):.2f} │ +{float(first['median']):.2f} │", printed)
@@ -71,7 +75,7 @@ def test_table1(
     }
     page = (out / "report.html").read_text()
     assert page.index("Reproduction error") < page.index("Images of other sizes") < page.index("Recovery error")
-    assert "C1 scenes, 6D sensor, C1 illuminations" in (out / "table1.tex").read_text()
+    assert "Photos scenes, 6D sensor, A illuminations" in (out / "table1.tex").read_text()
     assert [row["Per million"] for row in rows_of(out / "hot.csv")] == ["500"] * 8
     assert main(["paper", "table1", *tables, *given, *wish]) == 2
     assert "already exists; name another place for the report" in capsys.readouterr().err

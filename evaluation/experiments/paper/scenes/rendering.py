@@ -133,10 +133,12 @@ def lights_like(lut: Lut, truths: npt.NDArray[np.float64], count: int) -> Chosen
     """
     matches = nearest_lights(lut, truths).matches
     numbers = tuple(matches[image % len(matches)].mixture.lights[0] for image in range(count))
-    angles = np.array([match.angle for match in matches])
+    used = matches[:count]
+    angles = np.array([match.angle for match in used])
+    among = f"the first {len(used)} of {len(truths)}" if len(used) < len(truths) else f"{len(truths)}"
     return ChosenLights(
         numbers,
-        f"nearest by angle to {len(truths)} ground truths, {len(set(numbers))} different lights; angle to them "
+        f"nearest by angle to {among} ground truths, {len(set(numbers))} different lights; angle to them "
         f"{np.median(angles):.2f}° in the median, {angles.max():.2f}° at most",
     )
 

@@ -27,10 +27,13 @@ class Truths:
         Where they come from.
     lights
         (N, 3) float64 ≥ 0, linear camera RGB of any length.
+    images
+        The names of their N images; empty where they have none.
     """
 
     name: str
     lights: npt.NDArray[np.float64]
+    images: tuple[str, ...] = ()
 
 
 def read_truths(place: str) -> Truths:
@@ -52,17 +55,19 @@ def read_truths(place: str) -> Truths:
     file, _, start = place.partition("#")
     if not file.lower().endswith(_TEXTS):
         data = open_scenes(place)
-        return Truths(data.name, np.stack([scene.truth for scene in data.scenes]))
+        return Truths(
+            data.name, np.stack([scene.truth for scene in data.scenes]), tuple(scene.name for scene in data.scenes)
+        )
     lights = load_ground_truths(Path(file))
-    if not start:
-        return Truths(Path(file).stem, lights)
     names = _first_column(Path(file))
+    if not start:
+        return Truths(Path(file).stem, lights, tuple(names) if len(names) == len(lights) else ())
     if len(names) != len(lights):
         raise FormatError(f"{file} has {len(lights)} ground truths and {len(names)} names; {start!r} cannot choose")
     chosen = np.array([name.startswith(start) for name in names])
     if not chosen.any():
         raise InputError(f"no row of {file} begins with {start!r}; the first begins with {names[0]!r}")
-    return Truths(start.strip("/_"), lights[chosen])
+    return Truths(start.strip("/_"), lights[chosen], tuple(name for name in names if name.startswith(start)))
 
 
 def _first_column(path: Path) -> list[str]:

@@ -55,7 +55,7 @@ def test_a_few_spoil_the_maximum(make_table: TableMaker) -> None:
     assert errors[1] > 3 * errors[0]
     table = hot_table(rows, "reproduction")
     assert table.rows[1][:4] == (
-        "Random scenes, 550D sensor, C1 illuminations",
+        "Random scenes, 550D sensor, Given illuminations",
         200,
         8,
         rows[1].result.summary("reproduction").mean,

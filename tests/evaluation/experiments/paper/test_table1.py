@@ -29,7 +29,7 @@ SIX_D, FIVE_FIFTY_D = "Canon EOS 6D Mark II", "Canon EOS 550D"
 
 def small(make_table: TableMaker, noise: tuple[float, float] = (0.0, 0.0)) -> tuple[Setting, ...]:
     luts = [make_table(SIX_D, noise[0]), make_table(FIVE_FIFTY_D, noise[1])]
-    return settings(luts, PICTURES, TRUTHS, side=48, seed=3)
+    return settings(luts, PICTURES, TRUTHS, side=48, seed=3, names=("C1", "C1"))
 
 
 def test_the_eight_data_sets_are_the_paper_s_in_its_order(make_table: TableMaker) -> None:
@@ -104,14 +104,27 @@ def test_another_camera_has_no_numbers_of_the_paper(make_table: TableMaker) -> N
     assert {row[5] for row in joint_table(blocks).rows} == {"reproduction", "recovery"}
 
 
+def test_other_pictures_and_lights_have_no_numbers_of_the_paper(make_table: TableMaker) -> None:
+    luts = [make_table(SIX_D), make_table(FIVE_FIFTY_D)]
+    blocks = table1(settings(luts, PICTURES, TRUTHS, side=16))
+    beside = {block.cell for block in blocks if len(block_table(block, "recovery").rows) > 3}
+    assert beside == {("Random", "6D", "Random"), ("Random", "550D", "Random")}
+    assert not any("C1" in block_table(block, "recovery").title for block in blocks)
+    assert {row[:3] for row in joint_table(blocks).rows if row[5] == "paper"} == beside
+    # Random scenes do not depend on the pictures: of them the lights alone decide.
+    like = table1(settings(luts, PICTURES, TRUTHS, side=16, names=("Given", "C1")))
+    beside = {block.cell for block in like if len(block_table(block, "recovery").rows) > 3}
+    assert beside == {("Random", name, lights) for name in ("6D", "550D") for lights in ("C1", "Random")}
+
+
 def test_images_too_small_for_a_method_are_told(make_table: TableMaker) -> None:
     (block, *_) = table1(settings([make_table("Test")], PICTURES, TRUTHS, side=2))
     assert "White-Patch: no usable pixel in 5 images" in " ".join(block_table(block, "recovery").notes)
 
 
 def test_the_size_of_images_matters_where_there_is_noise(make_table: TableMaker) -> None:
-    rows = size_dependence([make_table("Test", noise=0.2)], PICTURES, TRUTHS, (24, 96))
-    assert [(row.cell, row.side) for row in rows[:2]] == [(("C1", "Test", "C1"), 24), (("C1", "Test", "Random"), 24)]
+    rows = size_dependence([make_table("Test", noise=0.2)], PICTURES, TRUTHS, (24, 96), names=("C1", "L"))
+    assert [(row.cell, row.side) for row in rows[:2]] == [(("C1", "Test", "L"), 24), (("C1", "Test", "Random"), 24)]
     assert len(rows) == 8
     table = size_table(rows)
     assert table.rows[0][1] == 24

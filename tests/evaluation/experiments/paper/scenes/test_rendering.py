@@ -36,6 +36,10 @@ def test_near_lights_are_those_of_the_command(make_table: TableMaker, tmp_path: 
     chosen = lights_like(lut, TRUTHS, 6)
     assert chosen.numbers == (0, 3, 1, 0, 3, 1)
     assert chosen.how.startswith("nearest by angle to 3 ground truths, 3 different lights")
+    # The angles are those of the lights that images have.
+    few = lights_like(lut, TRUTHS, 1).how
+    assert few.startswith("nearest by angle to the first 1 of 3 ground truths, 1 different lights")
+    assert few.split("angle to them")[1] == lights_like(lut, TRUTHS[:1], 1).how.split("angle to them")[1]
     scenes = rendered(lut, SOURCES, chosen, seed=2)
     lights = nearest_lights(lut, TRUTHS)
     made = generate_dataset(lut, tmp_path / "made", SOURCES, lights, seed=2, options=PLAIN)
