@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from evaluation.cli import main
-from generator import DatasetOptions, generate_dataset
+from generator import DatasetOptions, find_pictures, generate_dataset
 from generator.lights.choices import RandomLights
 from generator.pictures.sources import random_scenes
 from tests.evaluation.experiments.paper.conftest import LIGHTS, TableMaker, make_table
@@ -117,6 +117,33 @@ def test_table2(make_table: TableMaker, thumbnails: Path, tmp_path: Path, capsys
     copy.write_bytes(thumbnails.read_bytes())
     assert main(["paper", "table2", str(thumbnails), "--generated", str(copy)]) == 2
     assert "9 of 9 images of copy are also in photos" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("shared", "said"),
+    [("keep", "They were kept, as in the paper"), ("leave-out", "Generated: made, 4 images"), ("refuse", "")],
+)
+def test_table2_tests_the_pictures_that_it_trained_on_only_where_it_says_so(
+    make_table: TableMaker,
+    thumbnails: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    shared: str,
+    said: str,
+) -> None:
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    rng = np.random.default_rng(1)
+    for name in ("p0", "p3", "q1", "q2"):
+        Image.fromarray(rng.integers(0, 256, (30, 30, 3), np.uint8)).save(pictures / f"{name}.png")
+    options = DatasetOptions(previews=False)
+    lights = RandomLights(2, len(LIGHTS), 0)
+    generate_dataset(make_table("Test"), tmp_path / "made", find_pictures(str(pictures)), lights, options=options)
+    wish = ("--generated", str(tmp_path / "made"), "--methods", "constant-light", "--shared", shared)
+    assert main(["paper", "table2", str(thumbnails), *wish]) == (2 if shared == "refuse" else 0)
+    printed = capsys.readouterr()
+    assert said in printed.out
+    assert "4 of 8 images of made are also in photos, by name: p0.png" in printed.out + printed.err
 
 
 def test_bits(thumbnails: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -19,12 +21,24 @@ from evaluation.experiments.paper.table1 import (
 from evaluation.experiments.running import evaluate
 from evaluation.methods.standard import standard_methods
 from foundation.errors import InputError
-from generator.pictures.sources import random_scenes
+from generator.pictures.sources import SourcePicture, random_scenes
 from tests.evaluation.experiments.paper.conftest import TableMaker
 
 PICTURES = random_scenes(5, 24, 16, seed=8)
 TRUTHS = np.array([[2.0, 3.1, 1.0], [0.3, 0.7, 1.0]])
 SIX_D, FIVE_FIFTY_D = "Canon EOS 6D Mark II", "Canon EOS 550D"
+
+
+class Black:
+    """A black picture."""
+
+    name = "black"
+
+    def read(self) -> SourcePicture:
+        return SourcePicture(np.zeros((16, 24, 3), np.uint8))
+
+    def to_json(self) -> dict[str, Any]:
+        return {"picture": self.name}
 
 
 def small(make_table: TableMaker, noise: tuple[float, float] = (0.0, 0.0)) -> tuple[Setting, ...]:
@@ -117,9 +131,9 @@ def test_other_pictures_and_lights_have_no_numbers_of_the_paper(make_table: Tabl
     assert beside == {("Random", name, lights) for name in ("6D", "550D") for lights in ("C1", "Random")}
 
 
-def test_images_too_small_for_a_method_are_told(make_table: TableMaker) -> None:
-    (block, *_) = table1(settings([make_table("Test")], PICTURES, TRUTHS, side=2))
-    assert "White-Patch: no usable pixel in 5 images" in " ".join(block_table(block, "recovery").notes)
+def test_images_without_a_usable_pixel_are_told(make_table: TableMaker) -> None:
+    blocks = table1(settings([make_table("Test")], [*PICTURES[:4], Black()], TRUTHS, side=24))
+    assert "White-Patch: no usable pixel in 1 images" in " ".join(block_table(blocks[0], "recovery").notes)
 
 
 def test_the_size_of_images_matters_where_there_is_noise(make_table: TableMaker) -> None:
