@@ -20,7 +20,7 @@ import numpy.typing as npt
 from evaluation.datasets.identities import known_again
 from evaluation.datasets.states import state_of
 from evaluation.experiments.folds import folds_to_csv
-from evaluation.experiments.running import SceneMethod, answer_scenes, ordered_map, truths_of
+from evaluation.experiments.running import SceneMethod, answer_scenes, truths_of
 from evaluation.experiments.suspicions import suspicions
 from evaluation.learning.model_files import StoredMethod, TrainingRecord
 from evaluation.methods.method import Method
@@ -42,6 +42,7 @@ from foundation.errors import InputError, first_of
 from foundation.files import make_folder, partial_path, publish_folder, require_free, write_whole
 from foundation.hashing import sha256_of
 from foundation.held_folders import LOCK_FILE, held_folder
+from foundation.processors import ordered_map
 from foundation.version import software
 
 WHAT = "the results"

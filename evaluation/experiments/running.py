@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import copy
 import traceback
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -29,12 +27,10 @@ from evaluation.results.answers import SceneAnswer, read_light, results_of
 from evaluation.results.result import Result
 from evaluation.scene import MixedScene, Scene
 from foundation.errors import CropError, FormatError, InputError
+from foundation.processors import ordered_map
 
 _HOUSE = Path(__file__).parents[1]
 """This package's folder: what lies outside of it, and is no installed library, is the user's."""
-
-_In = TypeVar("_In")
-_Out = TypeVar("_Out")
 
 
 @runtime_checkable
@@ -146,33 +142,6 @@ def answer_scenes(
     runners = [_runner_of(method) for method in methods]
     blind = all(isinstance(method, SceneMethod) for method in methods)
     yield from ordered_map(lambda scene: _answer(scene, runners, blind), scenes, workers)
-
-
-def ordered_map(function: Callable[[_In], _Out], things: Iterable[_In], workers: int) -> Iterator[_Out]:
-    """Yield the function's values in the order of the things; with one worker in the calling thread.
-
-    Two things a worker are taken in advance, no more, so that neither things nor values pile up. What has begun is
-    waited for when the caller stops, what has not is dropped.
-
-    Examples
-    --------
-    >>> list(ordered_map(abs, [-3, 2, -1], workers=2))
-    [3, 2, 1]
-    """
-    if workers <= 1:
-        yield from map(function, things)
-        return
-    waiting: deque[Future[_Out]] = deque()
-    pool = ThreadPoolExecutor(workers)
-    try:
-        for thing in things:
-            waiting.append(pool.submit(function, thing))
-            if len(waiting) >= 2 * workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,14 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.running import ordered_map, truths_of
+from evaluation.experiments.running import truths_of
 from evaluation.methods.green_stability import choose, counted, family_names, lights_of, require_enough
 from evaluation.methods.method import Method
 from evaluation.methods.naming import find_method
 from evaluation.metrics import ErrorKind, Summary, recovery_error, reproduction_error, summarise
 from evaluation.results.tables import Cell, Table
 from evaluation.scene import Scene
+from foundation.processors import ordered_map
 
 
 @dataclass(frozen=True)

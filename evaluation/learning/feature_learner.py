@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Protocol
@@ -20,6 +19,7 @@ import numpy.typing as npt
 from evaluation.methods.pixels import GREY, unit
 from evaluation.scene import Image, Scene
 from foundation.errors import InputError
+from foundation.processors import ordered_map
 
 Features = npt.NDArray[Any]
 """Features of one image (...) of any dtype; each learner says which shape and dtype its own have."""
@@ -161,11 +161,10 @@ def extract(
         return [learner.features(image, scene.saturation, mask) for learner in learners]
 
     rows: list[list[Features | None]] = []
-    with ThreadPoolExecutor(max(1, workers)) as pool:
-        for row in pool.map(of_one, scenes):
-            rows.append(row)
-            if on_scene:
-                on_scene()
+    for row in ordered_map(of_one, scenes, workers):
+        rows.append(row)
+        if on_scene:
+            on_scene()
     return tuple([row[place] for row in rows] for place in range(len(learners)))
 
 

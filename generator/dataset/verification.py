@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from foundation.errors import FormatError
 from foundation.hashing import stream_sha256
+from foundation.processors import ordered_map
 from generator.dataset.production.records import SUMS
 from generator.stores.places import DESCRIPTION
 from generator.stores.store import Store, open_store
@@ -39,31 +39,28 @@ def file_faults(
     with store.open(SUMS) as listed:
         total = sum(1 for _ in listed)
     known: set[str] = {SUMS}
-    pending: deque[Future[str | None]] = deque()
     verified = 0
-
-    def finished(most: int) -> Iterator[str]:
-        nonlocal verified
-        while len(pending) > most:
-            fault = pending.popleft().result()
+    with store.open(SUMS) as listed:
+        for name, fault in ordered_map(partial(_verify_line, store), enumerate(listed, start=1), workers):
             if fault is not None:
                 yield fault
+            if not name:
+                continue
+            known.add(name)
             verified += 1
             if progress is not None:
                 progress(verified, total)
-
-    with ThreadPoolExecutor(workers) as pool, store.open(SUMS) as listed:
-        for number, line in enumerate(listed, start=1):
-            digest, _, name = line.decode("utf-8", "replace").rstrip("\n").partition("  ")
-            if name:
-                known.add(name)
-                pending.append(pool.submit(_fault_of, store, name, digest))
-                yield from finished(4 * workers)
-            else:
-                yield f"{SUMS}, line {number}: expected a hash, two blanks and a name"
-        yield from finished(0)
     for name in sorted(set(store.names()) - known):
         yield f"{name} is no part of the dataset"
+
+
+def _verify_line(store: Store, numbered: tuple[int, bytes]) -> tuple[str, str | None]:
+    """Return the name that a numbered line of the list has, empty if it has none, and what is wrong."""
+    number, line = numbered
+    digest, _, name = line.decode("utf-8", "replace").rstrip("\n").partition("  ")
+    if not name:
+        return "", f"{SUMS}, line {number}: expected a hash, two blanks and a name"
+    return name, _fault_of(store, name, digest)
 
 
 def _fault_of(store: Store, name: str, digest: str) -> str | None:

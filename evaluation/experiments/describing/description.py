@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -20,6 +19,7 @@ from evaluation.experiments.describing.quantities import QUANTITIES, Summed
 from evaluation.experiments.folds import group_of
 from evaluation.scene import MixedScene, SceneSet
 from foundation.errors import InputError
+from foundation.processors import ordered_map
 
 OF_LIGHTS: Final = {"light_red": 0, "light_blue": 1}
 """Numbers that each light has, and not each image: places of ln(R/G) and ln(B/G)."""
@@ -110,17 +110,16 @@ def describe(
     luminance, chroma = np.zeros(len(LUMINANCE_EDGES) - 1), np.zeros((len(CHROMA_EDGES) - 1,) * 2)
     masked = 0.0
     # Images are measured in no other threads than these, and what is kept of one is a few kilobytes.
-    with ThreadPoolExecutor(max(1, workers)) as pool:
-        for numbers in pool.map(partial(measure_scene, side=side), data.scenes):
-            sizes[numbers.size] += 1
-            values.append(numbers.values)
-            lights.append(numbers.lights)
-            blocks.append(numbers.blocks.astype(np.float32))
-            luminance += numbers.luminance
-            chroma += numbers.chroma
-            masked += numbers.masked
-            if on_scene:
-                on_scene()
+    for numbers in ordered_map(partial(measure_scene, side=side), data.scenes, workers):
+        sizes[numbers.size] += 1
+        values.append(numbers.values)
+        lights.append(numbers.lights)
+        blocks.append(numbers.blocks.astype(np.float32))
+        luminance += numbers.luminance
+        chroma += numbers.chroma
+        masked += numbers.masked
+        if on_scene:
+            on_scene()
     scaled = all(scene.saturation is not None for scene in data.scenes)
     return DataDescription(
         name=data.name,

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.running import ordered_map, truths_of
+from evaluation.experiments.running import truths_of
 from evaluation.methods.gray_edge import GrayEdge
 from evaluation.methods.method import Method
 from evaluation.methods.pixels import usable
@@ -26,6 +26,7 @@ from evaluation.results.result import Result
 from evaluation.results.tables import Table
 from evaluation.scene import Image, Scene
 from foundation.errors import InputError
+from foundation.processors import ordered_map
 from generator.pictures.tonemap import fit_flash
 
 BITS: Final = tuple(range(8))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
 
@@ -11,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.scene import Image, Scene
+from foundation.processors import ordered_map
 
 _COVERED: Final = 1e-3
 """Least share of a pixel's area that must be usable; less is rounding of areas rather than a colour."""
@@ -69,11 +69,10 @@ def make_small(
         return SmallScene(scene.name, scene.truth, *shrink_image(image, side, scene.saturation, mask), None)
 
     made: list[SmallScene] = []
-    with ThreadPoolExecutor(max(1, workers)) as pool:
-        for scene in pool.map(small, scenes):
-            made.append(scene)
-            if on_scene:
-                on_scene()
+    for scene in ordered_map(small, scenes, workers):
+        made.append(scene)
+        if on_scene:
+            on_scene()
     return tuple(made)
 
 

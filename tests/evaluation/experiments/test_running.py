@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from threading import Event, Lock
+from threading import Lock
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.running import evaluate, ordered_map
+from evaluation.experiments.running import evaluate
 from evaluation.methods import GrayEdge
 from evaluation.methods.naming import find_method
 from evaluation.methods.pixels import GREY
@@ -150,37 +150,6 @@ def test_a_stranger_s_method_has_one_caller_at_a_time() -> None:
     (one,) = evaluate(scenes, [CountsCallers()], workers=1)
     (four,) = evaluate(scenes, [CountsCallers()], workers=4)
     np.testing.assert_array_equal(one.estimates, four.estimates)
-
-
-def test_order_and_memory_are_bounded() -> None:
-    taken: list[int] = []
-
-    def things() -> Iterator[int]:
-        for number in range(100):
-            taken.append(number)
-            yield number
-
-    for number, value in enumerate(ordered_map(lambda thing: thing**2, things(), 3)):
-        assert value == number**2
-        assert len(taken) <= number + 7
-
-
-def test_what_has_not_begun_is_dropped_when_one_fails() -> None:
-    begun: list[int] = []
-    release = Event()
-
-    def work(thing: int) -> int:
-        begun.append(thing)
-        if thing == 0:
-            raise KeyError(thing)
-        release.wait()
-        return thing
-
-    pulling = ordered_map(work, range(1000), 2)
-    release.set()
-    with pytest.raises(KeyError):
-        list(pulling)
-    assert len(begun) <= 5
 
 
 class HalfRight:
