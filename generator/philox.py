@@ -40,6 +40,10 @@ CROPS: Final = 6
 """Purpose of the words that choose where pictures are cut."""
 ITEMS: Final = 7
 """Purpose of the words that choose what a training item shows."""
+DITHERING: Final = 8
+"""Purpose of the words that choose which cell of the chart stands for a source colour."""
+VEILS: Final = 9
+"""Purpose of the words that choose which share of the print's veil is taken out of an image."""
 
 _WORD: Final = 0xFFFFFFFF
 """Mask of the lower 32 bits, a word."""
