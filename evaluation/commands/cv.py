@@ -170,25 +170,18 @@ def _chosen(text: str) -> tuple[list[Learner], list[str]]:
     return chosen, left_out
 
 
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _folds(data: SceneSet, text: str | None, seed: int) -> tuple[npt.NDArray[np.int64], str]:
     """Return the fold of each image, (N,) int64, and where the folds come from."""
     import numpy as np
 
     from evaluation.experiments.folds import draw_scene_folds, group_of, read_folds
     from foundation.errors import InputError
+    from generator.named_numbers import is_number
 
     if text is None and data.folds is not None:
         return np.asarray(data.folds, dtype=np.int64), "the data set's own"
     if text is not None and not text.lstrip("+-").isdigit():
-        if not Path(text).suffix or _is_number(text):
+        if not Path(text).suffix or is_number(text):
             raise InputError(f"--folds is {text!r}, expected a number from 2, or a CSV file with image,fold")
         return read_folds(Path(text), [scene.name for scene in data.scenes]), f"from {text}"
     number = _FOLDS if text is None else int(text)
