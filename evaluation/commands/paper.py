@@ -175,7 +175,7 @@ def table2(
     """Train learned methods on real and on generated images."""
     from evaluation.commands.choosing import choose_learners
     from evaluation.datasets import open_scenes
-    from evaluation.experiments.folds import draw_scene_folds, read_folds
+    from evaluation.experiments.folds import choose_folds
     from evaluation.experiments.paper.reporting import table2_report
     from evaluation.experiments.paper.table2 import table2 as run
     from evaluation.experiments.paper.table2 import table2_tables
@@ -206,10 +206,7 @@ def table2(
             unseen = (
                 f"{among}. They were kept, as in the paper, whose generated images show the pictures that are tested.",
             )
-    if folds.isdigit():
-        drawn = draw_scene_folds(real.scenes, int(folds), seed)
-    else:
-        drawn = read_folds(Path(folds), [scene.name for scene in real.scenes])
+    drawn, _ = choose_folds(real, folds, seed)
     with _progress(2 * count) as step:
         found = run(real.scenes, training, learners, drawn, seed, workers or processor_count(), step)
     is_cube = real.layout == "cube-plus"
