@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.result_options import PrintedError, PrintedStatistics
 from evaluation.commands.train import LEARNERS_HELP
 from foundation.console import EXIT_CODES
 
@@ -57,14 +58,8 @@ def cv(
     seed: Annotated[
         int, typer.Option(metavar="N", help="Of the folds and of all that is random in the training.", min=0)
     ] = 0,
-    error: Annotated[
-        Literal["reproduction", "recovery"],
-        typer.Option(help="Angular error that is printed, and drawn in the report; files have both."),
-    ] = "reproduction",
-    statistics: Annotated[
-        Literal["paper", "all"],
-        typer.Option(help="Print the paper's six statistics, or also 95th percentile, maximum and share below 3°."),
-    ] = "paper",
+    error: PrintedError = "reproduction",
+    statistics: PrintedStatistics = "paper",
     out: Annotated[
         Path | None,
         typer.Option(metavar="RESULTS", help="Write everything to this new folder.", show_default=False),
