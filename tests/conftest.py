@@ -78,6 +78,7 @@ SLOW = (
     "sim/camera/test_dng.py",
     "sim/world/test_geometry.py",
     "sim/world/test_world.py",
+    "synthesis/test_table.py",
 )
 """Folders and files, below this one, whose tests take more than their share of the minute."""
 
