@@ -112,9 +112,15 @@ def _dual(aside: _Array, penalties: _Array, start: _Array, bound: float | None) 
         slope = parts @ aside / total + penalties * multipliers
         return float(top + np.log(total) + 0.5 * penalties @ np.square(multipliers)), slope
 
-    # Any: scipy's result is untyped. The problem is convex and smooth, so that the start does not matter.
-    settings = {"maxiter": 2000, "ftol": 1e-13, "gtol": 1e-8}
     bounds = None if bound is None else [(-bound, bound)] * len(start)
     begin = start if bound is None else np.clip(start, -bound, bound)
-    found = minimize(value, begin, jac=True, method="L-BFGS-B", bounds=bounds, options=settings)
+    # The problem is convex and smooth, so that the start does not matter.
+    found = minimize(
+        value,
+        begin,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": 2000, "ftol": 1e-13, "gtol": 1e-8},
+    )
     return np.asarray(found.x, dtype=np.float64)
