@@ -17,7 +17,7 @@ import numpy.typing as npt
 from foundation.errors import FormatError, InputError
 from generator.lights.gamut import rb_of
 from generator.named_numbers import parse_numbers
-from generator.philox import Words
+from generator.philox import Words, standard_normal
 
 _Array = npt.NDArray[np.float64]
 _WORD: Final = float(1 << 32)
@@ -140,13 +140,6 @@ class Fitted:
             "sha256": self.sha256,
             "kernel": self.root.tolist(),
         }
-
-
-def standard_normal(words: tuple[Words, Words, Words, Words]) -> _Array:
-    """Return standard normal (N, 2) float64 from two words (N,) uint32 (G. E. P. Box and M. E. Muller, 1958)."""
-    radius = np.sqrt(-2 * np.log((words[0] + 1.0) / _WORD))
-    angle = 2 * np.pi * words[1] / _WORD
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
 _GAUSSIAN: Final = {

@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError
-from generator.lights.distributions import standard_normal
 from generator.lights.gamut import rb_of
-from generator.philox import Words
+from generator.philox import Words, standard_normal
 from generator.statistics.image_numbers import log_chroma
 
 _OF_SCOTT: Final = 0.5

@@ -40,7 +40,19 @@ def log_chroma(lights: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 def cell_borders(size: int, side: int = CELLS) -> npt.NDArray[np.int64]:
-    """Return where cells begin along a side of `size` px, and where the last ends; at most `side` cells, 0 for all.
+    """Return where cells begin along a side of `size` px, and where the last ends.
+
+    Parameters
+    ----------
+    size
+        Of the image, px.
+    side
+        Cells, at most; 0 for as many as pixels.
+
+    Returns
+    -------
+    ndarray
+        (cells + 1,) int64, px, from 0 to `size`.
 
     Examples
     --------
@@ -57,7 +69,7 @@ def cell_means(image: npt.NDArray[np.generic], light: npt.ArrayLike, side: int =
     Parameters
     ----------
     image
-        (H, W, 3), linear camera RGB.
+        (H, W, 3) uint16 or float, linear camera RGB.
     light
         (3,) float above 0, linear camera RGB of any length; its mean over the channels counts as 1.
     side
