@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError
+from generator.named_numbers import is_number
 
 _TRIPLES: Final = (
     ("gt_r", "gt_g", "gt_b"),
@@ -46,7 +47,7 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
         raise FormatError(f"{path} is empty; expected three numbers a line")
     columns: Sequence[int] = (0, 1, 2)
     head = [field.strip().lower() for field in next(csv.reader([numbered[0][1]]))]
-    named = not any(_is_number(token) for token in re.split(r"[\s,;]+", numbered[0][1]))
+    named = not any(is_number(token) for token in re.split(r"[\s,;]+", numbered[0][1]))
     if named:
         triple = next((names for names in _TRIPLES if all(name in head for name in names)), None)
         if triple is None:
@@ -69,11 +70,3 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
     if not truths:
         raise FormatError(f"{path} holds no ground truth below its head line")
     return np.array(truths)
-
-
-def _is_number(token: str) -> bool:
-    try:
-        float(token)
-    except ValueError:
-        return False
-    return True
