@@ -52,7 +52,7 @@ def cell_borders(size: int, side: int = CELLS) -> npt.NDArray[np.int64]:
     Returns
     -------
     ndarray
-        (cells + 1,) int64, px, from 0 to `size`.
+        (N,) int64, px, from 0 to `size`, one more than cells.
 
     Examples
     --------
