@@ -13,17 +13,11 @@ from foundation.console import EXIT_CODES
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    import numpy as np
-    import numpy.typing as npt
-
     from evaluation.experiments.transfer.material import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
     from evaluation.experiments.transfer.rows import TransferRow
     from evaluation.methods.method import Method
     from evaluation.scene import SceneSet
-
-_FOLDS = "3"
-"""Folds of the field's tables, on NUS and on Cube+."""
 
 _ALIKE = 2.0
 """Ratio of sizes from which the reader is told: learned methods reduce images by up to 2 themselves."""
@@ -64,7 +58,7 @@ def transfer(
         typer.Option(
             metavar="N|FILE",
             help="Folds of real cross-validation: a number, or a CSV file image,fold. \\[default: those of the "
-            f"data set's authors, else {_FOLDS}]",
+            "data set's authors, else 3]",
             show_default=False,
         ),
     ] = None,
@@ -124,6 +118,7 @@ def transfer(
     from dataclasses import asdict, replace
 
     from evaluation.datasets import open_scenes
+    from evaluation.experiments.folds import FOLDS, choose_folds
     from evaluation.experiments.transfer.figures import figures_of
     from evaluation.experiments.transfer.outcome import TransferOutcome, save_outcome
     from evaluation.experiments.transfer.plan import is_generated, plan_transfer
@@ -144,7 +139,7 @@ def transfer(
     plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared)
     told = _sizes(tested, plan, side)
     plan = replace(plan, notes=(*plan.notes, *([told] if told else []), *left_out))
-    drawn = _folds(folds, tested, seeds)
+    drawn = tuple(choose_folds(tested, folds, seed)[0] for seed in range(seeds))
     smallest = min(len(some.scenes) for some in plan.training)
     wanted = smallest if images is None else images
     count = count_images(tested.scenes, plan.training, len(drawn), wanted)
@@ -160,7 +155,7 @@ def transfer(
     settings: dict[str, Any] = {
         "methods": [describe_method(learner) for learner in learners],
         "statistics": [describe_method(method) for method in references],
-        "folds": folds or ("the data set's own" if tested.folds is not None else _FOLDS),
+        "folds": folds or ("the data set's own" if tested.folds is not None else str(FOLDS)),
         "matrix": matrix,
         "images": wanted,
         "seeds": list(range(seeds)),
@@ -203,20 +198,6 @@ def _references(text: str) -> list[Method]:
     from evaluation.commands.choosing import choose_methods
 
     return [] if text.strip().lower() == "none" else choose_methods(text.split(","))
-
-
-def _folds(text: str | None, test: SceneSet, seeds: int) -> tuple[npt.NDArray[np.int64], ...]:
-    """Return the folds of each seed: drawn by it, or the same for all where they are given."""
-    import numpy as np
-
-    from evaluation.experiments.folds import draw_scene_folds, read_folds
-
-    if text is None and test.folds is not None:
-        return (np.array(test.folds, dtype=np.int64),) * seeds
-    wanted = text or _FOLDS
-    if wanted.isdecimal():
-        return tuple(draw_scene_folds(test.scenes, int(wanted), seed) for seed in range(seeds))
-    return (read_folds(Path(wanted), [scene.name for scene in test.scenes]),) * seeds
 
 
 def _suspicions(test: SceneSet, rows: Sequence[TransferRow]) -> tuple[str, ...]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
-
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -168,7 +166,8 @@ def test_every_digit_is_as_likely_as_another() -> None:
     for digits in (first, second):
         above = np.array([(digits >= bound).mean() for bound in least])
         deviations = above - (255 - least) / 255
-        assert deviations.min() >= -(2.0**-16) and deviations.max() <= 0
+        assert deviations.min() >= -(2.0**-16)
+        assert deviations.max() <= 0
     both = np.zeros((255, 255))
     np.add.at(both, (first, second), 2.0**-16)
     together = both[::-1, ::-1].cumsum(0).cumsum(1)[::-1, ::-1][1:, 1:]
@@ -187,9 +186,6 @@ def deviation(counts: npt.NDArray[np.int64]) -> float:
     return ((statistic / freedom) ** (1 / 3) - (1 - variance)) / variance**0.5
 
 
-Drawn = Callable[[int, int, int], npt.NDArray[np.int64]]
-
-
 def outcomes(seed: int, image: int, first_row: int) -> npt.NDArray[np.int64]:
     """Return of each of 512 x 2048 pixels which of 2 x 2 x 2 nodes and which quarter of the cells it got: 0 … 31."""
     node, slot = np.indices((32768, 32))
@@ -203,8 +199,7 @@ def outcomes(seed: int, image: int, first_row: int) -> npt.NDArray[np.int64]:
 
 def test_cells_are_independent_of_place_image_seed_and_of_the_samples() -> None:
     here = outcomes(7, 3, 0)
-    # Which of the nodes is a draw of .4392 against .5608 (v = 127): classes are made equally likely by the slot alone,
-    # and nodes are held against each other by tables whose margins are taken as they are.
+    # Nodes are not all as likely, so that tables of two outcomes are held against the product of their margins.
     samples = np.zeros((32768, 32, 3), np.uint16)
     samples[..., 0] = np.arange(32)
     drawn = draw_samples(samples, np.zeros((512, 2048, 3), np.uint8), seed=7, image=3)[..., 0].astype(np.int64)
@@ -249,6 +244,7 @@ def test_faults_are_named() -> None:
         dither(picture, np.full((32768, 32), 512, np.uint16), 3)
     with pytest.raises(InputError, match=r"the target is uint8 \(3, 4, 3\)"):
         dither(picture, any_cells(1), 1, out=np.zeros((3, 4, 3), np.uint8))
+    samples = np.zeros((1, 8, 1, 3), np.uint16)
+    windows = [(0, 0, 2, 2)] * 2
     with pytest.raises(InputError, match="1 tables of cells were given for 2 items"):
-        samples = np.zeros((1, 8, 1, 3), np.uint16)
-        draw_batch(samples, [0, 0], [picture] * 2, [(0, 0, 2, 2)] * 2, white_level=9, cells=[any_cells(1)])
+        draw_batch(samples, [0, 0], [picture] * 2, windows, white_level=9, cells=[any_cells(1)])
