@@ -22,7 +22,7 @@ GOLDEN = "01be6ed9cc7e98556cbee866e3ab5729dff7c0dadd8b919d8384bbb5ee12e95f"
 
 
 def choices(
-    seed: int, image: int, height: int, width: int, first_row: int = 0
+    seed: int, image: int, height: int, width: int, *, first_row: int = 0
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Return the digits (H, W, 3) 0 … 254 of red, green, blue, and the slots (H, W) by the rule of `dithering.py`."""
     y, x = np.arange(first_row, first_row + height), np.arange(width)
@@ -43,7 +43,7 @@ def by_rule(
     picture: npt.NDArray[np.uint8], cells: npt.NDArray[np.uint16], bits: int, seed: int, image: int, first_row: int = 0
 ) -> npt.NDArray[np.uint8]:
     """Return the code picture by the rule at the head of `dithering.py`."""
-    up, slot = choices(seed, image, *picture.shape[:2], first_row)
+    up, slot = choices(seed, image, *picture.shape[:2], first_row=first_row)
     nodes = (31 * picture.astype(np.int64) + up) // 255
     cell = cells[nodes[..., 0] << 10 | nodes[..., 1] << 5 | nodes[..., 2], slot].astype(np.int64)
     fields = [cell >> 2 * bits, cell >> bits, cell]
