@@ -415,3 +415,41 @@ def dither(
     if work is not out:
         out[...] = work
     return out
+
+
+@compiled
+def _count_nodes(picture: Any, nearest: Any, counts: Any) -> None:
+    for y in range(picture.shape[0]):
+        for x in range(picture.shape[1]):
+            red, green, blue = nearest[picture[y, x, 0]], nearest[picture[y, x, 1]], nearest[picture[y, x, 2]]
+            counts[red << 10 | green << 5 | blue] += 1
+
+
+def nearest_nodes(picture: Picture) -> npt.NDArray[np.int64]:
+    """Return how many pixels of a picture are nearest to each source node.
+
+    Parameters
+    ----------
+    picture
+        (H, W, 3) uint8, sRGB codes.
+
+    Returns
+    -------
+    ndarray
+        (32768,) int64.
+
+    Raises
+    ------
+    InputError
+        The picture is of another shape or type.
+
+    Examples
+    --------
+    >>> np.flatnonzero(nearest_nodes(np.array([[[255, 0, 4], [0, 0, 5]]], np.uint8)))
+    array([    1, 31744])
+    """
+    check_picture(picture)
+    nearest = np.rint(np.arange(256) * (NODES - 1) / 255).astype(np.int64)
+    counts = np.zeros(NODES**3, np.int64)
+    _count_nodes(picture, nearest, counts)
+    return counts
