@@ -83,6 +83,14 @@ def transfer(
             show_default=False,
         ),
     ] = None,
+    only: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="CSV file with a column image: only these are tested; cross-validation still trains on all others.",
+            show_default=False,
+        ),
+    ] = None,
     images: Annotated[
         int | None,
         typer.Option(
@@ -144,6 +152,8 @@ def transfer(
     plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared)
     told = _sizes(tested, plan, side)
     plan = replace(plan, notes=(*plan.notes, *([told] if told else []), *left_out))
+    counted, places, partly = _only(only, tested)
+    plan = replace(plan, notes=(*plan.notes, *partly))
     drawn = _folds(folds, tested, seeds)
     smallest = min(len(some.scenes) for some in plan.training)
     wanted = smallest if images is None else images
@@ -155,12 +165,14 @@ def transfer(
             *(side, threads, lambda: advance(next(steps), count)),
             generated=tested.name if is_generated(tested) else "",
         )
-    plan = replace(plan, notes=(*plan.notes, *_suspicions(tested, rows)))
+    rows = tuple(replace(row, results=tuple(result.at(places) for result in row.results)) for row in rows)
+    plan = replace(plan, notes=(*plan.notes, *_suspicions(counted, rows)))
     figures = figures_of(rows, error)
     settings: dict[str, Any] = {
         "methods": [describe_method(learner) for learner in learners],
         "statistics": [describe_method(method) for method in references],
         "folds": folds or ("the data set's own" if tested.folds is not None else _FOLDS),
+        "only": None if only is None else only.name,
         "matrix": matrix,
         "images": wanted,
         "seeds": list(range(seeds)),
@@ -169,7 +181,7 @@ def transfer(
         "error": error,
         "reading": asdict(reading),
     }
-    outcome = TransferOutcome(tested, plan, rows, figures, drawn, settings)
+    outcome = TransferOutcome(counted, tested, plan, rows, figures, drawn, settings)
     for table in outcome.tables():
         print_table(table)
         print()
@@ -217,6 +229,29 @@ def _folds(text: str | None, test: SceneSet, seeds: int) -> tuple[npt.NDArray[np
     if wanted.isdecimal():
         return tuple(draw_scene_folds(test.scenes, int(wanted), seed) for seed in range(seeds))
     return (read_folds(Path(wanted), [scene.name for scene in test.scenes]),) * seeds
+
+
+def _only(file: Path | None, test: SceneSet) -> tuple[SceneSet, npt.NDArray[np.int64], tuple[str, ...]]:
+    """Return the test set without the images that do not count, the places (P,) of those that do, and notes."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from evaluation.experiments.folds import read_names
+
+    if file is None:
+        return test, np.arange(len(test.scenes), dtype=np.int64), ()
+    names = read_names(file, [scene.name for scene in test.scenes])
+    places = np.array([place for place, scene in enumerate(test.scenes) if scene.name in names], dtype=np.int64)
+    told = (
+        f"{len(places)} of the {len(test.scenes)} images of {test.name} count, those of {file.name}; cross-validation "
+        "trained on the others of all"
+    )
+    return (
+        replace(test, scenes=tuple(scene for scene in test.scenes if scene.name in names), folds=None),
+        places,
+        (told,),
+    )
 
 
 def _suspicions(test: SceneSet, rows: Sequence[TransferRow]) -> tuple[str, ...]:
