@@ -1,4 +1,7 @@
-"""Options spelled as ``name=number,name=number``, such as the shape of a mask or of a distribution."""
+"""Numbers in text: whether a word is one, and options spelled as ``name=number,name=number``.
+
+Such options are the shape of a mask or of a distribution.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,21 @@ from collections.abc import Mapping
 from foundation.errors import InputError
 
 Range = tuple[float, float]
+
+
+def is_number(text: str) -> bool:
+    """Return whether a text is a number to Python's `float`, which takes nan and inf for numbers too.
+
+    Examples
+    --------
+    >>> [is_number(text) for text in (".5", " -3e2 ", "r", "")]
+    [True, True, False, False]
+    """
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def parse_numbers(text: str, allowed: Mapping[str, Range], what: str) -> dict[str, float]:

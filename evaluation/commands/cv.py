@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.result_options import PrintedError, PrintedStatistics
 from evaluation.commands.train import LEARNERS_HELP
 from foundation.console import EXIT_CODES
 
@@ -17,9 +18,6 @@ if TYPE_CHECKING:
 
     from evaluation.methods.method import Learner
     from evaluation.scene import SceneSet
-
-_FOLDS = 3
-"""Folds by default: what the field's tables have."""
 
 HELP = f"""Cross-validate methods that learn: train on all folds but one and estimate the images of that one, for each.
 
@@ -60,14 +58,8 @@ def cv(
     seed: Annotated[
         int, typer.Option(metavar="N", help="Of the folds and of all that is random in the training.", min=0)
     ] = 0,
-    error: Annotated[
-        Literal["reproduction", "recovery"],
-        typer.Option(help="Angular error that is printed, and drawn in the report; files have both."),
-    ] = "reproduction",
-    statistics: Annotated[
-        Literal["paper", "all"],
-        typer.Option(help="Print the paper's six statistics, or also 95th percentile, maximum and share below 3°."),
-    ] = "paper",
+    error: PrintedError = "reproduction",
+    statistics: PrintedStatistics = "paper",
     out: Annotated[
         Path | None,
         typer.Option(metavar="RESULTS", help="Write everything to this new folder.", show_default=False),
@@ -90,7 +82,7 @@ def cv(
     """Cross-validate methods on a data set."""
     from evaluation.commands.choosing import require_order
     from evaluation.experiments.cross_validation import cross_validate
-    from evaluation.experiments.folds import folds_to_csv
+    from evaluation.experiments.folds import choose_folds, folds_to_csv
     from evaluation.experiments.run_folder import describe_run, write_run
     from evaluation.reports.terminal import print_table
     from evaluation.results.method_records import describe_method
@@ -106,7 +98,7 @@ def cv(
     if save_folds is not None:
         require_free_file(save_folds, "the folds")
     found = reading.open(data)
-    parts, origin = _folds(found, folds, seed)
+    parts, origin = choose_folds(found, folds, seed)
     count, threads = len(found.scenes), workers or processor_count()
     with orderly_end():
         with progress("images") as advance:
@@ -168,31 +160,3 @@ def _chosen(text: str) -> tuple[list[Learner], list[str]]:
         else:
             chosen.append(learner)
     return chosen, left_out
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _folds(data: SceneSet, text: str | None, seed: int) -> tuple[npt.NDArray[np.int64], str]:
-    """Return the fold of each image, (N,) int64, and where the folds come from."""
-    import numpy as np
-
-    from evaluation.experiments.folds import draw_scene_folds, group_of, read_folds
-    from foundation.errors import InputError
-
-    if text is None and data.folds is not None:
-        return np.asarray(data.folds, dtype=np.int64), "the data set's own"
-    if text is not None and not text.lstrip("+-").isdigit():
-        if not Path(text).suffix or _is_number(text):
-            raise InputError(f"--folds is {text!r}, expected a number from 2, or a CSV file with image,fold")
-        return read_folds(Path(text), [scene.name for scene in data.scenes]), f"from {text}"
-    number = _FOLDS if text is None else int(text)
-    groups = [group_of(scene) for scene in data.scenes]
-    alone = len(set(groups)) == len(groups)
-    origin = f"drawn by seed {seed}" + ("" if alone else f", {len(set(groups))} groups of images kept together")
-    return draw_scene_folds(data.scenes, number, seed), origin

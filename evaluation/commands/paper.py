@@ -175,13 +175,12 @@ def table2(
     """Train learned methods on real and on generated images."""
     from evaluation.commands.choosing import choose_learners
     from evaluation.datasets import open_scenes
-    from evaluation.experiments.folds import draw_scene_folds, read_folds
+    from evaluation.experiments.folds import choose_folds
     from evaluation.experiments.paper.reporting import table2_report
     from evaluation.experiments.paper.table2 import table2 as run
     from evaluation.experiments.paper.table2 import table2_tables
-    from evaluation.experiments.transfer.overlap import shared_images
+    from evaluation.experiments.transfer.overlap import trainable_images
     from evaluation.learning.standard import standard_learners
-    from foundation.errors import InputError, first_of
     from foundation.processors import processor_count
 
     _require_free(out)
@@ -190,26 +189,14 @@ def table2(
     learners = dict(zip(names, choose_learners(names), strict=True))
     real, made = reading.open(data), open_scenes(generated)
     count = len(real.scenes)
-    training, unseen = made.scenes, ()
-    if common := shared_images(made, real):
-        among = (
-            f"{len(common)} of {len(made.scenes)} images of {made.name} are also in {real.name}, by {common[0].by}: "
-            f"{first_of([one.name for one in common], 3)}"
-        )
-        if shared == "refuse" or any(one.by == "content" for one in common):
-            raise InputError(f"{among}; what is tested must be unseen: --shared leave-out trains without them")
-        if shared == "leave-out":
-            dropped = {one.position for one in common}
-            training = tuple(scene for place, scene in enumerate(training) if place not in dropped)
-            unseen = (f"{among}. They were left out.",)
-        else:
-            unseen = (
-                f"{among}. They were kept, as in the paper, whose generated images show the pictures that are tested.",
-            )
-    if folds.isdigit():
-        drawn = draw_scene_folds(real.scenes, int(folds), seed)
-    else:
-        drawn = read_folds(Path(folds), [scene.name for scene in real.scenes])
+    training, told = trainable_images(made, real, shared, real.name, copies=False)
+    fate = (
+        "left out"
+        if shared == "leave-out"
+        else "kept, as in the paper, whose generated images show the pictures that are tested"
+    )
+    unseen = (f"{told}. They were {fate}.",) if told else ()
+    drawn, _ = choose_folds(real, folds, seed)
     with _progress(2 * count) as step:
         found = run(real.scenes, training, learners, drawn, seed, workers or processor_count(), step)
     is_cube = real.layout == "cube-plus"

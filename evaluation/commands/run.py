@@ -6,12 +6,13 @@ import os
 import sys
 from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from evaluation.commands.choosing import METHOD_HELP
 from evaluation.commands.data_options import DataReading, with_data_options
+from evaluation.commands.result_options import PrintedError, PrintedStatistics
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
@@ -58,14 +59,8 @@ def run(
             show_default=False,
         ),
     ] = None,
-    error: Annotated[
-        Literal["reproduction", "recovery"],
-        typer.Option(help="Angular error that is printed, and drawn in the report; files have both."),
-    ] = "reproduction",
-    statistics: Annotated[
-        Literal["paper", "all"],
-        typer.Option(help="Print the paper's six statistics, or also 95th percentile, maximum and share below 3°."),
-    ] = "paper",
+    error: PrintedError = "reproduction",
+    statistics: PrintedStatistics = "paper",
     out: Annotated[
         Path | None,
         typer.Option(

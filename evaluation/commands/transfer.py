@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from evaluation.methods.method import Method
     from evaluation.scene import SceneSet
 
-_FOLDS = "3"
-"""Folds of the field's tables, on NUS and on Cube+."""
-
 _ALIKE = 2.0
 """Ratio of sizes from which the reader is told: learned methods reduce images by up to 2 themselves."""
 
@@ -64,7 +61,7 @@ def transfer(
         typer.Option(
             metavar="N|FILE",
             help="Folds of real cross-validation: a number, or a CSV file image,fold. \\[default: those of the "
-            f"data set's authors, else {_FOLDS}]",
+            "data set's authors, else 3]",
             show_default=False,
         ),
     ] = None,
@@ -132,6 +129,7 @@ def transfer(
     from dataclasses import asdict, replace
 
     from evaluation.datasets import open_scenes
+    from evaluation.experiments.folds import FOLDS, choose_folds
     from evaluation.experiments.transfer.figures import figures_of
     from evaluation.experiments.transfer.outcome import TransferOutcome, save_outcome
     from evaluation.experiments.transfer.plan import is_generated, plan_transfer
@@ -154,7 +152,7 @@ def transfer(
     plan = replace(plan, notes=(*plan.notes, *([told] if told else []), *left_out))
     counted, places, partly = _only(only, tested)
     plan = replace(plan, notes=(*plan.notes, *partly))
-    drawn = _folds(folds, tested, seeds)
+    drawn = tuple(choose_folds(tested, folds, seed)[0] for seed in range(seeds))
     smallest = min(len(some.scenes) for some in plan.training)
     wanted = smallest if images is None else images
     count = count_images(tested.scenes, plan.training, len(drawn), wanted)
@@ -171,7 +169,7 @@ def transfer(
     settings: dict[str, Any] = {
         "methods": [describe_method(learner) for learner in learners],
         "statistics": [describe_method(method) for method in references],
-        "folds": folds or ("the data set's own" if tested.folds is not None else _FOLDS),
+        "folds": folds or ("the data set's own" if tested.folds is not None else str(FOLDS)),
         "only": None if only is None else only.name,
         "matrix": matrix,
         "images": wanted,
@@ -215,20 +213,6 @@ def _references(text: str) -> list[Method]:
     from evaluation.commands.choosing import choose_methods
 
     return [] if text.strip().lower() == "none" else choose_methods(text.split(","))
-
-
-def _folds(text: str | None, test: SceneSet, seeds: int) -> tuple[npt.NDArray[np.int64], ...]:
-    """Return the folds of each seed: drawn by it, or the same for all where they are given."""
-    import numpy as np
-
-    from evaluation.experiments.folds import draw_scene_folds, read_folds
-
-    if text is None and test.folds is not None:
-        return (np.array(test.folds, dtype=np.int64),) * seeds
-    wanted = text or _FOLDS
-    if wanted.isdecimal():
-        return tuple(draw_scene_folds(test.scenes, int(wanted), seed) for seed in range(seeds))
-    return (read_folds(Path(wanted), [scene.name for scene in test.scenes]),) * seeds
 
 
 def _only(file: Path | None, test: SceneSet) -> tuple[SceneSet, npt.NDArray[np.int64], tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Folds of a data set: drawn by a seed, read from a file, written as one.
+"""Folds of a data set: its authors' own, drawn by a seed, or read from a file; written as one.
 
 A fold is held back while a method is trained on the others. Images that share a group, such as one picture under
 several lights, are always in the same fold: otherwise the method is tested on what it was trained on.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,8 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.states import first_copies
-from evaluation.scene import Scene
+from evaluation.scene import Scene, SceneSet
 from foundation.errors import FormatError, InputError, counted, first_of
+from generator.named_numbers import is_number
+
+FOLDS = 3
+"""Folds that are drawn by default: what the field's tables have, on NUS and on Cube+."""
 
 _LEAST = 2
 """Folds: with one there is nothing left to train on."""
@@ -26,6 +31,39 @@ _LEAST = 2
 def group_of(scene: Scene) -> str:
     """Return what the scene shares with others that must not be parted from it: its `group`, else its name."""
     return str(getattr(scene, "group", scene.name))
+
+
+def choose_folds(data: SceneSet, text: str | None = None, seed: int = 0) -> tuple[npt.NDArray[np.int64], str]:
+    """Return the fold of each image, (N,) int64 from 0, and where the folds come from, for the reader.
+
+    Parameters
+    ----------
+    data
+        The data set.
+    text
+        What --folds was given: a number of folds to draw, or the path of a CSV file with the columns image,fold. None
+        takes the data set's own folds, else draws `FOLDS`.
+    seed
+        Of folds that are drawn.
+
+    Raises
+    ------
+    InputError
+        The text is neither, or so many folds cannot be drawn; see `draw_folds`.
+    FormatError
+        The file has no folds of these images; see `read_folds`.
+    """
+    if text is None and data.folds is not None:
+        return np.asarray(data.folds, dtype=np.int64), "the data set's own"
+    if text is not None and not re.fullmatch(r"[+-]?\d+", text):
+        if is_number(text) or not (Path(text).suffix or Path(text).is_file()):
+            raise InputError(f"--folds is {text!r}, expected a number from 2, or a CSV file with image,fold")
+        return read_folds(Path(text), [scene.name for scene in data.scenes]), f"from {text}"
+    groups = {group_of(scene) for scene in data.scenes}
+    origin = f"drawn by seed {seed}"
+    if len(groups) < len(data.scenes):
+        origin += f", {len(groups)} groups of images kept together"
+    return draw_scene_folds(data.scenes, FOLDS if text is None else int(text), seed), origin
 
 
 def draw_folds(count: int, folds: int, seed: int = 0, groups: Sequence[str] | None = None) -> npt.NDArray[np.int64]:

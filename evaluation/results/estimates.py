@@ -20,6 +20,7 @@ import numpy.typing as npt
 from evaluation.scene import Scene
 from foundation.errors import FormatError, InputError, counted, first_of
 from foundation.hashing import sha256_of
+from generator.named_numbers import is_number
 
 _COLUMNS = ("image", "r", "g", "b")
 
@@ -126,7 +127,7 @@ def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
         raise FormatError(f"{path} is no CSV text: {error}; expected {','.join(_COLUMNS)}") from error
     heads = [head.strip().lower() for head in rows[0]] if rows else []
     headed = all(column in heads for column in _COLUMNS)
-    if not headed and not (len(heads) == len(_COLUMNS) and all(map(_is_number, heads[1:]))):
+    if not headed and not (len(heads) == len(_COLUMNS) and all(map(is_number, heads[1:]))):
         raise FormatError(
             f"{path} begins with {lines[0][:80].strip()!r}; expected the columns {','.join(_COLUMNS)}, with or without "
             "a head"
@@ -151,11 +152,3 @@ def _rows(path: Path, text: str) -> list[tuple[str, npt.NDArray[np.float64]]]:
                 f"{path}, line {number}: {separator.join(row)[:80]!r}; expected a name and three numbers"
             ) from error
     return found
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

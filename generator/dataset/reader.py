@@ -5,6 +5,7 @@
     previews/NNNNNN.jpg  the same, tone mapped, at most 512 px: the look of the raw, no white balance
     ground_truth.csv     image,source,illumination,r,g,b with r + g + b = 1, one row a light
     gt.txt               r g b a line in image order: the mean of the lights over the image
+    images.csv           where options do something to each image: what they did to it
     sources.csv          position,name,sha256,width,height,replaced_pixels,split,profile
     splits/train.txt …   names of images, where the dataset was divided
     dataset.json         the table's hash, seed, options: enough to make every byte again
@@ -37,6 +38,7 @@ from generator.dataset.production.layouts.by_name import read_member
 from generator.dataset.production.layouts.samples import member_name
 from generator.dataset.production.records import (
     FORMAT,
+    IMAGES,
     SOURCES,
     VERSION,
     Description,
@@ -138,6 +140,23 @@ class Dataset:
             )
         except ValidationError as error:
             raise FormatError(f"{self.store.place}/{SOURCES} is damaged; make the dataset again") from error
+
+    @cached_property
+    def details(self) -> dict[str, dict[str, str]]:
+        """What options did to each image, as `images.csv` has it, by the image's name; empty if none did anything.
+
+        Raises
+        ------
+        FormatError
+            The list is damaged.
+        """
+        if not self.store.has(IMAGES):
+            return {}
+        rows = csv.DictReader(io.StringIO(self.store.get(IMAGES).decode("utf-8", "replace")))
+        try:
+            return {row.pop("image"): row for row in rows}
+        except KeyError as error:
+            raise FormatError(f"{self.store.place}/{IMAGES} has no column image; make the dataset again") from error
 
     def _name(self, file: str, split: str | None, kind: str) -> str:
         if self.layout == "folder":

@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError
+from generator.named_numbers import is_number
+from generator.statistics.statistics_file import read_lights
 
 _TRIPLES: Final = (
     ("gt_r", "gt_g", "gt_b"),
@@ -25,7 +27,7 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
     """Return the ground truths of a file.
 
     Either a CSV file whose head names the columns `GT_R,GT_G,GT_B` or `r,g,b` (others are ignored), or lines of three
-    numbers between blanks or commas, as in `gt.txt` and Cube+.
+    numbers between blanks or commas, as in `gt.txt` and Cube+; or the lights of a `STATS.json` of `evaluate describe`.
 
     Returns
     -------
@@ -37,6 +39,8 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
     FormatError
         The file cannot be read, is empty, or a line is not three numbers ≥ 0 with a sum above 0.
     """
+    if is_statistics(path):
+        return read_lights(path)
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -46,7 +50,7 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
         raise FormatError(f"{path} is empty; expected three numbers a line")
     columns: Sequence[int] = (0, 1, 2)
     head = [field.strip().lower() for field in next(csv.reader([numbered[0][1]]))]
-    named = not any(_is_number(token) for token in re.split(r"[\s,;]+", numbered[0][1]))
+    named = not any(is_number(token) for token in re.split(r"[\s,;]+", numbered[0][1]))
     if named:
         triple = next((names for names in _TRIPLES if all(name in head for name in names)), None)
         if triple is None:
@@ -71,9 +75,6 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
     return np.array(truths)
 
 
-def _is_number(token: str) -> bool:
-    try:
-        float(token)
-    except ValueError:
-        return False
-    return True
+def is_statistics(path: Path) -> bool:
+    """Return whether a file is a `STATS.json` by its name."""
+    return path.suffix.lower() == ".json"

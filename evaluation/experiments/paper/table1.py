@@ -28,7 +28,7 @@ from evaluation.experiments.running import evaluate
 from evaluation.methods.standard import standard_methods
 from evaluation.metrics import ErrorKind
 from evaluation.results.tables import Table
-from foundation.errors import InputError
+from foundation.errors import InputError, counted
 from generator.pictures.sources import Source, random_scenes
 
 if TYPE_CHECKING:
@@ -203,9 +203,10 @@ def block_table(block: Block, kind: ErrorKind) -> Table:
         rows.append((result.method, *result.summary(kind).as_tuple()))
         if result.method in published:
             rows.append(("paper", *published[result.method].as_tuple()))
-    notes = [f"{block.images} images; lights {block.lights}."]
+    notes = [f"{counted(block.images, 'image')}; lights {block.lights}."]
     notes += [
-        f"{result.method}: no usable pixel in {int(result.guessed.sum())} images, whose light was taken to be grey."
+        f"{result.method}: no usable pixel in {counted(int(result.guessed.sum()), 'image')}, whose light "
+        "was taken to be grey."
         for result in block.results
         if result.guessed.any()
     ]

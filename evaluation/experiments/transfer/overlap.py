@@ -9,13 +9,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Literal
 
 import numpy as np
 
 from evaluation.datasets.generated import GeneratedScene
 from evaluation.scene import Scene, SceneSet
-from foundation.errors import InputError
+from foundation.errors import InputError, first_of
 from foundation.hashing import sha256_of
+
+Shared = Literal["refuse", "leave-out", "keep"]
+"""What to do about training images that show what test images show."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,45 @@ def shared_images(training: SceneSet, test: SceneSet) -> tuple[SharedImage, ...]
         if found:
             shared.append(SharedImage(position, name, *found))
     return tuple(shared)
+
+
+def trainable_images(
+    training: SceneSet, test: SceneSet, shared: Shared, called: str = "the test set", *, copies: bool = True
+) -> tuple[tuple[Scene, ...], str]:
+    """Return the images of a set that may be trained on, and in words what it shares with the test, "" for nothing.
+
+    Parameters
+    ----------
+    training, test
+        The two sets.
+    shared
+        What is to be done about shared images.
+    called
+        What the test set is called in those words.
+    copies
+        Whether `keep` keeps also what was found by content; else it is refused as by `refuse`.
+
+    Raises
+    ------
+    InputError
+        Images are shared and not to be trained on, or the two are one data set.
+    """
+    common = shared_images(training, test)
+    if not common:
+        return training.scenes, ""
+    told = (
+        f"{len(common)} of {len(training.scenes)} images of {training.name} are also in {called}, by {common[0].by}: "
+        f"{first_of([one.name for one in common], 3)}"
+    )
+    if shared == "keep" and not copies and any(one.by == "content" for one in common):
+        raise InputError(f"{told}; what is tested must be unseen: --shared leave-out trains without them")
+    if shared == "refuse":
+        raise InputError(
+            f"{told}; --shared leave-out trains without them, --shared keep with them (what was tested is then no "
+            "longer unseen)"
+        )
+    dropped = {one.position for one in common} if shared == "leave-out" else set[int]()
+    return tuple(scene for place, scene in enumerate(training.scenes) if place not in dropped), told
 
 
 _Key = tuple[str, str]

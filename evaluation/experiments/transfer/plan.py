@@ -5,19 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from evaluation.datasets.generated import GeneratedScene
 from evaluation.experiments.transfer.matrices import ColourMatrix, camera_matrix, choose_matrix
 from evaluation.experiments.transfer.naive import naive_scenes
-from evaluation.experiments.transfer.overlap import shared_images
+from evaluation.experiments.transfer.overlap import Shared, trainable_images
 from evaluation.experiments.transfer.pictures import find_sources
 from evaluation.experiments.transfer.rows import TrainingSet
 from evaluation.scene import Scene, SceneSet
 from foundation.errors import InputError, first_of
-
-Shared = Literal["refuse", "leave-out", "keep"]
-"""What to do about training images that show what test images show."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,32 +100,19 @@ def plan_transfer(
 
 def _trainable(some: SceneSet, test: SceneSet, shared: Shared, notes: list[str]) -> tuple[Scene, ...]:
     """Return the images of a set that may be trained on."""
-    common = shared_images(some, test)
-    dropped: set[int] = set()
-    if common:
-        first = common[0]
-        told = (
-            f"{len(common)} of {len(some.scenes)} images of {some.name} are also in the test set, by {first.by}: "
-            f"{first_of([one.name for one in common], 3)}"
-        )
-        if shared == "refuse":
-            raise InputError(
-                f"{told}; --shared leave-out trains without them, --shared keep with them (what was tested is then no "
-                "longer unseen)"
-            )
+    kept, told = trainable_images(some, test, shared)
+    if told:
         notes.append(f"{told}; {'left out' if shared == 'leave-out' else 'kept: what is tested is not unseen'}")
-        dropped = {one.position for one in common} if shared == "leave-out" else set()
-    kept = [scene for place, scene in enumerate(some.scenes) if place not in dropped]
     divided = [
         scene for scene in kept if isinstance(scene, GeneratedScene) and scene.entry.split not in (None, "train")
     ]
     if divided:
         notes.append(f"{some.name}: {len(divided)} images of its parts validation and test are not trained on")
         left_out = {id(scene) for scene in divided}
-        kept = [scene for scene in kept if id(scene) not in left_out]
+        kept = tuple(scene for scene in kept if id(scene) not in left_out)
     if not kept:
         raise InputError(f"{some.name} has no image left to train on: all are shared with the test set or set apart")
-    return tuple(kept)
+    return kept
 
 
 def _with_naive(

@@ -9,11 +9,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.methods.filters.shrinking import shrink
 from evaluation.scene import Image, Scene
 from foundation.processors import ordered_map
 
 _COVERED: Final = 1e-3
-"""Least share of a pixel's area that must be usable; less is rounding of areas rather than a colour."""
+"""Share of a pixel's area of which more must be usable; less is rounding of areas rather than a colour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,19 +106,11 @@ def shrink_image(
     >>> small[..., 0], mask
     (array([[20.,  0.]], dtype=float32), array([[False, False]]))
     """
-    import cv2
-
-    height, width = image.shape[:2]
-    scale = side / max(height, width)
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    usable = np.ones((height, width), np.float32)
+    usable = np.ones(image.shape[:2], dtype=bool)
     if saturation is not None:
-        usable[(image >= saturation).any(axis=2)] = 0
+        usable &= (image < saturation).all(axis=2)
     if mask is not None:
-        usable[mask] = 0
-    share = np.asarray(cv2.resize(usable, size, interpolation=cv2.INTER_AREA))
-    weighted = image.astype(np.float32) * usable[..., None]
-    summed = np.asarray(cv2.resize(weighted, size, interpolation=cv2.INTER_AREA))
-    empty = share < _COVERED
-    small = np.where(empty[..., None], 0, summed / np.where(empty, 1, share)[..., None])
-    return small.astype(np.float32), empty
+        usable &= ~mask
+    small, empty = shrink(image, usable, side, _COVERED)
+    small[empty] = 0
+    return small, empty

@@ -9,7 +9,7 @@ from evaluation.scene import Image
 
 
 def shrink(
-    image: Image, usable: npt.NDArray[np.bool_], longest: int
+    image: Image, usable: npt.NDArray[np.bool_], longest: int, least: float = 0.5
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
     """Return an image whose longer side is `longest` px, and where it must not be used.
 
@@ -23,11 +23,13 @@ def shrink(
         (H, W) bool, True where a pixel may be used.
     longest
         px, below the longer side.
+    least
+        Share of a pixel's area, 0 … 1, that must be exceeded by what is usable of it.
 
     Returns
     -------
     tuple of ndarray
-        (h, w, 3) float32; (h, w) bool, True where half or less of a pixel is usable, or none.
+        (h, w, 3) float32, 0 where nothing is usable; (h, w) bool, True where no more of a pixel is usable than `least`.
     """
     import cv2
 
@@ -40,6 +42,6 @@ def shrink(
         kept = np.where(usable, image[..., channel], 0).astype(np.float32)
         planes.append(np.asarray(cv2.resize(kept, size, interpolation=cv2.INTER_AREA), dtype=np.float32))
     found = np.stack(planes, axis=-1) / np.maximum(share, np.finfo(np.float32).tiny)[..., None]
-    masked = share <= 0.5
+    masked = share <= least
     found[share <= 0] = 0
     return found.astype(np.float32), masked

@@ -21,6 +21,7 @@ from generator.dataset.production.records import (
     CARD,
     GROUND_TRUTH,
     GROUND_TRUTH_COLUMNS,
+    IMAGES,
     SOURCE_COLUMNS,
     SOURCES,
     SPLITS,
@@ -88,6 +89,7 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
     splits: Counter[str] = Counter()
     skipped: list[Skipped] = []
     used: dict[int, Light] = {}
+    details: _ListedFile | None = None
     with ExitStack() as stack:
         truths = _ListedFile(stack, place.files, TRUTHS)
         table = _ListedFile(stack, place.files, GROUND_TRUTH)
@@ -113,6 +115,11 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
                 name = f"{image_key(image.number)}{suffix}"
                 table.write(_image_rows(name, source.name, image))
                 truths.write("{:.9f} {:.9f} {:.9f}\n".format(*image.truth))
+                if image.details:
+                    if details is None:
+                        details = _ListedFile(stack, place.files, IMAGES)
+                        details.write(_row(("image", *image.details)))
+                    details.write(_row((name, *map(_plain, image.details.values()))))
                 if source.split is not None:
                     parts[source.split].write(f"{name}\n")
                     splits[source.split] += 1
@@ -141,6 +148,8 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
         )
         text = (description.model_dump_json(indent=2) + "\n").encode()
         written = [table, truths, listed, *parts.values()]
+        if details is not None:
+            written.append(details)
         if not folder:
             card = _ListedFile(stack, place.files, CARD)
             card.write(_card(description))
@@ -184,6 +193,11 @@ def _row(fields: Iterable[object]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerow(fields)
     return text.getvalue()
+
+
+def _plain(value: float | str) -> str:
+    """Return a value of `images.csv`; nine digits give back every float32."""
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
 def _source_row(source: SourceRecord) -> str:

@@ -54,6 +54,11 @@ class DatasetOptions:
     shard_images: int = SHARD_IMAGES
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
+    @property
+    def has_details(self) -> bool:
+        """Whether options do something to each image that is recorded of it: `images.csv` lists it then."""
+        return False
+
     def __post_init__(self) -> None:
         for what, value, known in (("format", self.form, FORMATS), ("layout", self.layout, get_args(Layout))):
             if value not in known:

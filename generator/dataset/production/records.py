@@ -17,6 +17,7 @@ VERSION: Final = 2
 
 GROUND_TRUTH: Final = "ground_truth.csv"
 GROUND_TRUTH_COLUMNS: Final = ("image", "source", "illumination", "r", "g", "b")
+IMAGES: Final = "images.csv"
 SOURCES: Final = "sources.csv"
 SOURCE_COLUMNS: Final = ("position", "name", "sha256", "width", "height", "replaced_pixels", "split", "profile")
 TRUTHS: Final = "gt.txt"
@@ -24,6 +25,9 @@ SUMS: Final = "SHA256SUMS"
 CARD: Final = "README.md"
 
 Triple = tuple[float, float, float]
+Details = dict[str, int | float | str]
+"""What options did to one image, by column of `images.csv`; all images of a dataset have the same columns."""
+
 Layout = Literal["folder", "webdataset", "parquet"]
 Split = Literal["train", "validation", "test"]
 SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
@@ -105,12 +109,13 @@ class LightRow(_Record):
 
 
 class ImageRecord(_Record):
-    """An image that was made; `truth` is the mean of its lights over its pixels, of sum 1."""
+    """An image that was made; `truth` is the mean of its lights over its pixels, of sum 1; `details` as `Details`."""
 
     number: int
     position: int
     truth: Triple
     lights: list[LightRow]
+    details: Details = {}
 
 
 class FileSum(_Record):

@@ -142,7 +142,10 @@ def make_shard(
 
 def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
     maps = any(lighting.masks is not None for lighting in job.choice.lightings_of(job.position))
-    return open_writer(job.options.layout, place.files, job.shard, previews=job.options.previews, maps=maps)
+    options = job.options
+    return open_writer(
+        options.layout, place.files, job.shard, previews=options.previews, maps=maps, details=options.has_details
+    )
 
 
 @contextmanager

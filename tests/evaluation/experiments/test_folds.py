@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evaluation.experiments.folds import draw_folds, folds_to_csv, group_of, read_folds, require_apart
+from evaluation.experiments.folds import (
+    choose_folds,
+    draw_folds,
+    draw_scene_folds,
+    folds_to_csv,
+    group_of,
+    read_folds,
+    require_apart,
+)
+from evaluation.scene import SceneSet
 from foundation.errors import FormatError, InputError
 
 NAMES = ["a.png", "b.png", "c.png", "d, e.png"]
@@ -47,6 +57,42 @@ def test_groups_stay_together() -> None:
 def test_impossible_folds_are_refused(count: int, folds: int, groups: list[str] | None) -> None:
     with pytest.raises(InputError, match="expected 2 to"):
         draw_folds(count, folds, groups=groups)
+
+
+def test_folds_are_the_authors_unless_others_are_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    scenes: Any = tuple(SimpleNamespace(name=name, truth=np.ones(3), saturation=None) for name in NAMES)
+    data = SceneSet("Four", "plain", "four", scenes, folds=(1, 0, 1, 0))
+    assert [part if isinstance(part, str) else part.tolist() for part in choose_folds(data)] == [
+        [1, 0, 1, 0],
+        "the data set's own",
+    ]
+    drawn, origin = choose_folds(data, "2", seed=3)
+    assert (drawn.tolist(), origin) == (draw_scene_folds(scenes, 2, 3).tolist(), "drawn by seed 3")
+    assert set(choose_folds(replace(data, folds=None))[0].tolist()) == {0, 1, 2}
+    # Whether a word is a file is asked of the disk only where it has no ending.
+    Path("folds").write_text(folds_to_csv(NAMES, np.array([0, 1, 1, 1])))
+    assert choose_folds(data, "folds")[0].tolist() == [0, 1, 1, 1]
+    assert choose_folds(data, "folds")[1] == "from folds"
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("1", "expected 2 to 4"),
+        ("-2", "expected 2 to 4"),
+        ("+-2", "'[+]-2', expected a number from 2"),
+        ("2.0", "'2.0', expected a number from 2"),
+        ("²", "'²', expected a number from 2"),
+        ("two", "'two', expected a number from 2"),
+        ("two.csv", "cannot read folds from two.csv"),
+    ],
+)
+def test_what_names_no_folds_is_refused(text: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    scenes: Any = tuple(SimpleNamespace(name=name, truth=np.ones(3), saturation=None) for name in NAMES)
+    with pytest.raises((InputError, FormatError), match=why):
+        choose_folds(SceneSet("Four", "plain", "four", scenes), text)
 
 
 def test_a_file_of_folds_is_read_as_it_was_written(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ def require_libraries(layout: Layout) -> None:
         require_pyarrow()
 
 
-def open_writer(layout: Layout, store: Store, shard: int, *, previews: bool, maps: bool) -> ShardWriter:
+def open_writer(layout: Layout, store: Store, shard: int, *, previews: bool, maps: bool, details: bool) -> ShardWriter:
     """Return the writer of a shard.
 
     Parameters
@@ -35,6 +35,8 @@ def open_writer(layout: Layout, store: Store, shard: int, *, previews: bool, map
         Its number.
     previews, maps
         Whether its images have previews, and masks with maps of the ground truth.
+    details
+        Whether its images have details (`records.Details`).
     """
     match layout:
         case "folder":
@@ -46,7 +48,7 @@ def open_writer(layout: Layout, store: Store, shard: int, *, previews: bool, map
         case "parquet":
             from generator.dataset.production.layouts.parquet import ParquetWriter
 
-            return ParquetWriter(store, shard, previews, maps)
+            return ParquetWriter(store, shard, previews, maps, details)
 
 
 def read_member(layout: str, store: Store, container: str, file: str) -> bytes:

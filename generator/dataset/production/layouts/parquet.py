@@ -8,6 +8,7 @@ The columns::
     number, source, split, width, height
     truth     [r, g, b] of sum 1, the mean of the lights over the image
     lights    list of illumination and truth
+    details   what options did to the image, a JSON object in text; where the dataset has an `images.csv`
     masks, ground_truth   where several lights fall on an image: as images of 16 bits, not decoded by themselves either
 
 Needs pyarrow, the extra `parquet`.
@@ -55,7 +56,7 @@ def require_pyarrow() -> None:
         raise InputError("the layout parquet needs pyarrow; install it with: pip install croplab[parquet]")
 
 
-def schema(previews: bool, maps: bool) -> pa.Schema:
+def schema(previews: bool, maps: bool, details: bool) -> pa.Schema:
     """Return the columns, and in their metadata the features as `datasets` reads them."""
     import pyarrow as pa
 
@@ -75,10 +76,11 @@ def schema(previews: bool, maps: bool) -> pa.Schema:
             pa.list_(pa.struct([("illumination", pa.string()), ("truth", truth)])),
             {"feature": {"illumination": _STRING, "truth": _TRUTH}, "_type": "List"},
         ),
+        ("details", pa.string(), _STRING),
         ("masks", pa.list_(file), {"feature": _FILE, "_type": "List"}),
         ("ground_truth", file, _FILE),
     ]
-    left_out = {"preview": not previews, "masks": not maps, "ground_truth": not maps}
+    left_out = {"preview": not previews, "details": not details, "masks": not maps, "ground_truth": not maps}
     kept = [column for column in columns if not left_out.get(column[0])]
     features = {name: feature for name, _, feature in kept}
     info = json.dumps({"info": {"features": features}})
@@ -125,10 +127,10 @@ class _Part:
 class ParquetWriter:
     """Writes the images of a shard to `data/000003.parquet`, or to one file for each part of the dataset."""
 
-    def __init__(self, store: Store, shard: int, previews: bool, maps: bool) -> None:
+    def __init__(self, store: Store, shard: int, previews: bool, maps: bool, details: bool) -> None:
         self._store = store
         self._shard = shard_key(shard)
-        self._schema = schema(previews, maps)
+        self._schema = schema(previews, maps, details)
         self._stack = ExitStack()
         self._parts: dict[str, _Part] = {}
 
@@ -143,6 +145,8 @@ class ParquetWriter:
             self._parts[name] = _Part(self._stack.enter_context(self._store.create(name)), self._schema)
         metadata = metadata_of(sample)
         row: dict[str, Any] = {"number": metadata.pop("image"), **metadata, "masks": []}
+        if "details" in row:
+            row["details"] = json.dumps(row["details"], ensure_ascii=False)
         size = 0
         for kind, ending, pieces in sample.files:
             data = b"".join(pieces)

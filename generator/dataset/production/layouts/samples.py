@@ -85,7 +85,7 @@ def in_memory(sample: Sample) -> Sample:
 def metadata_of(sample: Sample) -> dict[str, Any]:
     """Return what a shard records of an image beside its pixels, as plain values for JSON."""
     record = sample.record
-    return {
+    plain: dict[str, Any] = {
         "image": record.number,
         "source": sample.source,
         "split": sample.split,
@@ -94,3 +94,5 @@ def metadata_of(sample: Sample) -> dict[str, Any]:
         "truth": list(record.truth),
         "lights": [{"illumination": light.illumination, "truth": list(light.truth)} for light in record.lights],
     }
+    # What no option asked for is no key: such datasets keep their bytes.
+    return plain | {"details": record.details} if record.details else plain

@@ -133,7 +133,7 @@ def test_other_pictures_and_lights_have_no_numbers_of_the_paper(make_table: Tabl
 
 def test_images_without_a_usable_pixel_are_told(make_table: TableMaker) -> None:
     blocks = table1(settings([make_table("Test")], [*PICTURES[:4], Black()], TRUTHS, side=24))
-    assert "White-Patch: no usable pixel in 1 images" in " ".join(block_table(blocks[0], "recovery").notes)
+    assert "White-Patch: no usable pixel in 1 image, whose" in " ".join(block_table(blocks[0], "recovery").notes)
 
 
 def test_the_size_of_images_matters_where_there_is_noise(make_table: TableMaker) -> None:

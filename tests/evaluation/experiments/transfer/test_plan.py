@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evaluation.datasets.thumbnails import Thumbnail
-from evaluation.experiments.transfer.overlap import shared_images
+from evaluation.experiments.transfer.overlap import shared_images, trainable_images
 from evaluation.experiments.transfer.plan import plan_transfer
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
@@ -69,6 +69,19 @@ def test_real_sets_are_compared_by_their_pixels() -> None:
         ("2", "4", "content"),
     ]
     assert not shared_images(one, _real("3", "4", place="other.npz", seed=1))
+
+
+def test_copies_are_kept_only_where_that_is_allowed() -> None:
+    one, other = _real("1", "2", place="one.npz"), _real("3", "4", place="other.npz")
+    said = "2 of 2 images of real are also in photos, by content: 1, 2"
+    assert trainable_images(one, other, "keep", "photos") == (one.scenes, said)
+    assert trainable_images(one, other, "leave-out", "photos", copies=False) == ((), said)
+    with pytest.raises(InputError, match=f"{said}.*must be unseen: --shared leave-out"):
+        trainable_images(one, other, "keep", "photos", copies=False)
+    # What shows the same scene by its name is no copy.
+    named = _real("3", "5", place="named.npz", seed=1)
+    assert trainable_images(named, other, "keep", copies=False)[0] == named.scenes
+    assert trainable_images(named, other, "leave-out", copies=False)[0] == named.scenes[1:]
 
 
 def test_naive_counterparts_are_of_the_same_images(maker: Maker, tmp_path: Path) -> None:
