@@ -29,6 +29,7 @@ SLOW = (
     "calibration/pipeline/test_options.py",
     "calibration/pipeline/test_plain_session.py",
     "calibration/pipeline/test_prefetching.py",
+    "calibration/pipeline/test_print_and_sensor.py",
     "calibration/pipeline/test_refused_table.py",
     "calibration/pipeline/test_small_charts.py",
     "calibration/radiometry/test_cell_field.py",
