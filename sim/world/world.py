@@ -220,6 +220,31 @@ class World:
         light = self.field(points_mm) * self._drive(colour, settings, lamp)
         return np.einsum("ncp,np->nc", self._signals(self._reflectance(rgb)), light) * self.worn(points_mm)
 
+    def of_primaries(self, rgb: ArrayLike, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what printed codes at points of a clean flat print give under each primary alone, at full drive.
+
+        Parameters
+        ----------
+        rgb
+            (N, 3) float or int codes 0 … 255.
+        points_mm
+            (N, 2) float64.
+
+        Returns
+        -------
+        ndarray
+            (N, 3, 3) float64, DN above black at the reference exposure, [point, channel, primary], where nothing is
+            blurred. Its product with `drive` is `seen`, without stain and fold.
+        """
+        return self._signals(self._reflectance(rgb)) * self.field(points_mm)[:, None]
+
+    def drive(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float64]:
+        """Return (3,) float64: how much of each primary's light at full drive a frame collects, gain included.
+
+        Parameters are those of `expose`.
+        """
+        return self._drive(colour, settings, lamp)
+
     def worn(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what stain and fold leave of the light of a clean flat print.
 
