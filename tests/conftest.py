@@ -83,7 +83,9 @@ SLOW = (
     "house/test_contributing.py",
     "sim/camera/test_dng.py",
     "sim/world/test_geometry.py",
+    "sim/world/test_profile.py",
     "sim/world/test_world.py",
+    "synthesis/test_table.py",
 )
 """Folders and files, below this one, whose tests take more than their share of the minute."""
 
