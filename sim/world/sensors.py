@@ -106,7 +106,7 @@ class Body:
 
 
 @dataclass(frozen=True, eq=False)
-class HotPhotosites:
+class HotPattern:
     """Photosites whose dark current is out of proportion, the same ones in every frame.
 
     Their excess is proportional to the exposure time and to the gain, and has the shot noise of its electrons. How many

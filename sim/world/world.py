@@ -32,7 +32,7 @@ from sim.world.drawing import PAPER, Print, label_map
 from sim.world.geometry import Folded, View, Waviness
 from sim.world.profile import printed_reflectance
 from sim.world.room import REFERENCE_EXPOSURE, Room
-from sim.world.sensors import Body, HotPhotosites
+from sim.world.sensors import Body, HotPattern
 from sim.world.spectra import projector_primaries, sensitivities
 from sim.world.wear import Fold, Stain
 
@@ -80,7 +80,7 @@ class World:
         self._dn = room.white_level_share * (body.saturation - body.black) / float(paper.max())
         self._lens, self._falloff = self._shading()
         self._falloff[:, 3] = self._balance()
-        self.hot = HotPhotosites.drawn(self._random(6), body.sensor, room.hot_per_million, room.hot_dn_per_s)
+        self.hot = HotPattern.drawn(self._random(6), body.sensor, room.hot_per_million, room.hot_dn_per_s)
         self._lock = threading.Lock()
         self._light: NDArray[np.float32] | None = None
 
