@@ -30,14 +30,14 @@ measure (P800, Canon Pro-300); the XP-960's dye black lets red beyond 680 nm thr
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
-from typing import Literal, cast, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from sim.world.sensitivities import read_sensitivities
 
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 5.0)
 """(81,) float64, the wavelengths of every spectrum here."""
@@ -258,16 +258,19 @@ def sensitivities(name: str) -> NDArray[np.float64]:
     Parameters
     ----------
     name
-        ``Canon_EOS_600D`` (the sensor generation of the EOS 550D) or ``Canon_EOS_200D`` (that of the EOS 6D Mark II).
+        ``Canon_EOS_600D`` (the sensor generation of the EOS 550D), ``Canon_EOS_200D`` (that of the EOS 6D Mark II),
+        another of `sim.world.sensitivities.known_sensitivities`, or the path of a file.
 
     Returns
     -------
     ndarray
-        (81, 3) float64, R, G, B, relative to the peak of G; read-only.
+        (81, 3) float64, R, G, B, relative; read-only. Those of `sim.data` are relative to the peak of G.
+
+    Raises
+    ------
+    InputError, FormatError
+        See `sim.world.sensitivities.read_sensitivities`.
     """
-    text = resources.files("sim").joinpath("data", f"{name}_380_780_5.json").read_text(encoding="utf-8")
-    document = cast("dict[str, dict[str, dict[str, dict[str, list[float]]]]]", json.loads(text))
-    table = document["spectral_data"]["data"]["main"]
-    curves = np.array([table[f"{wavelength:.0f}"] for wavelength in WAVELENGTHS_NM])
+    curves = read_sensitivities(name).at(WAVELENGTHS_NM)
     curves.setflags(write=False)
     return curves
