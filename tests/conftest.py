@@ -69,6 +69,7 @@ SLOW = (
     "generator/dataset/test_making.py",
     "generator/dataset/test_reader.py",
     "generator/dataset/test_stores.py",
+    "generator/dataset/test_varied_datasets.py",
     "generator/kernels/test_choice_statistics.py",
     "generator/kernels/test_patches.py",
     "generator/test_cli.py",
@@ -77,7 +78,9 @@ SLOW = (
     "house/test_contributing.py",
     "sim/camera/test_dng.py",
     "sim/world/test_geometry.py",
+    "sim/world/test_profile.py",
     "sim/world/test_world.py",
+    "synthesis/test_table.py",
 )
 """Folders and files, below this one, whose tests take more than their share of the minute."""
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from foundation.errors import FormatError
 from generator.named_numbers import is_number
+from generator.statistics.statistics_file import read_lights
 
 TRIPLES: Final = (
     ("gt_r", "gt_g", "gt_b"),
@@ -27,7 +28,7 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
     """Return the ground truths of a file.
 
     Either a CSV file whose head names the columns `GT_R,GT_G,GT_B` or `r,g,b` (others are ignored), or lines of three
-    numbers between blanks or commas, as in `gt.txt` and Cube+.
+    numbers between blanks or commas, as in `gt.txt` and Cube+; or the lights of a `STATS.json` of `evaluate describe`.
 
     Returns
     -------
@@ -39,6 +40,8 @@ def load_ground_truths(path: Path) -> npt.NDArray[np.float64]:
     FormatError
         The file cannot be read, is empty, or a line is not three numbers ≥ 0 with a sum above 0.
     """
+    if is_statistics(path):
+        return read_lights(path)
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -82,3 +85,8 @@ def is_ground_truth(numbers: Sequence[float]) -> bool:
     (True, False)
     """
     return len(numbers) == 3 and bool(np.isfinite(numbers).all()) and min(numbers) >= 0 and sum(numbers) > 0
+
+
+def is_statistics(path: Path) -> bool:
+    """Return whether a file is a `STATS.json` by its name."""
+    return path.suffix.lower() == ".json"

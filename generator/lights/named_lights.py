@@ -136,7 +136,7 @@ def named_lights(
     gamut
         What the table can make.
     truths
-        By name, linear RGB of the table's camera.
+        By name (K, 3) float64 ≥ 0, linear RGB of the table's camera.
     names
         Of the pictures, in the order of the sources.
     file

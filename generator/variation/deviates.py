@@ -19,7 +19,7 @@ BITS: Final = 14
 
 @lru_cache(maxsize=1)
 def normal_deviates() -> npt.NDArray[np.float32]:
-    """Return the deviates (2**14,) float32, rising.
+    """Return the deviates (16384,) float32, rising.
 
     Examples
     --------

@@ -145,7 +145,7 @@ def brightness_reached(
     share
         0 … 1. Of share 0, what no pixel reaches: half a count above the largest.
     weights, end
-        How its light falls off, as of `expose`.
+        How its light falls off, (H, W, 2) float32 and three numbers, as of `expose`.
 
     Returns
     -------

@@ -35,7 +35,7 @@ _OPTIONS: Final[dict[str, dict[str, Range]]] = {
 }
 
 
-class Exposure(Protocol):
+class ExposureChoice(Protocol):
     """The factor on the counts of each image."""
 
     @property
@@ -86,7 +86,7 @@ class DrawnExposure:
         return None
 
     def factor(self, seed: int, number: int, brightness: float) -> float:
-        """Return the factor of image `number`; see `Exposure.factor`."""
+        """Return the factor of image `number`; see `ExposureChoice.factor`."""
         del brightness
         return 2.0 ** _quantile(self.stops, _uniform(seed, number))
 
@@ -112,7 +112,7 @@ class NormalExposure:
         return None
 
     def factor(self, seed: int, number: int, brightness: float) -> float:
-        """Return the factor of image `number`; see `Exposure.factor`."""
+        """Return the factor of image `number`; see `ExposureChoice.factor`."""
         del brightness
         tail = NormalDist().cdf(-_TAILS)
         place = tail + (1 - 2 * tail) * _uniform(seed, number)
@@ -161,7 +161,7 @@ class AutomaticExposure:
         return self.share
 
     def factor(self, seed: int, number: int, brightness: float) -> float:
-        """Return the factor of image `number`; see `Exposure.factor`."""
+        """Return the factor of image `number`; see `ExposureChoice.factor`."""
         logarithms = tuple(math.log(level) for level in self.levels)
         level = math.exp(_quantile(logarithms, _uniform(seed, number)))
         return min(level / brightness, self.most) if brightness > 0 else self.most
@@ -171,7 +171,7 @@ class AutomaticExposure:
         return {"exposure": "automatic", "share": self.share, "levels": list(self.levels), "most": self.most}
 
 
-def parse_exposure(text: str) -> Exposure:
+def parse_exposure(text: str) -> ExposureChoice:
     """Return the exposure that a text names.
 
     A number is a factor; ``stops:low=-2,high=1`` draws evenly in stops, ``normal:mean=-1,sd=.5`` normally;
@@ -216,7 +216,7 @@ _EXAMPLES: Final = {
 }
 
 
-def _fixed(text: str) -> Exposure:
+def _fixed(text: str) -> ExposureChoice:
     least, most = (2.0**stops for stops in _STOPS)
     try:
         factor = float(text)

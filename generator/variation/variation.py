@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from foundation.errors import InputError
 from generator.variation.exposing import brightness_reached, expose
-from generator.variation.exposures import Exposure
+from generator.variation.exposures import ExposureChoice
 from generator.variation.gradients import Gradient
 from generator.variation.iso_speed import IsoSpeed
 from generator.variation.sensor_noise import SensorNoise, measured_noise
@@ -75,7 +75,7 @@ class Variation:
         The noise is missing.
     """
 
-    exposure: Exposure | None = None
+    exposure: ExposureChoice | None = None
     gradient: Gradient | None = None
     iso: IsoSpeed | None = None
     noise: SensorNoise | None = None
@@ -98,12 +98,12 @@ class Variation:
         return self.gradient is not None and self.gradient.colour > 0
 
     def apply(self, image: npt.NDArray[np.uint16], white_level: int, seed: int, number: int) -> Varied:
-        """Change an image (H, W, 3) uint16, contiguous, in place and return what was done to it.
+        """Change an image in place and return what was done to it.
 
         Parameters
         ----------
         image
-            Counts of the table, as drawn.
+            (H, W, 3) uint16, contiguous; counts of the table, as drawn.
         white_level
             Saturation.
         seed, number
@@ -154,7 +154,7 @@ NO_VARIATION: Final = Variation()
 
 
 def varied_by(
-    lut: Lut, exposure: Exposure | None = None, gradient: Gradient | None = None, iso: IsoSpeed | None = None
+    lut: Lut, exposure: ExposureChoice | None = None, gradient: Gradient | None = None, iso: IsoSpeed | None = None
 ) -> Variation:
     """Return the variation of images of a table, whose noise is measured if anything is set.
 

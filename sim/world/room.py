@@ -1,4 +1,4 @@
-"""The simulated lab around print and camera: light, lens, paper and what is wrong with them, as one frozen value."""
+"""The simulated lab around the camera: light, lens, print and what is wrong with them, as one frozen value."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from drivers.camera import ExposureSettings
-from sim.world.spectra import LampSpectrum
+from sim.world.profile import ProfileName
+from sim.world.spectra import LampSpectrum, PaperName
 
 REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 """The exposure at which `Room.white_level_share` holds."""
@@ -14,7 +15,7 @@ REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.
 
 @dataclass(frozen=True)
 class Room:
-    """Everything about the lab that is not the print and not the camera's body.
+    """Everything about the lab that is not the chart's drawing and not the camera's body.
 
     Attributes
     ----------
@@ -65,6 +66,11 @@ class Room:
         takes six tenths of that, of red three. A thumb's is 25 mm across.
     fold_mm
         How far a crease across the print stands off its plane, 0 for none.
+    profile
+        ``unmanaged``: the file's codes are ink codes. ``managed``: a print shop's profile makes ink codes of them, so
+        that greys are grey (`sim.world.profile`).
+    paper
+        ``poster``, ``matt`` or ``glossy`` (`sim.world.spectra.paper`).
     """
 
     seed: int = 0
@@ -94,6 +100,8 @@ class Room:
     stain_mm: float = 0.0
     stain_depth: float = 0.5
     fold_mm: float = 0.0
+    profile: ProfileName = "unmanaged"
+    paper: PaperName = "poster"
 
     def __post_init__(self) -> None:
         if self.seed < 0:

@@ -81,6 +81,13 @@ class Body:
             raise ValueError(f"{self.model}: pattern is {self.pattern!r}; one R, two G and one B are expected")
 
     @property
+    def camera(self) -> str:
+        """Maker and model, the maker once, as `drivers.raw.rawfile` reads them from the body's files."""
+        words = self.model.split(" ")
+        known = not self.maker or words[0].casefold() == self.maker.split(" ")[0].casefold()
+        return self.model if known else f"{self.maker} {self.model}"
+
+    @property
     def half_size(self) -> tuple[int, int]:
         """Rows and columns of the half-size image, whole 2×2 blocks of the visible mosaic."""
         return self.visible.height // 2, self.visible.width // 2

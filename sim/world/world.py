@@ -30,9 +30,10 @@ from foundation.processors import processor_count
 from foundation.srgb import decode_srgb
 from sim.world.drawing import PAPER, Print, label_map
 from sim.world.geometry import Folded, View, Waviness
+from sim.world.profile import printed_reflectance
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import Body
-from sim.world.spectra import print_reflectance, projector_primaries, sensitivities
+from sim.world.spectra import projector_primaries, sensitivities
 from sim.world.wear import Fold, Stain
 
 _BACKDROP_REFLECTANCE: Final = 0.04
@@ -75,7 +76,7 @@ class World:
         )
         self._primaries = projector_primaries(room.lamp_spectrum)
         self._sensitivities = sensitivities(body.sensitivities)
-        paper = np.einsum("pl,l,lc->c", self._primaries, print_reflectance([PAPER])[0], self._sensitivities)
+        paper = np.einsum("pl,l,lc->c", self._primaries, self._reflectance([PAPER])[0], self._sensitivities)
         self._dn = room.white_level_share * (body.saturation - body.black) / float(paper.max())
         self._lens, self._falloff = self._shading()
         self._falloff[:, 3] = self._balance()
@@ -165,7 +166,7 @@ class World:
         ndarray
             (N, 3) float64, DN above black where `field` is 1, leak and ambient light included, without clipping.
         """
-        return self._signals(print_reflectance(rgb)) @ self._drive(colour, settings, lamp)
+        return self._signals(self._reflectance(rgb)) @ self._drive(colour, settings, lamp)
 
     def seen(
         self,
@@ -193,7 +194,32 @@ class World:
             stain and fold included.
         """
         light = self.field(points_mm) * self._drive(colour, settings, lamp)
-        return np.einsum("ncp,np->nc", self._signals(print_reflectance(rgb)), light) * self.worn(points_mm)
+        return np.einsum("ncp,np->nc", self._signals(self._reflectance(rgb)), light) * self.worn(points_mm)
+
+    def of_primaries(self, rgb: ArrayLike, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what printed codes at points of a clean flat print give under each primary alone, at full drive.
+
+        Parameters
+        ----------
+        rgb
+            (N, 3) float or int codes 0 … 255.
+        points_mm
+            (N, 2) float64.
+
+        Returns
+        -------
+        ndarray
+            (N, 3, 3) float64, DN above black at the reference exposure, [point, channel, primary], where nothing is
+            blurred. Its product with `drive` is `seen`, without stain and fold.
+        """
+        return self._signals(self._reflectance(rgb)) * self.field(points_mm)[:, None]
+
+    def drive(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float64]:
+        """Return (3,) float64: how much of each primary's light at full drive a frame collects, gain included.
+
+        Parameters are those of `expose`.
+        """
+        return self._drive(colour, settings, lamp)
 
     def worn(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what stain and fold leave of the light of a clean flat print.
@@ -284,6 +310,10 @@ class World:
         time = settings.shutter_s / reference.shutter_s
         return shown * time * (reference.aperture / settings.aperture) ** 2 * (settings.iso / reference.iso)
 
+    def _reflectance(self, rgb: ArrayLike) -> NDArray[np.float64]:
+        """Return (N, 81): reflectance of the chart's codes (N, 3) on this print."""
+        return printed_reflectance(rgb, self.room.profile, self.room.paper)
+
     def _signals(self, reflectance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (N, 3, 3): DN of (N, 81) reflectances at the reference exposure, [colour, channel, primary]."""
         seen = self._primaries[None] * self._sensitivities.T[:, None] * self._dn
@@ -305,7 +335,7 @@ class World:
         visible, room = self.body.visible, self.room
         drawing = label_map(self.sheet)
         backdrop = np.full((1, len(self._sensitivities)), _BACKDROP_REFLECTANCE)
-        reflectance = np.concatenate([print_reflectance(drawing.codes), backdrop])
+        reflectance = np.concatenate([self._reflectance(drawing.codes), backdrop])
         table = self._signals(reflectance).astype(np.float32)
         nodes = self._nodes()
         # A uniform aperture of one photosite has a variance of 1/12.

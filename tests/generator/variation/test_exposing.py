@@ -116,14 +116,14 @@ def test_the_rule_in_plain_integers() -> None:
     quantiles: list[float] = [NormalDist().inv_cdf((place + 0.5) / 2**14) for place in range(2**14)]
     scale = float(np.sqrt(np.mean(np.square(quantiles))))
     for y in range(3):
-        k0, k1, _, _ = (int(word) for word in philox.words(seed, 5 + y, 0, number, philox.NOISE))
+        k0, k1, _, _ = (int(key) for key in philox.words(seed, 5 + y, 0, number, philox.NOISE))
         for x in range(37):
-            word = ((k1 << 32 | k0) + (x + 1) * 0x9E3779B97F4A7C15) % 2**64
+            word: int = ((k1 << 32 | k0) + (x + 1) * 0x9E3779B97F4A7C15) % 2**64
             word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 % 2**64
             word = (word ^ word >> 27) * 0x94D049BB133111EB % 2**64
             word ^= word >> 31
             for channel in range(3):
-                z = quantiles[word >> (50 - 14 * channel) & 16383] / scale
+                z: float = quantiles[word >> (50 - 14 * channel) & 16383] / scale
                 missing = 0.75 * noise.read[channel] ** 2 + 0.5 * noise.shot[channel] * 2000
                 assert abs(image[y, x, channel] - (2000 + z * missing**0.5)) < 0.501
 
@@ -153,7 +153,8 @@ def test_neither_threads_nor_tiles_change_a_count() -> None:
     expose(part, 0.8, NOISE, weights=weights[40:60], first_row=40, **options)
     np.testing.assert_array_equal(part, whole[40:60])
     other = source.copy()
-    expose(other, 0.8, NOISE, weights=weights, **(options | {"number": 4}))
+    options["number"] = 4
+    expose(other, 0.8, NOISE, weights=weights, **options)
     assert (other != whole).mean() > 0.5
 
 
@@ -193,7 +194,7 @@ def test_brightness_reached_by_a_share() -> None:
         assert brightness_reached(image, share) == brightest[round(share * brightest.size) - 1]
     assert brightness_reached(image, 0.0) == brightest[0] + 0.5
     weights = rng.random((120, 130, 2), dtype=np.float32)
-    fallen = image * (1 - weights[..., 1:] * np.float32([0.5, 0.25, 0.75]))
+    fallen = image * (1 - weights[..., 1:] * np.array([0.5, 0.25, 0.75], np.float32))
     expected = np.sort(np.floor(fallen.max(axis=2)).reshape(-1))[::-1][round(0.02 * brightest.size) - 1]
     assert abs(brightness_reached(image, 0.02, weights, (0.5, 0.75, 0.25)) - expected) <= 1
 
