@@ -44,6 +44,12 @@ DITHERING: Final = 8
 """Purpose of the words that choose which cell of the chart stands for a source colour."""
 VEILS: Final = 9
 """Purpose of the words that choose which share of the print's veil is taken out of an image."""
+EXPOSURES: Final = 12
+"""Purpose of the words that draw how much light an image is exposed to."""
+GRADIENTS: Final = 13
+"""Purpose of the words that shape how the light of an image falls off."""
+NOISE: Final = 14
+"""Purpose of the words that are the keys of the noise that is added to an image's rows."""
 PICTURES: Final = 15
 """Purpose of the words that draw source pictures by their weights."""
 

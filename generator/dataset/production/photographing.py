@@ -1,4 +1,4 @@
-"""The photograph of one picture: its raw image, its ground truth, and how it was rendered."""
+"""The photograph of one picture: its raw image, and how it was rendered."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from generator.dataset.production.options import DatasetOptions
-from generator.dataset.production.records import ImageRendering, Triple
-from generator.lights.lighting import Lighting
+from generator.dataset.production.records import Details
+from generator.lights.lighting import Lighting, Mixture
 from generator.pictures.picture import Picture
 
 if TYPE_CHECKING:
@@ -23,27 +23,38 @@ if TYPE_CHECKING:
 
 _threads: Final = threading.local()
 
-Photograph = tuple[npt.NDArray[np.uint16], Triple, list[tuple[str, str, bytes]], ImageRendering | None]
-"""Raw image (H, W, 3) uint16, mean chromaticity of its lights, maps of several lights, and how it was rendered."""
-
 
 def photograph(
-    lut: Lut, picture: Picture, lighting: Lighting, options: DatasetOptions, seed: int, number: int
-) -> Photograph:
-    """Return the photograph of a picture's print.
+    lut: Lut,
+    picture: Picture,
+    lighting: Lighting,
+    options: DatasetOptions,
+    seed: int,
+    number: int,
+    white_level: int,
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float32] | None, Details]:
+    """Return the raw image of a picture's print.
 
     Parameters
     ----------
     lut
         The table.
     picture
-        (H, W, 3) uint8, sRGB codes; where it is not rendered by colour of colours that the table has samples of.
+        (H, W, 3) uint8, sRGB codes; where they are those of the print, of colours that the table has samples of.
     lighting
         Its light.
     options
         How it is rendered.
     seed, number
         The dataset's seed, and the image's number in it.
+    white_level
+        What mixtures of several lights on a pixel are cut at.
+
+    Returns
+    -------
+    tuple
+        (H, W, 3) uint16, linear camera RGB; of several lights the weights (H, W, K) float32 of each in each pixel, else
+        None; and what is recorded of the rendering.
 
     Raises
     ------
@@ -55,7 +66,6 @@ def photograph(
     from generator.kernels.dithering import dither
     from generator.kernels.mixing import mix_samples
     from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, draw_samples
-    from generator.masks.maps import encode_maps
 
     # The hash of the table stands for its samples in the dataset's description.
     for mixture in lighting.mixtures:
@@ -63,51 +73,45 @@ def photograph(
             lut.require_unchanged(light)
     share = options.black_point.share(seed, number)
     cells = None
-    record = None
+    details: Details = {}
     if options.rendering == "colorimetric":
-        reference = rendering_of(lut, options).reference_of(lighting)
+        rendering = rendering_of(lut, options)
+        reference = rendering.reference_of(lighting)
         lut.require_unchanged(reference)
-        mixtures = rendering_of(lut, options).mixtures(reference)
-        outside, distance = _misses(picture, mixtures)
-        record = ImageRendering(reference=reference, outside=outside, distance=distance, black_taken=share)
+        mixtures = rendering.mixtures(reference)
         cells = mixtures.cells
-    elif options.black_point.kind != "keep":
-        record = ImageRendering(black_taken=share)
-    bits = lut.provenance.bits
+        details |= {"reference": reference} | _misses(picture, mixtures)
+    if options.black_point.kind != "keep":
+        details["black_taken"] = share
     alone = lighting.masks is None and len(lighting.mixtures[0].lights) == 1 and not share
-    if cells is not None and not (alone or picture.size >= 3 * WHOLE_LIGHT_PIXELS):
-        # Of a small picture only the samples of its cells are mixed, or freed of black: they are to be known first.
-        picture, cells = dither(picture, cells, bits, seed, number), None
-    tables = [_samples(lut, lighting, place, picture, cells is not None, share, seed) for place in range(len(lighting.mixtures))]
+    if cells is not None and not (alone or (lighting.masks is None and picture.size >= 3 * WHOLE_LIGHT_PIXELS)):
+        # Which samples are to be mixed, or freed of black, is known by the cells.
+        picture, cells = dither(picture, cells, lut.provenance.bits, seed, number), None
+    tables = [_samples(lut, mixture, picture, share, seed, cells is not None) for mixture in lighting.mixtures]
     if lighting.masks is None:
-        image = draw_samples(tables[0], picture, seed=seed, image=number, cells=cells, out=_reused(picture.shape))
-        return image, chromaticity(lighting.whites(lut)[0]), [], record
-    if cells is not None:
-        picture = dither(picture, cells, bits, seed, number)
+        out = _reused(picture.shape)
+        return draw_samples(tables[0], picture, seed=seed, image=number, cells=cells, out=out), None, details
     weights = lighting.weights_of(*picture.shape[:2])
-    white_level = lut.provenance.white_level
     image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
-    return image, chromaticity(lighting.overall(lut, weights)), encode_maps(weights, lighting.whites(lut)), record
+    return image, weights, details
 
 
 def _samples(
-    lut: Lut, lighting: Lighting, place: int, picture: Picture, dithered: bool, share: float, seed: int
+    lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int, dithered: bool
 ) -> npt.NDArray[np.uint16]:
-    """Return the samples of one of an image's lights, without a share of the print's black.
+    """Return the samples of a light without a share of the print's black, at least those of a picture's colours.
 
-    Where a picture is dithered while it is drawn, its cells are not known, and all samples are wanted.
+    A picture that is `dithered` while it is drawn may show any.
     """
     from generator.kernels.palette import colours_in
     from generator.kernels.rendering import WHOLE_LIGHT_PIXELS
     from generator.rendering.black_points import veil_of, without_veil
 
-    mixture = lighting.mixtures[place]
-    if not share:
-        return mixture.samples(lut, seed, picture)
     samples = mixture.samples(lut, seed, picture)
-    colours = None
-    if not dithered and picture.size < 3 * WHOLE_LIGHT_PIXELS:
-        colours = colours_in(picture, lut.provenance.bits)
+    if not share:
+        return samples
+    small = not dithered and picture.size < 3 * WHOLE_LIGHT_PIXELS
+    colours = colours_in(picture, lut.provenance.bits) if small else None
     return without_veil(samples, veil_of(lut, mixture, share), lut.provenance.white_level, colours)
 
 
@@ -124,14 +128,12 @@ def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
 
     Raises
     ------
-    InputError
-        The options have no colour matrix.
+    QualityError
+        No matrix is known, and none can be had from the table.
     """
-    from foundation.errors import InputError
+    from generator.rendering.table_matrix import matrix_for
 
-    matrix = options.matrix
-    if matrix is None:
-        raise InputError("colorimetric rendering needs a colour matrix; give one, or choose rendering by codes")
+    matrix = options.matrix or matrix_for(lut)
     return _rendering(lut, matrix.name, tuple(matrix.rows.ravel().tolist()), matrix.source)
 
 
@@ -140,7 +142,7 @@ def cells_sha256(mixtures: CellMixtures) -> str:
     return hashlib.sha256(mixtures.cells.astype("<u2").tobytes()).hexdigest()
 
 
-def _misses(picture: Picture, mixtures: CellMixtures) -> tuple[float, float]:
+def _misses(picture: Picture, mixtures: CellMixtures) -> Details:
     """Return which share of a picture the print cannot show, and by how many degrees colours are missed in the mean.
 
     Each pixel counts as the source node nearest to it.
@@ -148,11 +150,9 @@ def _misses(picture: Picture, mixtures: CellMixtures) -> tuple[float, float]:
     from generator.kernels.dithering import nearest_nodes
 
     counts = nearest_nodes(picture)
-    total = counts.sum()
-    return (
-        round(float(counts[mixtures.outside].sum() / total), 6),
-        round(float(counts @ mixtures.distance.astype(np.float64) / total), 6),
-    )
+    outside = counts[mixtures.outside].sum() / counts.sum()
+    distance = counts @ mixtures.distance.astype(np.float64) / counts.sum()
+    return {"outside": round(float(outside), 6), "distance": round(float(distance), 6)}
 
 
 def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
@@ -165,9 +165,3 @@ def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
     if memory is None or memory.size < size:
         _threads.memory = memory = np.empty(size, np.uint16)
     return memory[:size].reshape(shape)
-
-
-def chromaticity(white: npt.NDArray[np.float64]) -> Triple:
-    """Return (r, g, b) of sum 1 of linear RGB (3,) float64."""
-    red, green, blue = (float(part) for part in white / white.sum())
-    return red, green, blue

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer
 
 FORMAT: Final = "crop.dataset"
 VERSION: Final = 2
@@ -125,10 +125,30 @@ class FileSum(_Record):
     sha256: str
 
 
+class RenderingSummary(_Record):
+    """How the images of a dataset were rendered, where that is not by codes with the print's black kept.
+
+    Attributes
+    ----------
+    outside, distance
+        Means over all pixels of the columns of `images.csv`: the share of colours that the print cannot show, and by
+        how many degrees they are missed. None where images were rendered by codes.
+    black_taken
+        Mean over all images of the share of the print's black that was taken out.
+    mixtures
+        SHA-256 of the mixtures of cells that were used, by the light of the table that they are for.
+    """
+
+    outside: float | None = None
+    distance: float | None = None
+    black_taken: float = 0.0
+    mixtures: dict[int, str] = {}
+
+
 class ShardRecord(_Record):
     """What a shard made; images and files in the order of their numbers, sources in that of their positions.
 
-    `lights` are those of the table that were used, alone or mixed.
+    `lights` are those of the table that were used, alone or mixed, `mixtures` as `RenderingSummary` has them.
     """
 
     shard: int
@@ -137,6 +157,7 @@ class ShardRecord(_Record):
     images: list[ImageRecord]
     files: list[FileSum]
     lights: list[Light]
+    mixtures: dict[int, str] = {}
 
 
 class Description(_Record):
@@ -156,6 +177,8 @@ class Description(_Record):
         The lights of the table that were used, alone or mixed.
     skipped
         Sources that could not be read.
+    rendering
+        How images were rendered; None by codes with the print's black kept.
     """
 
     format: Literal["crop.dataset"] = FORMAT
@@ -173,6 +196,12 @@ class Description(_Record):
     splits: dict[str, int] = {}
     lights: list[Light]
     skipped: list[Skipped]
+    rendering: RenderingSummary | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave `rendering` out where there is none: datasets are then described as before it was known."""
+        return {key: value for key, value in handler(self).items() if key != "rendering" or value is not None}
 
 
 @dataclass(frozen=True, slots=True)
