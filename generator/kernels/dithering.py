@@ -21,6 +21,7 @@ samples that `choice.py` draws. All lights of a mixture see the same cell.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numba
@@ -302,8 +303,24 @@ def _dither(
                     copy1(scratch + i, to + 3 * GROUP * group + i)
 
 
-def checked_cells(cells: Cells, bits: int) -> Cells:
-    """Return a table of cells, (32768, 32) uint16, as compiled code reads it: each node's in a line of the cache.
+@dataclass(frozen=True, eq=False)
+class CellTable:
+    """A table of cells as compiled code reads it, checked once.
+
+    Attributes
+    ----------
+    cells
+        (32768, 32) uint16, those of a node in a line of the cache; read-only.
+    bits
+        Bits of a channel of the chart that has them.
+    """
+
+    cells: Cells
+    bits: int
+
+
+def checked_cells(cells: Cells | CellTable, bits: int) -> CellTable:
+    """Return a table of cells to draw from: itself, if it was checked already.
 
     Parameters
     ----------
@@ -317,24 +334,27 @@ def checked_cells(cells: Cells, bits: int) -> Cells:
     InputError
         They are of another shape or type, or a cell is not in the chart.
     """
+    if isinstance(cells, CellTable):
+        if cells.bits != bits:
+            raise InputError(f"the cells are of a chart of {cells.bits} bits a channel, the samples of one of {bits}")
+        return cells
     if cells.dtype != np.uint16 or cells.shape != (NODES**3, SLOTS):
         raise InputError(f"the cells are {cells.dtype} {cells.shape}, expected uint16 ({NODES**3}, {SLOTS})")
     if not 1 <= bits <= 5:
         raise InputError(f"the chart has {bits} bits a channel, expected 1 to 5")
     if int(cells.max()) >> 3 * bits:
         raise InputError(f"cell {cells.max()} is not in a chart of {bits} bits a channel, expected 0 to {8**bits - 1}")
-    if cells.flags.c_contiguous and cells.ctypes.data % LINE == 0:
-        return cells
     memory = np.empty(cells.size + LINE // 2, np.uint16)
     first = -memory.ctypes.data % LINE // 2
     aligned = memory[first : first + cells.size].reshape(cells.shape)
     aligned[...] = cells
-    return aligned
+    aligned.flags.writeable = False
+    return CellTable(aligned, bits)
 
 
 def dither(
     picture: Picture,
-    cells: Cells,
+    cells: Cells | CellTable,
     bits: int,
     seed: int = 0,
     image: int = 0,
@@ -353,7 +373,8 @@ def dither(
         (H, W, 3) uint8, sRGB codes.
     cells
         (32768, 32) uint16: for each source node, (red << 10) | (green << 5) | blue, 32 equally likely cells of the
-        chart, ((r << 2n) | (g << n) | b) for n bits a channel; such as `CellMixtures.cells` of `generator.rendering`.
+        chart, ((r << 2n) | (g << n) | b) for n bits a channel; such as `CellMixtures.cells` of `generator.rendering`,
+        or what `checked_cells` made of them, which is quicker for many small pictures.
     bits
         n, 1 … 5.
     seed, image, first_row, threads
@@ -401,7 +422,7 @@ def dither(
             source.strides[0],
             width,
             bottom - top,
-            table.ctypes.data,
+            table.cells.ctypes.data,
             np.uint32(bits),
             key,
             image,

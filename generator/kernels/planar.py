@@ -34,7 +34,7 @@ from generator.kernels.arguments import (
     run_in_threads,
 )
 from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, choose_group, row_keys
-from generator.kernels.dithering import PLACES_BYTES, Cells, checked_cells, choose_dithered, dither_keys
+from generator.kernels.dithering import PLACES_BYTES, Cells, CellTable, checked_cells, choose_dithered, dither_keys
 from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, planes8_mirrored, prefetch
 
 Window = tuple[int, int, int, int]
@@ -216,7 +216,7 @@ def draw_batch(
     gains: npt.ArrayLike = 1.0,
     seeds: npt.ArrayLike = 0,
     images: npt.ArrayLike = 0,
-    cells: Sequence[Cells] | None = None,
+    cells: Sequence[Cells | CellTable] | None = None,
     taken: npt.ArrayLike | None = None,
     stretches: npt.ArrayLike = 1.0,
     threads: int = 1,
@@ -243,7 +243,7 @@ def draw_batch(
         (N,) bool, float, int and int, or one for all, as for `draw_planar`.
     cells
         N tables of cells (32768, 32) uint16, by which the pictures are dithered as by `dithering.dither`; one may
-        serve many items. None: the pictures are codes.
+        serve many items, or what `checked_cells` made of them. None: the pictures are codes.
     taken
         (N, 3) float ≥ 0, counts that are taken out of the channels of each item's samples; None takes out nothing.
     stretches
@@ -341,7 +341,9 @@ def draw_batch(
     return target
 
 
-def _addresses(cells: Sequence[Cells] | None, count: int, bits: int, plan: npt.NDArray[np.int64]) -> dict[int, Cells]:
+def _addresses(
+    cells: Sequence[Cells | CellTable] | None, count: int, bits: int, plan: npt.NDArray[np.int64]
+) -> dict[int, CellTable]:
     """Write the address of each item's table of cells into the plan; return the tables, to be kept until they are used.
 
     Most items of a batch share a table; each is checked once.
@@ -352,7 +354,7 @@ def _addresses(cells: Sequence[Cells] | None, count: int, bits: int, plan: npt.N
         raise InputError(f"{len(cells)} tables of cells were given for {count} items, expected one each")
     checked = {id(table): table for table in cells}
     inks = {identity: checked_cells(table, bits) for identity, table in checked.items()}
-    plan[:, 9] = [inks[id(table)].ctypes.data for table in cells]
+    plan[:, 9] = [inks[id(table)].cells.ctypes.data for table in cells]
     return inks
 
 

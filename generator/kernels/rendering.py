@@ -35,7 +35,7 @@ from generator.kernels.arguments import (
     writable,
 )
 from generator.kernels.choice import LEAD, SCRATCH_BYTES, choose_group, offsets_slot, prefetch_group, row_keys
-from generator.kernels.dithering import DITHER_BYTES, Cells, checked_cells, dither_keys
+from generator.kernels.dithering import DITHER_BYTES, Cells, CellTable, checked_cells, dither_keys
 from generator.kernels.drawing import choose_first_groups, draw_dithered, draw_groups
 from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.streaming import first_line, line_buffer_bytes, stream_lines
@@ -171,7 +171,7 @@ def draw_samples(
     image: int = 0,
     first_row: int = 0,
     threads: int = 1,
-    cells: Cells | None = None,
+    cells: Cells | CellTable | None = None,
     out: npt.NDArray[np.uint16] | None = None,
 ) -> npt.NDArray[np.uint16]:
     """Return the raw linear image of `picture` under one light; the rule stands at the head of this file.
@@ -240,7 +240,7 @@ def draw_samples(
             work[top:].ctypes.data,
             work.strides[0],
             work.nbytes >= streaming.STREAMED_BYTES,
-            0 if inks is None else inks.ctypes.data,
+            0 if inks is None else inks.cells.ctypes.data,
             scratch.ctypes.data,
         )
 

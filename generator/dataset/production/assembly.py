@@ -52,7 +52,7 @@ class _RenderingSums:
     """Adds up how images were rendered."""
 
     def __init__(self) -> None:
-        self._sums: Counter[str] = Counter()
+        self._sums = dict.fromkeys(("images", "pixels", "black_taken", "outside", "distance"), 0.0)
         self._mixtures: dict[int, str] = {}
 
     def add(self, details: Details, pixels: int) -> None:
