@@ -76,6 +76,7 @@ SLOW = (
     "generator/dataset/test_making.py",
     "generator/dataset/test_reader.py",
     "generator/dataset/test_stores.py",
+    "generator/dataset/test_varied_datasets.py",
     "generator/kernels/test_choice_statistics.py",
     "generator/kernels/test_patches.py",
     "generator/test_cli.py",
