@@ -29,7 +29,7 @@ ROOM = Room(waviness_mm=0.5, vignetting=0.08, projector_falloff=0.05)
 
 def task_of(bits: int = 3, page: str = "A5", window: int = 5, **room: float) -> TableTask:
     chart = designed(bits, page, 1)[0]
-    return TableTask(chart, BODIES["Test"], replace(ROOM, **room), SETTINGS, LIGHTS, window, {"by": "test"})
+    return TableTask(chart, BODIES["Test"], replace(ROOM, **room), SETTINGS, LIGHTS, None, window, {"by": "test"})
 
 
 @dataclass(frozen=True, eq=False)
