@@ -40,6 +40,12 @@ CROPS: Final = 6
 """Purpose of the words that choose where pictures are cut."""
 ITEMS: Final = 7
 """Purpose of the words that choose what a training item shows."""
+EXPOSURES: Final = 12
+"""Purpose of the words that draw how much light an image is exposed to."""
+GRADIENTS: Final = 13
+"""Purpose of the words that shape how the light of an image falls off."""
+NOISE: Final = 14
+"""Purpose of the words that are the keys of the noise that is added to an image's rows."""
 PICTURES: Final = 15
 """Purpose of the words that draw source pictures by their weights."""
 

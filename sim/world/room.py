@@ -66,6 +66,13 @@ class Room:
         takes six tenths of that, of red three. A thumb's is 25 mm across.
     fold_mm
         How far a crease across the print stands off its plane, 0 for none.
+    hot_per_million
+        Photosites of a million whose dark current is out of proportion, the same in all frames, 0 for none. 20 is
+        plausible for an EOS 550D of ten years, 2 for an EOS 6D Mark II of three (chosen: several times what
+        `sim.world.sensors.HotPattern` has from the literature, as bodies are not delivered without any).
+    hot_dn_per_s
+        Mean excess of such a photosite, DN per second at ISO 100; exponentially distributed. Chosen: at half a second
+        the hottest of a hundred is nearly saturated.
     profile
         ``unmanaged``: the file's codes are ink codes. ``managed``: a print shop's profile makes ink codes of them, so
         that greys are grey (`sim.world.profile`).
@@ -100,6 +107,8 @@ class Room:
     stain_mm: float = 0.0
     stain_depth: float = 0.5
     fold_mm: float = 0.0
+    hot_per_million: float = 0.0
+    hot_dn_per_s: float = 4000.0
     profile: ProfileName = "unmanaged"
     paper: PaperName = "poster"
 
@@ -114,7 +123,7 @@ class Room:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 … below 1 is expected")
         for name in (
             "waviness_mm", "blur_px", "response_spread", "primary_difference", "wheel_hz", "shutter_jitter_s",
-            "stain_mm", "fold_mm",
+            "stain_mm", "fold_mm", "hot_per_million", "hot_dn_per_s",
         ):  # fmt: skip
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is expected")

@@ -32,7 +32,7 @@ from sim.world.drawing import PAPER, Print, label_map
 from sim.world.geometry import Folded, View, Waviness
 from sim.world.profile import printed_reflectance
 from sim.world.room import REFERENCE_EXPOSURE, Room
-from sim.world.sensors import Body
+from sim.world.sensors import Body, HotPattern
 from sim.world.spectra import projector_primaries, sensitivities
 from sim.world.wear import Fold, Stain
 
@@ -80,6 +80,7 @@ class World:
         self._dn = room.white_level_share * (body.saturation - body.black) / float(paper.max())
         self._lens, self._falloff = self._shading()
         self._falloff[:, 3] = self._balance()
+        self.hot = HotPattern.drawn(self._random(6), body.sensor, room.hot_per_million, room.hot_dn_per_s)
         self._lock = threading.Lock()
         self._light: NDArray[np.float32] | None = None
 
@@ -121,12 +122,35 @@ class World:
                 part = light[:, top - visible.top : bottom - visible.top] if seen else light[:, : bottom - top, :0]
                 noise_rows, rows = noise[top - first : bottom - first], frame[top:bottom]
                 counts(part, weights, noise_rows, visible.left, black, noise_dn, gain_e, body.saturation, rows)
+            self._heat(frame, noise, light, weights, settings, first, last)
 
         _in_blocks(body.sensor[0], block)
         return frame
 
+    def _heat(
+        self,
+        frame: NDArray[np.uint16],
+        noise: NDArray[np.float32],
+        light: NDArray[np.float32],
+        weights: NDArray[np.float32],
+        settings: ExposureSettings,
+        first: int,
+        last: int,
+    ) -> None:
+        """Write the counts of hot photosites in rows first … last − 1 of a frame, whose deviates are `noise`."""
+        some = slice(*np.searchsorted(self.hot.rows, [first, last]).tolist())
+        rows, columns = self.hot.rows[some], self.hot.columns[some]
+        visible = self.body.visible
+        y, x = rows - visible.top, columns - visible.left
+        seen = (y >= 0) & (y < visible.height) & (x >= 0) & (x < visible.width)
+        electrons_dn = self.hot.excess_dn(settings.iso, settings.shutter_s)[some]
+        electrons_dn[seen] += weights.astype(np.float64) @ light[:, y[seen], x[seen]]
+        spread = np.sqrt(electrons_dn / self.body.gain_e(settings.iso) + self.body.noise_dn(settings.iso) ** 2)
+        count = self.body.black + 0.5 + electrons_dn + spread * noise[rows - first, columns]
+        frame[rows, columns] = np.clip(count, 0, self.body.saturation).astype(np.uint16)
+
     def signal(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float32]:
-        """Return what a frame would be without noise, black and clipping.
+        """Return what a frame would be without noise, black, hot photosites and clipping.
 
         Parameters
         ----------
