@@ -241,7 +241,9 @@ def _linear_srgb(power: _Array) -> _Array:
     """Return the linear sRGB (3,) float64 of a light for the CIE 1931 2° observer, negative values clipped to 0."""
     import colour
 
-    spectrum = colour.SpectralDistribution(dict(zip(WAVELENGTHS_NM.tolist(), power.tolist(), strict=True)))
+    # On the grid of the observer's functions, or colour-science warns that it resamples.
+    grid = np.arange(360.0, 781.0)
+    spectrum = colour.SpectralDistribution(np.interp(grid, WAVELENGTHS_NM, power, left=0), grid)
     xyz = np.asarray(colour.sd_to_XYZ(spectrum, k=1.0, method="Integration"), dtype=np.float64)
     linear = np.asarray(colour.XYZ_to_sRGB(xyz / xyz[1], apply_cctf_encoding=False), dtype=np.float64)
     return np.maximum(linear, 0.0)
