@@ -190,7 +190,7 @@ def _measurement(task: TableTask) -> PatchMeasurement:
         ]
     )
     places = np.concatenate([points.cells_mm, points.references_mm])
-    sensor = PatchSensor.of(task.body, len(codes), task.window, task.room.seed, task.room.response_spread)
+    sensor = PatchSensor.of(task.body, len(codes), task.window, task.room, task.exposure.shutter_s)
     blank = Print(chart.page_mm, np.zeros((0, 4)), np.zeros((0, 3), dtype=np.uint8))
     world = World(blank, task.body, task.room)
     lamp: ChartLamp
