@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,6 @@ from foundation.files import write_whole
 from foundation.srgb import encode_srgb
 
 Kind = Literal["uniform", "blackbody", "spectrum"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")
 """Columns of `illuminations.csv` (docs/formats.md)."""
 
@@ -126,8 +125,16 @@ def save_illuminations(illuminations: Sequence[Illumination], path: Path) -> Non
     write_whole(path, illuminations_to_csv(illuminations))
 
 
-def load_illuminations(path: Path) -> tuple[Illumination, ...]:
+def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illumination, ...]:
     """Read `illuminations.csv`; further columns are ignored.
+
+    Parameters
+    ----------
+    path
+        The file.
+    computed
+        Whether lights may have spectra of their own, and names: those of a table. A plan's may not, as a projector
+        shows codes.
 
     Raises
     ------
@@ -148,15 +155,15 @@ def load_illuminations(path: Path) -> tuple[Illumination, ...]:
     for number, row in enumerate(rows):
         try:
             kind = row["kind"]
-            if kind not in KINDS:
-                raise ValueError(f"kind is {kind!r}, expected {', '.join(KINDS[:-1])} or {KINDS[-1]}")
+            if kind not in ("uniform", "blackbody", "spectrum") or (kind == "spectrum" and not computed):
+                raise ValueError(f"kind is {kind!r}, expected uniform or blackbody")
             if _whole(row, "index") != number:
                 raise ValueError(f"index is {row['index']}, expected {number}")
             cct_k = _kelvin(row) if kind == "blackbody" else None
             codes = Colour(_whole(row, "red"), _whole(row, "green"), _whole(row, "blue"))
         except ValueError as error:
             raise FormatError(f"{path}, light {number}: {error}") from error
-        lights.append(Illumination(number, kind, cct_k, codes, row.get(NAME) or None))
+        lights.append(Illumination(number, kind, cct_k, codes, (row.get(NAME) or None) if computed else None))
     return tuple(lights)
 
 

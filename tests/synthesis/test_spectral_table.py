@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from acquisition.lights.illuminations import load_illuminations
 from calibration.table.lut import Lut, open_lut
 from calibration.table.verification import find_faults
 from evaluation.datasets.generated import open_generated
-from foundation.errors import InputError
+from foundation.errors import FormatError, InputError
 from generator.cli import main as generate
 from generator.lights.choices import parse_light
 from sim.world.profile import printed_reflectance
@@ -69,6 +70,11 @@ def test_lights_have_names_on_disk_and_in_use(lut: Lut, lights: LightSpectra) ->
     assert set(parse_light("4200K", lut).lights) == {4, 5}
     with pytest.raises(InputError):
         parse_light("FL3", lut)
+
+
+def test_a_session_cannot_be_planned_with_spectra(lut: Lut) -> None:
+    with pytest.raises(FormatError, match="kind is 'spectrum', expected uniform or blackbody"):
+        load_illuminations(lut.folder / "illuminations.csv")
 
 
 def test_the_table_is_whole_and_names_its_spectra(lut: Lut, lights: LightSpectra) -> None:
