@@ -32,6 +32,13 @@ def table(
             "simulated lab (EOS 550D)."
         ),
     ] = "Canon_EOS_600D",
+    lights: Annotated[
+        str | None,
+        typer.Option(
+            help="CSV of spectra (wavelength, then a column each), or published ones: D65,A,FL2,cie-led,5600K,"
+            "2000:10000:200K,daylight:4000:10000:500; else the 707 lights of the simulated projector."
+        ),
+    ] = None,
     settings: Annotated[
         Path | None, typer.Option(help="TOML file with facts of the body, exposure, room, chart; defaults else.")
     ] = None,
@@ -42,11 +49,12 @@ def table(
 ) -> None:
     """Compute a whole table from spectra and the sensor's noise model, without a frame.
 
-    Reads the sensitivities and the settings. Writes OUT/samples.npy, illuminations.csv, references.csv and lut.json,
-    which says that the table was computed: a table for generate like one that build-lut makes of a session in the
-    simulated lab, in minutes.
+    Reads the sensitivities, the spectra of lights and the settings. Writes OUT/samples.npy, illuminations.csv,
+    references.csv and lut.json, which says that the table was computed: a table for generate like one that build-lut
+    makes of a session in the simulated lab, in minutes.
     """
     from foundation.processors import processor_count
+    from synthesis.light_spectra import read_lights
     from synthesis.settings import load_settings
     from synthesis.table import compute_table
     from synthesis.tasks import table_task
@@ -54,7 +62,8 @@ def table(
     given = load_settings(settings)
     if seed is not None:
         given = given.model_copy(update={"seed": seed})
-    task = table_task(camera, given, str(settings or "the settings"))
+    spectra = None if lights is None else read_lights(lights)
+    task = table_task(camera, given, str(settings or "the settings"), spectra)
     with orderly_end():
         done = compute_table(task, out, threads or processor_count())
     print(

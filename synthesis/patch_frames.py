@@ -21,11 +21,12 @@ import numpy.typing as npt
 
 from calibration.sampling.samples import Sites
 from drivers.raw.rawfile import Area, Mosaic
-from sim.world.sensors import Body
+from sim.world.room import Room
+from sim.world.sensors import Body, HotPattern
 
 _CHANNELS: Final = "RGB"
 
-_RESPONSE, _NOISE, _BLACK = 11, 12, 13
+_RESPONSE, _NOISE, _BLACK, _HOT = 11, 12, 13, 14
 """Purposes of the random streams, so that none is drawn from twice; those of `sim.world.world` are below 10."""
 
 _SKIPPED_COLUMNS: Final = 4
@@ -51,6 +52,10 @@ class PatchSensor:
         Of response and noise.
     response
         (N · 2 · window, 2 · window) float32, what each photosite gives over what it should: the fixed pattern.
+    hot
+        The photosites whose dark current is out of proportion.
+    shutter_s
+        Exposure time of every frame, seconds: their excess grows with it.
     """
 
     body: Body
@@ -58,16 +63,20 @@ class PatchSensor:
     window: int
     seed: int
     response: _Float
+    hot: HotPattern
+    shutter_s: float
 
     @staticmethod
-    def of(body: Body, patches: int, window: int, seed: int, response_spread: float) -> PatchSensor:
-        """Return the sensor of a body under so many patches; `response_spread` is the PRNU's standard deviation."""
+    def of(body: Body, patches: int, window: int, room: Room, shutter_s: float) -> PatchSensor:
+        """Return the sensor of a body under so many patches, with what a room says of its photosites."""
+        seed, response_spread = room.seed, room.response_spread
         shape = (patches * 2 * window, 2 * window)
         response = _random(seed, _RESPONSE).standard_normal(shape, dtype=np.float32)
         response *= np.float32(response_spread)
         response += np.float32(1)
         response.setflags(write=False)
-        return PatchSensor(body, patches, window, seed, response)
+        hot = HotPattern.drawn(_random(seed, _HOT), shape, room.hot_per_million, room.hot_dn_per_s)
+        return PatchSensor(body, patches, window, seed, response, hot, shutter_s)
 
     @property
     def sites(self) -> Sites:
@@ -130,6 +139,8 @@ class PatchSensor:
         found = np.empty(self.response.shape, dtype=np.uint16)
         noise_dn, gain_e = body.noise_dn(iso), body.gain_e(iso)
         counts(light, weights.astype(np.float32), noise, 0, float(body.black), noise_dn, gain_e, body.saturation, found)
+        lit = weights @ light[:, self.hot.rows, self.hot.columns]
+        self.hot.raise_counts(found, noise, lit, body, iso, self.shutter_s)
         found.setflags(write=False)
         black = np.full((2, 2), float(body.black))
         masked = sum(area.height * max(area.width - _SKIPPED_COLUMNS, 0) for area in body.masked) // 4

@@ -17,6 +17,7 @@ brightness.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -70,11 +71,6 @@ class CellMixtures:
     ----------
     cells
         (K, 32) uint16, numbers of cells of the chart, ((r << 2n) | (g << n) | b) for n bits a channel; ascending.
-    distance
-        (K,) float32, angle between the mean of the 32 and the wanted colour, degrees.
-    outside
-        (K,) bool, whether the print cannot show the colour with cells near to it: the mean of the 32 differs from it by
-        more than `MET_WITHIN` in a channel.
     colours
         (K, 3) float32, what the camera sees of the 32 in the mean, over the white of the light.
     wanted
@@ -82,10 +78,18 @@ class CellMixtures:
     """
 
     cells: npt.NDArray[np.uint16]
-    distance: npt.NDArray[np.float32]
-    outside: npt.NDArray[np.bool_]
     colours: npt.NDArray[np.float32]
     wanted: npt.NDArray[np.float32]
+
+    @cached_property
+    def distance(self) -> npt.NDArray[np.float32]:
+        """(K,) float32, angle between the mean of the 32 and the wanted colour, degrees."""
+        return angles_deg(self.colours, self.wanted).astype(np.float32)
+
+    @cached_property
+    def outside(self) -> npt.NDArray[np.bool_]:
+        """(K,) bool, whether cells near to a colour cannot show it: the mean is off by more than `MET_WITHIN`."""
+        return np.asarray((np.abs(self.colours - self.wanted) > MET_WITHIN * self.wanted).any(axis=1))
 
 
 def mix_cells(profile: PrintProfile, wanted: _Array) -> CellMixtures:
@@ -102,8 +106,10 @@ def mix_cells(profile: PrintProfile, wanted: _Array) -> CellMixtures:
     --------
     >>> ramp = np.stack([np.full(8, 0.5), np.full(8, 0.5), np.linspace(0.2, 0.9, 8)], axis=-1)
     >>> mixtures = mix_cells(PrintProfile(ramp, np.ones(8, bool)), np.array([[0.5, 0.5, 0.55]]))
-    >>> mixtures.cells.min(), mixtures.cells.max(), round(float(mixtures.colours[0, 2]), 2), bool(mixtures.outside[0])
-    (np.uint16(3), np.uint16(4), 0.55, False)
+    >>> int(mixtures.cells.min()), int(mixtures.cells.max()), bool(mixtures.outside[0])
+    (3, 4, False)
+    >>> [round(float(seen), 3) for seen in mixtures.colours[0]]
+    [0.5, 0.5, 0.55]
     """
     from scipy.spatial import KDTree
 
@@ -121,17 +127,37 @@ def mix_cells(profile: PrintProfile, wanted: _Array) -> CellMixtures:
 
     cells = chosen(np.arange(len(wanted)), NEIGHBOURS, SPREAD_COST)
     missed = angles_deg(colours[cells].mean(axis=1), wanted) > GREY_WITHIN_DEG
-    again = np.flatnonzero(missed & (angles_deg(wanted, np.ones(3)) < NEAR_GREY_DEG))
+    again = np.flatnonzero(missed & near_grey(wanted))
     if len(again):
         cells[again] = chosen(again, WIDE_NEIGHBOURS, WIDE_SPREAD_COST)
-    made = colours[cells].mean(axis=1)
-    return CellMixtures(
-        np.sort(usable[cells], axis=1).astype(np.uint16),
-        angles_deg(made, wanted).astype(np.float32),
-        np.asarray((np.abs(made - wanted) > MET_WITHIN * wanted).any(axis=1)),
-        made.astype(np.float32),
-        wanted.astype(np.float32),
-    )
+    return mixtures_of(np.sort(usable[cells], axis=1).astype(np.uint16), profile, wanted)
+
+
+def mixtures_of(cells: npt.NDArray[np.uint16], profile: PrintProfile, wanted: _Array) -> CellMixtures:
+    """Return mixtures of cells that were chosen, with what the camera sees of them.
+
+    Parameters
+    ----------
+    cells
+        (K, 32) uint16, numbers of cells.
+    profile
+        The print under a light.
+    wanted
+        (K, 3) float64 > 0, what the camera should see, over the white of the light.
+    """
+    made = profile.colours[cells].mean(axis=1)
+    return CellMixtures(cells, made.astype(np.float32), wanted.astype(np.float32))
+
+
+def near_grey(colours: _Array) -> npt.NDArray[np.bool_]:
+    """Return (K,) bool, which of (K, 3) float64 colours over white are within `NEAR_GREY_DEG` of grey.
+
+    Examples
+    --------
+    >>> near_grey(np.array([[0.5, 0.5, 0.55], [0.5, 0.2, 0.2]])).tolist()
+    [True, False]
+    """
+    return np.asarray(angles_deg(colours, np.ones(3)) < NEAR_GREY_DEG)
 
 
 @compiled

@@ -16,7 +16,6 @@ import numpy.typing as npt
 from foundation.angles import angles_deg
 from foundation.srgb import decode_srgb
 from generator.kernels.palette import channels_of
-from generator.lights.lighting import plain
 from generator.rendering.matrices import ColourMatrix, camera_matrix, choose_matrix
 from generator.rendering.print_profiles import PrintProfile, profile_of
 
@@ -67,7 +66,7 @@ def fitted_matrix(lut: Lut) -> ColourMatrix:
     """
     bodies = [(abs(light.cct_k - DAYLIGHT_K), light.index) for light in lut.illuminations if light.cct_k is not None]
     light = min(bodies)[1] if bodies else int(np.ptp(np.log(lut.white), axis=1).argmin())
-    rows, residual = fit_matrix(profile_of(lut, plain(light)))
+    rows, residual = fit_matrix(profile_of(lut, light))
     source = f"least squares over the table's colours under light {light}; {residual:.1f} degrees off in the median"
     return ColourMatrix(TABLE, rows, source)
 

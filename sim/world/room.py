@@ -69,7 +69,9 @@ class Room:
     hot_per_million
         Photosites of a million whose dark current is out of proportion, the same in all frames, 0 for none. 20 is
         plausible for an EOS 550D of ten years, 2 for an EOS 6D Mark II of three (chosen: several times what
-        `sim.world.sensors.HotPattern` has from the literature, as bodies are not delivered without any).
+        `sim.world.sensors.HotPattern` has from the literature, as bodies are not delivered without any). Where a
+        session has dark frames, `build-lut` lists the cells in which one stands out by 30 counts and more as unfit, and
+        `generate` replaces their colours; a table computed by `sim table` has none, and keeps them in its images.
     hot_dn_per_s
         Mean excess of such a photosite, DN per second at ISO 100; exponentially distributed. Chosen: at half a second
         the hottest of a hundred is nearly saturated.

@@ -147,6 +147,40 @@ class HotPattern:
         place = np.sort(random.choice(sensor[0] * sensor[1], count, replace=False))
         return cls(place // sensor[1], place % sensor[1], random.exponential(dn_per_s, count))
 
+    def within(self, first: int, last: int) -> HotPattern:
+        """Return those in rows first … last − 1, their rows counted from the first."""
+        some = slice(*np.searchsorted(self.rows, [first, last]).tolist())
+        return HotPattern(self.rows[some] - first, self.columns[some], self.dn_per_s[some])
+
+    def raise_counts(
+        self,
+        frame: NDArray[np.uint16],
+        noise: NDArray[np.float32],
+        light_dn: NDArray[np.float64],
+        body: Body,
+        iso: int,
+        shutter_s: float,
+    ) -> None:
+        """Write the counts of hot photosites into a frame, by the photon transfer that ordinary ones have.
+
+        Parameters
+        ----------
+        frame
+            (rows, columns) uint16 counts, changed where a photosite is hot.
+        noise
+            (rows, columns) float32, the standard normal deviates that the frame was made with.
+        light_dn
+            (H,) float64, what light alone gives each of them, DN above black.
+        body
+            Gives black, gain, read noise and saturation.
+        iso, shutter_s
+            ISO speed, and exposure time in seconds.
+        """
+        signal = light_dn + self.excess_dn(iso, shutter_s)
+        spread = np.sqrt(signal / body.gain_e(iso) + body.noise_dn(iso) ** 2)
+        count = body.black + 0.5 + signal + spread * noise[self.rows, self.columns]
+        frame[self.rows, self.columns] = np.clip(count, 0, body.saturation).astype(np.uint16)
+
     def excess_dn(self, iso: int, shutter_s: float) -> NDArray[np.float64]:
         """Return (H,) float64: DN above an ordinary photosite at an ISO speed and exposure time in seconds."""
         return self.dn_per_s * shutter_s * iso / 100

@@ -122,7 +122,7 @@ class World:
                 part = light[:, top - visible.top : bottom - visible.top] if seen else light[:, : bottom - top, :0]
                 noise_rows, rows = noise[top - first : bottom - first], frame[top:bottom]
                 counts(part, weights, noise_rows, visible.left, black, noise_dn, gain_e, body.saturation, rows)
-            self._heat(frame, noise, light, weights, settings, first, last)
+            self._heat(frame[first:last], noise, weights, settings, first)
 
         _in_blocks(body.sensor[0], block)
         return frame
@@ -131,23 +131,17 @@ class World:
         self,
         frame: NDArray[np.uint16],
         noise: NDArray[np.float32],
-        light: NDArray[np.float32],
-        weights: NDArray[np.float32],
+        drive: NDArray[np.float32],
         settings: ExposureSettings,
         first: int,
-        last: int,
     ) -> None:
-        """Write the counts of hot photosites in rows first … last − 1 of a frame, whose deviates are `noise`."""
-        some = slice(*np.searchsorted(self.hot.rows, [first, last]).tolist())
-        rows, columns = self.hot.rows[some], self.hot.columns[some]
-        visible = self.body.visible
-        y, x = rows - visible.top, columns - visible.left
+        """Raise the counts of hot photosites among some rows of a frame, the first of which is `first`."""
+        hot, visible, light = self.hot.within(first, first + len(frame)), self.body.visible, self._render()
+        y, x = hot.rows + first - visible.top, hot.columns - visible.left
         seen = (y >= 0) & (y < visible.height) & (x >= 0) & (x < visible.width)
-        electrons_dn = self.hot.excess_dn(settings.iso, settings.shutter_s)[some]
-        electrons_dn[seen] += weights.astype(np.float64) @ light[:, y[seen], x[seen]]
-        spread = np.sqrt(electrons_dn / self.body.gain_e(settings.iso) + self.body.noise_dn(settings.iso) ** 2)
-        count = self.body.black + 0.5 + electrons_dn + spread * noise[rows - first, columns]
-        frame[rows, columns] = np.clip(count, 0, self.body.saturation).astype(np.uint16)
+        lit = np.zeros(len(hot.rows))
+        lit[seen] = drive.astype(np.float64) @ light[:, y[seen], x[seen]]
+        hot.raise_counts(frame, noise, lit, self.body, settings.iso, settings.shutter_s)
 
     def signal(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float32]:
         """Return what a frame would be without noise, black, hot photosites and clipping.

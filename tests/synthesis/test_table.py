@@ -29,7 +29,7 @@ ROOM = Room(waviness_mm=0.5, vignetting=0.08, projector_falloff=0.05)
 
 def task_of(bits: int = 3, page: str = "A5", window: int = 5, **room: float) -> TableTask:
     chart = designed(bits, page, 1)[0]
-    return TableTask(chart, BODIES["Test"], replace(ROOM, **room), SETTINGS, LIGHTS, window, {"by": "test"})
+    return TableTask(chart, BODIES["Test"], replace(ROOM, **room), SETTINGS, LIGHTS, None, window, {"by": "test"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,3 +157,17 @@ def test_the_usual_task_is_the_projectors_707_lights_under_which_a_session_is_ta
     assert task.body.model == "Canon EOS 5DS"
     assert task.exposure == SETTINGS
     assert task.room == Room(seed=TableSettings().seed, lamp_drift_per_hour=0)
+
+
+def test_hot_photosites_are_in_the_samples_of_every_light_and_in_no_list(computed: Lut, tmp_path: Path) -> None:
+    task = task_of(hot_per_million=100.0, hot_dn_per_s=4000.0)
+    hot = open_lut(compute_table(task, tmp_path / "lut", threads=2).folder)
+    apart = np.asarray(hot.samples, dtype=np.float64) - np.asarray(computed.samples, dtype=np.float64)
+    raised = np.abs(apart) > 200
+    # 512 cells of 100 photosites and 100 a million: some five, the same ones under every light.
+    assert 2 <= raised.any(axis=0).sum() <= 12
+    assert (apart[raised] > 0).all()
+    steady = raised.all(axis=0)
+    assert steady.sum() >= 2
+    assert np.ptp(apart[:, steady], axis=0).max() < 0.25 * apart[:, steady].max()
+    assert {cell.cause.split(":")[0] for cell in hot.provenance.unfit} <= {"clipped"}

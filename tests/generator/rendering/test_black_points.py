@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -151,7 +153,7 @@ def test_a_crop_is_the_image_but_for_rounding_and_has_noise_below_0() -> None:
     taken, stretch = veil(1.0)
     level = 15000
     window = [(7, 5, 30, 20)]
-    arguments = {"white_level": level, "seeds": 4, "images": 9}
+    arguments: dict[str, Any] = {"white_level": level, "seeds": 4, "images": 9}
     plainly = draw_batch(samples[None], [0], [picture], window, **arguments)[0]
     crop = draw_batch(samples[None], [0], [picture], window, taken=[taken], stretches=[stretch], **arguments)[0]
     exact = (plainly.astype(np.float64) * level - taken[:, None, None]) * stretch[:, None, None] / level

@@ -11,6 +11,7 @@ import pytest
 from foundation.angles import angles_deg
 from foundation.errors import InputError
 from generator.lights.lighting import Lighting, Mixture, plain
+from generator.masks.request import parse_masks
 from generator.rendering.colorimetric import ColorimetricRendering, colorimetric_mixtures
 from generator.rendering.matrices import ColourMatrix
 from generator.rendering.print_profiles import profile_of
@@ -69,17 +70,31 @@ def test_lights_have_numbers_temperatures_and_mixtures(make_table: MakeTable) ->
         colorimetric_mixtures(lut, 1000.0)
 
 
-def test_an_image_takes_the_reference_nearest_to_its_light(make_table: MakeTable) -> None:
-    rendering = ColorimetricRendering(make_table(bits=1), ColourMatrix("mine", MATRIX, ""))
-    assert sorted(rendering.references) == [0, 1, 2]
-    for light in range(3):
-        assert rendering.reference_of(Lighting((plain(light),))) == light
+def test_greys_are_grey_under_mixtures_of_lights_and_several_lights(make_table: MakeTable) -> None:
+    lut = make_table(bits=4, tint=0.15)
+    rendering = ColorimetricRendering(lut, ColourMatrix("mine", MATRIX, ""))
+    mixture = Mixture((0, 2), (0.3, 0.7))
+    mixtures = rendering.mixtures_for(Lighting((mixture,)))
+    shown = mixture.samples(lut).astype(np.float64)[mixtures.cells[GREYS]].mean(axis=(1, 2))
+    assert angles_deg(shown, mixture.white(lut)).max() < 0.5
+    assert mixtures.distance[GREYS].max() < 0.5
+    # Two lights that are the same are one.
+    lighting = Lighting((mixture, mixture), parse_masks("half-plane", 2, 1).maker(0))
+    assert rendering.light_of(lighting).weights == pytest.approx(mixture.weights)
+    np.testing.assert_array_equal(rendering.mixtures_for(lighting).cells, mixtures.cells)
+
+
+def test_several_lights_count_alike_however_bright(make_table: MakeTable) -> None:
+    lut = make_table(bits=1)
+    rendering = ColorimetricRendering(lut, ColourMatrix("mine", MATRIX, ""))
+    light = rendering.light_of(Lighting((plain(0), plain(1)), parse_masks("half-plane", 2, 1).maker(0)))
+    parts = np.array(light.weights) * lut.white[list(light.lights)].sum(axis=1)
+    assert parts[0] == pytest.approx(parts[1])
 
 
 def test_a_table_of_one_light(make_table: MakeTable) -> None:
     rendering = ColorimetricRendering(make_table(bits=1, lights=1), ColourMatrix("mine", MATRIX, ""))
-    assert rendering.references == (0,)
-    assert rendering.mixtures(rendering.reference_of(Lighting((plain(0),)))).cells.max() < 8
+    assert rendering.mixtures_for(Lighting((plain(0),))).cells.max() < 8
 
 
 def test_the_matrix_is_that_of_the_camera_or_of_the_table(make_table: MakeTable) -> None:
@@ -107,13 +122,13 @@ def test_cells_that_clip_and_cells_with_hot_samples_are_not_used(make_table: Mak
         samples[511] = np.minimum(samples[511], 5000)
 
     lut = make_table(change=spoil, white_level=11000)
-    assert np.flatnonzero(~profile_of(lut, plain(1)).usable).tolist() == [100]
+    assert np.flatnonzero(~profile_of(lut, 1).usable).tolist() == [100]
     # The paper clips when saturation is below it, and the white point follows what does not.
     clipped = make_table(white_level=5000, name="clipped")
-    profile = profile_of(clipped, plain(1))
+    profile = profile_of(clipped, 1)
     assert not profile.usable[511]
     assert profile.usable.sum() > 300
-    whole = profile_of(make_table(name="whole"), plain(1))
+    whole = profile_of(make_table(name="whole"), 1)
     assert profile.white < whole.white
     shown = clipped.samples[1].astype(np.float64)[colorimetric_mixtures(clipped, 1).cells[GREYS]].mean(axis=(1, 2))
     assert angles_deg(shown, clipped.white[1]).max() < 0.7

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,7 @@ from generator.rendering.kept_mixtures import cache_folder, keep_mixtures, load_
 def mixtures() -> CellMixtures:
     rng = np.random.default_rng(4)
     return CellMixtures(
-        rng.integers(0, 32768, (7, 32)).astype(np.uint16),
-        rng.random(7).astype(np.float32),
-        rng.random(7) < 0.5,
+        np.sort(rng.integers(0, 32768, (7, 32)), axis=1).astype(np.uint16),
         rng.random((7, 3)).astype(np.float32),
         rng.random((7, 3)).astype(np.float32),
     )
@@ -29,7 +28,7 @@ def test_what_is_kept_is_found(mixtures: CellMixtures, tmp_path: Path) -> None:
     keep_mixtures("ab12", mixtures, folder)
     found = load_mixtures("ab12", 7, folder)
     assert found is not None
-    for name in ("cells", "distance", "outside", "colours", "wanted"):
+    for name in ("cells", "colours", "wanted"):
         kept, given = getattr(found, name), getattr(mixtures, name)
         assert kept.dtype == given.dtype
         np.testing.assert_array_equal(kept, given)
@@ -74,3 +73,16 @@ def test_the_folder_is_the_one_of_the_system(tmp_path: Path, monkeypatch: pytest
     assert cache_folder() == tmp_path / ".cache" / "croplab"
     monkeypatch.setattr("sys.platform", "darwin")
     assert cache_folder() == tmp_path / "Library" / "Caches" / "croplab"
+
+
+def test_what_was_kept_first_makes_room(
+    mixtures: CellMixtures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "notes.txt").write_text("not ours")
+    for number in range(3):
+        keep_mixtures(f"{number}", mixtures, tmp_path)
+        os.utime(tmp_path / f"{number}.mixtures", ns=(number, number))
+    size = (tmp_path / "0.mixtures").stat().st_size
+    monkeypatch.setattr("generator.rendering.kept_mixtures.MOST_BYTES", 3 * size)
+    keep_mixtures("3", mixtures, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1.mixtures", "2.mixtures", "3.mixtures", "notes.txt"]
