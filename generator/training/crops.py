@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -126,7 +126,9 @@ class Crops:
         Threads that share a batch; no value depends on it.
     rendering
         ``"codes"``: a picture's codes are those of the print; ``"colorimetric"``: each pixel is a cell that looks to
-        the camera as the picture's colour should, 2 MB of memory for each light of the table that lights are near to.
+        the camera as the picture's colour should. Which, is found when a light is first drawn: it takes some seconds a
+        light the first time, later they lie in the user's cache folder; and 2 MB of memory for each light. So name the
+        lights, rather than leave it at all of a large table.
     matrix
         Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
     black_point
@@ -353,24 +355,31 @@ def _tables_of(lut: Lut, lights: Sequence[Mixture], seed: int) -> tuple[npt.NDAr
     return np.stack([mixture.samples(lut, seed) for mixture in lights]), np.arange(len(lights))
 
 
-def _cells_of(
-    lut: Lut, lights: Sequence[Mixture], rendering: Rendering, matrix: ColourMatrix | None
-) -> tuple[CellTable, ...]:
-    """Return for each light the cells that stand for source colours under it; none where codes are those of the print.
+class _Cells:
+    """For each light the cells that stand for source colours under it, found when they are first asked for."""
 
-    Lights near to each other share theirs.
-    """
-    if rendering == "codes":
-        if matrix is not None:
-            raise InputError("a colour matrix is for colorimetric rendering; choose that, or leave the matrix out")
-        return ()
-    if rendering != "colorimetric":
-        raise InputError(f"{rendering!r} is no rendering; use one of codes, colorimetric")
-    from generator.rendering.colorimetric import ColorimetricRendering
-    from generator.rendering.table_matrix import matrix_for
+    def __init__(self, lut: Lut, lights: Sequence[Mixture], matrix: ColourMatrix | None) -> None:
+        from generator.rendering.colorimetric import ColorimetricRendering
+        from generator.rendering.table_matrix import matrix_for
 
-    by_colour = ColorimetricRendering(lut, matrix or matrix_for(lut))
-    references = [by_colour.reference_of(Lighting((light,))) for light in lights]
-    bits = lut.provenance.bits
-    cells = {light: checked_cells(by_colour.mixtures(light).cells, bits) for light in sorted(set(references))}
-    return tuple(cells[light] for light in references)
+        self._lights = lights
+        self._bits = lut.provenance.bits
+        self._rendering = ColorimetricRendering(lut, matrix or matrix_for(lut))
+        self._found: dict[int, CellTable] = {}
+
+    def __getitem__(self, light: int) -> CellTable:
+        if light not in self._found:
+            mixtures = self._rendering.mixtures_for(Lighting((self._lights[light],)))
+            self._found[light] = checked_cells(mixtures.cells, self._bits)
+        return self._found[light]
+
+
+def _cells_of(lut: Lut, lights: Sequence[Mixture], rendering: Rendering, matrix: ColourMatrix | None) -> _Cells | None:
+    """Return the cells that stand for source colours; None where codes are those of the print."""
+    if rendering not in get_args(Rendering):
+        raise InputError(f"{rendering!r} is no rendering; use one of {', '.join(get_args(Rendering))}")
+    if rendering == "colorimetric":
+        return _Cells(lut, lights, matrix)
+    if matrix is not None:
+        raise InputError("a colour matrix is for colorimetric rendering; choose that, or leave the matrix out")
+    return None

@@ -53,25 +53,15 @@ class _RenderingSums:
 
     def __init__(self) -> None:
         self._sums = dict.fromkeys(("images", "pixels", "black_taken", "outside", "distance"), 0.0)
-        self._mixtures: dict[int, str] = {}
 
     def add(self, details: Details, pixels: int) -> None:
         """Add what is recorded of an image of so many pixels."""
         self._sums["images"] += 1
         self._sums["black_taken"] += float(details.get("black_taken", 0))
-        if "reference" in details:
+        if "cells" in details:
             self._sums["pixels"] += pixels
             for name in ("outside", "distance"):
                 self._sums[name] += pixels * float(details[name])
-
-    def add_mixtures(self, mixtures: Mapping[int, str], place: str) -> None:
-        """Add the mixtures of cells that a shard was made of; a FormatError if another shard had others."""
-        for light, sha256 in mixtures.items():
-            if self._mixtures.setdefault(light, sha256) != sha256:
-                raise FormatError(
-                    f"two shards were made of different mixtures of cells for light {light}; remove {place} with all "
-                    "beside it and begin again, on machines of one kind"
-                )
 
     def summary(self) -> RenderingSummary:
         """Return means over pixels and images."""
@@ -81,7 +71,7 @@ class _RenderingSums:
             if self._sums["pixels"]
         }
         black_taken = round(self._sums["black_taken"] / max(self._sums["images"], 1), 6)
-        return RenderingSummary(**by_colour, black_taken=black_taken, mixtures=dict(sorted(self._mixtures.items())))
+        return RenderingSummary(**by_colour, black_taken=black_taken)
 
 
 class _ListedFile:
@@ -166,7 +156,6 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
                 counts["images"] += 1
             for file in record.files:
                 sums.write(f"{file.sha256}  {file.name}\n".encode())
-            rendered.add_mixtures(record.mixtures, place.notes.place)
             used.update((light.illumination, light) for light in record.lights)
         if not counts["images"]:
             raise NothingMadeError(

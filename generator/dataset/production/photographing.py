@@ -18,6 +18,7 @@ from generator.pictures.picture import Picture
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
+    from generator.kernels.dithering import CellTable
     from generator.rendering.cell_mixtures import CellMixtures
     from generator.rendering.colorimetric import ColorimetricRendering
 
@@ -63,9 +64,10 @@ def photograph(
     QualityError
         The table cannot render the picture so under that light.
     """
-    from generator.kernels.dithering import dither
+    from generator.kernels.dithering import dither, nearest_nodes
     from generator.kernels.mixing import mix_samples
     from generator.kernels.rendering import WHOLE_LIGHT_PIXELS, draw_samples
+    from generator.rendering.gamut_summaries import summarise
 
     # The hash of the table stands for its samples in the dataset's description.
     for mixture in lighting.mixtures:
@@ -76,11 +78,13 @@ def photograph(
     details: Details = {}
     if options.rendering == "colorimetric":
         rendering = rendering_of(lut, options)
-        reference = rendering.reference_of(lighting)
-        lut.require_unchanged(reference)
-        mixtures = rendering.mixtures(reference)
-        cells = mixtures.cells
-        details |= {"reference": reference} | _misses(picture, mixtures)
+        for light in rendering.light_of(lighting).lights:
+            lut.require_unchanged(light)
+        mixtures = rendering.mixtures_for(lighting)
+        cells, name = _table(mixtures, lut.provenance.bits)
+        missed = summarise(mixtures, nearest_nodes(picture).astype(np.float64))
+        outside, distance = round(missed.outside, 6), round(missed.distance_deg, 6)
+        details |= {"cells": name, "outside": outside, "distance": distance}
     if options.black_point.kind != "keep":
         details["black_taken"] = share
     alone = lighting.masks is None and len(lighting.mixtures[0].lights) == 1 and not share
@@ -137,22 +141,13 @@ def rendering_of(lut: Lut, options: DatasetOptions) -> ColorimetricRendering:
     return _rendering(lut, matrix.name, tuple(matrix.rows.ravel().tolist()), matrix.source)
 
 
-def cells_sha256(mixtures: CellMixtures) -> str:
-    """Return the SHA-256 of the cells of mixtures, as little-endian uint16 in C order."""
-    return hashlib.sha256(mixtures.cells.astype("<u2").tobytes()).hexdigest()
+@lru_cache(maxsize=8)
+def _table(mixtures: CellMixtures, bits: int) -> tuple[CellTable, str]:
+    """Return the cells of mixtures to draw from, and what they are called: the first 16 digits of their SHA-256."""
+    from generator.kernels.dithering import checked_cells
 
-
-def _misses(picture: Picture, mixtures: CellMixtures) -> Details:
-    """Return which share of a picture the print cannot show, and by how many degrees colours are missed in the mean.
-
-    Each pixel counts as the source node nearest to it.
-    """
-    from generator.kernels.dithering import nearest_nodes
-
-    counts = nearest_nodes(picture)
-    outside = counts[mixtures.outside].sum() / counts.sum()
-    distance = counts @ mixtures.distance.astype(np.float64) / counts.sum()
-    return {"outside": round(float(outside), 6), "distance": round(float(distance), 6)}
+    digest = hashlib.sha256(mixtures.cells.astype("<u2").tobytes()).hexdigest()
+    return checked_cells(mixtures.cells, bits), digest[:16]
 
 
 def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:

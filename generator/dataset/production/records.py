@@ -155,20 +155,17 @@ class RenderingSummary(_Record):
         how many degrees they are missed. None where images were rendered by codes.
     black_taken
         Mean over all images of the share of the print's black that was taken out.
-    mixtures
-        SHA-256 of the mixtures of cells that were used, by the light of the table that they are for.
     """
 
     outside: float | None = None
     distance: float | None = None
     black_taken: float = 0.0
-    mixtures: dict[int, str] = {}
 
 
 class ShardRecord(_Record):
     """What a shard made; images and files in the order of their numbers, sources in that of their positions.
 
-    `lights` are those of the table that were used, alone or mixed, `mixtures` as `RenderingSummary` has them.
+    `lights` are those of the table that were used, alone or mixed.
     """
 
     shard: int
@@ -177,7 +174,6 @@ class ShardRecord(_Record):
     images: list[ImageRecord]
     files: list[FileSum]
     lights: list[Light]
-    mixtures: dict[int, str] = {}
 
 
 class Description(_Record):

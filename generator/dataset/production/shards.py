@@ -24,7 +24,7 @@ from foundation.errors import FormatError, InputError
 from generator.dataset.production.image_light import image_light
 from generator.dataset.production.layouts.by_name import open_writer
 from generator.dataset.production.layouts.samples import Sample, ShardWriter
-from generator.dataset.production.photographing import cells_sha256, photograph, rendering_of
+from generator.dataset.production.photographing import photograph
 from generator.dataset.production.plan import ShardJob, light_of, split_of, versions
 from generator.dataset.production.records import (
     ImageRecord,
@@ -135,16 +135,9 @@ def make_shard(
         images=images,
         files=files,
         lights=[light_of(lut, light) for light in sorted(used)],
-        mixtures=_mixtures_of(job, lut, images),
     )
     place.commit(record)
     return record
-
-
-def _mixtures_of(job: ShardJob, lut: Lut, images: list[ImageRecord]) -> dict[int, str]:
-    """Return the hashes of the mixtures of cells that images were made of, by the light that they are for."""
-    references = {int(image.details["reference"]) for image in images if "reference" in image.details}
-    return {light: cells_sha256(rendering_of(lut, job.options).mixtures(light)) for light in sorted(references)}
 
 
 def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:

@@ -135,7 +135,7 @@ def test_taken_out_of_each_light_it_is_taken_out_of_their_mixture() -> None:
         without_veil(table, Veil(black, 1 / (1 - black / white)), 65535)
         for table, black, white in zip(tables, blacks, whites, strict=True)
     ]
-    codes = (np.arange(64)[:, None] >> [4, 2, 0] & 3).astype(np.uint8)[None] << 6
+    codes = ((np.arange(64)[:, None] >> [4, 2, 0] & 3) << 6).astype(np.uint8)[None]
     for weight in (0.0, 0.25, 0.5, 1.0):
         weights = np.array([weight, 1 - weight], np.float32)
         mixed = mix_samples(tables, codes, weights)[0].astype(np.float64)
