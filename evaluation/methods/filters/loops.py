@@ -17,8 +17,6 @@ from foundation.compiled import compiled
 if TYPE_CHECKING:
     from evaluation.scene import Image
 
-BINS = 4096
-"""Of the histogram of projections: the two that hold the limits have some thousand pixels of 18 million."""
 SPAN = 64
 """Pixels of a row that are added at a time where none is left out: a few vectors in each of three channels."""
 SPANS_OF_A_SUM = 60_000
@@ -242,60 +240,3 @@ def sum_powers(
             sums[j % 3] = max(sums[j % 3], found[j])
         else:
             sums[j % 3] += found[j]
-
-
-@compiled
-def count_projections(
-    image: Image, free: npt.NDArray[np.bool_], direction: npt.NDArray[np.float64], step: float
-) -> npt.NDArray[np.int64]:
-    """Return (BINS,) int64, the histogram of the projections of an image's pixels (H, W, 3) on a direction (3,)."""
-    counts = np.zeros(BINS, np.int64)
-    for y in range(image.shape[0]):
-        for x in range(image.shape[1]):
-            if free.size and not free[y, x]:
-                continue
-            along = image[y, x, 0] * direction[0] + image[y, x, 1] * direction[1] + image[y, x, 2] * direction[2]
-            counts[min(BINS - 1, int(along * step))] += 1
-    return counts
-
-
-@compiled
-def sum_outer_bins(
-    image: Image,
-    free: npt.NDArray[np.bool_],
-    direction: npt.NDArray[np.float64],
-    step: float,
-    low: int,
-    high: int,
-    bordering: npt.NDArray[np.float64],
-) -> npt.NDArray[np.float64]:
-    """Return (3, 3) float64, the sum of x xᵀ over the pixels whose bin is below `low` or above `high`.
-
-    The pixels of the bins `low` and `high` themselves are written to `bordering` (N, 4) float64: red, green, blue and
-    the projection, in reading order. Image and direction are those of `count_projections`.
-    """
-    total = np.zeros((3, 3), np.float64)
-    found = 0
-    for y in range(image.shape[0]):
-        a, b, c, ab, ac, bc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for x in range(image.shape[1]):
-            if free.size and not free[y, x]:
-                continue
-            red, green, blue = float(image[y, x, 0]), float(image[y, x, 1]), float(image[y, x, 2])
-            along = red * direction[0] + green * direction[1] + blue * direction[2]
-            at = min(BINS - 1, int(along * step))
-            if at < low or at > high:
-                a += red * red
-                b += green * green
-                c += blue * blue
-                ab += red * green
-                ac += red * blue
-                bc += green * blue
-            elif at in (low, high):
-                bordering[found, 0] = red
-                bordering[found, 1] = green
-                bordering[found, 2] = blue
-                bordering[found, 3] = along
-                found += 1
-        total += np.array([[a, ab, ac], [ab, b, bc], [ac, bc, c]])
-    return total
