@@ -93,7 +93,7 @@ def sum_outer_bins(
                 j = kept[at]
                 if free.size and not free[y, left + j]:
                     continue
-                red, green, blue = float(row[3 * j]), float(row[3 * j + 1]), float(row[3 * j + 2])
+                red, green, blue = np.float64(row[3 * j]), np.float64(row[3 * j + 1]), np.float64(row[3 * j + 2])
                 if first <= bins[j] <= last:
                     if inside < bordering.shape[0]:
                         bordering[inside, 0] = red
