@@ -14,7 +14,7 @@ import cv2
 from evaluation.datasets import open_scenes
 from evaluation.experiments.paper.scenes.developing import developed
 from evaluation.experiments.paper.scenes.rendering import ScaledSource
-from evaluation.experiments.transfer.matrices import choose_matrix
+from generator.rendering.matrices import choose_matrix
 
 
 def main() -> None:

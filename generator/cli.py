@@ -15,7 +15,14 @@ from foundation.console import EXIT_CODES, run
 from foundation.errors import InputError
 from foundation.processors import processor_count
 from generator.command.grouping import grouped
-from generator.command.options import ImageOptions, LightOptions, PictureOptions, Places, WorkOptions
+from generator.command.options import (
+    ImageOptions,
+    LightOptions,
+    PictureOptions,
+    Places,
+    VariationOptions,
+    WorkOptions,
+)
 
 if TYPE_CHECKING:
     from generator.dataset.production.plan import Plan
@@ -44,7 +51,12 @@ that cannot be read is left out, and named. When it was interrupted or killed, r
 @app.command(help=_HELP)
 @grouped
 def generate(
-    places: Places, pictures: PictureOptions, light: LightOptions, images: ImageOptions, work: WorkOptions
+    places: Places,
+    pictures: PictureOptions,
+    light: LightOptions,
+    variation: VariationOptions,
+    images: ImageOptions,
+    work: WorkOptions,
 ) -> None:
     """Make a dataset, or one share of it; or finish or verify one that is there."""
     _require_alone({"--verify": work.verify, "--finish": work.finish}, places.lut)
@@ -63,7 +75,7 @@ def generate(
         if places.lut is None or places.out is None:
             raise InputError("the table and the place of the dataset are missing; write generate LUT OUT --sources DIR")
         workers = work.makers()
-        plan = _plan(places.lut, places.out, pictures, light, images, work)
+        plan = _plan(places.lut, places.out, pictures, light, variation, images, work)
         if work.shard is not None:
             _make_share(plan, places.out, work.shard, workers)
         else:
@@ -81,7 +93,13 @@ def _require_alone(commands: dict[str, str | None], more: Path | None) -> None:
 
 
 def _plan(
-    lut: Path, out: str, pictures: PictureOptions, light: LightOptions, images: ImageOptions, work: WorkOptions
+    lut: Path,
+    out: str,
+    pictures: PictureOptions,
+    light: LightOptions,
+    variation: VariationOptions,
+    images: ImageOptions,
+    work: WorkOptions,
 ) -> Plan:
     """Return the plan of a dataset whose place is free."""
     from calibration.table.lut import open_lut
@@ -91,8 +109,11 @@ def _plan(
     require_free_place(out)
     table = open_lut(lut)
     sources = pictures.find(images.seed)
-    options = images.dataset_options(work.shard_images, pictures.preparation(images.seed).describe())
-    return Plan(table, sources, light.request().choose(table, images.seed), images.seed, options)
+    options = images.dataset_options(
+        work.shard_images, pictures.preparation(images.seed).describe(), variation.variation(table), pictures.crops
+    )
+    choice = light.request().choose(table, images.seed, [source.name for source in sources], pictures.crops)
+    return Plan(table, sources, choice, images.seed, options)
 
 
 def _make_whole(plan: Plan, out: str, workers: Workers) -> Dataset:

@@ -40,6 +40,14 @@ CROPS: Final = 6
 """Purpose of the words that choose where pictures are cut."""
 ITEMS: Final = 7
 """Purpose of the words that choose what a training item shows."""
+EXPOSURES: Final = 12
+"""Purpose of the words that draw how much light an image is exposed to."""
+GRADIENTS: Final = 13
+"""Purpose of the words that shape how the light of an image falls off."""
+NOISE: Final = 14
+"""Purpose of the words that are the keys of the noise that is added to an image's rows."""
+PICTURES: Final = 15
+"""Purpose of the words that draw source pictures by their weights."""
 
 _WORD: Final = 0xFFFFFFFF
 """Mask of the lower 32 bits, a word."""
@@ -122,3 +130,10 @@ def distinct(seed: int, count: int, total: int, number: int, purpose: int) -> tu
         chosen.append(moved.get(j, j))
         moved[j] = moved.get(i, i)
     return tuple(chosen)
+
+
+def standard_normal(words: tuple[Words, Words, Words, Words]) -> npt.NDArray[np.float64]:
+    """Return standard normal (N, 2) float64 from the first two words (N,) uint32 (G. E. P. Box, M. E. Muller, 1958)."""
+    radius = np.sqrt(-2 * np.log((words[0] + 1.0) / (_WORD + 1)))
+    angle = 2 * np.pi * words[1] / (_WORD + 1)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# PyTorch loads Triton's LLVM where that is installed, which crashes a process in which Mesa has loaded its own for
+# OpenGL. No program shows a full screen and trains; a test process may do both. None keeps a module from
+# being imported.
+sys.modules.setdefault("triton", None)  # pyright: ignore[reportArgumentType]
 
 TESTS = Path(__file__).parent
 SLOW = (
@@ -29,6 +35,7 @@ SLOW = (
     "calibration/pipeline/test_options.py",
     "calibration/pipeline/test_plain_session.py",
     "calibration/pipeline/test_prefetching.py",
+    "calibration/pipeline/test_print_and_sensor.py",
     "calibration/pipeline/test_refused_table.py",
     "calibration/pipeline/test_small_charts.py",
     "calibration/radiometry/test_cell_field.py",
@@ -69,6 +76,7 @@ SLOW = (
     "generator/dataset/test_making.py",
     "generator/dataset/test_reader.py",
     "generator/dataset/test_stores.py",
+    "generator/dataset/test_varied_datasets.py",
     "generator/kernels/test_choice_statistics.py",
     "generator/kernels/test_patches.py",
     "generator/test_cli.py",
@@ -77,7 +85,9 @@ SLOW = (
     "house/test_contributing.py",
     "sim/camera/test_dng.py",
     "sim/world/test_geometry.py",
+    "sim/world/test_profile.py",
     "sim/world/test_world.py",
+    "synthesis/test_table.py",
 )
 """Folders and files, below this one, whose tests take more than their share of the minute."""
 

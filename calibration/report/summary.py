@@ -196,7 +196,8 @@ def _light_rows(figures: TableFigures) -> list[SummaryRow]:
             SummaryRow(
                 "Tint of the greys",
                 ", ".join(f"{name}: {angle:.2f}°" for name, angle in tints),
-                "angle to bare paper's camera RGB; 0 is a neutral print",
+                "angle to bare paper's camera RGB; a print through the printer's profile has 1° to 2.5°, for it is "
+                "neutral to the eye and not to the camera, one of plain ink codes 4° to 8°",
             )
         )
     return rows

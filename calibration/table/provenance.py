@@ -51,6 +51,9 @@ class Provenance(BaseModel):
         light; empty in tables made before they were recorded.
     files_sha256
         Of further files of the table, `references.csv`; empty in tables made before they were recorded.
+    computed
+        Where the table was computed from spectra and a model of the sensor and nothing was photographed: by what,
+        and with which settings. None where it was made from frames.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -69,6 +72,12 @@ class Provenance(BaseModel):
     illuminations_sha256: str | None = None
     lights_sha256: list[str] = []
     files_sha256: dict[str, str] = {}
+    computed: dict[str, Any] | None = None
+
+    def to_json(self) -> str:
+        """Return the text of `lut.json`; `computed` stands in it where the table was computed."""
+        left_out = {"computed"} if self.computed is None else set[str]()
+        return self.model_dump_json(indent=2, exclude=left_out) + "\n"
 
 
 class _Head(BaseModel):

@@ -151,8 +151,7 @@ class LutWriter:
             "illuminations_sha256": sha256_of(truth.encode()),
             "lights_sha256": lights,
         }
-        text = provenance.model_copy(update=hashes).model_dump_json(indent=2)
-        write_whole(self._folder / PROVENANCE, text + "\n")
+        write_whole(self._folder / PROVENANCE, provenance.model_copy(update=hashes).to_json())
 
 
 def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[np.float64]) -> str:

@@ -200,8 +200,10 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold(
         "grey_tint_deg", "Tint of the print's greys against paper", "°", "at most", 6.0, None,
         "greys are not neutral; the ground truth is paper's, so methods that rely on grey are judged by another grey",
-        JUDGEMENT + "; the simulated print, without colour management, has 4.5",
-        "print without colour management on matte paper, or accept it",
+        JUDGEMENT + "; simulated prints have 1 to 2.5 through the printer's profile, 4.5 (poster paper) to 8 (glossy) "
+        "where codes are ink codes, as the publication printed them",
+        "generate with --rendering colorimetric, which takes the print as it is measured; or have the chart printed "
+        "through the printer's profile (docs/printing.md)",
     ),
     Threshold(
         "noise_misfit", "Cells' noise about the photon-transfer curve", "share", "at most", 0.3, None,

@@ -333,9 +333,9 @@ def _pictures(place: str, matrix: str) -> tuple[Sequence[Source], str, str]:
     from evaluation.datasets import open_scenes
     from evaluation.datasets.opening import layout_of
     from evaluation.experiments.paper.scenes.developing import developed
-    from evaluation.experiments.transfer.matrices import choose_matrix
     from foundation.errors import FormatError, InputError
     from generator import find_pictures
+    from generator.rendering.matrices import choose_matrix
 
     chosen = choose_matrix(matrix)
     try:

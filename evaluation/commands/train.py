@@ -10,7 +10,7 @@ import typer
 from evaluation.commands.data_options import DataReading, with_data_options
 from foundation.console import EXIT_CODES
 
-LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, convnet or constant-light"
+LEARNERS_HELP = "regression-trees, smart-color-cat, color-beaver, log-chroma, kernel-ridge, convnet or constant-light"
 """The suite's own, for the help of commands."""
 
 HELP = f"""Train a method on every image of a data set and write what it has learned to a model file.

@@ -13,6 +13,9 @@ from foundation.console import EXIT_CODES
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import numpy as np
+    import numpy.typing as npt
+
     from evaluation.experiments.transfer.material import AnyLearner
     from evaluation.experiments.transfer.plan import TransferPlan
     from evaluation.experiments.transfer.rows import TransferRow
@@ -74,6 +77,14 @@ def transfer(
             metavar="CAMERA|FILE|none",
             help="Colour matrix of the naive baseline: of a camera, or a file of 3 x 3 numbers, linear sRGB to camera. "
             "\\[default: the camera of the table]",
+            show_default=False,
+        ),
+    ] = None,
+    only: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="CSV file with a column image: only these are tested; cross-validation still trains on all others.",
             show_default=False,
         ),
     ] = None,
@@ -139,6 +150,8 @@ def transfer(
     plan = plan_transfer(tested, [open_scenes(place) for place in train], naive, matrix, shared)
     told = _sizes(tested, plan, side)
     plan = replace(plan, notes=(*plan.notes, *([told] if told else []), *left_out))
+    counted, places, partly = _only(only, tested)
+    plan = replace(plan, notes=(*plan.notes, *partly))
     drawn = tuple(choose_folds(tested, folds, seed)[0] for seed in range(seeds))
     smallest = min(len(some.scenes) for some in plan.training)
     wanted = smallest if images is None else images
@@ -150,12 +163,14 @@ def transfer(
             *(side, threads, lambda: advance(next(steps), count)),
             generated=tested.name if is_generated(tested) else "",
         )
-    plan = replace(plan, notes=(*plan.notes, *_suspicions(tested, rows)))
+    rows = tuple(replace(row, results=tuple(result.at(places) for result in row.results)) for row in rows)
+    plan = replace(plan, notes=(*plan.notes, *_suspicions(counted, rows)))
     figures = figures_of(rows, error)
     settings: dict[str, Any] = {
         "methods": [describe_method(learner) for learner in learners],
         "statistics": [describe_method(method) for method in references],
         "folds": folds or ("the data set's own" if tested.folds is not None else str(FOLDS)),
+        "only": None if only is None else only.name,
         "matrix": matrix,
         "images": wanted,
         "seeds": list(range(seeds)),
@@ -164,7 +179,7 @@ def transfer(
         "error": error,
         "reading": asdict(reading),
     }
-    outcome = TransferOutcome(tested, plan, rows, figures, drawn, settings)
+    outcome = TransferOutcome(counted, tested, plan, rows, figures, drawn, settings)
     for table in outcome.tables():
         print_table(table)
         print()
@@ -198,6 +213,29 @@ def _references(text: str) -> list[Method]:
     from evaluation.commands.choosing import choose_methods
 
     return [] if text.strip().lower() == "none" else choose_methods(text.split(","))
+
+
+def _only(file: Path | None, test: SceneSet) -> tuple[SceneSet, npt.NDArray[np.int64], tuple[str, ...]]:
+    """Return the test set without the images that do not count, the places (P,) of those that do, and notes."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from evaluation.experiments.folds import read_names
+
+    if file is None:
+        return test, np.arange(len(test.scenes), dtype=np.int64), ()
+    names = read_names(file, [scene.name for scene in test.scenes])
+    places = np.array([place for place, scene in enumerate(test.scenes) if scene.name in names], dtype=np.int64)
+    told = (
+        f"{len(places)} of the {len(test.scenes)} images of {test.name} count, those of {file.name}; cross-validation "
+        "trained on the others of all"
+    )
+    return (
+        replace(test, scenes=tuple(scene for scene in test.scenes if scene.name in names), folds=None),
+        places,
+        (told,),
+    )
 
 
 def _suspicions(test: SceneSet, rows: Sequence[TransferRow]) -> tuple[str, ...]:

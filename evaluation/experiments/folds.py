@@ -166,6 +166,40 @@ def read_folds(path: Path, names: Sequence[str]) -> npt.NDArray[np.int64]:
     return folds.astype(np.int64)
 
 
+def read_names(path: Path, names: Sequence[str]) -> frozenset[str]:
+    """Return the images of a data set that a CSV file names in its column `image`.
+
+    Parameters
+    ----------
+    path
+        The file.
+    names
+        Names of the data set's images.
+
+    Raises
+    ------
+    FormatError
+        The file is not there or no such table, names no image, or one that the data set lacks.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            table = csv.DictReader(stream)
+            columns = list(table.fieldnames or ())
+            given = [row.get("image") or "" for row in table]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = (isinstance(error, OSError) and error.strerror) or str(error)
+        raise FormatError(f"cannot read images from {path}: {reason}; expected CSV with a column image") from error
+    if "image" not in columns:
+        raise FormatError(f"{path} has the columns {','.join(columns)}; expected image among them")
+    strange = sorted(set(given) - set(names))
+    if strange or not given:
+        raise FormatError(
+            f"{path} names {first_of(strange) if strange else 'no image'}; expected images of the data set, such as "
+            f"{names[0]}"
+        )
+    return frozenset(given)
+
+
 def folds_to_csv(names: Sequence[str], folds: npt.NDArray[np.int64]) -> str:
     """Return folds (N,) int64 as CSV text that `read_folds` reads: `image,fold`.
 

@@ -8,6 +8,7 @@ from evaluation.learning.color_beaver import ColorBeaver
 from evaluation.learning.constant_light import ConstantLight
 from evaluation.learning.convnet import ConvNet
 from evaluation.learning.feature_learner import FeatureLearner
+from evaluation.learning.kernel_ridge import KernelRidge
 from evaluation.learning.log_chroma import LogChroma
 from evaluation.learning.regression_trees import RegressionTrees
 from evaluation.learning.smart_color_cat import SmartColorCat
@@ -26,6 +27,7 @@ def standard_learners() -> Mapping[str, FeatureLearner]:
         SmartColorCat(),
         ColorBeaver(),
         LogChroma(),
+        KernelRidge(),
         ConvNet(),
         ConstantLight(),
     )

@@ -24,6 +24,7 @@ ERRORS_FILE = "errors.csv"
 
 _KINDS: tuple[ErrorKind, ...] = ("recovery", "reproduction")
 _TRUTH = ("truth_r", "truth_g", "truth_b")
+_ESTIMATE = ("r", "g", "b")
 _GUESSED = {"": False, "0": False, "no": False, "false": False, "1": True, "yes": True, "true": True}
 
 
@@ -43,6 +44,8 @@ class MethodErrors:
         Kind of error to (N,) float64, degrees.
     guessed
         (N,) bool, True where no pixel was usable and the estimate is therefore grey.
+    estimates
+        (N, 3) float64, linear camera RGB of any length; None where the file does not hold them all.
     """
 
     method: str
@@ -50,6 +53,7 @@ class MethodErrors:
     truths: npt.NDArray[np.float64] | None
     errors: Mapping[ErrorKind, npt.NDArray[np.float64]]
     guessed: npt.NDArray[np.bool_]
+    estimates: npt.NDArray[np.float64] | None = None
 
 
 def read_errors(place: Path | str) -> dict[str, MethodErrors]:
@@ -88,7 +92,7 @@ def read_errors(place: Path | str) -> dict[str, MethodErrors]:
             "evaluate run writes them"
         )
     known = all(name in columns for name in _TRUTH)
-    found: dict[str, dict[str, tuple[list[float], bool]]] = {}
+    found: dict[str, dict[str, tuple[list[float], bool, list[float]]]] = {}
     for row in rows:
         where = f"{path}, line {rows.line_num}"
         wanted = (*_KINDS, *(_TRUTH if known else ()))
@@ -101,21 +105,31 @@ def read_errors(place: Path | str) -> dict[str, MethodErrors]:
         images = found.setdefault(row["method"] or "", {})
         if row["image"] in images:
             raise FormatError(f"{where}: {row['method']} on {row['image']} stands there a second time; remove one")
-        images[row["image"]] = numbers, _GUESSED[guessed]
+        images[row["image"]] = numbers, _GUESSED[guessed], [_estimate(row.get(name)) for name in _ESTIMATE]
     if not found:
         raise FormatError(f"{path} has no line of errors below its head; run the methods again")
     return {method: _errors_of(method, images, known) for method, images in found.items()}
 
 
-def _errors_of(method: str, images: Mapping[str, tuple[list[float], bool]], known: bool) -> MethodErrors:
-    numbers = np.array([line for line, _ in images.values()])
+def _errors_of(method: str, images: Mapping[str, tuple[list[float], bool, list[float]]], known: bool) -> MethodErrors:
+    numbers = np.array([line for line, _, _ in images.values()])
+    estimates = np.array([estimate for _, _, estimate in images.values()])
     return MethodErrors(
         method=method,
         images=tuple(images),
         truths=numbers[:, 2:] if known else None,
         errors={kind: numbers[:, place] for place, kind in enumerate(_KINDS)},
-        guessed=np.array([guessed for _, guessed in images.values()]),
+        guessed=np.array([guessed for _, guessed, _ in images.values()]),
+        estimates=estimates if np.isfinite(estimates).all() else None,
     )
+
+
+def _estimate(text: str | None) -> float:
+    """Return a part of an estimate; NaN where there is none: nothing here is computed from it."""
+    try:
+        return float(text or "")
+    except ValueError:
+        return math.nan
 
 
 def _number(text: str | None, name: str, where: str) -> float:

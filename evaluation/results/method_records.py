@@ -24,7 +24,9 @@ from foundation.hashing import file_sha256, sha256_of
 _DEEPEST = 6
 """Levels of values within values that are followed: settings are flat, and a graph of objects may have a circle."""
 
-_HOUSE = frozenset(("evaluation", "generator", "foundation", "calibration", "acquisition", "drivers", "sim", "tests"))
+_HOUSE = frozenset(
+    ("evaluation", "generator", "synthesis", "foundation", "calibration", "acquisition", "drivers", "sim", "tests")
+)
 """This suite's packages, whose version stands beside the results."""
 
 

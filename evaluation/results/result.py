@@ -73,6 +73,25 @@ class Result:
     causes: Mapping[int, str] | None = None
     maps: MapErrors | None = None
 
+    def at(self, places: npt.NDArray[np.int64]) -> Result:
+        """Return what was made of the scenes at `places` (P,) int64 alone, in that order; errors by pixel are left out.
+
+        Examples
+        --------
+        >>> result = Result("Mine", np.eye(3), {"recovery": np.array([1.0, 2.0, 3.0])}, np.zeros(3, bool), {2: "dark"})
+        >>> some = result.at(np.array([2, 0]))
+        >>> some.errors["recovery"], some.causes
+        (array([3., 1.]), {0: 'dark'})
+        """
+        causes = self.causes
+        return Result(
+            self.method,
+            self.estimates[places],
+            {kind: errors[places] for kind, errors in self.errors.items()},
+            self.guessed[places],
+            None if causes is None else {new: causes[old] for new, old in enumerate(places.tolist()) if old in causes},
+        )
+
     def summary(self, kind: ErrorKind) -> Summary:
         """Return the numbers that sum up one kind of error, the six of the paper's tables among them."""
         return summarise(self.errors[kind])

@@ -19,14 +19,17 @@ from generator.command.grouping import option
 from generator.dataset.production.workers import Workers
 
 if TYPE_CHECKING:
+    from calibration.table.lut import Lut
     from generator.dataset.production.options import DatasetOptions
     from generator.lights.request import LightRequest
     from generator.pictures.picture import Preparation
     from generator.pictures.sources import Source
+    from generator.variation.variation import Variation
 
 _SOURCES = "Source pictures"
 _LIGHT = "Light"
 _IMAGES = "Images"
+_VARIATION = "Variation"
 _WORK = "Work"
 
 
@@ -68,6 +71,10 @@ class PictureOptions:
     crop_at: Annotated[
         Literal["centre", "random"], option(None, "Where to cut; random is chosen by the seed.", _SOURCES)
     ] = "centre"
+    crops: Annotated[
+        int,
+        option("N", "Cut N different crops of each picture, at random places far from each other.", _SOURCES, min=1),
+    ] = 1
     profiles: Annotated[
         Literal["honour", "ignore"],
         option(
@@ -80,7 +87,7 @@ class PictureOptions:
         from generator.pictures.picture import Preparation
 
         crop = None if self.crop is None else _size(self.crop, "--crop")
-        return Preparation(self.max_side, crop, self.cover, self.crop_at, self.profiles, seed)
+        return Preparation(self.max_side, crop, self.cover, self.crop_at, self.profiles, seed, self.crops)
 
     def find(self, seed: int) -> tuple[Source, ...]:
         """Return the sources: pictures that are found, then random ones.
@@ -96,9 +103,11 @@ class PictureOptions:
         places = self.sources or []
         if not places and (preparation.crop or preparation.max_side):
             raise InputError(
-                "--crop and --max-side are for pictures, and --sources names none; random ones have --size"
+                "--crop, --crops and --max-side are for pictures, and --sources names none; random ones have --size"
             )
         found: tuple[Source, ...] = find_pictures(places, preparation)
+        if self.random_scenes and self.crops > 1:
+            raise InputError("--crops is for pictures; leave --random-scenes out, or make a dataset of them alone")
         if self.random_scenes:
             found += random_scenes(self.random_scenes, *_size(self.size, "--size"), seed)
         if not found:
@@ -144,13 +153,22 @@ class LightOptions:
         Path | None,
         option(
             "GT.csv",
-            "For the picture at place i the light nearest in angle to ground truth i of this file "
-            "(columns GT_R,GT_G,GT_B or r,g,b, or lines of three numbers).",
+            "For scene i, in the order of the pictures, the light nearest in angle to ground truth i of this file, "
+            "which starts over when it ends (columns GT_R,GT_G,GT_B or r,g,b, or lines of three numbers).",
             _LIGHT,
         ),
     ] = None
     match: Annotated[
         Path | None, option("GT.csv", "The same with a mixture of lights that matches the ground truth.", _LIGHT)
+    ] = None
+    lights_by_name: Annotated[
+        Path | None,
+        option(
+            "FILE.csv",
+            "For each picture the light that this file gives for its name (columns source or name, and r,g,b), matched "
+            "by a mixture; several rows of a name are several images.",
+            _LIGHT,
+        ),
     ] = None
     outside: Annotated[
         Literal["refuse", "nearest"], option(None, "What to do about lights that the table cannot make.", _LIGHT)
@@ -180,6 +198,7 @@ class LightOptions:
             distribution=self.distribution,
             nearest=self.nearest,
             match=self.match,
+            lights_by_name=self.lights_by_name,
             outside=self.outside,
             lights_per_image=self.lights_per_image,
             masks=self.masks,
@@ -216,7 +235,9 @@ class ImageOptions:
         option("PATH", "Write a page of previews to this PNG file; with --verify of a dataset that is there.", _IMAGES),
     ] = None
 
-    def dataset_options(self, shard_images: int, reading: Mapping[str, Any]) -> DatasetOptions:
+    def dataset_options(
+        self, shard_images: int, reading: Mapping[str, Any], variation: Variation, crops: int
+    ) -> DatasetOptions:
         """Return what the dataset is to be; an InputError says which option cannot be used."""
         from generator.dataset.production.options import DatasetOptions, parse_split
 
@@ -226,7 +247,58 @@ class ImageOptions:
             previews=self.preview,
             split=None if self.split is None else parse_split(self.split),
             shard_images=shard_images,
+            variation=variation,
+            crops=crops,
             reading=reading,
+        )
+
+
+@dataclass(frozen=True)
+class VariationOptions:
+    """What differs from image to image beside scene and light."""
+
+    exposure: Annotated[
+        str | None,
+        option(
+            "KIND",
+            "Expose images anew: a factor such as .5; stops:low=-2,high=1 or normal:mean=-1,sd=.5, drawn for each; "
+            "clip:share=.01 clips that share of the pixels, level:share=.01,low=.3,high=.9 lets it reach a level over "
+            "saturation (most=8 limits the factor). Noise is that of the light, counts are cut at saturation.",
+            _VARIATION,
+        ),
+    ] = None
+    gradient: Annotated[
+        str | None,
+        option(
+            "KIND",
+            "Let the light fall off over the image by up to some stops: smooth, soft-edge, spots or window with the "
+            "numbers of --masks and stops=1,least=0,colour=0; with a colour, ln(R/G) and ln(B/G) of the far end differ "
+            "by up to that, and images have masks and maps of the ground truth.",
+            _VARIATION,
+        ),
+    ] = None
+    iso: Annotated[
+        str | None,
+        option(
+            "N/BASE",
+            "Add the noise of ISO speed N to that of the table, which was photographed with speed BASE: 1600/100, or "
+            "1600/100:read=2.5, electrons of read noise before the amplifier.",
+            _VARIATION,
+        ),
+    ] = None
+
+    def variation(self, lut: Lut) -> Variation:
+        """Return the variation of images of a table; an InputError says which option cannot be used."""
+        from generator.variation.exposures import parse_exposure
+        from generator.variation.gradients import parse_gradient
+        from generator.variation.iso_speed import parse_iso
+        from generator.variation.variation import varied_by
+
+        return varied_by(
+            lut,
+            None if self.exposure is None else parse_exposure(self.exposure),
+            None if self.gradient is None else parse_gradient(self.gradient),
+            None if self.iso is None else parse_iso(self.iso),
         )
 
 

@@ -133,7 +133,8 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
                 y = head - 0.2 if under_it else top + heights[row] + 0.15
                 for place, light in enumerate(entry.lights):
                     dot(left + 0.13 * place, y, light)
-                words = _short(" and ".join(map(partial(_label, named), entry.lights, entry.truths)), 28)
+                labels = dict.fromkeys(map(partial(_label, named), entry.lights, entry.truths))
+                words = _short(" and ".join(labels), 28)
                 size, ink = (8, _INK) if under_it else (7, _FAINT)
                 put(left + 0.05 + 0.13 * len(entry.lights), y + 0.04, words, size, ink)
         under = top + heights[row] + (0.0 if shared else caption)

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from foundation.errors import FormatError, InputError
 from generator.lights.gamut import rb_of
 from generator.named_numbers import parse_numbers
-from generator.philox import Words
+from generator.philox import Words, standard_normal
 
 _Array = npt.NDArray[np.float64]
 _WORD: Final = float(1 << 32)
@@ -64,7 +64,7 @@ class Gaussian:
 
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
         """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words."""
-        first, second = _normal(words).T
+        first, second = standard_normal(words).T
         across = self.correlation * first + np.sqrt(1 - self.correlation**2) * second
         return np.stack([self.r + self.sd_r * first, self.b + self.sd_b * across], axis=1)
 
@@ -125,7 +125,7 @@ class Fitted:
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
         """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words."""
         chosen = (words[2].astype(np.uint64) * np.uint64(len(self.rb))) >> np.uint64(32)
-        normal = _normal(words)
+        normal = standard_normal(words)
         aside = np.stack(
             [self.root[0, 0] * normal[:, 0], self.root[1, 0] * normal[:, 0] + self.root[1, 1] * normal[:, 1]], axis=1
         )
@@ -140,13 +140,6 @@ class Fitted:
             "sha256": self.sha256,
             "kernel": self.root.tolist(),
         }
-
-
-def _normal(words: tuple[Words, Words, Words, Words]) -> _Array:
-    """Return standard normal (N, 2) float64 from two words (N,) uint32 (G. E. P. Box and M. E. Muller, 1958)."""
-    radius = np.sqrt(-2 * np.log((words[0] + 1.0) / _WORD))
-    angle = 2 * np.pi * words[1] / _WORD
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
 _GAUSSIAN: Final = {
@@ -164,7 +157,8 @@ def parse_distribution(text: str) -> Distribution:
     """Return the distribution that a text names.
 
     ``uniform``; ``gaussian:r=.3,b=.25,sd=.02`` or ``gaussian:r=.3,b=.25,sd_r=.03,sd_b=.02,corr=-.8``; ``fit:GT.csv``
-    with a file as `ground_truths.load_ground_truths` reads it, or the file alone.
+    with a file as `ground_truths.load_ground_truths` reads it, or the file alone; of a `STATS.json` that
+    `evaluate describe` wrote the lights are fitted in the plane of ln(R/G) and ln(B/G) (`log_kernels`).
 
     Raises
     ------
@@ -178,13 +172,17 @@ def parse_distribution(text: str) -> Distribution:
     >>> parse_distribution("gaussian:r=.3,b=.25,sd=.02")
     Gaussian(r=0.3, b=0.25, sd_r=0.02, sd_b=0.02, correlation=0.0)
     """
-    from generator.lights.ground_truths import load_ground_truths
+    from generator.lights.ground_truths import is_statistics, load_ground_truths
 
     kind, _, rest = text.strip().partition(":")
     if kind == "uniform" and not rest:
         return Uniform()
     path = Path(rest if kind == "fit" else text)
     if (kind == "fit" and rest) or path.is_file():
+        if is_statistics(path):
+            from generator.lights.log_kernels import LogKernels
+
+            return LogKernels.of(load_ground_truths(path), path.name)
         return Fitted.of(load_ground_truths(path), path.name)
     if kind == "gaussian":
         numbers = parse_numbers(rest, _GAUSSIAN, "the distribution gaussian")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -21,6 +22,7 @@ from generator.lights.distributions import parse_distribution
 from generator.lights.gamut import Gamut, OutsideGamut
 from generator.lights.ground_truths import load_ground_truths
 from generator.lights.lighting import LightChoice
+from generator.lights.named_lights import load_named_truths, named_lights
 from generator.masks.request import parse_masks
 
 if TYPE_CHECKING:
@@ -46,6 +48,8 @@ class LightRequest:
         Where those lights are drawn from; see `lights.distributions.parse_distribution`.
     nearest, match
         Files of ground truths, for which the table's nearest lights are taken, or mixtures that match them.
+    lights_by_name
+        File of ground truths of each picture by its name, which mixtures match.
     outside
         What to do about chromaticities that the table cannot make.
     lights_per_image
@@ -60,12 +64,24 @@ class LightRequest:
     distribution: str | None = None
     nearest: Path | None = None
     match: Path | None = None
+    lights_by_name: Path | None = None
     outside: OutsideGamut = "refuse"
     lights_per_image: int | None = None
     masks: str | None = None
 
-    def choose(self, lut: Lut, seed: int) -> LightChoice:
+    def choose(self, lut: Lut, seed: int, names: Sequence[str] = (), crops: int = 1) -> LightChoice:
         """Return the choice of lights.
+
+        Parameters
+        ----------
+        lut
+            The table.
+        seed
+            Of lights and masks that are drawn.
+        names
+            Of the pictures, in the order of the sources, for lights that go by them.
+        crops
+            Of each picture.
 
         Raises
         ------
@@ -80,18 +96,19 @@ class LightRequest:
                 f"--masks {self.masks} says where several lights fall, but each image has one; ask for more with "
                 "--lights-per-image"
             )
-        choice = self._lights(lut, seed, together)
+        choice = self._lights(lut, seed, together, names, crops)
         if together == 1:
             return choice
         return SimultaneousLights(choice, together, parse_masks(self.masks or MASKS, together, seed))
 
-    def _lights(self, lut: Lut, seed: int, together: int) -> LightChoice:
+    def _lights(self, lut: Lut, seed: int, together: int, names: Sequence[str], crops: int) -> LightChoice:
         """Return the choice of lights with as many for each picture as its images have together."""
         choices = {
             "--illuminations": self.illuminations is not None,
             "--light": bool(self.light),
             "--nearest": self.nearest is not None,
             "--match": self.match is not None,
+            "--lights-by-name": self.lights_by_name is not None,
             "--distribution": self.distribution is not None,
             "--random": self.random is not None and self.distribution is None,
         }
@@ -111,6 +128,9 @@ class LightRequest:
         if self.match is not None:
             truths = load_ground_truths(self.match)
             return matched_lights(Gamut.of(lut), truths, self.match.name, together, self.outside)
+        if self.lights_by_name is not None:
+            truths_by_name, file = load_named_truths(self.lights_by_name), self.lights_by_name.name
+            return named_lights(Gamut.of(lut), truths_by_name, names, file, self.outside, crops)
         if self.distribution is not None:
             return DrawnLights(Gamut.of(lut), parse_distribution(self.distribution), count, seed)
         return RandomLights(count, len(lut.white), seed)

@@ -35,14 +35,15 @@ Shares = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class RandomStreams:
-    """Uniform random numbers of one image; each `stream` of them is independent of the others."""
+    """Uniform random numbers of one image; each `stream` of them is independent of the others, and each purpose."""
 
     seed: int
     number: int
+    purpose: int = philox.MASKS
 
     def uniform(self, stream: int, count: int = _STEP) -> npt.NDArray[np.float64]:
         """Return (count,) float64 between 0 and 1."""
-        word = philox.words(self.seed, np.arange(count), stream, self.number, philox.MASKS)[0]
+        word = philox.words(self.seed, np.arange(count), stream, self.number, self.purpose)[0]
         return (word + 0.5) / (1 << 32)
 
 

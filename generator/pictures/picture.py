@@ -15,7 +15,6 @@ These steps turn a file's values into codes, in this order, so that one picture 
 
 from __future__ import annotations
 
-import hashlib
 import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -28,7 +27,7 @@ import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
 from foundation.srgb import srgb_codes
-from generator import philox
+from generator.pictures.crop_places import random_places
 from generator.pictures.profiles import ADOBE_RGB, ASSUMED, from_adobe_rgb, to_srgb
 
 Picture = npt.NDArray[np.uint8]
@@ -58,6 +57,8 @@ class Preparation:
         Whether a picture is first made as small as still covers the crop.
     crop_at
         Where to cut: ``"centre"``, or ``"random"``, a place that the seed and the picture's name choose.
+    crops
+        How many different crops to cut; more than one are cut at random places, the first at that of one.
     profiles
         ``"honour"`` converts pictures of other colour spaces to sRGB; ``"ignore"`` takes all codes as they stand.
     seed
@@ -75,6 +76,7 @@ class Preparation:
     crop_at: Literal["centre", "random"] = "centre"
     profiles: Literal["honour", "ignore"] = "honour"
     seed: int = 0
+    crops: int = 1
 
     def __post_init__(self) -> None:
         if self.max_side is not None and self.max_side < 1:
@@ -85,6 +87,8 @@ class Preparation:
             )
         if self.crop is None and (self.cover or self.crop_at == "random"):
             raise InputError("no crop was given to cover or to cut at random; give its size, such as 512x512")
+        if self.crops < 1 or (self.crops > 1 and self.crop is None):
+            raise InputError(f"{self.crops} crops were asked for, expected 1 or more, and their size, such as 512x512")
 
     def describe(self) -> dict[str, Any]:
         """Return the options that are set, as a JSON object."""
@@ -93,11 +97,22 @@ class Preparation:
             options["max_side"] = self.max_side
         if self.crop is not None:
             options |= {"crop": list(self.crop), "cover": self.cover, "crop_at": self.crop_at}
+        if self.crops > 1:
+            options |= {"crop_at": "random", "crops": self.crops}
         return options
 
 
 UNPREPARED: Final = Preparation()
 """Nothing is done on request: the whole picture in its own size, profiles honoured."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Cut:
+    """A part of a picture: place of its top left pixel in the picture, px, and its codes (H, W, 3) uint8."""
+
+    left: int
+    top: int
+    picture: Picture
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -107,13 +122,16 @@ class Reading:
     Attributes
     ----------
     picture
-        (H, W, 3) uint8, sRGB codes.
+        (H, W, 3) uint8, sRGB codes; of several crops the first.
     profile
         How its colour profile was treated, in words, such as ``"Display P3, converted to sRGB"``.
+    cuts
+        The crops, where several were asked for.
     """
 
     picture: Picture
     profile: str
+    cuts: tuple[Cut, ...] = ()
 
 
 def read_picture(path: Path | str, max_side: int | None = None) -> Picture:
@@ -200,7 +218,8 @@ def open_picture(path: Path, preparation: Preparation = UNPREPARED, name: str | 
     else:
         codes, word = from_adobe_rgb(codes), ADOBE_RGB
     codes = _turn(codes, values.orientation)
-    return Reading(_fit(codes, preparation, path, path.name if name is None else name), word)
+    cuts = _fit(codes, preparation, path, path.name if name is None else name)
+    return Reading(cuts[0].picture, word, cuts if preparation.crops > 1 else ())
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -348,12 +367,12 @@ def _turn(picture: Picture, orientation: int) -> Picture:
     return np.ascontiguousarray(turned() if turned else picture)
 
 
-def _fit(picture: Picture, preparation: Preparation, path: Path, name: str) -> Picture:
-    """Return `picture` (H, W, 3) uint8 made smaller and cut."""
+def _fit(picture: Picture, preparation: Preparation, path: Path, name: str) -> tuple[Cut, ...]:
+    """Return `picture` (H, W, 3) uint8 made smaller and cut, in as many crops as are asked for."""
     height, width = picture.shape[:2]
     scale = 1.0 if preparation.max_side is None else preparation.max_side / max(height, width)
     if preparation.crop is None:
-        return _shrink(picture, scale)
+        return (Cut(0, 0, _shrink(picture, scale)),)
     wide, high = preparation.crop
     if preparation.cover:
         scale = min(scale, max(wide / width, high / height))
@@ -363,13 +382,18 @@ def _fit(picture: Picture, preparation: Preparation, path: Path, name: str) -> P
         raise FormatError(
             f"cannot cut {path}: it is {width}x{height} px where the crop is {wide}x{high}; ask for a smaller crop"
         )
-    left, top = (width - wide) // 2, (height - high) // 2
-    if preparation.crop_at == "random":
-        place = hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()
-        a, b, number = (int.from_bytes(place[at : at + 4], "little") for at in (0, 4, 8))
-        across, down, _, _ = philox.words(preparation.seed, a, b, number, philox.CROPS)
-        left, top = int(across) * (width - wide + 1) >> 32, int(down) * (height - high + 1) >> 32
-    return np.ascontiguousarray(picture[top : top + high, left : left + wide])
+    places = [((width - wide) // 2, (height - high) // 2)]
+    if preparation.crop_at == "random" or preparation.crops > 1:
+        free = (width - wide + 1, height - high + 1)
+        if preparation.crops > free[0] * free[1]:
+            raise FormatError(
+                f"cannot cut {path} in {preparation.crops} different crops of {wide}x{high} px: it is "
+                f"{width}x{height} px and has {free[0] * free[1]}; ask for fewer, or for smaller ones"
+            )
+        places = random_places(free, (wide, high), preparation.crops, preparation.seed, name)
+    return tuple(
+        Cut(left, top, np.ascontiguousarray(picture[top : top + high, left : left + wide])) for left, top in places
+    )
 
 
 def _shrink(picture: Picture, scale: float) -> Picture:

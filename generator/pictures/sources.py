@@ -16,7 +16,7 @@ import numpy as np
 
 from foundation.errors import FormatError, InputError, StorageError
 from generator import philox
-from generator.pictures.picture import LARGEST_SIDE, UNPREPARED, Picture, Preparation, open_picture
+from generator.pictures.picture import LARGEST_SIDE, UNPREPARED, Cut, Picture, Preparation, open_picture
 from generator.stores.places import DESCRIPTION, filesystem, is_remote, local_path
 
 if TYPE_CHECKING:
@@ -41,16 +41,19 @@ class SourcePicture:
     Attributes
     ----------
     picture
-        (H, W, 3) uint8, sRGB codes.
+        (H, W, 3) uint8, sRGB codes; of several crops the first.
     sha256
         Hash of the file's bytes; None where there is no file.
     profile
         How its colour profile was treated, in words; None where there is no file.
+    cuts
+        The crops, where several were asked for.
     """
 
     picture: Picture
     sha256: str | None = None
     profile: str | None = None
+    cuts: tuple[Cut, ...] = ()
 
 
 class Source(Protocol):
@@ -133,7 +136,7 @@ class PictureFile:
                 raise InputError(
                     f"there is not enough memory to read {self.location}; use fewer workers, or leave it out"
                 ) from error
-        return SourcePicture(reading.picture, digest.hexdigest(), reading.profile)
+        return SourcePicture(reading.picture, digest.hexdigest(), reading.profile, reading.cuts)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The simulated lab around print and camera: light, lens, paper and what is wrong with them, as one frozen value."""
+"""The simulated lab around the camera: light, lens, print and what is wrong with them, as one frozen value."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from drivers.camera import ExposureSettings
-from sim.world.spectra import LampSpectrum
+from sim.world.profile import ProfileName
+from sim.world.spectra import LampSpectrum, PaperName
 
 REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.5)
 """The exposure at which `Room.white_level_share` holds."""
@@ -14,7 +15,7 @@ REFERENCE_EXPOSURE: Final = ExposureSettings(iso=100, aperture=8.0, shutter_s=0.
 
 @dataclass(frozen=True)
 class Room:
-    """Everything about the lab that is not the print and not the camera's body.
+    """Everything about the lab that is not the chart's drawing and not the camera's body.
 
     Attributes
     ----------
@@ -65,6 +66,20 @@ class Room:
         takes six tenths of that, of red three. A thumb's is 25 mm across.
     fold_mm
         How far a crease across the print stands off its plane, 0 for none.
+    hot_per_million
+        Photosites of a million whose dark current is out of proportion, the same in all frames, 0 for none. 20 is
+        plausible for an EOS 550D of ten years, 2 for an EOS 6D Mark II of three (chosen: several times what
+        `sim.world.sensors.HotPattern` has from the literature, as bodies are not delivered without any). Where a
+        session has dark frames, `build-lut` lists the cells in which one stands out by 30 counts and more as unfit, and
+        `generate` replaces their colours; a table computed by `sim table` has none, and keeps them in its images.
+    hot_dn_per_s
+        Mean excess of such a photosite, DN per second at ISO 100; exponentially distributed. Chosen: at half a second
+        the hottest of a hundred is nearly saturated.
+    profile
+        ``unmanaged``: the file's codes are ink codes. ``managed``: a print shop's profile makes ink codes of them, so
+        that greys are grey (`sim.world.profile`).
+    paper
+        ``poster``, ``matt`` or ``glossy`` (`sim.world.spectra.paper`).
     """
 
     seed: int = 0
@@ -94,6 +109,10 @@ class Room:
     stain_mm: float = 0.0
     stain_depth: float = 0.5
     fold_mm: float = 0.0
+    hot_per_million: float = 0.0
+    hot_dn_per_s: float = 4000.0
+    profile: ProfileName = "unmanaged"
+    paper: PaperName = "poster"
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -106,7 +125,7 @@ class Room:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 … below 1 is expected")
         for name in (
             "waviness_mm", "blur_px", "response_spread", "primary_difference", "wheel_hz", "shutter_jitter_s",
-            "stain_mm", "fold_mm",
+            "stain_mm", "fold_mm", "hot_per_million", "hot_dn_per_s",
         ):  # fmt: skip
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is expected")

@@ -14,25 +14,53 @@ overprints of cyan, magenta, yellow and black mixed by Demichel's weights in the
 band; peak wavelengths, widths and the secondary absorption follow measured ramps on photo paper (yellow: density 1.25
 below 480 nm, half at 490; magenta 1.17 at 540, 0.2 at 450; cyan 1.0 at three quarters at 600 nm, half of it left at
 700), which our solids match within about 0.1 in density. The surface's own reflection (matte paper) is added after.
+What a printer's profile makes of codes: `sim.world.profile`.
+
+Papers. ``poster`` is what stands above. ``matt`` and ``glossy`` follow prints that an Epson XP-960 made without colour
+management, measured with a ColorMunki (olemagnp/print_profiles on GitHub, Argyll .ti3 files with spectra; none is
+copied): solid inks and their overprints, 400 to 730 nm, on PermaJet Matt Plus 240 and Ilford Galerie Smooth Pearl,
+which one set of inks over two surfaces matches within 2.5 CIEDE2000 on average. Over that collection, and an Epson
+P800's glossy print (metebalci/profiling-an-epson-p800-printer), the density of black is 1.63 to 1.79 on four matt photo
+papers, 2.11 to 2.51 on ten from satin to glossy, 1.46 on an art and 1.28 on an office paper; the convex hulls of
+printed colours in CIELAB under D50 have 460 000 to 540 000, 580 000 to 790 000, 402 000 and 245 000 units. A review of
+many more papers has 1.6 to 1.7 and 2.0 to 2.2 (M. McNamee, "The whole range", swpp.co.uk, 2010). Ours have hulls of
+466 000 and 596 000: four inks, where such printers have six and more. Black is even over wavelength, as pigment blacks
+measure (P800, Canon Pro-300); the XP-960's dye black lets red beyond 680 nm through, which is left out.
 """
 
 from __future__ import annotations
 
-import json
+from dataclasses import dataclass
 from functools import cache
-from importlib import resources
-from typing import Literal, cast
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from sim.world.sensitivities import read_sensitivities
 
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 5.0)
 """(81,) float64, the wavelengths of every spectrum here."""
 
 LampSpectrum = Literal["uhp", "led"]
 
+PaperName = Literal["poster", "matt", "glossy"]
+"""Papers of the simulated print."""
+
 SURFACE_REFLECTANCE = 0.03
-"""Light that matte paper returns before it meets ink (share of the incident)."""
+"""Light that plain matte paper returns before it meets ink (share of the incident)."""
+
+MATT_SURFACE = 0.0165
+"""The same of coated matt photo paper: the measured matt black is 0.016 to 0.026 from 400 to 660 nm."""
+
+GLOSSY_SURFACE = 0.0035
+"""The same of glossy paper, lit off the mirror's angle: the measured glossy black falls to 0.0038."""
+
+MATT_BLACK = 1.8
+"""Density of solid matt black below the surface, so that the density of black is that of the measured paper."""
+
+GLOSSY_BLACK = 2.0
+"""Density of solid photo black below the surface, for the same reason."""
 
 YULE_NIELSEN_N = 2.0
 """Yule-Nielsen factor; 2 is full optical dot gain."""
@@ -41,8 +69,8 @@ DOT_GAIN = 0.14
 """Mechanical dot gain: how much a coverage of one half grows."""
 
 _BLACK_GENERATION = 0.9
-"""Coverage of black where all three inks are full; below 1, so that black never hides them wholly (chosen, not
-measured)."""
+"""Coverage of black on poster paper where all three inks are full; below 1, so that black never hides them wholly
+(chosen, not measured)."""
 _UNDERCOLOUR_REMOVAL = 0.4
 """Share of the black by which each of the three inks is reduced; partial, so that dark cells keep their inks
 (chosen)."""
@@ -86,6 +114,46 @@ def projector_primaries(lamp: LampSpectrum = "uhp") -> NDArray[np.float64]:
     return power * np.array(balance)[:, None]
 
 
+@dataclass(frozen=True, eq=False)
+class InkedPaper:
+    """A paper and the inks on it.
+
+    Attributes
+    ----------
+    white
+        (81,) float64, reflectance of the bare paper.
+    inks
+        (4, 81) float64, optical density of solid cyan, magenta, yellow and black over white, surface left out.
+    surface
+        Share of the incident light that the surface sends to the camera before it meets ink.
+    black_generation
+        Coverage of black where all three inks are full.
+    undercolour_removal
+        Share of the black by which each of the three inks is reduced.
+    """
+
+    white: NDArray[np.float64]
+    inks: NDArray[np.float64]
+    surface: float
+    black_generation: float
+    undercolour_removal: float
+
+    def overprints(self) -> NDArray[np.float64]:
+        """Return (16, 81) float64, reflectance below the surface of the overprints, in the order of `shares`."""
+        densities = np.zeros((1, len(WAVELENGTHS_NM)))
+        for density in self.inks:
+            densities = np.concatenate([densities, densities + density], axis=0)
+        return (self.white - self.surface) / (1 - self.surface) * 10.0**-densities
+
+    def shares(self, coverage: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (N, 16) float64, Demichel's share of each overprint where inks are set to cover (N, 4)."""
+        covered = coverage + 4 * DOT_GAIN * coverage * (1 - coverage)
+        weights = np.ones((len(covered), 1))
+        for ink in covered.T:
+            weights = np.concatenate([weights * (1 - ink)[:, None], weights * ink[:, None]], axis=1)
+        return weights
+
+
 def paper_white() -> NDArray[np.float64]:
     """Return (81,) float64, the reflectance of bare paper: slightly blue by its brightener, absorbing near ultraviolet.
 
@@ -94,7 +162,7 @@ def paper_white() -> NDArray[np.float64]:
     return (0.45 + 0.405 * _rise(402, 9)) + 0.075 * _gauss(452, 22, 50) + 0.03 * _rise(680, 15)
 
 
-def _ink_densities() -> NDArray[np.float64]:
+def _poster_inks() -> NDArray[np.float64]:
     """Return (4, 81) float64: optical density of solid cyan, magenta, yellow and black over white."""
     cyan = 1.40 * _gauss(606, 48, 85) + 0.12 * _gauss(380, 30)
     magenta = 1.17 * _gauss(542, 45, 29) + 0.10 * _gauss(400, 40)
@@ -103,49 +171,84 @@ def _ink_densities() -> NDArray[np.float64]:
     return np.stack([cyan, magenta, yellow, black])
 
 
-def ink_coverage(rgb: ArrayLike) -> NDArray[np.float64]:
+def _photo_inks(black: float) -> NDArray[np.float64]:
+    """Return (4, 81) float64: the same of a photo printer, with a black of even density as pigment blacks have it.
+
+    Least squares over cyan, magenta, yellow and their overprints, 400 … 730 nm, on a glossy and a matt paper.
+    """
+    cyan = 1.85 * (_gauss(596, 37, 81) + 0.14 * _gauss(380, 75))
+    magenta = 1.77 * (_gauss(548, 59, 29) + 0.10 * _gauss(397, 20))
+    yellow = 1.84 * (1 - _rise(492, 11))
+    return np.stack([cyan, magenta, yellow, np.full_like(WAVELENGTHS_NM, black)])
+
+
+@cache
+def paper(name: PaperName) -> InkedPaper:
+    """Return a paper with its inks.
+
+    Parameters
+    ----------
+    name
+        ``poster``: plain matt paper with little ink, density of black 1.5 absolute, 1.43 over white.
+        ``matt``: coated matt photo paper, 1.7 absolute. ``glossy``: resin-coated photo paper, 2.3 absolute. The head of
+        this file names the measurements.
+
+    Raises
+    ------
+    ValueError
+        There is no such paper.
+    """
+    if name == "poster":
+        return InkedPaper(paper_white(), _poster_inks(), SURFACE_REFLECTANCE, _BLACK_GENERATION, _UNDERCOLOUR_REMOVAL)
+    if name == "matt":
+        white = (0.45 + 0.43 * _rise(402, 9)) + 0.045 * _gauss(452, 22, 50) + 0.035 * _rise(640, 15)
+        return InkedPaper(white, _photo_inks(MATT_BLACK), MATT_SURFACE, 1.0, 0.5)
+    if name == "glossy":
+        return InkedPaper(paper_white(), _photo_inks(GLOSSY_BLACK), GLOSSY_SURFACE, 1.0, 0.5)
+    raise ValueError(f"paper {name!r}: known are {', '.join(get_args(PaperName))}")
+
+
+def ink_coverage(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
     """Return the share of the paper that each ink is set to cover.
 
     Parameters
     ----------
     rgb
         (..., 3) float or int codes 0 … 255.
+    on
+        The paper; poster paper limits black to 0.9 and reduces the inks by 0.4 of it, the others to 1 and by 0.5.
 
     Returns
     -------
     ndarray
         (..., 4) float64 in 0 … 1, cyan, magenta, yellow, black: the complement of the code, with grey component
-        replacement: black grows with the square of the least of the three, which lose 0.4 of it.
+        replacement: black grows with the square of the least of the three, which lose a share of it.
     """
+    chosen = paper(on)
     cmy = 1 - np.asarray(rgb, dtype=np.float64) / 255
-    black = _BLACK_GENERATION * cmy.min(axis=-1, keepdims=True) ** 2
-    return np.concatenate([cmy - _UNDERCOLOUR_REMOVAL * black, black], axis=-1)
+    black = chosen.black_generation * cmy.min(axis=-1, keepdims=True) ** 2
+    return np.concatenate([cmy - chosen.undercolour_removal * black, black], axis=-1)
 
 
-def print_reflectance(rgb: ArrayLike) -> NDArray[np.float64]:
-    """Return the reflectance of printed codes; (255, 255, 255) is bare paper.
+def print_reflectance(rgb: ArrayLike, on: PaperName = "poster") -> NDArray[np.float64]:
+    """Return the reflectance of printed ink codes; (255, 255, 255) is bare paper.
 
     Parameters
     ----------
     rgb
         (N, 3) float or int codes 0 … 255.
+    on
+        The paper.
 
     Returns
     -------
     ndarray
-        (N, 81) float64, 0 … 1, never below `SURFACE_REFLECTANCE`.
+        (N, 81) float64, 0 … 1, never below the reflectance of the paper's surface.
     """
-    asked = ink_coverage(rgb)
-    covered = asked + 4 * DOT_GAIN * asked * (1 - asked)
-    weights = np.ones((len(covered), 1))
-    densities = np.zeros((1, len(WAVELENGTHS_NM)))
-    for ink, density in zip(covered.T, _ink_densities(), strict=True):
-        weights = np.concatenate([weights * (1 - ink)[:, None], weights * ink[:, None]], axis=1)
-        densities = np.concatenate([densities, densities + density], axis=0)
-    body = (paper_white() - SURFACE_REFLECTANCE) / (1 - SURFACE_REFLECTANCE)
-    overprints = body * 10.0**-densities
-    mixed = (weights @ overprints ** (1 / YULE_NIELSEN_N)) ** YULE_NIELSEN_N
-    return SURFACE_REFLECTANCE + (1 - SURFACE_REFLECTANCE) * mixed
+    chosen = paper(on)
+    weights = chosen.shares(ink_coverage(rgb, on))
+    mixed = (weights @ chosen.overprints() ** (1 / YULE_NIELSEN_N)) ** YULE_NIELSEN_N
+    return chosen.surface + (1 - chosen.surface) * mixed
 
 
 @cache
@@ -155,16 +258,19 @@ def sensitivities(name: str) -> NDArray[np.float64]:
     Parameters
     ----------
     name
-        ``Canon_EOS_600D`` (the sensor generation of the EOS 550D) or ``Canon_EOS_200D`` (that of the EOS 6D Mark II).
+        ``Canon_EOS_600D`` (the sensor generation of the EOS 550D), ``Canon_EOS_200D`` (that of the EOS 6D Mark II),
+        another of `sim.world.sensitivities.known_sensitivities`, or the path of a file.
 
     Returns
     -------
     ndarray
-        (81, 3) float64, R, G, B, relative to the peak of G; read-only.
+        (81, 3) float64, R, G, B, relative; read-only. Those of `sim.data` are relative to the peak of G.
+
+    Raises
+    ------
+    InputError, FormatError
+        See `sim.world.sensitivities.read_sensitivities`.
     """
-    text = resources.files("sim").joinpath("data", f"{name}_380_780_5.json").read_text(encoding="utf-8")
-    document = cast("dict[str, dict[str, dict[str, dict[str, list[float]]]]]", json.loads(text))
-    table = document["spectral_data"]["data"]["main"]
-    curves = np.array([table[f"{wavelength:.0f}"] for wavelength in WAVELENGTHS_NM])
+    curves = read_sensitivities(name).at(WAVELENGTHS_NM)
     curves.setflags(write=False)
     return curves

@@ -30,9 +30,10 @@ from foundation.processors import processor_count
 from foundation.srgb import decode_srgb
 from sim.world.drawing import PAPER, Print, label_map
 from sim.world.geometry import Folded, View, Waviness
+from sim.world.profile import printed_reflectance
 from sim.world.room import REFERENCE_EXPOSURE, Room
-from sim.world.sensors import Body
-from sim.world.spectra import print_reflectance, projector_primaries, sensitivities
+from sim.world.sensors import Body, HotPattern
+from sim.world.spectra import projector_primaries, sensitivities
 from sim.world.wear import Fold, Stain
 
 _BACKDROP_REFLECTANCE: Final = 0.04
@@ -75,10 +76,11 @@ class World:
         )
         self._primaries = projector_primaries(room.lamp_spectrum)
         self._sensitivities = sensitivities(body.sensitivities)
-        paper = np.einsum("pl,l,lc->c", self._primaries, print_reflectance([PAPER])[0], self._sensitivities)
+        paper = np.einsum("pl,l,lc->c", self._primaries, self._reflectance([PAPER])[0], self._sensitivities)
         self._dn = room.white_level_share * (body.saturation - body.black) / float(paper.max())
         self._lens, self._falloff = self._shading()
         self._falloff[:, 3] = self._balance()
+        self.hot = HotPattern.drawn(self._random(6), body.sensor, room.hot_per_million, room.hot_dn_per_s)
         self._lock = threading.Lock()
         self._light: NDArray[np.float32] | None = None
 
@@ -120,12 +122,29 @@ class World:
                 part = light[:, top - visible.top : bottom - visible.top] if seen else light[:, : bottom - top, :0]
                 noise_rows, rows = noise[top - first : bottom - first], frame[top:bottom]
                 counts(part, weights, noise_rows, visible.left, black, noise_dn, gain_e, body.saturation, rows)
+            self._heat(frame[first:last], noise, weights, settings, first)
 
         _in_blocks(body.sensor[0], block)
         return frame
 
+    def _heat(
+        self,
+        frame: NDArray[np.uint16],
+        noise: NDArray[np.float32],
+        drive: NDArray[np.float32],
+        settings: ExposureSettings,
+        first: int,
+    ) -> None:
+        """Raise the counts of hot photosites among some rows of a frame, the first of which is `first`."""
+        hot, visible, light = self.hot.within(first, first + len(frame)), self.body.visible, self._render()
+        y, x = hot.rows + first - visible.top, hot.columns - visible.left
+        seen = (y >= 0) & (y < visible.height) & (x >= 0) & (x < visible.width)
+        lit = np.zeros(len(hot.rows))
+        lit[seen] = drive.astype(np.float64) @ light[:, y[seen], x[seen]]
+        hot.raise_counts(frame, noise, lit, self.body, settings.iso, settings.shutter_s)
+
     def signal(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float32]:
-        """Return what a frame would be without noise, black and clipping.
+        """Return what a frame would be without noise, black, hot photosites and clipping.
 
         Parameters
         ----------
@@ -165,7 +184,7 @@ class World:
         ndarray
             (N, 3) float64, DN above black where `field` is 1, leak and ambient light included, without clipping.
         """
-        return self._signals(print_reflectance(rgb)) @ self._drive(colour, settings, lamp)
+        return self._signals(self._reflectance(rgb)) @ self._drive(colour, settings, lamp)
 
     def seen(
         self,
@@ -193,7 +212,32 @@ class World:
             stain and fold included.
         """
         light = self.field(points_mm) * self._drive(colour, settings, lamp)
-        return np.einsum("ncp,np->nc", self._signals(print_reflectance(rgb)), light) * self.worn(points_mm)
+        return np.einsum("ncp,np->nc", self._signals(self._reflectance(rgb)), light) * self.worn(points_mm)
+
+    def of_primaries(self, rgb: ArrayLike, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what printed codes at points of a clean flat print give under each primary alone, at full drive.
+
+        Parameters
+        ----------
+        rgb
+            (N, 3) float or int codes 0 … 255.
+        points_mm
+            (N, 2) float64.
+
+        Returns
+        -------
+        ndarray
+            (N, 3, 3) float64, DN above black at the reference exposure, [point, channel, primary], where nothing is
+            blurred. Its product with `drive` is `seen`, without stain and fold.
+        """
+        return self._signals(self._reflectance(rgb)) * self.field(points_mm)[:, None]
+
+    def drive(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float64]:
+        """Return (3,) float64: how much of each primary's light at full drive a frame collects, gain included.
+
+        Parameters are those of `expose`.
+        """
+        return self._drive(colour, settings, lamp)
 
     def worn(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what stain and fold leave of the light of a clean flat print.
@@ -284,6 +328,10 @@ class World:
         time = settings.shutter_s / reference.shutter_s
         return shown * time * (reference.aperture / settings.aperture) ** 2 * (settings.iso / reference.iso)
 
+    def _reflectance(self, rgb: ArrayLike) -> NDArray[np.float64]:
+        """Return (N, 81): reflectance of the chart's codes (N, 3) on this print."""
+        return printed_reflectance(rgb, self.room.profile, self.room.paper)
+
     def _signals(self, reflectance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (N, 3, 3): DN of (N, 81) reflectances at the reference exposure, [colour, channel, primary]."""
         seen = self._primaries[None] * self._sensitivities.T[:, None] * self._dn
@@ -305,7 +353,7 @@ class World:
         visible, room = self.body.visible, self.room
         drawing = label_map(self.sheet)
         backdrop = np.full((1, len(self._sensitivities)), _BACKDROP_REFLECTANCE)
-        reflectance = np.concatenate([print_reflectance(drawing.codes), backdrop])
+        reflectance = np.concatenate([self._reflectance(drawing.codes), backdrop])
         table = self._signals(reflectance).astype(np.float32)
         nodes = self._nodes()
         # A uniform aperture of one photosite has a variance of 1/12.

@@ -98,7 +98,7 @@ def test_only_the_decorator_keeps_machine_code() -> None:
     """`cache=True` anywhere else would fail where there is no folder for it."""
     caching = [
         str(path.relative_to(ROOT))
-        for package in ("drivers", "sim", "acquisition", "calibration", "generator", "evaluation")
+        for package in ("drivers", "sim", "acquisition", "calibration", "synthesis", "generator", "evaluation")
         for path in (ROOT / package).rglob("*.py")
         if "cache=True" in path.read_text()
     ]

@@ -18,9 +18,9 @@ COMMANDS = {
     "build-lut": "calibration.cli",
     "generate": "generator.cli",
     "evaluate": "evaluation.cli",
-    "sim": "sim.cli",
+    "sim": "synthesis.cli",
 }
-ROOMS = ("drivers", "sim", "acquisition", "calibration", "generator", "evaluation")
+ROOMS = ("drivers", "sim", "acquisition", "calibration", "synthesis", "generator", "evaluation")
 HEAVY = (
     *("numba", "matplotlib", "colour", "rawpy", "cv2", "scipy", "tifffile", "OpenImageIO", "reportlab"),
     *("distributed", "pyarrow", "torch", "zarr"),

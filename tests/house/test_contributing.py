@@ -15,7 +15,18 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-COPIED = ("foundation", "drivers", "sim", "acquisition", "calibration", "generator", "evaluation", "tests", "examples")
+COPIED = (
+    "foundation",
+    "drivers",
+    "sim",
+    "acquisition",
+    "calibration",
+    "synthesis",
+    "generator",
+    "evaluation",
+    "tests",
+    "examples",
+)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from evaluation.datasets.published.mat5 import check_mat5
 from foundation.errors import FormatError
 
 
@@ -23,6 +24,7 @@ def read_mat(path: Path) -> Mapping[str, Any]:
     from scipy.io import loadmat
 
     try:
+        check_mat5(path.read_bytes())
         return loadmat(path)
     except NotImplementedError as error:
         raise FormatError(f"{path} is of MATLAB's version 7.3, expected 7 at most; save it with -v7") from error

@@ -16,9 +16,7 @@ import numpy.typing as npt
 
 from evaluation.scene import Image, MixedScene, Scene
 from foundation.errors import FormatError
-
-CELLS: Final = 64
-"""Cells a side: the size of the thumbnails that colour constancy is learned from (FFCC, and the sets at hand)."""
+from generator.statistics.image_numbers import CELLS, cell_borders
 
 LEVELS: Final = 4096
 """Steps of a share of saturation in which exposures are counted: 12 bits, a quarter of a raw file's."""
@@ -101,7 +99,7 @@ def reduce_scene(scene: Scene, image: Image, mask: npt.NDArray[np.bool_] | None,
         The scene's ground truth is no light.
     """
     height, width = image.shape[:2]
-    rows, columns = _borders(height, side), _borders(width, side)
+    rows, columns = cell_borders(height, side), cell_borders(width, side)
     light = _even(np.asarray(scene.truth, dtype=np.float64))
     if not (np.isfinite(light).all() and light.min() > 0):
         raise FormatError(
@@ -140,12 +138,6 @@ def reduce_scene(scene: Scene, image: Image, mask: npt.NDArray[np.bool_] | None,
         enough = (used >= _USABLE * area) & (used > 0)
         colours[first:last][enough] = sums[enough] / used[enough][:, None]
     return Cells(colours, height * width, masked, clipped, levels)
-
-
-def _borders(size: int, side: int) -> npt.NDArray[np.int64]:
-    """Return where cells begin along one side, and where the last ends."""
-    count = min(side or size, size)
-    return np.arange(count + 1, dtype=np.int64) * size // count
 
 
 def _bands(rows: npt.NDArray[np.int64], width: int) -> Iterator[tuple[int, int]]:

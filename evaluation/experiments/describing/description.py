@@ -11,15 +11,14 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.describing.cells import CELLS
-from evaluation.experiments.describing.lights import log_chroma
-from evaluation.experiments.describing.measuring import CHROMA_EDGES, LUMINANCE_EDGES, measure_scene
+from evaluation.experiments.describing.measuring import measure_scene
 from evaluation.experiments.describing.noise import NoiseCurve, photon_transfer
 from evaluation.experiments.describing.quantities import QUANTITIES, Summed
 from evaluation.experiments.folds import group_of
 from evaluation.scene import MixedScene, SceneSet
 from foundation.errors import InputError
 from foundation.processors import ordered_map
+from generator.statistics.image_numbers import CELLS, CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
 
 OF_LIGHTS: Final = {"light_red": 0, "light_blue": 1}
 """Numbers that each light has, and not each image: places of ln(R/G) and ln(B/G)."""

@@ -8,6 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from generator.statistics.image_numbers import log_chroma
+
 _COMPARED: Final = 1000
 """Lights of a set that the energy distance is taken of, at most: distances of all pairs are held."""
 
@@ -43,12 +45,6 @@ class LightDistribution:
     along: float
     across: float
     hull_area: float
-
-
-def log_chroma(lights: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return ln(R/G) and ln(B/G) (N, 2) float64 of colours (N, 3) float above 0."""
-    given = np.log(np.asarray(lights, dtype=np.float64))
-    return given[:, [0, 2]] - given[:, 1:2]
 
 
 def light_distribution(lights: npt.ArrayLike) -> LightDistribution:

@@ -9,14 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal
 
-LUMINANCE_PERCENTS: Final = (1, 5, 25, 50, 75, 95)
-"""Percentiles of luminance, as shares of the 99th: the brightest percent is lamps and highlights."""
-
-GREY_DEG: Final = 3.0
-"""Degrees from white up to which a cell is near grey: about what a good method's median error is."""
-
-DARK: Final = 0.001
-"""Least luminance in a gradient, as a share of the 99th percentile: a logarithm needs one."""
+from generator.statistics.image_numbers import GREY_DEG, LUMINANCE_PERCENTS
 
 Summed = Literal["median", "mean", "spread"]
 """How numbers of images become one of the set; the spread is their standard deviation."""

@@ -8,12 +8,12 @@ import numpy as np
 
 from evaluation.experiments.describing.against import TOLERANCE, FigureCompared, compare_figures, sentence
 from evaluation.experiments.describing.description import DataDescription, figures, known_values
-from evaluation.experiments.describing.lights import energy_distance, light_distribution, log_chroma
-from evaluation.experiments.describing.measuring import CHROMA_EDGES, LUMINANCE_EDGES
+from evaluation.experiments.describing.lights import energy_distance, light_distribution
 from evaluation.experiments.describing.quantities import QUANTITIES
 from evaluation.reports.description_figures import chroma_figure, lights_figure, luminance_figure, noise_figure
 from evaluation.reports.page import Part, figure_part, heading, page, paragraph, row_part, table_part
 from evaluation.results.tables import Table
+from generator.statistics.image_numbers import CHROMA_EDGES, LUMINANCE_EDGES, log_chroma
 
 
 def figures_table(description: DataDescription) -> Table:

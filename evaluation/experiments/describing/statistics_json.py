@@ -18,17 +18,12 @@ import numpy.typing as npt
 
 from evaluation.experiments.describing.description import OF_LIGHTS, DataDescription, figures, known_values
 from evaluation.experiments.describing.lights import light_distribution
-from evaluation.experiments.describing.measuring import CHROMA_EDGES, LUMINANCE_EDGES
 from evaluation.experiments.describing.noise import NoiseCurve, NoiseLevel
 from evaluation.experiments.describing.quantities import QUANTITIES
 from foundation.errors import FormatError
 from foundation.version import software
-
-FORMAT: Final = "crop.statistics"
-"""What the file calls itself."""
-
-VERSION: Final = 1
-"""Of the format; raised when a reader of the version before would misread a file."""
+from generator.statistics.image_numbers import CHROMA_EDGES, LUMINANCE_EDGES
+from generator.statistics.statistics_file import FORMAT, VERSION, lights_of, read_content
 
 QUANTILES: Final = (0, 1, 5, 10, 25, 50, 75, 90, 95, 99, 100)
 """Percents at which the distribution of a number over the images is written."""
@@ -92,16 +87,7 @@ def read_statistics(path: Path | str) -> DataDescription:
     FormatError
         There is no such file, it is of another format or version, or a part of it is missing.
     """
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise FormatError(f"{path} cannot be read as statistics: {error}; write one with evaluate describe") from error
-    known = cast("Mapping[str, Any]", content if isinstance(content, dict) else {})
-    if (known.get("format"), known.get("version")) != (FORMAT, VERSION):
-        raise FormatError(
-            f"{path} is of format {known.get('format')}, version {known.get('version')}; expected {FORMAT}, version "
-            f"{VERSION}: write it anew with evaluate describe DATA --out STATS.json"
-        )
+    known, _ = read_content(path)
     try:
         return _description(known)
     except (KeyError, TypeError, ValueError) as error:
@@ -117,9 +103,6 @@ def _description(content: Mapping[str, Any]) -> DataDescription:
     missing = {quantity.value for quantity in QUANTITIES} - values.keys() - OF_LIGHTS.keys()
     if missing or any(given.shape != (len(images),) for given in values.values()):
         raise ValueError(f"values of {len(images)} images expected, and of {', '.join(sorted(missing)) or 'each name'}")
-    lights = _array(content["lights"])
-    if lights.ndim != 2 or lights.shape[1] != 3 or not (np.isfinite(lights) & (lights > 0)).all():
-        raise ValueError(f"lights of shape {lights.shape}, expected (L, 3), all above 0")
     luminance, chroma = _array(content["luminance"]["shares"]), _array(content["chroma"]["shares"])
     if luminance.shape != (len(LUMINANCE_EDGES) - 1,) or chroma.shape != (len(CHROMA_EDGES) - 1,) * 2:
         raise ValueError(f"histograms of {luminance.shape} and {chroma.shape} bins")
@@ -134,7 +117,7 @@ def _description(content: Mapping[str, Any]) -> DataDescription:
         sizes=tuple((int(size["width"]), int(size["height"]), int(size["images"])) for size in content["sizes"]),
         masked=float(content["masked"]),
         values=values,
-        lights=lights,
+        lights=lights_of(content),
         luminance=luminance,
         chroma=chroma,
         noise_unit=noise["unit"],

@@ -3,8 +3,8 @@
 The paper's 550D tables give White-Patch mean errors of 9 to 26°, which noise cannot: the largest of thousands of normal
 deviates lies a few standard deviations above the mean, some percent of a white. A photosite whose dark signal is high
 can be above every white of its channel, and the largest value of an image is then its. The simulated sensors have shot
-and read noise and no such photosites, and `build-lut` is told nothing of any; here some are put into a table that is
-read, and nothing is written.
+and read noise and, unless a room asks for them, no such photosites, and `build-lut` is told nothing of any; here some
+are put into a table that is read, and nothing is written.
 
 A hot photosite is one of a table's values (colour, sample, channel), the same under every light as on a sensor that
 stands still. Its dark signal, drawn evenly from 0 to saturation, is added, and the sum cut below saturation, since
@@ -160,6 +160,6 @@ def hot_table(rows: Sequence[HotRow], kind: ErrorKind) -> Table:
         tuple((row.title, row.per_million, row.count, *row.result.summary(kind).as_tuple()) for row in rows),
         notes=(
             "A model: dark signals drawn evenly up to saturation, at the same places under every light. The simulated "
-            "sensors have none.",
+            "sensors have none unless their room asks for some.",
         ),
     )

@@ -17,11 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from evaluation.datasets.generated import GeneratedScene
-from evaluation.experiments.transfer.matrices import ColourMatrix
 from evaluation.experiments.transfer.pictures import FoundPicture
 from foundation.errors import FormatError
 from foundation.srgb import decode_srgb
 from generator.lights.lighting import parse_mixture
+from generator.rendering.matrices import ColourMatrix
 
 _LINEAR: Final = decode_srgb(np.arange(256) / 255)
 """Linear light 0 … 1 of each code."""

@@ -41,18 +41,21 @@ class TransferOutcome:
     Attributes
     ----------
     test
-        The test set as it was opened, N images.
+        The test set, N images: of `crossed` those that count.
+    crossed
+        The test set as it was opened, M images, on which methods were cross-validated.
     plan
         What was trained on.
     rows, figures
         The results and what they come to.
     folds
-        For each seed the fold of each test image, (N,) int64.
+        For each seed the fold of each image of `crossed`, (M,) int64.
     settings
         What was asked for, as JSON has it.
     """
 
     test: SceneSet
+    crossed: SceneSet
     plan: TransferPlan
     rows: tuple[TransferRow, ...]
     figures: TransferFigures
@@ -75,10 +78,8 @@ def labelled_results(rows: Sequence[TransferRow]) -> tuple[Result, ...]:
     """Return the results of all rows, each under a name of its own: method, training and, of several, the seed."""
     named: list[Result] = []
     for row in rows:
-        training = "" if row.kind == "none" else f", {row.training}"
-        for seed, result in enumerate(row.results):
-            ending = f", seed {seed}" if len(row.results) > 1 else ""
-            named.append(replace(result, method=f"{row.method}{training}{ending}"))
+        labels = row.labels(len(row.results))
+        named += [replace(result, method=label) for result, label in zip(row.results, labels, strict=True)]
     return tuple(named)
 
 
@@ -93,12 +94,13 @@ def save_outcome(outcome: TransferOutcome, folder: Path) -> None:
         The disk is full, read-only or gone; nothing is left behind.
     """
     names = [scene.name for scene in outcome.test.scenes]
+    every = [scene.name for scene in outcome.crossed.scenes]
     truths = np.stack([scene.truth for scene in outcome.test.scenes])
     with whole_folder(folder, "the results") as partial:
         write_whole(partial / "results.csv", table_to_csv(long_table(outcome.figures)))
         write_whole(partial / "errors.csv", errors_csv(names, truths, labelled_results(outcome.rows)))
         for seed, folds in enumerate(outcome.folds):
-            write_whole(partial / f"folds_{seed}.csv", folds_to_csv(names, folds))
+            write_whole(partial / f"folds_{seed}.csv", folds_to_csv(every, folds))
         write_whole(partial / "tables.tex", "\n".join(table_to_latex(table) for table in outcome.tables()))
         write_whole(partial / "report.html", report_page(outcome))
         write_whole(partial / "run.json", json.dumps(_provenance(outcome), indent=2, ensure_ascii=False) + "\n")

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evaluation.datasets.generated import GeneratedScene
-from evaluation.experiments.transfer.matrices import ColourMatrix, camera_matrix, choose_matrix
 from evaluation.experiments.transfer.naive import naive_scenes
 from evaluation.experiments.transfer.overlap import Shared, trainable_images
 from evaluation.experiments.transfer.pictures import find_sources
 from evaluation.experiments.transfer.rows import TrainingSet
 from evaluation.scene import Scene, SceneSet
 from foundation.errors import InputError, first_of
+from generator.rendering.matrices import ColourMatrix, camera_matrix, choose_matrix
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,6 +95,17 @@ class TransferRow:
             case "none":
                 return "none"
 
+    def labels(self, seeds: int) -> tuple[str, ...]:
+        """Return the names of its results in errors.csv: method, training and, of several seeds, the seed.
+
+        Examples
+        --------
+        >>> TransferRow("Trees", "naive", "made", 9, ()).labels(2)
+        ('Trees, made: linear sRGB × light, seed 0', 'Trees, made: linear sRGB × light, seed 1')
+        """
+        name = self.method if self.kind == "none" else f"{self.method}, {self.training}"
+        return (name,) if seeds == 1 else tuple(f"{name}, seed {seed}" for seed in range(seeds))
+
 
 def draw_images(count: int, wanted: int, seed: int) -> Places:
     """Return which of `count` images to train on, (P,) int64 in ascending order, P = `wanted`, drawn by a seed.

@@ -107,7 +107,7 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
             for source in fresh:
                 listed.write(_source_row(source))
                 counts["sources"] += 1
-                counts["pixels"] += source.width * source.height
+                counts["pixels"] += source.width * source.height * int(options.get("crops", 1))
                 counts["replaced"] += source.replaced_pixels
             skipped += left_out
             for image in record.images:

@@ -9,6 +9,7 @@ from typing import Any, Final, get_args
 from foundation.errors import InputError
 from generator.dataset.production.records import Layout
 from generator.files.formats import FORMATS, Format
+from generator.variation.variation import NO_VARIATION, Variation
 
 SHARD_IMAGES: Final = 256
 """Images of a shard unless said otherwise: all that a kill can cost, for each shard that was being made."""
@@ -30,6 +31,10 @@ class DatasetOptions:
         Shares of train, validation and test, 0 … 1, sum 1; None leaves the dataset undivided.
     shard_images
         Images of one shard, 1 or more.
+    variation
+        What differs from image to image beside scene and light; see `generator.variation`.
+    crops
+        Crops of each picture, 1 or more; of more than one the sources must have as many.
     reading
         How sources were read, as plain values; recorded only.
 
@@ -52,12 +57,14 @@ class DatasetOptions:
     previews: bool = True
     split: tuple[float, float, float] | None = None
     shard_images: int = SHARD_IMAGES
+    variation: Variation = NO_VARIATION
+    crops: int = 1
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     @property
     def has_details(self) -> bool:
         """Whether options do something to each image that is recorded of it: `images.csv` lists it then."""
-        return False
+        return self.variation.is_on or self.crops > 1
 
     def __post_init__(self) -> None:
         for what, value, known in (("format", self.form, FORMATS), ("layout", self.layout, get_args(Layout))):
@@ -65,6 +72,8 @@ class DatasetOptions:
                 raise InputError(f"{value!r} is no {what} of a dataset; use one of {', '.join(known)}")
         if self.shard_images < 1:
             raise InputError(f"shards of {self.shard_images} images were asked for, expected 1 or more")
+        if self.crops < 1:
+            raise InputError(f"{self.crops} crops of each picture were asked for, expected 1 or more")
         split = self.split
         if split is not None and not (len(split) == 3 and min(split) >= 0 and abs(sum(split) - 1) < 1e-6):
             shares = ",".join(f"{share:g}" for share in split)

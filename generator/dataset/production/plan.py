@@ -1,8 +1,9 @@
 """What a dataset is to be, before a pixel is touched: every image has its number, every number its shard.
 
 A dataset is a function of its table, its list of sources, the choice of lights, the seed and the options. Image number
-`position · lights_each + k` shows the source at `position` under the k-th of its lights, whether or not the sources
-before it can be read. Shard i holds the numbers from i · n up to (i + 1) · n, n the images of a shard. So any worker
+`(position · crops + c) · lights_each + k` shows crop c of the source at `position` (the one, or the whole, unless
+several are asked for) under the k-th light of scene `position · crops + c`, whether or not the sources before it can be
+read. Shard i holds the numbers from i · n up to (i + 1) · n, n the images of a shard. So any worker
 can make any shard at any time, and a shard made twice is the same twice.
 """
 
@@ -92,12 +93,22 @@ class Plan:
             )
         if self.total > 1 << 32:
             raise InputError(f"{self.total} images are more than a dataset holds, 2^32; make several, each with a seed")
+        if self.options.variation.tints and any(lighting.masks for lighting in self.choice.lightings_of(0)):
+            raise InputError(
+                "a gradient with a colour and several lights an image were both asked for, but masks tell either; "
+                "leave out colour, or ask for one light"
+            )
         require_libraries(self.options.layout)
 
     @property
     def total(self) -> int:
         """Images planned."""
-        return len(self.sources) * self.choice.lights_each
+        return len(self.sources) * self.images_each
+
+    @property
+    def images_each(self) -> int:
+        """Images of each source."""
+        return self.options.crops * self.choice.lights_each
 
     @property
     def shards(self) -> int:
@@ -112,7 +123,7 @@ class Plan:
         """Return the task of shard number `shard`."""
         first = shard * self.options.shard_images
         stop = first + self.images_of(shard)
-        each = self.choice.lights_each
+        each = self.images_each
         places = range(first // each, (stop - 1) // each + 1)
         return ShardJob(
             table=self.lut.folder.resolve(),
@@ -156,6 +167,11 @@ class Plan:
             "split": dict(zip(SPLITS, options.split, strict=True)) if options.split else None,
             "shard_images": options.shard_images,
         }
+        # What is off is no key: such datasets keep their bytes.
+        if options.variation.is_on:
+            recorded["variation"] = options.variation.describe()
+        if options.crops > 1:
+            recorded["crops"] = options.crops
         return json.loads(json.dumps(recorded))
 
 

@@ -16,44 +16,46 @@ from collections import deque
 from collections.abc import Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
+from generator.dataset.production.image_light import image_light
 from generator.dataset.production.layouts.by_name import open_writer
 from generator.dataset.production.layouts.samples import Sample, ShardWriter
 from generator.dataset.production.plan import ShardJob, light_of, split_of, versions
 from generator.dataset.production.records import (
     ImageRecord,
-    LightRow,
     ShardRecord,
     Skipped,
     SourceRecord,
-    Triple,
 )
 from generator.dataset.production.workers import SILENT, Callbacks
 from generator.dataset.production.workplace import Workplace
 from generator.lights.lighting import Lighting
-from generator.pictures.picture import Picture
+from generator.pictures.picture import Cut, Picture
 from generator.pictures.sources import Source
 from generator.stores.store import Pieces
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
+LARGEST_COUNT: Final = 65535
+"""Largest value of 16 bits."""
+
 _threads = threading.local()
 
 
 @dataclass(frozen=True)
 class _ReadSource:
-    """A source picture (H, W, 3) uint8, sRGB codes that the table has samples of, and what is recorded of it."""
+    """The crops of a source, sRGB codes that the table has samples of, or all of it, and what is recorded of it."""
 
-    picture: Picture
+    cuts: tuple[Cut, ...]
     record: SourceRecord
 
 
@@ -118,13 +120,13 @@ def make_shard(
                 callbacks.on_skip(source.name, str(error), len(_wanted(job, job.position + row)))
                 continue
             sources.append(read.record)
-            for number, lighting in _wanted(job, job.position + row):
+            for number, crop, lighting in _wanted(job, job.position + row):
                 while len(pending) >= 2 * workers:
                     finish_one(writer)
                 if cancelled is not None and cancelled.is_set():
                     raise ShardCancelled
                 used.update(light for mixture in lighting.mixtures for light in mixture.lights)
-                pending.append(pool.submit(_make, job, lut, writer, number, read, lighting))
+                pending.append(pool.submit(_make, job, lut, writer, number, read, crop, lighting))
         while pending:
             finish_one(writer)
         files = writer.close()
@@ -141,8 +143,9 @@ def make_shard(
 
 
 def _writer_of(job: ShardJob, place: Workplace) -> ShardWriter:
-    maps = any(lighting.masks is not None for lighting in job.choice.lightings_of(job.position))
     options = job.options
+    lightings = job.choice.lightings_of(job.position * options.crops)
+    maps = options.variation.tints or any(lighting.masks is not None for lighting in lightings)
     return open_writer(
         options.layout, place.files, job.shard, previews=options.previews, maps=maps, details=options.has_details
     )
@@ -211,12 +214,15 @@ def _table(folder: Path, sha256: str) -> Lut:
     return lut
 
 
-def _wanted(job: ShardJob, position: int) -> list[tuple[int, Lighting]]:
-    """Return number and lighting of each image of the source at `position` that is in the shard."""
-    lightings = job.choice.lightings_of(position)
-    first = position * job.choice.lights_each
-    numbered = ((first + place, lighting) for place, lighting in enumerate(lightings))
-    return [(number, lighting) for number, lighting in numbered if job.first <= number < job.stop]
+def _wanted(job: ShardJob, position: int) -> list[tuple[int, int, Lighting]]:
+    """Return number, crop and lighting of each image of the source at `position` that is in the shard."""
+    crops, each = job.options.crops, job.choice.lights_each
+    numbered = (
+        ((position * crops + crop) * each + place, crop, lighting)
+        for crop in range(crops)
+        for place, lighting in enumerate(job.choice.lightings_of(position * crops + crop))
+    )
+    return [wanted for wanted in numbered if job.first <= wanted[0] < job.stop]
 
 
 def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
@@ -225,8 +231,14 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
 
     source: Source = job.sources[place]
     scene = source.read()
-    picture, replaced = replace_unfit_colours(scene.picture, lut.provenance)
-    height, width = picture.shape[:2]
+    whole = (Cut(0, 0, scene.picture),) if job.options.crops == 1 else scene.cuts
+    if len(whole) != job.options.crops:
+        raise InputError(
+            f"{source.name} has {max(1, len(whole))} crops, expected {job.options.crops}; give the preparation of "
+            "pictures and the options of the dataset the same number, and leave random scenes out"
+        )
+    fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in whole]
+    height, width = scene.picture.shape[:2]
     least = smallest_side(job.options.form)
     if min(height, width) < least:
         raise FormatError(
@@ -240,40 +252,50 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
         profile=scene.profile,
         width=width,
         height=height,
-        replaced_pixels=replaced,
+        replaced_pixels=sum(replaced for _, replaced in fit),
         split=split_of(job.options.split, job.seed, scene.sha256, source.name),
     )
-    return _ReadSource(picture, record)
+    cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))
+    return _ReadSource(cuts, record)
 
 
-def _make(job: ShardJob, lut: Lut, writer: ShardWriter, number: int, source: _ReadSource, lighting: Lighting) -> Sample:
+def _make(
+    job: ShardJob, lut: Lut, writer: ShardWriter, number: int, source: _ReadSource, crop: int, lighting: Lighting
+) -> Sample:
     from generator.files.formats import ImageMetadata, encode_pieces, encode_preview, suffix_of
     from generator.pictures.preview import preview_of
 
-    height, width = source.picture.shape[:2]
+    options, cut = job.options, source.cuts[crop]
+    height, width = cut.picture.shape[:2]
     white_level = lut.provenance.white_level
-    image, truth, maps = _photograph(lut, source.picture, lighting, job.seed, number)
-    metadata = ImageMetadata(white_level, truth, lut.provenance.camera)
+    # What exceeds saturation may be below it once it is exposed anew, and is cut then.
+    most = LARGEST_COUNT if options.variation.is_on else white_level
+    image, weights = _photograph(lut, cut.picture, lighting, job.seed, number, most)
+    varied = options.variation.apply(image, white_level, job.seed, number)
+    light = image_light(lut, lighting, weights, varied, options.variation.tints)
+    metadata = ImageMetadata(white_level, light.truth, lut.provenance.camera)
     files: list[tuple[str, str, Pieces]] = [
-        ("images", suffix_of(job.options.form), encode_pieces(image, job.options.form, metadata)),
-        *((kind, ending, (data,)) for kind, ending, data in maps),
+        ("images", suffix_of(options.form), encode_pieces(image, options.form, metadata)),
+        *((kind, ending, (data,)) for kind, ending, data in light.maps),
     ]
-    if job.options.previews:
+    if options.previews:
         files.append(("previews", ".jpg", (encode_preview(preview_of(image, white_level)),)))
-    rows = [
-        LightRow(illumination=mixture.label, truth=chromaticity(mixture.white(lut))) for mixture in lighting.mixtures
-    ]
-    record = ImageRecord(number=number, position=source.record.position, truth=truth, lights=rows)
+    record = ImageRecord(
+        number=number,
+        position=source.record.position,
+        truth=light.truth,
+        lights=light.rows,
+        details=({"crop": crop, "left": cut.left, "top": cut.top} if options.crops > 1 else {}) | varied.details,
+    )
     return writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
 
 
 def _photograph(
-    lut: Lut, picture: Picture, lighting: Lighting, seed: int, number: int
-) -> tuple[npt.NDArray[np.uint16], Triple, list[tuple[str, str, bytes]]]:
-    """Return the raw image (H, W, 3) uint16, the mean chromaticity of its lights, and the maps of several lights."""
+    lut: Lut, picture: Picture, lighting: Lighting, seed: int, number: int, white_level: int
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float32] | None]:
+    """Return the raw image (H, W, 3) uint16, and of several lights the weights (H, W, K) of each in each pixel."""
     from generator.kernels.mixing import mix_samples
     from generator.kernels.rendering import draw_samples
-    from generator.masks.maps import encode_maps
 
     # The hash of the table stands for its samples in the dataset's description.
     for mixture in lighting.mixtures:
@@ -281,12 +303,9 @@ def _photograph(
             lut.require_unchanged(light)
     tables = [mixture.samples(lut, seed, picture) for mixture in lighting.mixtures]
     if lighting.masks is None:
-        image = draw_samples(tables[0], picture, seed=seed, image=number, out=_reused(picture.shape))
-        return image, chromaticity(lighting.whites(lut)[0]), []
+        return draw_samples(tables[0], picture, seed=seed, image=number, out=_reused(picture.shape)), None
     weights = lighting.weights_of(*picture.shape[:2])
-    white_level = lut.provenance.white_level
-    image = mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number)
-    return image, chromaticity(lighting.overall(lut, weights)), encode_maps(weights, lighting.whites(lut))
+    return mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number), weights
 
 
 def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
@@ -299,9 +318,3 @@ def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
     if memory is None or memory.size < size:
         _threads.memory = memory = np.empty(size, np.uint16)
     return memory[:size].reshape(shape)
-
-
-def chromaticity(white: npt.NDArray[np.float64]) -> Triple:
-    """Return (r, g, b) of sum 1 of linear RGB (3,) float64."""
-    red, green, blue = (float(part) for part in white / white.sum())
-    return red, green, blue

@@ -153,6 +153,39 @@ def test_folds_are_read(place: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert all(" 15 " in line for line in cross_validated[:2])
 
 
+def test_only_some_images_are_tested(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    halves = [[f"real_{n:02d}" for n in range(30) if n % 2 == half] for half in (0, 1)]
+    for number, names in enumerate(halves):
+        Path(f"half{number}.csv").write_text("image\n" + "\n".join(names) + "\n")
+    assert main([*BASIC, "--out", "whole"]) == 0
+    for number in range(2):
+        assert main([*BASIC, "--only", f"half{number}.csv", "--out", f"part{number}"]) == 0
+    assert "15 of the 30 images of real count, those of half1.csv" in capsys.readouterr().out
+    # Cross-validation is that of all thirty: trained on twenty, whichever are tested.
+    whole, parts = read_errors("whole"), [read_errors(f"part{number}") for number in range(2)]
+    for method, every in whole.items():
+        known = dict(zip(every.images, every.errors["recovery"].tolist(), strict=True))
+        for part, names in zip(parts, halves, strict=True):
+            assert list(part[method].images) == names
+            assert part[method].errors["recovery"].tolist() == [known[name] for name in names]
+    lines = list(csv.DictReader(Path("part0/results.csv").read_text().splitlines()))
+    assert {line["images"] for line in lines if line["training"] == "cross-validation"} == {"20"}
+    assert Path("part0/folds_0.csv").read_text() == Path("whole/folds_0.csv").read_text()
+    assert main(["pool", "part0", "part1", "--error", "recovery", "--out", "pool"]) == 0
+    together = csv.DictReader(Path("pool/results.csv").read_text().splitlines())
+    pooled = {(line["method"], line["training"], line["statistic"]): float(line["degrees"]) for line in together}
+    error = whole["Map of the mean, made: generated"].errors["recovery"]
+    assert pooled["Map of the mean", "generated", "median"] == pytest.approx(summarise(error).median, abs=2e-6)
+    assert pooled["Map of the mean", "generated", "worst25"] == pytest.approx(summarise(error).worst25, abs=2e-6)
+    assert {line["test_images"] for line in csv.DictReader(Path("pool/by_test_set.csv").read_text().splitlines())} == {
+        "30"
+    }
+    capsys.readouterr()
+    assert main(["pool", "part0", "whole"]) == 2
+    assert "real_00 is a test image of part0 and of whole" in capsys.readouterr().err
+    assert main(["compare", "pool", "--method", "Map of the mean, made: generated", "--method", "Gray-world"]) == 0
+
+
 def test_images_made_small_are_alike(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*BASIC, "--side", "6"]) == 0
     printed = capsys.readouterr().out
@@ -169,6 +202,8 @@ def test_images_made_small_are_alike(place: Path, capsys: pytest.CaptureFixture[
         (("--statistics", "magic"), "'magic'"),
         (("--images", "13"), "13 training images of 12 were asked for"),
         (("--folds", "31"), "31 folds of 30 images"),
+        (("--only", "none.csv"), "cannot read images from none.csv"),
+        (("--only", "own.py"), "expected image among them"),
         (("--folds", "none.csv"), "cannot read folds from none.csv"),
         (("--naive", "lut"), "holds no picture"),
         (("--naive", "pictures", "--matrix", "Pinhole"), "'Pinhole' is neither a file nor a camera"),

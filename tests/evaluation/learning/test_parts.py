@@ -13,12 +13,13 @@ import pytest
 from evaluation.learning.color_beaver import ColorBeaver, bounded
 from evaluation.learning.convnet import ConvNet
 from evaluation.learning.feature_learner import FeatureLearner
+from evaluation.learning.kernel_ridge import KernelRidge
 from evaluation.learning.regression_trees import RegressionTrees, consensus
 from evaluation.learning.smart_color_cat import CHOICES, FINE, SmartColorCat
 from evaluation.learning.working_size import reduce
 from evaluation.metrics import recovery_error
 from foundation.errors import InputError
-from tests.evaluation.learning.made_up_world import lights_on_a_line, world
+from tests.evaluation.learning.made_up_world import MadeUp, lights_on_a_line, world
 
 RED, GREEN, GREY = (0.8, 0.1, 0.1), (0.1, 0.3, 0.1), (0.2, 0.2, 0.2)
 
@@ -124,6 +125,55 @@ def test_color_beaver_chooses_the_better_base() -> None:
     good, bad = truths[:, [0, 2]], rng.permutation(truths[:, [0, 2]])
     model = ColorBeaver(norms="1 2", generations=20).fit_features(np.stack([bad, good], axis=1), truths)
     assert int(model.base) == 1
+
+
+def counts_of(scenes: list[MadeUp]) -> npt.NDArray[np.uint16]:
+    found: list[Any] = [KernelRidge().features(scene.image) for scene in scenes]
+    return np.stack(found)
+
+
+def test_kernel_ridge_solves_its_equations() -> None:
+    scenes = world(12)
+    counts = counts_of(scenes)
+    truths = np.stack([scene.truth / scene.truth.sum() for scene in scenes])
+    model = KernelRidge(penalty=3.0).fit_features(counts, truths)
+    # Written down a second time, from the distances: the equations (K + λ I) a = y - mean y with λ = 3 · 12 / 900.
+    roots = np.sqrt(counts.reshape(12, -1) / counts.reshape(12, -1).sum(axis=1, keepdims=True))
+    distances = ((roots[:, None] - roots[None]) ** 2).sum(axis=2)
+    kernel = np.exp(-distances / 2)
+    left = (kernel + 3 * 12 / 900 * np.eye(12)) @ model.weights
+    np.testing.assert_allclose(left, truths[:, :2] - truths[:, :2].mean(axis=0), atol=1e-12)
+    expected = truths[:, :2].mean(axis=0) + kernel @ model.weights
+    np.testing.assert_allclose(model.lights(counts)[:, :2], expected, atol=1e-12)
+
+
+def test_kernel_ridge_counts_chromaticities_where_they_lie() -> None:
+    image = np.zeros((8, 8, 3), np.float32)
+    image[:2], image[2:4] = RED, (0.1, 0.8, 0.1)
+    counts: Any = KernelRidge().features(image)
+    assert counts.shape == (64, 64)
+    assert counts[51, 6] == 16
+    assert counts[6, 51] == 16
+    # Black pixels, half of the image, have no chromaticity.
+    assert counts.sum() == 32
+
+
+def test_the_penalty_of_kernel_ridge_grows_with_the_images() -> None:
+    # Twice the same images are the same problem: with a fixed penalty they would be fitted more closely.
+    scenes = world(20)
+    learner = KernelRidge()
+    counts = counts_of(scenes)
+    truths = np.stack([scene.truth / scene.truth.sum() for scene in scenes])
+    once = learner.fit_features(counts, truths)
+    twice = learner.fit_features(np.concatenate([counts, counts]), np.concatenate([truths, truths]))
+    other = counts_of(world(5, seed=1))
+    np.testing.assert_allclose(once.lights(other), twice.lights(other), atol=1e-10)
+
+
+@pytest.mark.parametrize("penalty", [0.0, -1.0, float("nan")])
+def test_kernel_ridge_refuses_a_penalty_that_is_none(penalty: float) -> None:
+    with pytest.raises(ValueError, match="expected a number above 0"):
+        KernelRidge(penalty=penalty)
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,14 @@ def test_columns_in_another_order_and_without_truths(tmp_path: Path) -> None:
     assert mine.truths is None
     assert (mine.errors["recovery"][0], mine.errors["reproduction"][0]) == (2, 7)
     assert not mine.guessed.any()
+    assert mine.estimates is None
+
+
+@pytest.mark.parametrize(("second", "whole"), [("1,2,3", True), ("1,,3", False), ("1,nan,3", False)])
+def test_estimates_are_there_where_all_are(tmp_path: Path, second: str, whole: bool) -> None:
+    lines = ("a,Mine,3,4,5,1,2", f"b,Mine,{second},1,2")
+    mine = read_errors(written(tmp_path, *lines, head="image,method,r,g,b,recovery,reproduction"))["Mine"]
+    assert (None if mine.estimates is None else mine.estimates.tolist()) == ([[3, 4, 5], [1, 2, 3]] if whole else None)
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,20 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 
+import colour
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
+from sim.world.profile import relative_lab
 from sim.world.spectra import (
     SURFACE_REFLECTANCE,
     WAVELENGTHS_NM,
     LampSpectrum,
+    PaperName,
     ink_coverage,
+    paper,
     paper_white,
     print_reflectance,
     projector_primaries,
@@ -26,7 +31,18 @@ from tests.data_files import available
 
 CAMERAS = ("Canon_EOS_600D", "Canon_EOS_200D")
 LAMPS: tuple[LampSpectrum, ...] = ("uhp", "led")
+PAPER_NAMES: tuple[PaperName, ...] = ("poster", "matt", "glossy")
 ALL_CODES = np.array(list(product(range(0, 256, 8), repeat=3)), dtype=np.uint8)
+
+
+def absolute_lab(reflectance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return CIELAB (N, 3) under D50 relative to an ideal white, as instruments measure prints."""
+    shape = colour.SpectralShape(380, 780, 5)
+    observer = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape).values
+    light = observer * colour.SDS_ILLUMINANTS["D50"].copy().align(shape).values[:, None]
+    white = light.sum(axis=0)
+    chromaticity = (white / white.sum())[:2]
+    return np.asarray(colour.XYZ_to_Lab(reflectance @ light / white[1], chromaticity), dtype=np.float64)
 
 
 def measured(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -42,10 +58,10 @@ def interpolated(
     return np.asarray(np.interp(at, where, values), dtype=np.float64)
 
 
-def seen(camera: str, lamp: LampSpectrum, codes: NDArray[np.uint8]) -> NDArray[np.float64]:
+def seen(camera: str, lamp: LampSpectrum, codes: NDArray[np.uint8], on: PaperName = "poster") -> NDArray[np.float64]:
     """Return (N, 3) camera RGB of printed codes under the projector's white, 1 for bare paper."""
     light = projector_primaries(lamp).sum(axis=0)[:, None] * sensitivities(camera)
-    return (print_reflectance(codes) @ light) / (paper_white() @ light)
+    return (print_reflectance(codes, on) @ light) / (paper(on).white @ light)
 
 
 @pytest.mark.parametrize("lamp", LAMPS)
@@ -153,6 +169,73 @@ def test_bare_paper_is_white_and_black_is_as_black_as_matte_paper_gets() -> None
     assert reflectance[1, (WAVELENGTHS_NM >= 400) & (WAVELENGTHS_NM <= 700)].max() < 0.042
 
 
+# CIELAB (D50, CIE 1931, ideal white) of solids that an Epson XP-960 printed without colour management, computed from
+# the measured spectra that the head of `sim.world.spectra` names.
+SOLID_CODES = [[255] * 3, [0, 255, 255], [255, 0, 255], [255, 255, 0], [255, 0, 0], [0, 255, 0], [0, 0, 255], [0] * 3]
+SOLID_LAB: dict[PaperName, list[list[int]]] = {
+    "matt": [[96, 0, -1], [50, -27, -56], [50, 78, -11], [90, 1, 104], [49, 69, 51], [41, -56, 27], [22, 30, -50],
+             [15, 0, -3]],
+    "glossy": [[95, -1, -2], [51, -38, -58], [50, 82, -17], [89, -4, 109], [49, 72, 67], [41, -80, 34], [15, 43, -65],
+               [5, 2, -4]],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("on", SOLID_LAB)
+def test_solids_of_photo_papers_look_like_measured_ones(on: PaperName) -> None:
+    white = relative_lab(print_reflectance([[255] * 3], on), on)
+    np.testing.assert_allclose(white, [[100, 0, 0]], atol=1e-6)
+    lab = absolute_lab(print_reflectance(SOLID_CODES, on))
+    off = colour.delta_E(np.array(SOLID_LAB[on], dtype=np.float64), lab, method="CIE 2000")
+    assert off.max() < 4.5
+    assert np.mean(off) < 2.5
+
+
+# Density of the blackest print: 12 measured papers, 1.63 to 1.79 and 2.11 to 2.42 (head of `sim.world.spectra`); black
+# over white of the paper that was there before: 1.43.
+DENSITIES: dict[PaperName, tuple[float, float]] = {"poster": (1.4, 1.55), "matt": (1.6, 1.8), "glossy": (2.1, 2.42)}
+
+
+@pytest.mark.parametrize("on", DENSITIES)
+def test_black_is_as_dense_as_published(on: PaperName) -> None:
+    lightness = float(absolute_lab(print_reflectance([[0, 0, 0]], on))[0, 0])
+    luminance = ((lightness + 16) / 116) ** 3 if lightness > 8 else lightness / 903.3
+    low, high = DENSITIES[on]
+    assert low < -np.log10(luminance) < high
+
+
+# Convex hulls of everything measured on those papers: matt 460 000 to 540 000, glossy 580 000 to 790 000 CIELAB units;
+# by profiles (McNamee 2010) art papers 500 000 to 600 000 and glossy ones 800 000 to 900 000, with more inks.
+HULLS: dict[PaperName, tuple[float, float]] = {"matt": (4.6e5, 5.4e5), "glossy": (5.8e5, 7.9e5)}
+
+
+@pytest.mark.parametrize("on", HULLS)
+def test_the_gamut_is_as_large_as_that_of_measured_prints(on: PaperName) -> None:
+    steps = np.array(list(product(np.linspace(0, 255, 9), repeat=3)))
+    low, high = HULLS[on]
+    assert low < ConvexHull(absolute_lab(print_reflectance(steps, on))).volume < high
+
+
+@pytest.mark.parametrize("on", SOLID_LAB)
+@pytest.mark.parametrize("ink", [0, 1, 2])
+def test_ramps_have_the_spectra_of_measured_ramps(ink: int, on: PaperName) -> None:
+    """A step of a measured ramp is one of ours at some coverage: which, the printer's driver decides."""
+    files = available("print/photo_paper_reflectance.csv")
+    if not files:
+        pytest.skip("print/photo_paper_reflectance.csv is not here")
+    table = measured(files[0])
+    at = table["wavelength_nm"]
+    ramp = np.full((256, 3), 255)
+    ramp[:, ink] = np.arange(256)
+    ours = print_reflectance(ramp, on) / paper(on).white
+    ours = np.stack([interpolated(at, WAVELENGTHS_NM, row) for row in ours])
+    name = ("c", "m", "yellow")[ink]
+    for step in ("1/4", "2/4", "3/4"):
+        theirs = table[f"{name}_{step}"] / table["white"]
+        away = np.sqrt(((ours - theirs) ** 2).mean(axis=1)).min()
+        # Another printer's inks.
+        assert away < 0.08, (name, step, away)
+
+
 def test_ink_never_covers_less_than_nothing_or_more_than_all() -> None:
     coverage = ink_coverage(ALL_CODES)
     assert coverage.min() >= 0
@@ -160,9 +243,10 @@ def test_ink_never_covers_less_than_nothing_or_more_than_all() -> None:
     assert coverage[-1].max() < 0.06
 
 
+@pytest.mark.parametrize("on", PAPER_NAMES)
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_all_colours_are_distinct_and_each_channel_grows_with_its_code(camera: str) -> None:
-    colours = seen(camera, "uhp", ALL_CODES)
+def test_all_colours_are_distinct_and_each_channel_grows_with_its_code(camera: str, on: PaperName) -> None:
+    colours = seen(camera, "uhp", ALL_CODES, on)
     cube = colours.reshape(32, 32, 32, 3)
     for channel in range(3):
         assert np.diff(cube[..., channel], axis=channel).min() > 0

@@ -402,3 +402,48 @@ def test_what_cannot_be_is_refused(change: object, named: str) -> None:
     assert callable(change)
     with pytest.raises(ValueError, match=named):
         change()
+
+
+HOT = Room(hot_per_million=40, hot_dn_per_s=3000, response_spread=0, black_leak=0)
+
+
+def dark_excess(world: World, settings: ExposureSettings, frames: int = 8) -> NDArray[np.float64]:
+    """Return the mean of dark frames over black, of the whole sensor."""
+    dark = [world.expose(BLACK, settings, key=(k,)).astype(np.float64) for k in range(frames)]
+    return np.mean(dark, axis=0) - world.body.black
+
+
+def test_hot_photosites_are_few_the_same_in_all_frames_and_grow_with_time_and_gain() -> None:
+    world = World(squares_sheet(), BODIES["Test"], HOT)
+    rows, columns = BODIES["Test"].sensor
+    assert len(world.hot.rows) == round(40 * rows * columns / 1e6) == 21
+    short = dark_excess(world, ExposureSettings(iso=100, aperture=8, shutter_s=0.5))
+    where = np.zeros(BODIES["Test"].sensor, dtype=bool)
+    where[world.hot.rows, world.hot.columns] = True
+    # 8 frames of 6 DN: six standard errors are 13 DN.
+    assert np.abs(short[~where]).max() < 13
+    expected = np.minimum(0.5 * world.hot.dn_per_s, 13584 - 2048)
+    error = np.sqrt((expected / 1.8 + 36) / 8)
+    assert (np.abs(short[where] - expected) < SIX_SIGMA * error + 1).all()
+    assert expected.mean() == pytest.approx(1500, rel=0.7)
+    long = dark_excess(world, ExposureSettings(iso=400, aperture=8, shutter_s=1.0))
+    below = 8 * expected < 9000
+    assert 5 < below.sum() < 21
+    np.testing.assert_allclose(long[where][below], 8 * expected[below], atol=6 * math.sqrt(9000 / 0.45 / 8))
+    assert long.max() == 13584 - 2048
+
+
+def test_hot_photosites_add_to_light_and_leave_all_others_as_they_were() -> None:
+    cold = World(squares_sheet(), BODIES["Test"], replace(HOT, hot_per_million=0.0))
+    hot = World(squares_sheet(), BODIES["Test"], HOT)
+    plain, lit = (world.expose(WHITE, REFERENCE_EXPOSURE, key=(7,)).astype(np.int64) for world in (cold, hot))
+    changed = np.zeros(plain.shape, dtype=bool)
+    changed[hot.hot.rows, hot.hot.columns] = True
+    assert np.array_equal(plain[~changed], lit[~changed])
+    added = np.minimum(0.5 * hot.hot.dn_per_s, 13584 - plain[changed])
+    assert (np.abs(lit[changed] - plain[changed] - added) < 0.2 * added + 60).all()
+    assert not np.array_equal(World(squares_sheet(), BODIES["Test"], replace(HOT, seed=1)).hot.rows, hot.hot.rows)
+
+
+def squares_sheet() -> Print:
+    return Print((180, 125), np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8))

@@ -5,7 +5,7 @@ had developed; nobody has published how. Ours, with the ground truth at hand:
 
 1. the image is divided by its light, green kept, and cut where the first channel clips, so that clipped skies become
    white and not pink (dcraw's ``-H 0``); thumbnails do not show what was clipped, and keep a few pink ones;
-2. the camera's colour matrix takes it to linear sRGB (`evaluation.experiments.transfer.matrices`: white stays white);
+2. the camera's colour matrix takes it to linear sRGB (`generator.rendering.matrices`: white stays white);
 3. it is scaled so that one in a hundred of the values of the channel that reaches highest lies above 1, dcraw's
    "99th-percentile white point", and cut to 0 … 1;
 4. the curve of IEC 61966-2-1 and eight bits.
@@ -19,11 +19,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from evaluation.experiments.transfer.matrices import ColourMatrix
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.errors import InputError
 from foundation.srgb import srgb_codes
 from generator.pictures.sources import SourcePicture
+from generator.rendering.matrices import ColourMatrix
 
 WHITE_PERCENTILE: Final = 99.0
 """Percentile that becomes white; dcraw's."""
@@ -68,7 +68,7 @@ def develop(
     --------
     A grey wedge stays grey, whatever the light and the camera; one in a hundred values is clipped:
 
-    >>> from evaluation.experiments.transfer.matrices import camera_matrix
+    >>> from generator.rendering.matrices import camera_matrix
     >>> wedge = np.linspace(0, 1, 5)[:, None, None] * np.array([400.0, 1000.0, 700.0])
     >>> develop(wedge, np.array([0.4, 1.0, 0.7]), matrix=camera_matrix("EOS 550D"))[:, 0]
     array([[  0,   0,   0],

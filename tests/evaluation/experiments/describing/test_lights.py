@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from evaluation.experiments.describing.lights import energy_distance, light_distribution, log_chroma
+from evaluation.experiments.describing.lights import energy_distance, light_distribution
+from generator.statistics.image_numbers import log_chroma
 
 
 def lights_at(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from evaluation.datasets.generated import GeneratedMixedScene, GeneratedScene
-from evaluation.experiments.transfer.matrices import ColourMatrix
 from evaluation.experiments.transfer.naive import naive_image, naive_scenes
 from evaluation.experiments.transfer.pictures import find_sources
 from generator.lights.choices import ListedLights, SimultaneousLights
 from generator.lights.lighting import mixture_of
 from generator.masks.request import parse_masks
 from generator.pictures.picture import Preparation
+from generator.rendering.matrices import ColourMatrix
 from tests.evaluation.experiments.transfer.conftest import LIGHTS, Maker, save_pictures, write_table
 
 MATRIX = np.array([[0.6, 0.3, 0.1], [0.1, 0.7, 0.2], [-0.2, 0.4, 0.8]])

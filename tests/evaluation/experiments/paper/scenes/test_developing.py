@@ -9,10 +9,10 @@ import numpy.typing as npt
 import pytest
 
 from evaluation.experiments.paper.scenes.developing import DevelopedSource, develop, developed
-from evaluation.experiments.transfer.matrices import camera_matrix
 from evaluation.scene import SceneSet
 from foundation.errors import InputError
 from foundation.srgb import decode_srgb, srgb_codes
+from generator.rendering.matrices import camera_matrix
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.experiments.transfer.matrices import camera_matrix, cameras, choose_matrix
 from foundation.errors import InputError
+from generator.rendering.matrices import camera_matrix, cameras, choose_matrix
 
 
 def test_every_camera_keeps_white() -> None:

@@ -1,0 +1,60 @@
+"""`evaluate pool`: the results of several transfers as one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from foundation.console import EXIT_CODES
+
+HELP = f"""Pool the results of several transfers, such as one for each of several cameras.
+
+Reads results folders that evaluate transfer --out has written. A row of the pool has the errors of one method, trained
+in one way, on the test images of all folders, each image once and with the same weight; seed k is seed k of each
+folder. Rows are matched by method, kind of training and name of the training set; by the first two alone where each
+folder has one training set. Prints the tables of evaluate transfer, and the ratios of each test set by itself. Folders
+that share a test image are refused. Writes nothing unless asked with --out: results.csv, errors.csv, by_test_set.csv,
+tables.tex and run.json.
+
+{EXIT_CODES}
+"""
+
+
+def pool(
+    results: Annotated[
+        list[str], typer.Argument(metavar="RESULTS", help="Results folders of transfers.", show_default=False)
+    ],
+    error: Annotated[
+        Literal["reproduction", "recovery"] | None,
+        typer.Option(help="Angular error to sum up. \\[default: that of the transfers]", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Write the results to this new folder.", show_default=False)
+    ] = None,
+) -> None:
+    """Pool the results of several transfers."""
+    from evaluation.experiments.pooling.pool import pool_transfers
+    from evaluation.experiments.pooling.reading import read_transfer
+    from evaluation.experiments.pooling.report import make_tables, save_pool
+    from evaluation.reports.terminal import print_table
+    from foundation.errors import InputError
+    from foundation.files import require_free
+
+    if out is not None:
+        require_free(out, "the results")
+    parts = [read_transfer(place) for place in results]
+    kinds = {part.error for part in parts}
+    if error is None and len(kinds) > 1:
+        raise InputError("the transfers were summed up by different errors; say which with --error")
+    chosen = error or parts[0].error
+    made = pool_transfers(parts)
+    tables = make_tables(made, chosen)
+    for table in tables.shown:
+        print_table(table)
+        print()
+    for note in made.notes:
+        print(note)
+    if out is not None:
+        save_pool(made, tables, [part.place for part in parts], chosen, out)

@@ -1,0 +1,126 @@
+"""Weights of images by which a set of them gets the moments of another set: entropy balancing.
+
+J. Hainmueller, "Entropy balancing for causal effects", Political Analysis 20 (2012) 25-46: of all weights that give the
+wanted moments, those nearest to equal ones (least Kullback-Leibler divergence). Wanted moments are means over M real
+images and known to their standard errors only, so they are met as far as that is worth it: the dual gets a quadratic
+penalty with each moment's own variance over M (M. Dudík, S. J. Phillips, R. E. Schapire, "Maximum entropy density
+estimation with generalized regularization", JMLR 8 (2007) 1217-1260). Of few real images little is learned, and weights
+stay near equal.
+
+What is left of images is told by the effective sample size, (Σw)² / Σw² (L. Kish, Survey Sampling, 1965): as many
+equally weighted images would give means as precise. If it falls below a floor, the multipliers are bounded, ever more
+narrowly until it does not. A moment that hardly any image has cannot then take the weights from those that can be met:
+a bounded multiplier is a price by the missing share instead of a condition.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+_Array = npt.NDArray[np.float64]
+
+LEAST_EFFECTIVE: Final = 0.2
+"""Least effective share of images: chosen. With a fifth, a mean over a thousand pictures is as precise as one over two
+hundred, the size of the real sets that they are made like; each picture counts about five times at most typically."""
+
+_BOUNDS: Final = tuple(float(bound) for bound in np.geomspace(8, 0.01, 40))
+"""Bounds of the multipliers that are tried, widest first: a moment of 1 more may count e⁸ times as much, that is
+freely, down to 1 %, that is hardly."""
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """Weights, and what they come to.
+
+    Attributes
+    ----------
+    weights
+        (N,) float64 above 0, sum 1.
+    bound
+        Bound of the multipliers; None where the floor of the effective sample size did not matter.
+    """
+
+    weights: _Array
+    bound: float | None
+
+    @property
+    def effective(self) -> float:
+        """Kish's effective sample size, 1 … N."""
+        return effective_size(self.weights)
+
+
+def effective_size(weights: _Array) -> float:
+    """Return Kish's effective sample size of weights (N,) float64 ≥ 0.
+
+    Examples
+    --------
+    >>> effective_size(np.array([1.0, 1.0, 1.0, 1.0])), effective_size(np.array([1.0, 0.0]))
+    (4.0, 1.0)
+    """
+    return float(weights.sum() ** 2 / np.square(weights).sum())
+
+
+def balance(moments: _Array, wanted: _Array, errors: _Array, least_effective: float = LEAST_EFFECTIVE) -> Balance:
+    """Return the weights of N images by which the means of their moments come near to the wanted ones.
+
+    Parameters
+    ----------
+    moments
+        (N, K) float64, the moments of each image.
+    wanted
+        (K,) float64, their wanted means.
+    errors
+        (K,) float64 above 0, the standard errors of those.
+    least_effective
+        Least effective sample size as a share of N, 0 … 1.
+
+    Examples
+    --------
+    >>> found = balance(np.arange(100.0)[:, None] / 100, np.array([0.6]), np.array([0.001]))
+    >>> round(float(found.weights @ np.arange(100.0)) / 100, 3), round(found.effective)
+    (0.6, 88)
+    """
+    aside = moments - wanted
+    start = np.zeros(len(wanted))
+    for bound in (None, *_BOUNDS):
+        start = _dual(aside, np.square(errors), start, bound)
+        found = Balance(_weights(aside, start), bound)
+        if found.effective >= least_effective * len(moments):
+            return found
+    return Balance(np.full(len(moments), 1 / len(moments)), 0.0)
+
+
+def _weights(aside: _Array, multipliers: _Array) -> _Array:
+    exponents = aside @ multipliers
+    parts = np.exp(exponents - exponents.max())
+    return parts / parts.sum()
+
+
+def _dual(aside: _Array, penalties: _Array, start: _Array, bound: float | None) -> _Array:
+    """Return the multipliers (K,) that minimise ln of the mean of exp(aside · λ), plus half of Σ penalty λ²."""
+    from scipy.optimize import minimize
+
+    def value(multipliers: _Array) -> tuple[float, _Array]:
+        exponents = aside @ multipliers
+        top = exponents.max()
+        parts = np.exp(exponents - top)
+        total = parts.sum()
+        slope = parts @ aside / total + penalties * multipliers
+        return float(top + np.log(total) + 0.5 * penalties @ np.square(multipliers)), slope
+
+    bounds = None if bound is None else [(-bound, bound)] * len(start)
+    begin = start if bound is None else np.clip(start, -bound, bound)
+    # The problem is convex and smooth, so that the start does not matter.
+    found = minimize(
+        value,
+        begin,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": 2000, "ftol": 1e-13, "gtol": 1e-8},
+    )
+    return np.asarray(found.x, dtype=np.float64)

@@ -1,0 +1,1 @@
+"""Rendering by colour: cells of the chart that together show a camera what it should see of a picture."""

@@ -1,0 +1,216 @@
+"""Which cells of the chart together show a wanted colour: 32 of them, equally likely, for each wanted colour.
+
+For a wanted colour t the weights w of the cells near to it are to make their mean t, and their spread small:
+
+    minimise  |m - t|² + λ Σ w |R - t|²,   m = Σ w R,  w ≥ 0,  Σ w = 1,
+
+R being what the camera sees of a cell. Weights are whole 32nds from the start, since a pixel takes one of 32 cells:
+from all 32 on the nearest cell, one 32nd at a time moves from a cell to another, each time by the move that lowers
+the sum most, until none does (an exchange algorithm, V. V. Fedorov, *Theory of Optimal Experiments*, 1972, chapter
+3). Rounding weights that are best as real numbers is worse: each of some four weights is off by up to a 64th.
+
+Differences are relative to t, channel by channel, and those of brightness count less than those of chromaticity: the
+field measures lights by angles, and where the print cannot show a colour, its hue is to stay rather than its
+brightness.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.angles import angles_deg
+from foundation.compiled import compiled
+from generator.rendering.print_profiles import PrintProfile
+
+SLOTS: Final = 32
+"""Cells of a mixture: what five random bits choose from, and enough that weights of 32nds reproduce a mean."""
+
+NEIGHBOURS: Final = 24
+"""Cells near to a wanted colour that are mixed: they surround it, except at the edge of what the print can show."""
+
+WIDE_NEIGHBOURS: Final = 384
+"""The same where the nearest do not surround a colour near grey."""
+
+SPREAD_COST: Final = 0.03
+"""λ: what a mixture's spread costs against its error; small, so that the mean is right within a hundredth of the
+distance of cells, and above 0, so that of all mixtures that are right the narrowest is taken."""
+
+WIDE_SPREAD_COST: Final = 0.003
+"""The same for colours near grey that are not met with the nearest cells; their chromaticity matters most."""
+
+BRIGHTNESS_COST: Final = 0.5
+"""What a relative difference of brightness counts against one of chromaticity. Chosen: see
+docs/reference/rendering.md."""
+
+MET_WITHIN: Final = 0.02
+"""Largest relative difference in a channel of a mixture that shows the wanted colour: two in a hundred, a tenth of what
+neighbouring cells of the chart differ."""
+
+NEAR_GREY_DEG: Final = 6.0
+"""Angle to grey below which a colour is near grey: greys of a picture are shared out among nodes as far as that."""
+
+GREY_WITHIN_DEG: Final = 0.2
+"""Angle to a wanted colour near grey from which more cells are tried."""
+
+_Array = npt.NDArray[np.float64]
+
+_AXES: Final = np.array([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]]) / np.sqrt([[3.0], [2.0], [6.0]])
+"""Brightness and two directions of chromaticity, of length 1, for relative or logarithmic differences of channels."""
+
+
+@dataclass(frozen=True, eq=False)
+class CellMixtures:
+    """For each of K wanted colours 32 equally likely cells whose mean shows it.
+
+    Attributes
+    ----------
+    cells
+        (K, 32) uint16, numbers of cells of the chart, ((r << 2n) | (g << n) | b) for n bits a channel; ascending.
+    colours
+        (K, 3) float32, what the camera sees of the 32 in the mean, over the white of the light.
+    wanted
+        (K, 3) float32, what it should see.
+    """
+
+    cells: npt.NDArray[np.uint16]
+    colours: npt.NDArray[np.float32]
+    wanted: npt.NDArray[np.float32]
+
+    @cached_property
+    def distance(self) -> npt.NDArray[np.float32]:
+        """(K,) float32, angle between the mean of the 32 and the wanted colour, degrees."""
+        return angles_deg(self.colours, self.wanted).astype(np.float32)
+
+    @cached_property
+    def outside(self) -> npt.NDArray[np.bool_]:
+        """(K,) bool, whether cells near to a colour cannot show it: the mean is off by more than `MET_WITHIN`."""
+        return np.asarray((np.abs(self.colours - self.wanted) > MET_WITHIN * self.wanted).any(axis=1))
+
+
+def mix_cells(profile: PrintProfile, wanted: _Array) -> CellMixtures:
+    """Return for each wanted colour the cells that together show it.
+
+    Parameters
+    ----------
+    profile
+        The print under a light.
+    wanted
+        (K, 3) float64 > 0, what the camera should see, over the white of the light.
+
+    Examples
+    --------
+    >>> ramp = np.stack([np.full(8, 0.5), np.full(8, 0.5), np.linspace(0.2, 0.9, 8)], axis=-1)
+    >>> mixtures = mix_cells(PrintProfile(ramp, np.ones(8, bool)), np.array([[0.5, 0.5, 0.55]]))
+    >>> int(mixtures.cells.min()), int(mixtures.cells.max()), bool(mixtures.outside[0])
+    (3, 4, False)
+    >>> [round(float(seen), 3) for seen in mixtures.colours[0]]
+    [0.5, 0.5, 0.55]
+    """
+    from scipy.spatial import KDTree
+
+    usable = np.flatnonzero(profile.usable)
+    colours = profile.colours[usable]
+    scale = np.array([[BRIGHTNESS_COST**0.5], [1.0], [1.0]]) * _AXES
+    tree: Any = KDTree(np.log(colours) @ scale.T)
+    places = np.log(wanted) @ scale.T
+
+    def chosen(of: npt.NDArray[np.int64], neighbours: int, cost: float) -> npt.NDArray[np.int64]:
+        near: Any = tree.query(places[of], k=np.arange(1, min(neighbours, len(usable)) + 1))[1]
+        out = np.empty((len(of), SLOTS), np.int64)
+        _exchange(colours, wanted[of], scale, np.ascontiguousarray(near, dtype=np.int64), cost, out)
+        return out
+
+    cells = chosen(np.arange(len(wanted)), NEIGHBOURS, SPREAD_COST)
+    missed = angles_deg(colours[cells].mean(axis=1), wanted) > GREY_WITHIN_DEG
+    again = np.flatnonzero(missed & near_grey(wanted))
+    if len(again):
+        cells[again] = chosen(again, WIDE_NEIGHBOURS, WIDE_SPREAD_COST)
+    return mixtures_of(np.sort(usable[cells], axis=1).astype(np.uint16), profile, wanted)
+
+
+def mixtures_of(cells: npt.NDArray[np.uint16], profile: PrintProfile, wanted: _Array) -> CellMixtures:
+    """Return mixtures of cells that were chosen, with what the camera sees of them.
+
+    Parameters
+    ----------
+    cells
+        (K, 32) uint16, numbers of cells.
+    profile
+        The print under a light.
+    wanted
+        (K, 3) float64 > 0, what the camera should see, over the white of the light.
+    """
+    made = profile.colours[cells].mean(axis=1)
+    return CellMixtures(cells, made.astype(np.float32), wanted.astype(np.float32))
+
+
+def near_grey(colours: _Array) -> npt.NDArray[np.bool_]:
+    """Return (K,) bool, which of (K, 3) float64 colours over white are within `NEAR_GREY_DEG` of grey.
+
+    Examples
+    --------
+    >>> near_grey(np.array([[0.5, 0.5, 0.55], [0.5, 0.2, 0.2]])).tolist()
+    [True, False]
+    """
+    return np.asarray(angles_deg(colours, np.ones(3)) < NEAR_GREY_DEG)
+
+
+@compiled
+def _exchange(colours: Any, wanted: Any, scale: Any, near: Any, cost: float, out: Any) -> None:
+    """Write into `out` (K, 32) the cells of `near` (K, M) for each wanted colour (K, 3); see the head of this file.
+
+    `scale` (3, 3) leads from relative differences of channels to what they cost.
+    """
+    candidates = near.shape[1]
+    slots = out.shape[1]
+    places = np.empty((candidates, 3))
+    single = np.empty(candidates)
+    counts = np.zeros(candidates, np.int64)
+    total = np.empty(3)
+    for k in range(len(wanted)):
+        nearest = 0
+        for j in range(candidates):
+            cell = near[k, j]
+            square = 0.0
+            for axis in range(3):
+                place = 0.0
+                for channel in range(3):
+                    place += scale[axis, channel] * (colours[cell, channel] / wanted[k, channel] - 1.0)
+                places[j, axis] = place
+                square += place * place
+            # In units of the square of a sum of all slots, as what follows is.
+            single[j] = cost * slots * square
+            if single[j] < single[nearest]:
+                nearest = j
+        counts[:] = 0
+        counts[nearest] = slots
+        for axis in range(3):
+            total[axis] = slots * places[nearest, axis]
+        while True:
+            best, source, sink = -1e-12, -1, -1
+            for i in range(candidates):
+                if counts[i] == 0:
+                    continue
+                for j in range(candidates):
+                    change = single[j] - single[i]
+                    for axis in range(3):
+                        step = places[j, axis] - places[i, axis]
+                        change += step * (2.0 * total[axis] + step)
+                    if change < best:
+                        best, source, sink = change, i, j
+            if source < 0:
+                break
+            counts[source] -= 1
+            counts[sink] += 1
+            for axis in range(3):
+                total[axis] += places[sink, axis] - places[source, axis]
+        slot = 0
+        for j in range(candidates):
+            for _ in range(counts[j]):
+                out[k, slot] = near[k, j]
+                slot += 1

@@ -1,0 +1,184 @@
+"""Rendering by colour: from a table, a light and a colour matrix to the cells that show the colours of a picture.
+
+What the camera should see of a source colour is a = C · linear sRGB, C being the colour matrix of its body. The
+print's black is not black and its paper not white, so black goes to the print's black point b and white to its white
+point w, as black point compensation does between two media (ISO 18619:2015; there in XYZ, here in camera RGB): t = b
++ (w - b) a.
+
+Mixtures of cells are exact for the lights of a table one by one, which are made once and kept. A mixture of lights,
+or several lights on an image, are one light more with nearly every image. There the mixtures are those of the table's
+light that is nearest, but colours near grey, by which the eye and every estimator know a light, are mixed anew for
+the very light of the image.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.angles import angles_deg
+from foundation.hashing import sha256_of
+from generator.lights.gamut import black_body
+from generator.lights.lighting import Lighting, Mixture, mixture_of, plain
+from generator.rendering import cell_mixtures, print_profiles, source_colours
+from generator.rendering.cell_mixtures import CellMixtures, mix_cells, mixtures_of, near_grey
+from generator.rendering.kept_mixtures import keep_mixtures, load_mixtures
+from generator.rendering.matrices import ColourMatrix
+from generator.rendering.print_profiles import PrintProfile, mixed_profile, profile_of
+from generator.rendering.table_matrix import matrix_for
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+
+_MIXTURES_AT_HAND: Final = 16
+"""Lights whose mixtures are kept in memory, 3 MB each: pictures that follow each other share some."""
+
+_PROFILES_AT_HAND: Final = 64
+"""Lights whose profiles are kept in memory, 1 MB each: mixtures of lights share their parts."""
+
+
+def wanted_colours(profile: PrintProfile, matrix: ColourMatrix) -> npt.NDArray[np.float64]:
+    """Return what the camera should see of each source node on a print, (32768, 3) float64 over the white of the light.
+
+    Parameters
+    ----------
+    profile
+        The print: its black and white points.
+    matrix
+        Linear sRGB to the camera's RGB.
+    """
+    seen = source_colours.source_colours(matrix)
+    return profile.black + (profile.white - profile.black) * seen
+
+
+def colorimetric_mixtures(
+    lut: Lut, light: float | Mixture, matrix: ColourMatrix | None = None, folder: Path | None = None
+) -> CellMixtures:
+    """Return for each source node the cells of a table that show it under a light.
+
+    Those of a light of the table are kept on disk for the next time.
+
+    Parameters
+    ----------
+    lut
+        The table.
+    light
+        A light of the table by its number (int), a black body between those of the table by its temperature in kelvin
+        (float), or any mixture of lights.
+    matrix
+        Linear sRGB to the camera's RGB; None for what `matrix_for` gives.
+    folder
+        Where mixtures are kept; None for `kept_mixtures.cache_folder`.
+
+    Raises
+    ------
+    InputError
+        The table has no such light.
+    QualityError
+        No cell of the table can be trusted under that light.
+    """
+    if not isinstance(light, Mixture):
+        light = black_body(lut, light) if isinstance(light, float) else plain(int(light))
+    light.white(lut)
+    matrix = matrix_for(lut) if matrix is None else matrix
+    return _mixtures(lut, light, tuple(matrix.rows.ravel().tolist()), folder)
+
+
+@dataclass(frozen=True, eq=False)
+class ColorimetricRendering:
+    """Rendering by colour with a table: which mixtures of cells an image is made of.
+
+    Attributes
+    ----------
+    lut
+        The table.
+    matrix
+        Linear sRGB to the camera's RGB.
+    """
+
+    lut: Lut
+    matrix: ColourMatrix
+
+    def light_of(self, lighting: Lighting) -> Mixture:
+        """Return the light for which an image's cells are chosen.
+
+        Of several lights on an image it is their sum, each as bright as the others: all of them fall on the same print,
+        so it can be right for one colour of light only.
+        """
+        shares: dict[int, float] = {}
+        for mixture, white in zip(lighting.mixtures, lighting.whites(self.lut), strict=True):
+            for light, weight in zip(mixture.lights, mixture.weights, strict=True):
+                shares[light] = shares.get(light, 0.0) + weight / float(white.sum())
+        return mixture_of(shares)
+
+    def mixtures_for(self, lighting: Lighting) -> CellMixtures:
+        """Return the mixtures, 32768 of them, for an image.
+
+        Raises
+        ------
+        QualityError
+            No cell of the table can be trusted under its light.
+        """
+        return colorimetric_mixtures(self.lut, self.light_of(lighting), self.matrix)
+
+
+@lru_cache(maxsize=_MIXTURES_AT_HAND)
+def _mixtures(lut: Lut, light: Mixture, rows: tuple[float, ...], folder: Path | None) -> CellMixtures:
+    matrix = ColourMatrix("", np.array(rows).reshape(3, 3), "")
+    first, *others = light.lights
+    if others:
+        return _mixtures_near_grey(lut, light, matrix, folder)
+    key = _key(lut, light, rows)
+    found = load_mixtures(key, source_colours.NODES, folder)
+    if found is None:
+        profile = _profile(lut, first)
+        found = mix_cells(profile, wanted_colours(profile, matrix))
+        keep_mixtures(key, found, folder)
+    return found
+
+
+def _mixtures_near_grey(lut: Lut, light: Mixture, matrix: ColourMatrix, folder: Path | None) -> CellMixtures:
+    """Return the mixtures of the light of the table that is nearest to `light`, those near grey mixed for `light`."""
+    nearest = int(angles_deg(lut.white, light.white(lut)).argmin())
+    base = colorimetric_mixtures(lut, nearest, matrix, folder)
+    profile = mixed_profile(
+        [_profile(lut, number) for number in light.lights],
+        np.array(light.weights)[:, None] * lut.white[list(light.lights)],
+    )
+    wanted = wanted_colours(profile, matrix)
+    # A cell that is odd or clipped under one of the lights of the mixture alone may be among those of the nearest.
+    anew = near_grey(wanted) | ~profile.usable[base.cells].all(axis=1)
+    again = mix_cells(profile, wanted[anew])
+    cells = base.cells.copy()
+    cells[anew] = again.cells
+    return mixtures_of(cells, profile, wanted)
+
+
+@lru_cache(maxsize=_PROFILES_AT_HAND)
+def _profile(lut: Lut, light: int) -> PrintProfile:
+    return profile_of(lut, light)
+
+
+def _key(lut: Lut, light: Mixture, rows: tuple[float, ...]) -> str:
+    """Return what mixtures are kept under: a hash of all that they depend on."""
+    depends = {
+        "table": lut.sha256,
+        "light": light.label,
+        "matrix": [row.hex() for row in rows],
+        "code": _code(),
+    }
+    return sha256_of(json.dumps(depends).encode())
+
+
+@lru_cache(maxsize=1)
+def _code() -> str:
+    """Return a hash of the code that computes mixtures, so that those of older code are not taken for its own."""
+    modules = (print_profiles, source_colours, cell_mixtures)
+    files = [Path(str(module.__file__)) for module in modules] + [Path(__file__)]
+    return sha256_of(b"".join(file.read_bytes() for file in files))

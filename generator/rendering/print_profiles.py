@@ -1,0 +1,233 @@
+"""What a camera sees of every cell of the chart under a light, from the table itself.
+
+The samples of a table are linear camera RGB, and its ground truth is what the camera sees of an ideal white. So the
+mean of a cell's samples over the white of the light is the cell's reflectance as this camera sees it under this
+light, and 1, 1, 1 is a grey that is as bright as can be. Rules that hold inside:
+
+- The mean counts, not the median: a picture made from the table shows samples as they are, each as often as another.
+- A cell that is not to be trusted is left out and not repaired: one that the table lists as unfit, one with a clipped
+  sample, whose mean is too low, and one whose mean a few odd samples have moved.
+- Black and white are neutral: the darkest and the brightest grey that mixtures of cells make exactly. A print's own
+  black and its paper are tinted, and greys mapped between them would be, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.errors import QualityError
+from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
+from generator.lights.lighting import plain
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+
+ODD_SIGMAS: Final = 8.0
+"""Distance of a cell's mean from its median, in standard errors, from which its mean is not trusted: far beyond the
+tails of 100 000 cells and channels of normal samples, where the standard error is known to a seventh from 25 samples;
+one photosite of 25 that is clipped beside a cell of a tenth of saturation moves the mean by more."""
+
+ODD_SHIFT: Final = 0.02
+"""Least shift of a mean, relative to the median, that matters: 0.02 is a degree of hue at most."""
+
+BLACK_MARGIN: Final = 1.1
+"""Black point over the darkest grey that the print's cells can make: at the very edge of the gamut, cells of unlike
+colours would have to be mixed. On simulated unmanaged prints black is then half a degree off grey at most; without the
+margin it is up to 0.9, with a quarter 0.2, but blacks would be that much paler."""
+
+WHITE_MARGIN: Final = 0.99
+"""White point over the brightest grey that the print's cells can make, for the same reason."""
+
+PAPER_MARGIN: Final = 0.97
+"""White point over the mean of the paper at most, so that white, too, is drawn from several cells."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PrintProfile:
+    """What a camera sees of each cell of a chart under one light.
+
+    Attributes
+    ----------
+    colours
+        (8**bits, 3) float64, mean of each cell's samples over the white of the light; 1 = what an ideal white shows.
+    usable
+        (8**bits,) bool, whether a cell's mean is to be trusted; see the head of this file. At least one is.
+    """
+
+    colours: _Array
+    usable: npt.NDArray[np.bool_]
+
+    @property
+    def bits(self) -> int:
+        """Bits of a channel of the chart, 1 … 5."""
+        return (len(self.colours).bit_length() - 1) // 3
+
+    @cached_property
+    def black(self) -> float:
+        """The black point: how bright the darkest grey is that is asked of the print; 1 = ideal white."""
+        return self._neutral[0]
+
+    @cached_property
+    def white(self) -> float:
+        """The white point: how bright the brightest grey is that is asked of the print; 1 = ideal white."""
+        return self._neutral[1]
+
+    @cached_property
+    def _neutral(self) -> tuple[float, float]:
+        """Return the black and the white point."""
+        brightness = self.colours.mean(axis=1)
+        usable = np.flatnonzero(self.usable)
+        darkest, brightest = (float(pick(brightness[usable])) for pick in (np.min, np.max))
+        if self.usable[0]:
+            darkest = float(brightness[0])
+        if self.usable[-1]:
+            brightest = float(brightness[-1])
+        ends = neutral_ends(self.colours[usable])
+        if ends is not None:
+            darkest, brightest = max(darkest, ends[0]), min(brightest * PAPER_MARGIN, ends[1] * WHITE_MARGIN)
+        if brightest <= BLACK_MARGIN * darkest:
+            # A print without contrast, or one that has no grey between its black and its paper.
+            return darkest, max(darkest, brightest)
+        return BLACK_MARGIN * darkest, brightest
+
+
+def profile_of(lut: Lut, light: int) -> PrintProfile:
+    """Return what the camera of a table sees of each cell under one of its lights.
+
+    Parameters
+    ----------
+    lut
+        The table.
+    light
+        Number of the light.
+
+    Raises
+    ------
+    InputError
+        The table has no such light.
+    QualityError
+        No cell of the table can be trusted under that light.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from calibration.table.lut import open_lut
+    >>> profile = profile_of(open_lut(Path("lut")), 0)
+    >>> profile.colours.shape, bool(profile.usable.all())
+    ((64, 3), True)
+    """
+    white = plain(light).white(lut)
+    samples = lut.samples[light]
+    means = samples.mean(axis=1, dtype=np.float64)
+    usable = (samples.max(axis=(1, 2)) < lut.provenance.white_level) & ~odd_cells(samples, means)
+    # A channel that sees nothing of a cell, in noise about 0, has no relative difference to anything.
+    usable &= means.min(axis=1) > 0
+    usable[[cell.colour for cell in lut.provenance.unfit]] = False
+    if not usable.any():
+        raise QualityError(
+            f"under light {light} no cell of the table {lut.folder} is fit for a profile of its print: all are listed "
+            "as unfit, clipped, or dark; choose other lights, or build the table again from a shorter exposure"
+        )
+    return PrintProfile(means / white, usable)
+
+
+def mixed_profile(profiles: Sequence[PrintProfile], whites: _Array) -> PrintProfile:
+    """Return what the camera sees of each cell under several lights together: light adds, and so do means.
+
+    A cell is usable that is so under each of them; where none is, all that are so under one of them.
+
+    Parameters
+    ----------
+    profiles
+        Of each light.
+    whites
+        (K, 3) float64 > 0, linear camera RGB of each light, as bright as it is in the mixture.
+
+    Examples
+    --------
+    >>> usable = np.ones(8, bool)
+    >>> one, other = PrintProfile(np.full((8, 3), 0.2), usable), PrintProfile(np.full((8, 3), 0.6), usable)
+    >>> mixed_profile([one, other], np.array([[1.0, 3.0, 2.0], [1.0, 1.0, 2.0]])).colours[0].round(3).tolist()
+    [0.4, 0.3, 0.4]
+    """
+    shares = whites / whites.sum(axis=0)
+    colours = np.sum([share * profile.colours for share, profile in zip(shares, profiles, strict=True)], axis=0)
+    usable = np.all([profile.usable for profile in profiles], axis=0)
+    if not usable.any():
+        usable = np.any([profile.usable for profile in profiles], axis=0)
+    return PrintProfile(colours, usable)
+
+
+def odd_cells(samples: npt.NDArray[np.uint16], means: _Array) -> npt.NDArray[np.bool_]:
+    """Return which cells have means that a few odd samples have moved: hot photosites, dust.
+
+    Parameters
+    ----------
+    samples
+        (N, S, 3) uint16, the samples of a light.
+    means
+        (N, 3) float64, their means.
+
+    Returns
+    -------
+    ndarray
+        (N,) bool.
+
+    Examples
+    --------
+    >>> samples = np.random.default_rng(1).poisson(400, (3, 25, 3)).astype(np.uint16)
+    >>> samples[1, 7, 0] = 9000
+    >>> odd_cells(samples, samples.mean(axis=1)).tolist()
+    [False, True, False]
+    """
+    medians = np.median(samples, axis=1)
+    deviations = np.median(np.abs(samples - medians[:, None]), axis=1)
+    # Half a count for rounding: without it, samples that are mostly one number have no scale.
+    sigmas = MEDIAN_ERROR * MAD_TO_SIGMA * np.maximum(deviations, 0.5) / np.sqrt(samples.shape[1])
+    shifts = np.abs(means - medians)
+    return ((shifts > ODD_SIGMAS * sigmas) & (shifts > ODD_SHIFT * medians)).any(axis=1)
+
+
+def neutral_ends(colours: _Array) -> tuple[float, float] | None:
+    """Return the darkest and the brightest grey (g, g, g) that mixtures of colours make exactly.
+
+    They are where the grey axis enters and leaves the convex hull of the colours.
+
+    Parameters
+    ----------
+    colours
+        (N, 3) float64, linear.
+
+    Returns
+    -------
+    tuple or None
+        The two values of g; None if no mixture is grey, or the colours lie in a plane.
+
+    Examples
+    --------
+    >>> cube = np.stack(np.meshgrid([0.1, 0.9], [0.1, 0.9], [0.2, 0.9]), axis=-1).reshape(-1, 3)
+    >>> [round(end, 6) for end in neutral_ends(cube)]
+    [0.2, 0.9]
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        planes: Any = ConvexHull(colours).equations
+    except (QhullError, ValueError):
+        return None
+    # Inside, every plane has normal · g (1, 1, 1) + offset ≤ 0.
+    slopes, offsets = planes[:, :3].sum(axis=1), planes[:, 3]
+    entering, leaving = slopes < 0, slopes > 0
+    if not entering.any() or not leaving.any():
+        return None
+    low = float((-offsets[entering] / slopes[entering]).max())
+    high = float((-offsets[leaving] / slopes[leaving]).min())
+    return (low, high) if 0 < low < high else None

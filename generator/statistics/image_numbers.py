@@ -1,0 +1,150 @@
+"""The numbers of one image, reduced to cells with the light divided out: what real and rendered images are told by.
+
+A number is a function of the cells alone, so that a picture as the camera would see it and a photograph of another
+camera are measured alike. `evaluate describe` makes the figures of a data set of them, `generate --like` chooses source
+pictures by them.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.angles import angles_deg
+
+CELLS: Final = 64
+"""Cells a side: the size of the thumbnails that colour constancy is learned from (FFCC, and the sets at hand)."""
+
+LUMINANCE_PERCENTS: Final = (1, 5, 25, 50, 75, 95)
+"""Percentiles of luminance, as shares of the 99th: the brightest percent is lamps and highlights."""
+
+GREY_DEG: Final = 3.0
+"""Degrees from white up to which a cell is near grey: about what a good method's median error is."""
+
+DARK: Final = 0.001
+"""Least luminance in a gradient, as a share of the 99th percentile: a logarithm needs one."""
+
+LUMINANCE_EDGES: Final = tuple(float(edge) for edge in np.linspace(-3, 0.5, 71))
+"""Edges of the luminance histogram: decimal logarithm of luminance over the 99th percentile."""
+
+CHROMA_EDGES: Final = tuple(float(edge) for edge in np.linspace(-1.6, 1.6, 65))
+"""Edges of the chroma histogram along ln(R/G) and ln(B/G); colours beyond are counted at the rim."""
+
+
+def log_chroma(lights: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return ln(R/G) and ln(B/G) (N, 2) float64 of colours (N, 3) float above 0."""
+    given = np.log(np.asarray(lights, dtype=np.float64))
+    return given[:, [0, 2]] - given[:, 1:2]
+
+
+def cell_borders(size: int, side: int = CELLS) -> npt.NDArray[np.int64]:
+    """Return where cells begin along a side of `size` px, and where the last ends.
+
+    Parameters
+    ----------
+    size
+        Of the image, px.
+    side
+        Cells, at most; 0 for as many as pixels.
+
+    Returns
+    -------
+    ndarray
+        (N,) int64, px, from 0 to `size`, one more than cells.
+
+    Examples
+    --------
+    >>> cell_borders(10, 4).tolist()
+    [0, 2, 5, 7, 10]
+    """
+    count = min(side or size, size)
+    return np.arange(count + 1, dtype=np.int64) * size // count
+
+
+def cell_means(image: npt.NDArray[np.generic], light: npt.ArrayLike, side: int = CELLS) -> npt.NDArray[np.float64]:
+    """Return an image of which every pixel is usable as cells (h, w, 3) float64, divided by its light.
+
+    Parameters
+    ----------
+    image
+        (H, W, 3) uint16 or float, linear camera RGB.
+    light
+        (3,) float above 0, linear camera RGB of any length; its mean over the channels counts as 1.
+    side
+        Cells a side, at most; 0 keeps every pixel.
+
+    Examples
+    --------
+    >>> cell_means(np.array([[[2, 2, 1], [4, 4, 2]]], np.uint16), [1, 1, 0.5], side=1).round(2).tolist()
+    [[[2.5, 2.5, 2.5]]]
+    """
+    rows, columns = (cell_borders(size, side) for size in image.shape[:2])
+    # Rows first: whole numbers of 64 bits, so that nothing is rounded or overflows.
+    sums = np.add.reduceat(np.add.reduceat(image, rows[:-1], axis=0, dtype=np.float64), columns[:-1], axis=1)
+    even = np.asarray(light, dtype=np.float64)
+    return sums / (np.diff(rows)[:, None] * np.diff(columns))[..., None] / (even / even.mean())
+
+
+def numbers_of_cells(
+    colours: npt.NDArray[np.float64],
+) -> tuple[dict[str, float], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return what the cells of an image give.
+
+    Parameters
+    ----------
+    colours
+        (h, w, 3) float64, linear camera RGB divided by the light; NaN where a cell has no colour.
+
+    Returns
+    -------
+    tuple
+        Numbers by their names, NaN where one is not known: `luminance_1` … `luminance_95`, `edges`, `edges_95`,
+        `chroma_spread`, `log_red_spread`, `log_blue_spread`, `near_grey`, `grey_red`, `grey_blue`; the histograms of
+        luminance (70,) and of chroma (64, 64) float64, each of sum 1, all 0 of an image without a usable cell.
+    """
+    luminance = colours.mean(axis=2)
+    known = luminance[np.isfinite(luminance)]
+    white = percentile(known, 99)
+    shares = known / white if white > 0 else np.empty(0)
+    values = {f"luminance_{percent}": percentile(shares, percent) for percent in LUMINANCE_PERCENTS}
+    edges = _edges(luminance, white)
+    values["edges"] = float(edges.mean()) if edges.size else np.nan
+    values["edges_95"] = percentile(edges, 95)
+    with np.errstate(divide="ignore"):
+        darkness = np.log10(np.maximum(shares, 0))
+    counted = np.histogram(np.clip(darkness, LUMINANCE_EDGES[0], LUMINANCE_EDGES[-1]), LUMINANCE_EDGES)[0]
+    chroma_values, chroma = _of_colours(colours[np.isfinite(luminance)])
+    return values | chroma_values, counted / max(counted.sum(), 1), chroma
+
+
+def percentile(values: npt.NDArray[np.float64], percent: float) -> float:
+    """Return a percentile of values (N,) by MATLAB's definition; NaN of none."""
+    return float(np.percentile(values, percent, method="hazen")) if values.size else np.nan
+
+
+def _of_colours(colours: npt.NDArray[np.float64]) -> tuple[dict[str, float], npt.NDArray[np.float64]]:
+    """Return the numbers that colours (N, 3) give, and the histogram of their chroma."""
+    bins = len(CHROMA_EDGES) - 1
+    lit = colours[(colours > 0).all(axis=1)]
+    names = ("chroma_spread", "log_red_spread", "log_blue_spread", "near_grey", "grey_red", "grey_blue")
+    if not len(lit):
+        return dict.fromkeys(names, np.nan), np.zeros((bins, bins))
+    places = log_chroma(lit)
+    spread = float(np.sqrt((lit / lit.sum(axis=1, keepdims=True)).var(axis=0).mean()))
+    near = float((angles_deg(lit, np.ones(3)) <= GREY_DEG).mean())
+    red, blue = (float(number) for number in log_chroma(colours.mean(axis=0, keepdims=True))[0])
+    kept = np.clip(places, CHROMA_EDGES[0], CHROMA_EDGES[-1])
+    counted = np.histogram2d(kept[:, 0], kept[:, 1], (CHROMA_EDGES, CHROMA_EDGES))[0]
+    numbers = (spread, *map(float, places.std(axis=0)), near, red, blue)
+    return dict(zip(names, numbers, strict=True)), counted / len(lit)
+
+
+def _edges(luminance: npt.NDArray[np.float64], white: float) -> npt.NDArray[np.float64]:
+    """Return |difference of ln luminance| of all neighbours, side by side and one above the other."""
+    if not white > 0:
+        return np.empty(0)
+    logarithm = np.log(np.maximum(luminance / white, DARK))
+    steps = np.concatenate([np.abs(np.diff(logarithm, axis=axis)).ravel() for axis in (0, 1)])
+    return steps[np.isfinite(steps)]

@@ -1,0 +1,1 @@
+"""What makes photographs differ beside scene and light: exposure, uneven light, the noise of another ISO speed."""

@@ -1,0 +1,80 @@
+"""The ISO speed whose noise images are to have, beside that of their table."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from foundation.errors import InputError
+from generator.named_numbers import parse_numbers
+from generator.variation.sensor_noise import SENSOR_ELECTRONS
+
+
+@dataclass(frozen=True)
+class IsoSpeed:
+    """A speed at or above that of the table: noise can be added, and not be taken away.
+
+    Attributes
+    ----------
+    wanted, base
+        The speed that images are to have, and that with which the table was photographed.
+    sensor_electrons
+        Read noise of a photosite before the amplifier, electrons; see `sensor_noise`.
+
+    Raises
+    ------
+    InputError
+        The wanted speed is below that of the table, or a number is not above 0.
+    """
+
+    wanted: float
+    base: float
+    sensor_electrons: float = SENSOR_ELECTRONS
+
+    def __post_init__(self) -> None:
+        if not (0 < self.base < float("inf") and 0 < self.wanted < float("inf") and 0 <= self.sensor_electrons < 1e6):
+            raise InputError(
+                f"ISO {self.wanted:g} of a table of ISO {self.base:g} with {self.sensor_electrons:g} electrons of read "
+                "noise was asked for, expected numbers above 0"
+            )
+        if self.wanted < self.base:
+            raise InputError(
+                f"ISO {self.wanted:g} was asked for, below the ISO {self.base:g} of the table, whose noise cannot be "
+                f"taken away; ask for {self.base:g} or more"
+            )
+
+    @property
+    def ratio(self) -> float:
+        """The wanted speed over that of the table, 1 or more."""
+        return self.wanted / self.base
+
+    def describe(self) -> dict[str, Any]:
+        """Return the speeds as plain values."""
+        return {"wanted": self.wanted, "table": self.base, "sensor_electrons": self.sensor_electrons}
+
+
+def parse_iso(text: str) -> IsoSpeed:
+    """Return the speed that a text names: ``1600/100``, wanted over the table's, with ``:read=2.8`` electrons.
+
+    Raises
+    ------
+    InputError
+        It names none.
+
+    Examples
+    --------
+    >>> parse_iso("1600/100").ratio
+    16.0
+    >>> parse_iso("1600/100:read=2.8").sensor_electrons
+    2.8
+    """
+    speeds, _, rest = text.strip().partition(":")
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*/\s*(\d+(?:\.\d*)?)\s*", speeds, re.ASCII)
+    if not match:
+        raise InputError(
+            f"{text!r} is no ISO speed; write the wanted one over that with which the table was photographed, such as "
+            "1600/100: a table does not say its own"
+        )
+    numbers = parse_numbers(rest, {"read": (0.0, 1000.0)}, "an ISO speed")
+    return IsoSpeed(float(match[1]), float(match[2]), numbers.get("read", SENSOR_ELECTRONS))

@@ -1,0 +1,139 @@
+"""The noise of a table's samples, and that of the same camera at a higher ISO speed.
+
+The model is photon transfer (EMVA 1288, release 4.0, section 2.4): a sample of the mean y counts has the variance
+
+    read² + shot · y,        shot = 1 / (electrons per count)
+
+beside what grows with y² (photosites and print that differ), which scales with a sample and is left in it. A table's
+numbers are measured from its samples: cells of all levels, each with the mean and variance of its samples.
+
+At k times the table's ISO speed a count stands for k times fewer electrons, so shot becomes k · shot. Read noise that
+arises before the amplifier grows with k, what arises behind does not. How it is divided cannot be told from one speed;
+`SENSOR_ELECTRONS` is assumed unless a number is given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from foundation.errors import InputError
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+
+Three = tuple[float, float, float]
+
+SENSOR_ELECTRONS: Final = 2.5
+"""Read noise of a photosite before the amplifier, electrons: sensors of 2008 to 2020 have some 2 to 3 at their highest
+speeds, where nothing else is left (W. Claff, photonstophotos.net, input-referred read noise); chosen, not measured."""
+
+_PHOTOSITES: Final = (1, 2, 1)
+"""Photosites whose mean a sample of red, green and blue is: those of the half-size image of a Bayer mosaic."""
+
+_LIGHTS: Final = 6
+"""Lights whose cells are measured: 200 000 cells of a full table tell each number to a percent."""
+
+_MISFIT: Final = 0.25
+"""RMS by which variances may differ from the curve, relative: .006 in the simulated tables of two cameras, and .1 where
+a table has so few cells that a level is known from eight."""
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """The noise of red, green and blue samples: variance = read² + shot · mean.
+
+    Attributes
+    ----------
+    read
+        Counts, from 0.
+    shot
+        Counts: variance for each count of the mean, from 0.
+
+    Examples
+    --------
+    >>> noise = SensorNoise(read=(6.0, 4.2, 6.0), shot=(0.56, 0.28, 0.56))
+    >>> noise.at(4.0).shot
+    (2.24, 1.12, 2.24)
+    """
+
+    read: Three
+    shot: Three
+
+    def at(self, ratio: float, sensor_electrons: float = SENSOR_ELECTRONS) -> SensorNoise:
+        """Return the noise at `ratio` ≥ 1 times the ISO speed, for samples of the same mean.
+
+        Parameters
+        ----------
+        ratio
+            ISO speed over that of these samples.
+        sensor_electrons
+            Read noise of a photosite before the amplifier, electrons; no more than all read noise is taken for it.
+        """
+        read: list[float] = []
+        for counts, shot, photosites in zip(self.read, self.shot, _PHOTOSITES, strict=True):
+            early = min(counts**2, photosites * (sensor_electrons * shot) ** 2)
+            read.append(float(np.sqrt(counts**2 + (ratio**2 - 1) * early)))
+        return SensorNoise(_three(read), _three([ratio * shot for shot in self.shot]))
+
+    def describe(self) -> dict[str, Any]:
+        """Return the numbers as plain values."""
+        return {"read": list(self.read), "shot": list(self.shot)}
+
+
+def measured_noise(lut: Lut) -> SensorNoise:
+    """Return the noise of a table's samples.
+
+    Read from the cells under up to six of its lights, those that are brightest in their darkest channel, so that
+    dark samples, which are cut at 0 and hence too quiet, are few; cells with such a sample, and unfit cells, are left
+    out. The curve is fitted by `calibration.radiometry.photon_transfer`. Numbers have six digits, so that they are the
+    same wherever a dataset is made.
+
+    Raises
+    ------
+    InputError
+        The samples do not follow the curve, or too few cells can be read.
+    """
+    from calibration.radiometry.photon_transfer import photon_transfer
+
+    count = lut.samples.shape[2]
+    lights = np.argsort(-lut.white.min(axis=1), kind="stable")[:_LIGHTS]
+    unfit = np.array([cell.colour for cell in lut.provenance.unfit], dtype=np.int64)
+    means: list[npt.NDArray[np.float64]] = []
+    variances: list[npt.NDArray[np.float64]] = []
+    for light in map(int, lights):
+        samples = np.delete(np.asarray(lut.samples[light]), unfit, axis=0)
+        samples = samples[(samples > 0).all(axis=(1, 2))].astype(np.float32)
+        if count > 1:
+            means.append(samples.mean(axis=1, dtype=np.float64))
+            variances.append(samples.var(axis=1, ddof=1, dtype=np.float64))
+    cells = sum(map(len, means))
+    if cells < _FEWEST:
+        raise InputError(
+            f"the noise of {lut.folder} cannot be measured: {cells} cells with several samples above 0, expected "
+            f"{_FEWEST} or more; leave out --iso, --exposure and --gradient, or use another table"
+        )
+    curve = photon_transfer(np.concatenate(means), np.concatenate(variances), count)
+    seen = np.concatenate(variances).max() > 0
+    if seen and not curve.misfit.max() <= _MISFIT:
+        raise InputError(
+            f"the samples of {lut.folder} do not follow the photon-transfer curve: variances differ from it by "
+            f"{curve.misfit.max():.0%} RMS, expected {_MISFIT:.0%} or less; leave out --iso, --exposure and "
+            "--gradient, or use another table"
+        )
+    if not seen:
+        return SensorNoise((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    shot = [0.0 if not np.isfinite(gain) else 1 / gain for gain in curve.gain_e.tolist()]
+    return SensorNoise(_three(curve.read_noise.tolist()), _three(shot))
+
+
+_FEWEST: Final = 32
+"""Cells that a curve of three numbers is fitted to at least."""
+
+
+def _three(numbers: list[float]) -> Three:
+    red, green, blue = (float(f"{number:.6g}") for number in numbers)
+    return red, green, blue

@@ -1,0 +1,249 @@
+"""Spectral sensitivities of cameras, as ISO 17321-1 has them measured, read from files in the layout of rawtoaces.
+
+The layout is that of AcademySoftwareFoundation/rawtoaces-data, schema 0.1.0: ``spectral_data.units`` is ``relative``,
+``spectral_data.index.main`` names the channels, and ``spectral_data.data.main`` has their responses to light of equal
+power by wavelength in nanometres. Only proportions matter: exposure is set elsewhere.
+
+Files of some cameras come with the suite (`sim.data`) and are known by name; any other is named by its path.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from foundation.errors import FormatError, InputError
+from foundation.hashing import sha256_of
+
+SUFFIX: Final = "_380_780_5.json"
+"""What the names of the files in `sim.data` end in: first and last wavelength, and the step (as rawtoaces-data)."""
+
+NEEDED_NM: Final = (400.0, 700.0)
+"""Wavelengths that a file must cover: beyond them a camera with its infrared filter sees under 2 % of its light."""
+
+WIDEST_STEP_NM: Final = 20.0
+"""Distance of two wavelengths that may be bridged by a straight line: filters' edges rise over some 40 nm, and bench
+measurements are taken every 5 or 10 nm (ISO 17321-1 asks for 10 at most)."""
+
+EDGE_SHARE: Final = 0.05
+"""Share of a channel's peak that may be left at the first and the last wavelength of a file, beyond which the channel
+is taken to be blind (judgement): what is cut off there is below a hundredth of its light."""
+
+_CHANNELS: Final = ("R", "G", "B")
+
+_Array = npt.NDArray[np.float64]
+
+
+class _Header(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    manufacturer: str = ""
+    model: str = ""
+
+
+class _Spectra(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    units: str = "relative"
+    index: dict[str, list[str]]
+    data: dict[str, dict[str, list[float]]]
+
+
+class _Document(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    header: _Header = _Header()
+    spectral_data: _Spectra
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivities:
+    """A camera's spectral sensitivities.
+
+    Attributes
+    ----------
+    name
+        The file's, without its suffix.
+    maker, model
+        As the file names the camera; empty where it does not.
+    wavelengths_nm
+        (W,) float64, ascending.
+    curves
+        (W, 3) float64 ≥ 0, R, G, B, response to light of equal power per nm, relative.
+    sha256
+        Of the file.
+    """
+
+    name: str
+    maker: str
+    model: str
+    wavelengths_nm: _Array
+    curves: _Array
+    sha256: str
+
+    @property
+    def camera(self) -> str:
+        """Maker and model as raw files have them, e.g. ``Canon EOS 5DS``; the name where the file states no model."""
+        return " ".join(f"{self.maker} {self.model}".split()) if self.model else self.name
+
+    def at(self, wavelengths_nm: _Array) -> _Array:
+        """Return the curves (N, 3) float64 at wavelengths (N,) nm: straight lines between those measured, 0 beyond."""
+        found = np.zeros((len(wavelengths_nm), 3))
+        for channel in range(3):
+            found[:, channel] = np.interp(wavelengths_nm, self.wavelengths_nm, self.curves[:, channel], left=0, right=0)
+        return found
+
+
+def known_sensitivities() -> tuple[str, ...]:
+    """Return the names of the cameras whose sensitivities come with the suite, in alphabetical order.
+
+    Examples
+    --------
+    >>> "Canon_EOS_5DS" in known_sensitivities()
+    True
+    """
+    files = (entry.name for entry in resources.files("sim").joinpath("data").iterdir())
+    return tuple(sorted(name.removesuffix(SUFFIX) for name in files if name.endswith(SUFFIX)))
+
+
+def read_sensitivities(name: str) -> Sensitivities:
+    """Return the sensitivities that a name or a path stands for.
+
+    Parameters
+    ----------
+    name
+        One of `known_sensitivities`, or the path of a file.
+
+    Raises
+    ------
+    InputError
+        There is no such camera and no such file.
+    FormatError
+        The file is not in the layout, or its numbers cannot be a camera's: gaps, values below 0, no light at all, or
+        wavelengths that are not nanometres.
+    """
+    if name in known_sensitivities():
+        data = resources.files("sim").joinpath("data", name + SUFFIX).read_bytes()
+        return parse_sensitivities(data, name, name)
+    path = Path(name)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"no camera {name!r}: cannot read such a file ({error.strerror}), and those known by name are "
+            f"{', '.join(known_sensitivities())}; name one of them, or a file of spectral sensitivities"
+        ) from error
+    return parse_sensitivities(data, path.name.removesuffix(SUFFIX).removesuffix(".json"), str(path))
+
+
+def parse_sensitivities(data: bytes, name: str, where: str) -> Sensitivities:
+    """Return the sensitivities in the bytes of a file.
+
+    Parameters
+    ----------
+    data
+        The file.
+    name
+        What to call them.
+    where
+        The file's name for messages.
+
+    Raises
+    ------
+    FormatError
+        See `read_sensitivities`.
+    """
+    try:
+        document = _Document.model_validate(json.loads(data))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise FormatError(f"{where} is no JSON: {error}; expected a file of rawtoaces-data's layout") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"])) or "document"
+        raise FormatError(
+            f"{where}: {key}: {first['msg']}; expected rawtoaces-data's layout: spectral_data with units, index.main "
+            "and data.main"
+        ) from error
+    spectra = document.spectral_data
+    if spectra.units != "relative":
+        raise FormatError(
+            f"{where}: spectral_data.units is {spectra.units!r}, 'relative' expected: responses to light of equal "
+            "power; multiply a quantum efficiency by the wavelength first"
+        )
+    if tuple(spectra.index.get("main", ())) != _CHANNELS or "main" not in spectra.data:
+        raise FormatError(
+            f"{where}: spectral_data.index.main is {spectra.index.get('main')}, with data.main under it; "
+            f"{list(_CHANNELS)} expected"
+        )
+    wavelengths, curves = _sorted(spectra.data["main"], where)
+    _require_camera(wavelengths, curves, where)
+    header = document.header
+    return Sensitivities(name, header.manufacturer, header.model, wavelengths, curves, sha256_of(data))
+
+
+def _sorted(table: Mapping[str, list[float]], where: str) -> tuple[_Array, _Array]:
+    """Return wavelengths (W,), ascending, and curves (W, 3)."""
+    rows: list[tuple[float, list[float]]] = []
+    for text, values in table.items():
+        try:
+            wavelength = float(text)
+        except ValueError as error:
+            raise FormatError(f"{where}: {text!r} is no wavelength; a number of nanometres expected") from error
+        if len(values) != len(_CHANNELS) or not all(map(math.isfinite, [wavelength, *values])):
+            raise FormatError(f"{where}: at {text} nm stand {values}; three numbers expected, for R, G and B")
+        rows.append((wavelength, values))
+    rows.sort(key=lambda row: row[0])
+    wavelengths = np.array([row[0] for row in rows], dtype=np.float64)
+    return wavelengths, np.array([row[1] for row in rows], dtype=np.float64).reshape(-1, 3)
+
+
+def _require_camera(wavelengths: _Array, curves: _Array, where: str) -> None:
+    """Refuse numbers that cannot be a camera's sensitivities."""
+    low, high = NEEDED_NM
+    if len(wavelengths) < 2 or wavelengths[0] > low or wavelengths[-1] < high:
+        span = "none" if not len(wavelengths) else f"{wavelengths[0]:g} to {wavelengths[-1]:g}"
+        raise FormatError(
+            f"{where}: its wavelengths are {span}, {low:g} to {high:g} nm at least expected; "
+            "convert them to nanometres if they are not, or measure the rest"
+        )
+    steps = np.diff(wavelengths)
+    if steps.min() <= 0:
+        raise FormatError(f"{where}: {wavelengths[int(steps.argmin())]:g} nm stands there twice; leave one out")
+    inside = (wavelengths[:-1] < high) & (wavelengths[1:] > low)
+    if steps[inside].max() > WIDEST_STEP_NM:
+        at = int(np.flatnonzero(inside)[steps[inside].argmax()])
+        raise FormatError(
+            f"{where}: there is a gap from {wavelengths[at]:g} to {wavelengths[at + 1]:g} nm, {WIDEST_STEP_NM:g} nm at "
+            "most expected; measure what lies between"
+        )
+    if curves.min() < 0:
+        row, channel = np.unravel_index(int(curves.argmin()), curves.shape)
+        raise FormatError(
+            f"{where}: {_CHANNELS[channel]} is {curves[row, channel]:g} at {wavelengths[row]:g} nm, 0 or more "
+            "expected; set to 0 what is a measurement's noise about 0"
+        )
+    peak = curves.max(axis=0)
+    if peak.min() <= 0:
+        raise FormatError(f"{where}: {_CHANNELS[int(peak.argmin())]} is 0 at every wavelength; it sees no light at all")
+    for place in (0, -1):
+        left = curves[place] / peak
+        if left.max() > EDGE_SHARE:
+            raise FormatError(
+                f"{where}: {_CHANNELS[int(left.argmax())]} still has {left.max():.0%} of its peak at its last "
+                f"wavelength, {wavelengths[place]:g} nm; {EDGE_SHARE:.0%} at most expected, so it goes on beyond: add "
+                "what is lacking"
+            )
+
+
+def describe_sensitivities(found: Sensitivities) -> dict[str, Any]:
+    """Return what a record says of sensitivities: name, camera, and the file's hash."""
+    return {"name": found.name, "camera": found.camera, "sha256": found.sha256}

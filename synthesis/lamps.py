@@ -1,0 +1,94 @@
+"""What lights the chart: the simulated projector under its codes, or any spectra from one luminaire.
+
+Light adds: a frame under a projector's light is the weighted sum of the same frame under each of its three primaries.
+A luminaire has one spectrum a light, and so one frame of its own for each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.lights.illuminations import Illumination
+from calibration.radiometry.primaries import pure_lights
+from drivers.camera import ExposureSettings
+from drivers.presenter import WHITE
+from sim.world.world import World
+from synthesis.patch_frames import PatchSensor
+
+_Array = npt.NDArray[np.float64]
+_Float = npt.NDArray[np.float32]
+
+
+class ChartLamp(Protocol):
+    """What lights the chart."""
+
+    @property
+    def illuminations(self) -> Sequence[Illumination]:
+        """The lights."""
+        ...
+
+    def lit(self, light: int) -> tuple[_Float, _Array]:
+        """Return the light on every photosite by primary, (3, rows, columns) float32, and the primaries' weights (3,).
+
+        As `synthesis.patch_frames.PatchSensor.expose` takes them, for the frame of a light.
+        """
+        ...
+
+    def even(self) -> tuple[_Float, _Array]:
+        """Return the same, (3, rows, columns) and (3,), for the frame that the flat field is read from first."""
+        ...
+
+    def pure(self) -> tuple[int, int, int] | None:
+        """Return the lights of red, green and blue alone; None where the light has no primaries."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectorLamp:
+    """The simulated projector.
+
+    Attributes
+    ----------
+    world
+        Room, body and page.
+    settings
+        The exposure of every frame.
+    illuminations
+        The lights and their codes.
+    light
+        (3, rows, columns) float32, the light on every photosite under each primary at full drive.
+    """
+
+    world: World
+    settings: ExposureSettings
+    illuminations: tuple[Illumination, ...]
+    light: _Float
+
+    @staticmethod
+    def of(
+        world: World,
+        settings: ExposureSettings,
+        illuminations: tuple[Illumination, ...],
+        sensor: PatchSensor,
+        rgb: npt.NDArray[np.uint8],
+        points_mm: _Array,
+    ) -> ProjectorLamp:
+        """Return the projector in front of patches of printed codes (N, 3) at points (N, 2) of the print."""
+        return ProjectorLamp(world, settings, illuminations, sensor.light(world.of_primaries(rgb, points_mm)))
+
+    def lit(self, light: int) -> tuple[_Float, _Array]:
+        """Return light (3, rows, columns) float32 and weights (3,) of a light's frame; see `ChartLamp.lit`."""
+        return self.light, self.world.drive(self.illuminations[light].colour, self.settings)
+
+    def even(self) -> tuple[_Float, _Array]:
+        """Return light (3, rows, columns) float32 and weights (3,) of a white frame."""
+        return self.light, self.world.drive(WHITE, self.settings)
+
+    def pure(self) -> tuple[int, int, int] | None:
+        """Return the lights of red, green and blue alone; None where one is not planned."""
+        return pure_lights(self.illuminations)

@@ -1,0 +1,140 @@
+"""What a settings file of `sim table` may say: body, exposure, room, chart; everything has a default.
+
+One TOML file becomes frozen values at the door; unknown keys are errors.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from acquisition.config import unknown_key
+from calibration.sampling.samples import WINDOW
+from calibration.sampling.windows import WINDOWS
+from drivers.camera import ExposureSettings
+from foundation.errors import ConfigurationError
+from sim.world.room import Room
+
+NOT_COMPUTED: Final = (
+    "blur_px", "fold_mm", "lamp_drift_per_hour", "shutter_jitter_s", "stain_depth", "stain_mm", "wheel_hz",
+)  # fmt: skip
+"""What a photographed room may have and a computed table has not: its frames know neither neighbours nor time."""
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class ComputedExposure(_Settings):
+    """The exposure of every frame, as `[camera]` of LAB.toml has it."""
+
+    iso: Annotated[int, Field(ge=50, le=25600)] = 100
+    """ISO speed."""
+    aperture: Annotated[float, Field(gt=0)] = 8.0
+    """f-number."""
+    shutter_s: Annotated[float, Field(gt=0)] = 0.5
+    """Shutter time, s."""
+
+
+class ComputedChart(_Settings):
+    """The chart, as `acquire chart` designs it."""
+
+    bits: Annotated[int, Field(ge=1, le=5)] = 5
+    """Bits kept of each channel."""
+    page: str | None = None
+    """Paper: A0 … A8, or the smallest that fits."""
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Seed of the order of the colours."""
+
+
+class TableSettings(_Settings):
+    """Everything that a settings file of `sim table` says."""
+
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Seed of everything that chance decides: the photosites' response, noise."""
+    window: int = WINDOW
+    """Half-size pixels along the side of a cell's window: 3, 5, 7 or 9."""
+    camera: dict[str, Any] = {}
+    """Facts of the body that differ; see `sim.world.body_settings.find_body`."""
+    exposure: ComputedExposure = ComputedExposure()
+    room: dict[str, bool | int | float | str] = {}
+    """Parameters of the room that differ; see `sim.world.room.Room`."""
+    chart: ComputedChart = ComputedChart()
+
+    @property
+    def exposed(self) -> ExposureSettings:
+        """The exposure as the simulated room takes it."""
+        return ExposureSettings(self.exposure.iso, self.exposure.aperture, self.exposure.shutter_s)
+
+
+def load_settings(path: Path | None) -> TableSettings:
+    """Return what a settings file says; the defaults where none is given.
+
+    Raises
+    ------
+    ConfigurationError
+        The file cannot be read, is not TOML, or holds an unknown key or an unusable value.
+    """
+    if path is None:
+        return TableSettings()
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"cannot read settings {path}: {error.strerror}; name a TOML file") from error
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"{path} is no text in UTF-8: {error}; save it as such") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(f"{path} is not TOML: {error}") from error
+    return parse_settings(document, str(path))
+
+
+def parse_settings(document: dict[str, Any], where: str) -> TableSettings:
+    """Return the settings in a TOML document; `where` names it in errors.
+
+    Raises
+    ------
+    ConfigurationError
+        It holds an unknown key or an unusable value.
+    """
+    try:
+        settings = TableSettings.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        if first["type"] == "extra_forbidden":
+            models: dict[str, type[BaseModel]] = {"exposure": ComputedExposure, "chart": ComputedChart}
+            model = models.get(str(first["loc"][0]), TableSettings) if len(first["loc"]) > 1 else TableSettings
+            raise unknown_key(key, model.model_fields, where) from error
+        raise ConfigurationError(f"{where}: {key} = {first['input']!r}: {first['msg']}") from error
+    if settings.window not in WINDOWS:
+        raise ConfigurationError(f"{where}: window = {settings.window}: {', '.join(map(str, WINDOWS))} expected")
+    return settings
+
+
+def room_of(settings: TableSettings, where: str) -> Room:
+    """Return the default room with the seed and the changes of the settings; its lamp does not age.
+
+    Raises
+    ------
+    ConfigurationError
+        A parameter is unknown, of the wrong type, or of no effect on a computed table.
+    """
+    known = [field.name for field in fields(Room) if field.name not in ("seed", *NOT_COMPUTED)]
+    for key in settings.room:
+        if key in NOT_COMPUTED:
+            raise ConfigurationError(
+                f"{where}: room.{key} has no effect on a computed table, whose frames know neither neighbours nor "
+                "time; leave it out, or photograph in the simulated lab with acquire run"
+            )
+        if key not in known:
+            raise unknown_key(f"room.{key}", known, where)
+    try:
+        return TypeAdapter(Room).validate_python({**settings.room, "seed": settings.seed, "lamp_drift_per_hour": 0.0})
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(["room", *(str(part) for part in first["loc"][:1])])
+        raise ConfigurationError(f"{where}: {key}: {first['msg']}, got {first['input']!r}") from error

@@ -1,0 +1,244 @@
+"""A whole table, lights by cells by samples, computed light by light and written as `build-lut` writes one.
+
+Rules that hold inside:
+
+- The same camera, lights, settings and seed give the same bytes, on any number of threads.
+- The table appears whole or not at all; what it needs of the disk is asked for before the work.
+- Its provenance says that it was computed, from what, and with which settings; no frame is listed.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.chart.model import Chart
+from acquisition.framing.planes import CLIPPING_SHARE
+from acquisition.lights.illuminations import Illumination
+from calibration.pipeline.registered_frame import ChartPoints
+from calibration.radiometry.corrections import corrections
+from calibration.radiometry.greys import references_csv
+from calibration.table.file_names import REFERENCES
+from calibration.table.provenance import Provenance, Unfit
+from calibration.table.source_frames import frames_sha256
+from calibration.table.writer import LutWriter
+from drivers.camera import ExposureSettings
+from foundation.errors import StorageError
+from foundation.files import require_free, whole_folder
+from foundation.processors import ordered_map
+from foundation.version import software
+from sim.world.drawing import Print
+from sim.world.room import Room
+from sim.world.sensors import Body
+from sim.world.world import World
+from synthesis.lamps import ChartLamp, ProjectorLamp
+from synthesis.measuring import ComputedFrame, PatchMeasurement
+from synthesis.patch_frames import PatchSensor
+
+ReportLights = Callable[[int, int], None]
+"""Called with the number of lights computed, and the number of all."""
+
+SPARE_BYTES: Final = 16 << 20
+"""Room for a table's text files: `lut.json` holds 2.2 kB a light (707 lights take 1.6 MB), `references.csv` a third."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TableTask:
+    """A table that is to be computed.
+
+    Attributes
+    ----------
+    chart
+        The chart that is thought to hang there.
+    body, room
+        The camera and the room.
+    exposure
+        Of every frame.
+    illuminations
+        The lights of the projector.
+    window
+        Half-size pixels along a window's side.
+    record
+        What the provenance says under `computed`.
+    """
+
+    chart: Chart
+    body: Body
+    room: Room
+    exposure: ExposureSettings
+    illuminations: tuple[Illumination, ...]
+    window: int
+    record: dict[str, Any]
+
+    @property
+    def sample_bytes(self) -> int:
+        """Bytes of `samples.npy`, but for its header."""
+        return len(self.illuminations) * self.chart.colour_count * self.window**2 * 6
+
+
+@dataclass(frozen=True, eq=False)
+class ComputedTable:
+    """What came of it.
+
+    Attributes
+    ----------
+    folder
+        The table.
+    lights, cells
+        How many it has.
+    unfit
+        Cells that are listed as unfit.
+    white
+        (L, 3) float64 counts, the ground truth.
+    """
+
+    folder: Path
+    lights: int
+    cells: int
+    unfit: int
+    white: _Array
+
+
+def compute_table(task: TableTask, out: Path, threads: int, progress: ReportLights | None = None) -> ComputedTable:
+    """Compute a table and write it.
+
+    Parameters
+    ----------
+    task
+        The table.
+    out
+        Its folder; must be free.
+    threads
+        How many lights are computed at a time; without effect on the bytes.
+    progress
+        Called after every light.
+
+    Raises
+    ------
+    InputError
+        `out` is taken.
+    QualityError
+        Bare paper is clipped under a light: less exposure is needed.
+    StorageError
+        The disk has not the room, or cannot be written.
+    """
+    require_free(out, "the table")
+    _require_room(out, task.sample_bytes + SPARE_BYTES)
+    measurement = _measurement(task)
+    lights, cells = len(task.illuminations), task.chart.colour_count
+    with whole_folder(out, "the table") as folder:
+        writer = LutWriter(folder, lights, cells, task.window**2)
+
+        def compute(light: int) -> _Kept:
+            frame = measurement.measure(light)
+            writer.put(light, frame.values)
+            return _Kept.of(frame)
+
+        kept: list[_Kept] = []
+        for one in ordered_map(compute, range(lights), threads):
+            kept.append(one)
+            if progress is not None:
+                progress(len(kept), lights)
+        unfit = _clipped_cells(kept, task.body.saturation)
+        white = np.array([one.frame.paper.white for one in kept])
+        provenance = _provenance(task, measurement, kept, white, unfit)
+        levels = measurement.points.levels.names
+        files: dict[str, str] = {}
+        if levels:
+            errors = np.array([one.frame.paper.error for one in kept])
+            greys, grey_errors = (
+                np.array([getattr(one.frame, name) for one in kept]) for name in ("greys", "grey_errors")
+            )
+            files[REFERENCES] = references_csv(levels, white, errors, greys, grey_errors)
+        writer.finish(task.illuminations, white, provenance, files=files)
+    return ComputedTable(out, lights, cells, len(unfit), white)
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """What is kept of a frame: all but its samples."""
+
+    frame: ComputedFrame
+    share_at_zero: float
+
+    @staticmethod
+    def of(frame: ComputedFrame) -> _Kept:
+        share = 1 - int(np.count_nonzero(frame.values)) / frame.values.size
+        return _Kept(replace(frame, values=frame.values[:0].copy()), share)
+
+
+def _measurement(task: TableTask) -> PatchMeasurement:
+    chart = task.chart
+    points = ChartPoints.of(chart)
+    greys = [reference for reference in chart.references if not reference.is_white]
+    codes = np.concatenate(
+        [
+            chart.rgb[chart.cell_of_colour],
+            np.array([reference.rgb for reference in (*chart.white_references, *greys)], dtype=np.uint8),
+        ]
+    )
+    places = np.concatenate([points.cells_mm, points.references_mm])
+    sensor = PatchSensor.of(task.body, len(codes), task.window, task.room, task.exposure.shutter_s)
+    blank = Print(chart.page_mm, np.zeros((0, 4)), np.zeros((0, 3), dtype=np.uint8))
+    world = World(blank, task.body, task.room)
+    lamp: ChartLamp = ProjectorLamp.of(world, task.exposure, task.illuminations, sensor, codes, places)
+    return PatchMeasurement.of(points, chart.page_mm, bool(chart.tags), sensor, lamp, task.exposure.iso)
+
+
+def _clipped_cells(kept: Sequence[_Kept], saturation: int) -> list[Unfit]:
+    """Return the cells of which a photosite came near saturation under a light."""
+    allowed = CLIPPING_SHARE * saturation
+    highest = np.array([one.frame.highest for one in kept])
+    found: list[Unfit] = []
+    for colour in np.flatnonzero(highest.max(axis=0) >= allowed).tolist():
+        light = int(highest[:, colour].argmax())
+        cause = f"clipped: {int(highest[light, colour])} counts under light {light}, below {allowed:.0f} allowed"
+        found.append(Unfit(colour=colour, cause=cause))
+    return found
+
+
+def _provenance(
+    task: TableTask, measurement: PatchMeasurement, kept: Sequence[_Kept], white: _Array, unfit: list[Unfit]
+) -> Provenance:
+    black = np.array([one.frame.black for one in kept])
+    done = corrections(
+        task.chart.page_mm,
+        black,
+        task.body.saturation,
+        [one.frame.paper.field for one in kept],
+        at_zero=np.array([one.share_at_zero for one in kept]),
+    )
+    if measurement.primaries is not None:
+        done.append(measurement.primaries.correction(white))
+    return Provenance(
+        camera=task.body.camera,
+        bits=task.chart.bits,
+        white_level=round(task.body.saturation - float(black.mean())),
+        corrections=done,
+        session_sha256=frames_sha256(()),
+        chart_sha256=task.chart.sha256,
+        software=software(),
+        unfit=unfit,
+        computed=task.record,
+    )
+
+
+def _require_room(out: Path, needed: int) -> None:
+    """Refuse a disk that has not so many bytes left."""
+    there = out.absolute()
+    while not there.exists():
+        there = there.parent
+    free = shutil.disk_usage(there).free
+    if free < needed:
+        raise StorageError(
+            f"{out}: the table takes {needed / 1e9:.2f} GB, the disk has {free / 1e9:.2f} GB left; free space, or name "
+            "a place on another disk"
+        )

@@ -1,0 +1,62 @@
+"""Small tables of prints with known faults."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from acquisition.lights.illuminations import Illumination
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
+from drivers.presenter import Colour
+from tests.generator.rendering.prints import WHITES, printed
+
+MakeTable = Callable[..., Lut]
+
+
+@pytest.fixture
+def make_table(tmp_path: Path) -> MakeTable:
+    """Return a maker of tables of a print, samples with a noise of Poisson, in folders of their own."""
+
+    def make(
+        bits: int = 3,
+        tint: float = 0.0,
+        lights: int = 3,
+        change: Callable[[npt.NDArray[np.uint16]], None] | None = None,
+        camera: str = "Canon EOS 550D",
+        white_level: int = 11536,
+        name: str = "lut",
+    ) -> Lut:
+        folder = tmp_path / name
+        folder.mkdir()
+        writer = LutWriter(folder, lights, 1 << 3 * bits, 25)
+        rng = np.random.default_rng(20191127)
+        plan: list[Illumination] = []
+        for light, kelvin in zip(range(lights), (2000.0, 5600.0, 10000.0), strict=False):
+            means = printed(bits, tint) * WHITES[light]
+            drawn = np.asarray(rng.poisson(np.repeat(means[:, None], 25, axis=1)), np.int64)
+            samples: npt.NDArray[np.uint16] = np.minimum(drawn, white_level).astype(np.uint16)
+            if change is not None:
+                change(samples)
+            writer.put(light, samples)
+            plan.append(Illumination(light, "blackbody", kelvin, Colour(255, 255 - light, light)))
+        writer.finish(
+            plan,
+            WHITES[:lights],
+            Provenance(
+                camera=camera,
+                bits=bits,
+                white_level=white_level,
+                session_sha256="1" * 64,
+                chart_sha256="2" * 64,
+                software="test 1",
+            ),
+        )
+        return open_lut(folder)
+
+    return make

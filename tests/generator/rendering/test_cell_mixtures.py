@@ -1,0 +1,112 @@
+"""Mixtures of cells show what is wanted, in the mean and with cells near to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from foundation.angles import angles_deg
+from generator.rendering.cell_mixtures import MET_WITHIN, SLOTS, mix_cells
+from generator.rendering.print_profiles import PrintProfile
+from tests.generator.rendering.prints import printed
+
+
+def profile(bits: int = 4, tint: float = 0.0) -> PrintProfile:
+    return PrintProfile(printed(bits, tint), np.ones(1 << 3 * bits, np.bool_))
+
+
+def inside(of: PrintProfile, count: int = 300) -> npt.NDArray[np.float64]:
+    """Return colours between eight cells of the chart that are neighbours by their codes."""
+    rng = np.random.default_rng(1)
+    levels = 2**of.bits
+    corner = rng.integers(levels // 4, levels - 1, (count, 3))
+    share = rng.random((count, 3))
+    found = np.zeros((count, 3))
+    for corner_bits in range(8):
+        step = np.array([corner_bits >> 2 & 1, corner_bits >> 1 & 1, corner_bits & 1])
+        weight = np.where(step == 1, share, 1 - share).prod(axis=1, keepdims=True)
+        code = corner + step
+        found += weight * of.colours[(code[:, 0] * levels + code[:, 1]) * levels + code[:, 2]]
+    return found
+
+
+def test_the_mean_of_the_cells_is_what_is_wanted() -> None:
+    print_ = profile()
+    wanted = inside(print_)
+    mixtures = mix_cells(print_, wanted)
+    assert mixtures.cells.shape == (len(wanted), SLOTS)
+    means = print_.colours[mixtures.cells].mean(axis=1)
+    np.testing.assert_allclose(mixtures.colours, means, rtol=1e-6)
+    np.testing.assert_allclose(mixtures.distance, angles_deg(means, wanted), atol=1e-4)
+    # Cells of a chart of four bits are some 15 % apart; rounding four weights to 32nds alone would err by 1/64 of that
+    # and more.
+    assert np.median(np.abs(means / wanted - 1).max(axis=1)) < 0.002
+    assert not mixtures.outside.any()
+
+
+def test_the_cells_are_near_to_what_is_wanted() -> None:
+    print_ = profile()
+    wanted = inside(print_)
+    mixtures = mix_cells(print_, wanted)
+    nearest = np.array([np.abs(np.log(print_.colours) - np.log(colour)).max(axis=1).min() for colour in wanted])
+    widest = np.abs(np.log(print_.colours[mixtures.cells]) - np.log(wanted)[:, None]).max(axis=(1, 2))
+    assert np.median(nearest) > 0.03
+    # The eight cells around a colour of a grid are up to some steps of the grid from it.
+    assert np.percentile(widest, 99) < 0.6
+
+
+@pytest.mark.parametrize("tint", [0.0, 0.15])
+def test_greys_are_grey_on_a_print_whose_greys_are_not(tint: float) -> None:
+    print_ = profile(tint=tint)
+    levels = 2**print_.bits
+    codes = print_.colours[np.arange(levels) * (levels * levels + levels + 1)]
+    assert (angles_deg(codes, np.ones(3)).max() > 4) == (tint > 0)
+    greys = np.linspace(print_.black, print_.white, 40)[:, None] * np.ones(3)
+    assert mix_cells(print_, greys).distance.max() < 0.5
+
+
+def test_what_the_print_cannot_show_is_said() -> None:
+    print_ = profile()
+    wanted = np.array([[0.5, 0.5, 0.5], [0.99, 0.99, 0.99], [0.9, 0.05, 0.05], [0.01, 0.01, 0.01]])
+    mixtures = mix_cells(print_, wanted)
+    assert mixtures.outside.tolist() == [False, True, True, True]
+    # What is too bright or too dark keeps its hue; what is too colourful cannot.
+    assert mixtures.distance[1] < 1
+    assert mixtures.distance[2] > 5
+    for colour, made, outside in zip(wanted, mixtures.colours, mixtures.outside, strict=True):
+        assert bool((np.abs(made / colour - 1) > MET_WITHIN).any()) == outside
+
+
+def test_cells_that_are_not_usable_are_never_taken() -> None:
+    colours = printed(3)
+    usable = np.ones(len(colours), np.bool_)
+    usable[::3] = False
+    mixtures = mix_cells(PrintProfile(colours, usable), inside(profile(3)))
+    assert usable[mixtures.cells].all()
+
+
+def test_one_usable_cell_is_all_that_is_taken() -> None:
+    usable = np.zeros(8, np.bool_)
+    usable[5] = True
+    mixtures = mix_cells(PrintProfile(printed(1), usable), np.full((2, 3), 0.3))
+    assert (mixtures.cells == 5).all()
+    assert mixtures.outside.all()
+
+
+def test_the_same_every_time() -> None:
+    print_ = profile()
+    wanted = inside(print_)
+    once, again = mix_cells(print_, wanted), mix_cells(print_, wanted[::-1])
+    np.testing.assert_array_equal(once.cells, again.cells[::-1])
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3])
+def test_charts_of_fewer_cells_say_how_far_they_are_off(bits: int) -> None:
+    print_ = profile(bits)
+    wanted = inside(profile(5), 100)
+    mixtures = mix_cells(print_, wanted)
+    assert mixtures.cells.max() < 8**bits
+    np.testing.assert_allclose(
+        mixtures.distance, angles_deg(print_.colours[mixtures.cells].mean(axis=1), wanted), atol=1e-4
+    )

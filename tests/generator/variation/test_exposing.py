@@ -1,0 +1,215 @@
+"""Counts exposed anew: the model of their noise, rounding, saturation, and independence of tiles and threads."""
+
+from __future__ import annotations
+
+import hashlib
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from foundation.errors import InputError
+from generator import philox
+from generator.variation.deviates import normal_deviates
+from generator.variation.exposing import brightness_reached, expose
+from generator.variation.sensor_noise import SensorNoise
+
+NOISE = SensorNoise(read=(6.0, 4.2, 5.0), shot=(0.56, 0.28, 0.4))
+QUIET = SensorNoise((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+GOLDEN = "9416889746f7cfe782d98d22ccb2c187b5366a9d9c4cdf885c288598aa9ddcaa"
+"""Of 64 x 64 pixels; `test_the_rule_in_plain_integers` says what they are."""
+Image = npt.NDArray[np.uint16]
+
+
+def photographed(mean: float, noise: SensorNoise, side: int = 400, seed: int = 1) -> Image:
+    """Return a flat patch as a camera of that noise takes it."""
+    sd = np.sqrt(np.square(noise.read) + np.array(noise.shot) * mean)
+    drawn = np.random.default_rng(seed).normal(mean, 1, (side, side, 3))
+    return np.rint(mean + (drawn - mean) * sd).clip(0, 65535).astype(np.uint16)
+
+
+def assert_noise(patch: Image, mean: float, noise: SensorNoise) -> None:
+    """Assert mean and variance of a flat patch within 4.5 standard errors; a rounded number has 1/12 more variance."""
+    count = patch.shape[0] * patch.shape[1]
+    expected = np.square(noise.read) + np.array(noise.shot) * mean + 1 / 12
+    assert np.abs(patch.mean(axis=(0, 1)) - mean).max() < 4.5 * np.sqrt(expected.max() / count)
+    ratio = patch.var(axis=(0, 1)) / expected
+    # The table of a patch was rounded too, which adds up to 1/12 of its own.
+    assert np.abs(ratio - 1).max() < 4.5 * np.sqrt(2 / count) + 0.2 / expected.min()
+
+
+@pytest.mark.parametrize("factor", [0.25, 0.5, 0.9])
+def test_less_light_is_as_noisy_as_a_camera_s(factor: float) -> None:
+    patch = photographed(2000, NOISE)
+    expose(patch, factor, NOISE)
+    assert_noise(patch, factor * 2000, NOISE)
+    # The world in which counts are divided alone: it would be told.
+    divided = np.rint(photographed(2000, NOISE) * factor).astype(np.uint16)
+    with pytest.raises(AssertionError):
+        assert_noise(divided, factor * 2000, NOISE)
+
+
+@pytest.mark.parametrize(("ratio", "factor"), [(8.0, 1.0), (8.0, 0.5), (4.0, 3.0)])
+def test_the_noise_of_another_speed(ratio: float, factor: float) -> None:
+    wanted = NOISE.at(ratio, sensor_electrons=2.8)
+    patch = photographed(1000, NOISE)
+    expose(patch, factor, NOISE, wanted=wanted, ratio=ratio)
+    assert_noise(patch, factor * 1000, wanted)
+
+
+def test_more_light_than_the_speed_allows_is_noisy_as_a_higher_speed() -> None:
+    noise = SensorNoise((0.0, 0.0, 0.0), NOISE.shot)
+    patch = photographed(1000, noise)
+    expose(patch, 3.0, noise, wanted=noise.at(2), ratio=2)
+    variance = patch.var(axis=(0, 1)) / (3 * 3 * 1000 * np.array(noise.shot))
+    assert np.abs(variance - 1).max() < 0.02
+
+
+def test_where_light_falls_off_noise_is_that_of_less_light() -> None:
+    patch = photographed(2000, NOISE)
+    weights = np.zeros((400, 400, 2), np.float32)
+    weights[:, :200, 0], weights[:, 200:, 1] = 1, 1
+    expose(patch, 1.0, NOISE, weights=weights, end=(0.5, 0.5, 0.5))
+    assert_noise(patch[:, :200], 2000, NOISE)
+    assert_noise(patch[:, 200:], 1000, NOISE)
+    np.testing.assert_array_equal(patch[:, :200], photographed(2000, NOISE)[:, :200])
+
+
+def test_an_end_with_a_tint() -> None:
+    image = np.full((1, 3, 3), 1000, np.uint16)
+    weights = np.array([[[1, 0], [0.5, 0.5], [0, 1]]], np.float32)
+    expose(image, 2.0, QUIET, weights=weights, end=(0.5, 1.0, 0.25))
+    np.testing.assert_array_equal(image[0], [[2000, 2000, 2000], [1500, 2000, 1250], [1000, 2000, 500]])
+
+
+def test_rounding_has_no_bias() -> None:
+    # Every odd count is a tie at half the light: halves up would lift the mean by a quarter.
+    image = np.arange(60000, dtype=np.uint16).reshape(100, 200, 3)
+    expose(image, 0.5, QUIET)
+    assert abs(image.mean() - np.arange(60000).mean() / 2) < 1e-3
+
+
+@pytest.mark.parametrize("factor", [1.0, 4.0, 64.0, 1e6])
+def test_nothing_wraps_and_saturation_cuts(factor: float) -> None:
+    image = np.tile(np.arange(65536, dtype=np.uint16)[:, None, None], (1, 2, 3))
+    loud = SensorNoise((300.0, 300.0, 300.0), (5.0, 5.0, 5.0))
+    share = expose(image, factor, loud, wanted=loud.at(16), ratio=16, white_level=12000)
+    assert image.max() == 12000
+    # Far above saturation all is saturated: a wrapped count would be dark.
+    assert (image[40000:] == 12000).all()
+    assert share == pytest.approx((image.max(axis=2) == 12000).mean())
+
+
+def test_darkness_stays_at_0() -> None:
+    image = np.zeros((200, 200, 3), np.uint16)
+    expose(image, 0.5, NOISE, wanted=NOISE.at(4), ratio=4)
+    assert (image == 0).mean() == pytest.approx(0.5, abs=0.05)
+    assert image.max() < 200
+
+
+def test_the_rule_in_plain_integers() -> None:
+    image = np.full((3, 37, 3), 4000, np.uint16)
+    noise, seed, number = SensorNoise((3.0, 2.0, 4.0), (0.5, 0.25, 0.5)), 0xFEDCBA9876543210, 77
+    expose(image, 0.5, noise, seed=seed, number=number, first_row=5)
+    quantiles: list[float] = [NormalDist().inv_cdf((place + 0.5) / 2**14) for place in range(2**14)]
+    scale = float(np.sqrt(np.mean(np.square(quantiles))))
+    for y in range(3):
+        k0, k1, _, _ = (int(key) for key in philox.words(seed, 5 + y, 0, number, philox.NOISE))
+        for x in range(37):
+            word: int = ((k1 << 32 | k0) + (x + 1) * 0x9E3779B97F4A7C15) % 2**64
+            word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 % 2**64
+            word = (word ^ word >> 27) * 0x94D049BB133111EB % 2**64
+            word ^= word >> 31
+            for channel in range(3):
+                z: float = quantiles[word >> (50 - 14 * channel) & 16383] / scale
+                missing = 0.75 * noise.read[channel] ** 2 + 0.5 * noise.shot[channel] * 2000
+                assert abs(image[y, x, channel] - (2000 + z * missing**0.5)) < 0.501
+
+
+def test_first_counts_are_fixed_for_ever() -> None:
+    # SplitMix64's published first output for state 0 is e220a8397b1dcdaf; the rule above rests on the same steps.
+    word = 0x9E3779B97F4A7C15
+    word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 % 2**64
+    word = (word ^ word >> 27) * 0x94D049BB133111EB % 2**64
+    assert word ^ word >> 31 == 0xE220A8397B1DCDAF
+    image = np.full((64, 64, 3), 3000, np.uint16)
+    expose(image, 0.7, NOISE, seed=3, number=9)
+    assert hashlib.sha256(image.tobytes()).hexdigest() == GOLDEN
+
+
+def test_neither_threads_nor_tiles_change_a_count() -> None:
+    whole = photographed(3000, NOISE, 97)
+    source = whole.copy()
+    weights = np.random.default_rng(4).random((97, 97, 2), dtype=np.float32)
+    options: dict[str, Any] = {"end": (0.3, 0.5, 0.4), "white_level": 2500, "seed": 8, "number": 3}
+    share = expose(whole, 0.8, NOISE, weights=weights, **options)
+    for threads in (2, 5):
+        again = np.empty_like(source)
+        assert expose(source, 0.8, NOISE, weights=weights, threads=threads, out=again, **options) == share
+        np.testing.assert_array_equal(again, whole)
+    part = source[40:60].copy()
+    expose(part, 0.8, NOISE, weights=weights[40:60], first_row=40, **options)
+    np.testing.assert_array_equal(part, whole[40:60])
+    other = source.copy()
+    options["number"] = 4
+    expose(other, 0.8, NOISE, weights=weights, **options)
+    assert (other != whole).mean() > 0.5
+
+
+def test_deviates_of_pixels_rows_and_channels_are_independent() -> None:
+    # A constant count whose noise is all that is added.
+    image = np.full((500, 500, 3), 20000, np.uint16)
+    noise = SensorNoise((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    expose(image, 1.0, QUIET, wanted=SensorNoise((1000.0, 1000.0, 1000.0), noise.shot))
+    z = (image.astype(np.float64) - 20000) / 1000
+    limit = 4.5 / 500
+    for one, other in (
+        (z[:, :-1], z[:, 1:]),
+        (z[:, :-16], z[:, 16:]),
+        (z[:-1], z[1:]),
+        (z[..., 0], z[..., 1]),
+        (z[..., 1], z[..., 2]),
+        (z[..., 0], z[..., 2]),
+    ):
+        assert abs((one * other).mean()) < limit
+        assert abs((np.square(one) * np.square(other)).mean() - 1) < 3 * limit
+    # Kurtosis of a normal distribution; the sum of four even numbers would have 2.7.
+    assert np.mean(z**4) == pytest.approx(3, abs=0.03)
+
+
+def test_deviates_have_the_moments_of_the_normal_distribution() -> None:
+    table = normal_deviates().astype(np.float64)
+    assert table.mean() == 0
+    assert np.mean(table**2) == pytest.approx(1, abs=1e-6)
+    assert np.mean(table**4) == pytest.approx(3, abs=0.01)
+
+
+def test_brightness_reached_by_a_share() -> None:
+    rng = np.random.default_rng(6)
+    image = rng.integers(0, 5000, (120, 130, 3)).astype(np.uint16)
+    brightest = np.sort(image.max(axis=2).reshape(-1))[::-1]
+    for share in (0.001, 0.02, 0.5):
+        assert brightness_reached(image, share) == brightest[round(share * brightest.size) - 1]
+    assert brightness_reached(image, 0.0) == brightest[0] + 0.5
+    weights = rng.random((120, 130, 2), dtype=np.float32)
+    fallen = image * (1 - weights[..., 1:] * np.array([0.5, 0.25, 0.75], np.float32))
+    expected = np.sort(np.floor(fallen.max(axis=2)).reshape(-1))[::-1][round(0.02 * brightest.size) - 1]
+    assert abs(brightness_reached(image, 0.02, weights, (0.5, 0.75, 0.25)) - expected) <= 1
+
+
+def test_what_is_refused() -> None:
+    image = np.zeros((4, 4, 3), np.uint16)
+    for wrong in (
+        lambda: expose(image.astype(np.float32), 1.0, NOISE),  # type: ignore[arg-type]
+        lambda: expose(image, 0.0, NOISE),
+        lambda: expose(image, 1.0, NOISE, ratio=0.5),
+        lambda: expose(image, 1.0, NOISE, white_level=0),
+        lambda: expose(image, 1.0, NOISE, weights=np.zeros((4, 5, 2), np.float32), end=(0.5, 0.5, 0.5)),
+        lambda: expose(image, 1.0, NOISE, weights=np.zeros((4, 4, 2), np.float32), end=(0.5, 1.5, 0.5)),
+        lambda: expose(image[:, ::2], 1.0, NOISE),
+        lambda: expose(image, 1.0, NOISE, seed=-1),
+    ):
+        with pytest.raises(InputError):
+            wrong()

@@ -1,0 +1,91 @@
+"""The noise of a table, told from its samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from calibration.table.lut import Lut
+from foundation.errors import InputError
+from generator.variation.iso_speed import parse_iso
+from generator.variation.sensor_noise import SensorNoise, Three, measured_noise
+from sim.world.sensors import BODIES
+
+
+def table(read: float, shot: float, response: float = 0.0, texture: float = 0.0, unfit: tuple[int, ...] = ()) -> Lut:
+    """Return what `measured_noise` reads of a table of 512 colours under 8 lights, as a camera would have given it."""
+    rng = np.random.default_rng(11)
+    levels = np.geomspace(40, 6000, 512)
+    means = np.linspace(0.3, 1, 8)[:, None] * levels
+    noise = np.sqrt(read**2 + shot * means + (response * means) ** 2)[..., None, None]
+    samples = means[..., None, None] + noise * rng.normal(size=(8, 512, 25, 3))
+    samples += texture * rng.normal(size=(8, 512, 1, 1)) * rng.choice([-1, 1], (8, 512, 25, 1))
+    samples[:, list(unfit)] = rng.uniform(0, 9000, (8, len(unfit), 25, 3))
+    return cast(
+        "Lut",
+        SimpleNamespace(
+            folder=Path("lut"),
+            samples=np.rint(samples).clip(0).astype(np.uint16),
+            white=means[:, -1:].repeat(3, axis=1),
+            provenance=SimpleNamespace(unfit=[SimpleNamespace(colour=colour) for colour in unfit]),
+        ),
+    )
+
+
+@pytest.mark.parametrize("response", [0.0, 0.004])
+def test_the_noise_is_found_again(response: float) -> None:
+    noise = measured_noise(table(6.0, 0.55, response, unfit=(3, 400)))
+    assert noise.read == pytest.approx([6.0] * 3, rel=0.05)
+    assert noise.shot == pytest.approx([0.55] * 3, rel=0.04)
+
+
+def test_samples_that_are_no_photograph_are_refused() -> None:
+    # Cells of a coarse print: their variance has nothing to do with their level.
+    lut = table(1.0, 0.1)
+    rng = np.random.default_rng(2)
+    wild = np.asarray(lut.samples).astype(np.float64) + rng.choice([0, 40], (8, 512, 1, 1)) * rng.normal(
+        size=(8, 512, 25, 1)
+    )
+    object.__setattr__(lut, "samples", wild.clip(1, 65535).astype(np.uint16))
+    with pytest.raises(InputError, match="photon-transfer curve"):
+        measured_noise(lut)
+
+
+def test_too_few_cells_are_refused(make_lut: Callable[..., Lut]) -> None:
+    with pytest.raises(InputError, match=r"32 cells|expected 32"):
+        measured_noise(make_lut(bits=1, lights=1))
+
+
+def test_a_table_of_poisson_samples(make_lut: Callable[..., Lut]) -> None:
+    noise = measured_noise(make_lut(bits=3))
+    assert noise.shot == pytest.approx([1.0] * 3, rel=0.1)
+
+
+def test_another_speed_of_the_simulated_bodies() -> None:
+    # A body's facts say how much of its read noise arises before the amplifier; green is the mean of two photosites.
+    for body in BODIES.values():
+        at = SensorNoise(*_of_body(body, 100)).at(16, body.sensor_noise_e)
+        read, shot = _of_body(body, 1600)
+        assert at.read == pytest.approx(read, rel=1e-5)
+        assert at.shot == pytest.approx(shot, rel=1e-5)
+
+
+def _of_body(body: Any, iso: int) -> tuple[Three, Three]:
+    read, gain = body.noise_dn(iso), body.gain_e(iso)
+    return (read, read / 2**0.5, read), (1 / gain, 0.5 / gain, 1 / gain)
+
+
+def test_read_noise_before_the_amplifier_is_no_more_than_all() -> None:
+    assert SensorNoise((2.0, 2.0, 2.0), (1.0, 1.0, 1.0)).at(10, 100.0).read == pytest.approx([20.0] * 3)
+    assert SensorNoise((2.0, 2.0, 2.0), (1.0, 1.0, 1.0)).at(10, 0.0).read == pytest.approx([2.0] * 3)
+
+
+@pytest.mark.parametrize("text", ["50/100", "1600", "0/100", "1600/100:read=-1", "a/b", "", "1600/100:gain=1"])
+def test_speeds_that_are_refused(text: str) -> None:
+    with pytest.raises(InputError):
+        parse_iso(text)

@@ -1,0 +1,121 @@
+"""A managed print looks as the file says wherever inks reach, and its greys are grey; an unmanaged one has a tint."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import product
+
+import colour
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sim.world.profile import ProfileName, ink_codes, intended_lab, printed_reflectance, relative_lab
+from sim.world.spectra import PaperName, paper, print_reflectance
+
+PAPERS: tuple[PaperName, ...] = ("poster", "matt", "glossy")
+GREYS = np.repeat(np.arange(256)[:, None], 3, axis=1)
+CODES = np.array(list(product(range(0, 256, 17), repeat=3)))
+
+
+@cache
+def seen(profile: ProfileName, on: PaperName) -> NDArray[np.float64]:
+    """Return CIELAB of all greys under D50, relative to paper."""
+    return relative_lab(printed_reflectance(GREYS, profile, on), on)
+
+
+def difference(wanted: NDArray[np.float64], lab: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(colour.delta_E(wanted, lab, method="CIE 2000"), dtype=np.float64)
+
+
+@pytest.mark.parametrize("on", PAPERS)
+def test_managed_greys_are_neutral_and_rise(on: PaperName) -> None:
+    lab = seen("managed", on)
+    neutral = lab * [1, 0, 0]
+    assert difference(neutral, lab).max() < 1
+    assert np.diff(lab[:, 0]).min() > 0
+    # IEC 61966-2-1: code 119 has .184 of white's luminance; black point compensation puts what black has below it.
+    black = ((lab[0, 0] + 16) / 116) ** 3 if lab[0, 0] > 8 else lab[0, 0] / 903.3
+    assert ((lab[119, 0] + 16) / 116) ** 3 == pytest.approx(black + (1 - black) * 0.184, rel=0.01)
+
+
+@pytest.mark.parametrize("on", PAPERS)
+def test_unmanaged_greys_have_the_tint_that_measured_prints_have(on: PaperName) -> None:
+    # Papers printed without colour management (head of `sim.world.spectra`): the largest chroma is 5 to 14, but for one
+    # printer, an Epson P800, whose driver balances its greys (1.3).
+    lab = seen("unmanaged", on)
+    assert 5 < np.hypot(lab[:, 1], lab[:, 2]).max() < 14
+    assert np.diff(lab[:, 0]).min() > 0
+
+
+@pytest.mark.parametrize("on", PAPERS)
+def test_a_managed_print_has_the_colours_of_the_file_where_inks_reach(on: PaperName) -> None:
+    rng = np.random.default_rng(3)
+    pale = 128 + rng.integers(-40, 41, (400, 3))
+    off = difference(intended_lab(pale, on), relative_lab(printed_reflectance(pale, "managed", on), on))
+    assert np.median(off) < 0.3
+    assert off.max() < 2.5
+
+
+@pytest.mark.parametrize("on", PAPERS)
+def test_what_no_ink_reaches_keeps_its_hue(on: PaperName) -> None:
+    wanted = intended_lab(CODES, on)
+    lab = relative_lab(printed_reflectance(CODES, "managed", on), on)
+    outside = difference(wanted, lab) > 3
+    assert 0.1 < outside.mean() < 0.6
+    chroma, wanted_chroma = (np.hypot(one[:, 1], one[:, 2]) for one in (lab, wanted))
+    assert np.mean(chroma[outside] < wanted_chroma[outside] + 1) > 0.95
+    plane, wanted_plane = (one[:, 1] + 1j * one[:, 2] for one in (lab, wanted))
+    turned = np.degrees(np.abs(np.angle(plane * wanted_plane.conj())))
+    assert np.median(turned[outside & (chroma > 10)]) < 6
+
+
+def test_no_ink_code_comes_nearer_than_the_profile_s() -> None:
+    axis = np.linspace(0, 255, 33)
+    inks = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    every = relative_lab(print_reflectance(inks, "glossy"), "glossy")
+    # Nodes of the profile's table, so that nothing is interpolated.
+    codes = np.random.default_rng(8).integers(0, 33, (60, 3)) * 255 / 32
+    wanted = intended_lab(codes, "glossy")
+    lab = relative_lab(printed_reflectance(codes, "managed", "glossy"), "glossy")
+    for target, found in zip(wanted, lab, strict=True):
+        along = target[1:] / np.hypot(*target[1:])
+
+        def away(
+            seen: NDArray[np.float64], target: NDArray[np.float64] = target, along: NDArray[np.float64] = along
+        ) -> NDArray[np.float64]:
+            off = seen - target
+            hue = off[..., 2] * along[0] - off[..., 1] * along[1]
+            return np.sqrt((off**2).sum(axis=-1) + 3 * hue**2)
+
+        assert float(away(found)) < float(away(every).min()) + 0.5
+
+
+@pytest.mark.parametrize("on", PAPERS)
+def test_white_is_bare_paper_and_reflectances_are_between_surface_and_one(on: PaperName) -> None:
+    for profile in ("unmanaged", "managed"):
+        reflectance = printed_reflectance(CODES, profile, on)
+        np.testing.assert_allclose(reflectance[-1], paper(on).white, rtol=1e-12)
+        assert reflectance.min() >= paper(on).surface
+        assert reflectance.max() <= 1
+
+
+def test_ink_codes_between_nodes_lie_between_those_of_nodes() -> None:
+    at = np.array([[96.0, 96, 96], [100, 100, 100], [103.59375, 103.59375, 103.59375]])
+    at[0] = 12 * 255 / 32
+    at[2] = 13 * 255 / 32
+    low, middle, high = ink_codes(at, "matt")
+    share = (100 - at[0, 0]) / (at[2, 0] - at[0, 0])
+    np.testing.assert_allclose(middle, (1 - share) * low + share * high, rtol=1e-9)
+    # Past a node by nothing or by a hair: no jump.
+    near = np.array([[95.624, 120, 30], [95.626, 120, 30]])
+    first, second = ink_codes(near, "matt")
+    assert np.abs(first - second).max() < 0.02
+
+
+def test_an_unmanaged_print_sends_codes_as_they_are_and_unknown_names_are_refused() -> None:
+    assert np.array_equal(printed_reflectance(CODES), print_reflectance(CODES))
+    with pytest.raises(ValueError, match="profile 'icc': known are unmanaged, managed"):
+        printed_reflectance(CODES, "icc")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="paper 'silk': known are poster, matt, glossy"):
+        printed_reflectance(CODES, "managed", "silk")  # pyright: ignore[reportArgumentType]
