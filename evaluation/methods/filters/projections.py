@@ -58,8 +58,10 @@ def sum_outer_bins(
 
     Parameters
     ----------
-    image, free, direction, step
-        See `count_projections`.
+    image, free
+        (H, W, 3) uint16, float32 or float64; (H, W) or (0, 0) bool, see above.
+    direction, step
+        (3,) float64, and bins a unit of projection; as for `count_projections`.
     brackets
         (4,) int64: the first and the last bin of the lower bracket, then of the upper one; they may overlap.
     bordering
