@@ -17,6 +17,9 @@ from acquisition.lights.illuminations import Illumination
 from calibration.radiometry.primaries import pure_lights
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
+from sim.world.drawing import PAPER
+from sim.world.profile import printed_reflectance
+from sim.world.spectra import sensitivities
 from sim.world.world import World
 from synthesis.patch_frames import PatchSensor
 
@@ -92,3 +95,70 @@ class ProjectorLamp:
     def pure(self) -> tuple[int, int, int] | None:
         """Return the lights of red, green and blue alone; None where one is not planned."""
         return pure_lights(self.illuminations)
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralLamp:
+    """A luminaire of one spectrum a light, all from one place, so that one field holds for every wavelength.
+
+    Each light is exposed so that bare paper's strongest channel reaches the room's `white_level_share`, as a
+    photographer would: a table of spectra has no brightness of its own.
+
+    Attributes
+    ----------
+    world
+        Body, print and room; the field is that of its projector's green.
+    illuminations
+        The lights.
+    powers
+        (L, 81) float64, relative power of each per nm.
+    sensor
+        The photosites under the patches.
+    reflectance
+        (N, 81) float64, of each patch's print.
+    field
+        (N,) float64, the light on each patch over that in the brightest place.
+    """
+
+    world: World
+    illuminations: tuple[Illumination, ...]
+    powers: _Array
+    sensor: PatchSensor
+    reflectance: _Array
+    field: _Array
+
+    @staticmethod
+    def of(
+        world: World,
+        illuminations: tuple[Illumination, ...],
+        powers: _Array,
+        sensor: PatchSensor,
+        rgb: npt.NDArray[np.uint8],
+        points_mm: _Array,
+    ) -> SpectralLamp:
+        """Return a luminaire of spectra (L, 81) before patches of printed codes (N, 3) at points (N, 2), mm."""
+        room = world.room
+        reflectance = printed_reflectance(rgb, room.profile, room.paper)
+        return SpectralLamp(world, illuminations, powers, sensor, reflectance, world.field(points_mm)[:, 1])
+
+    def signals(self, light: int) -> _Array:
+        """Return what each patch gives under a light, (N, 3) float64 DN above black, where nothing is blurred."""
+        room, body = self.world.room, self.world.body
+        seen = self.powers[light][:, None] * sensitivities(body.sensitivities)
+        paper = printed_reflectance([PAPER], room.profile, room.paper)[0] @ seen
+        level = room.white_level_share * (body.saturation - body.black) / float(paper.max())
+        return (self.reflectance @ seen) * level * self.field[:, None]
+
+    def lit(self, light: int) -> tuple[_Float, _Array]:
+        """Return light (3, rows, columns) float32 and weights (3,) of a light's frame; see `ChartLamp.lit`."""
+        return self.sensor.light(self.signals(light)[:, :, None]), np.array([1.0, 0.0, 0.0])
+
+    def even(self) -> tuple[_Float, _Array]:
+        """Return light (3, rows, columns) float32 and weights (3,) of the frame of the whitest light."""
+        whites = self.powers @ sensitivities(self.world.body.sensitivities)
+        # The light whose weakest channel is the strongest shows the field best in all three.
+        return self.lit(int((whites.min(axis=1) / whites.max(axis=1)).argmax()))
+
+    def pure(self) -> tuple[int, int, int] | None:
+        """Return None: one field holds for all wavelengths, so that a coloured cell's is that of paper."""
+        return None

@@ -37,7 +37,7 @@ from sim.world.drawing import Print
 from sim.world.room import Room
 from sim.world.sensors import Body
 from sim.world.world import World
-from synthesis.lamps import ChartLamp, ProjectorLamp
+from synthesis.lamps import ChartLamp, ProjectorLamp, SpectralLamp
 from synthesis.measuring import ComputedFrame, PatchMeasurement
 from synthesis.patch_frames import PatchSensor
 
@@ -63,7 +63,10 @@ class TableTask:
     exposure
         Of every frame.
     illuminations
-        The lights of the projector.
+        The lights.
+    powers
+        (L, 81) float64, their spectra, relative power per nm (`synthesis.lamps.SpectralLamp`); None for those that the
+        simulated projector shows.
     window
         Half-size pixels along a window's side.
     record
@@ -75,6 +78,7 @@ class TableTask:
     room: Room
     exposure: ExposureSettings
     illuminations: tuple[Illumination, ...]
+    powers: _Array | None
     window: int
     record: dict[str, Any]
 
@@ -189,7 +193,11 @@ def _measurement(task: TableTask) -> PatchMeasurement:
     sensor = PatchSensor.of(task.body, len(codes), task.window, task.room, task.exposure.shutter_s)
     blank = Print(chart.page_mm, np.zeros((0, 4)), np.zeros((0, 3), dtype=np.uint8))
     world = World(blank, task.body, task.room)
-    lamp: ChartLamp = ProjectorLamp.of(world, task.exposure, task.illuminations, sensor, codes, places)
+    lamp: ChartLamp
+    if task.powers is None:
+        lamp = ProjectorLamp.of(world, task.exposure, task.illuminations, sensor, codes, places)
+    else:
+        lamp = SpectralLamp.of(world, task.illuminations, task.powers, sensor, codes, places)
     return PatchMeasurement.of(points, chart.page_mm, bool(chart.tags), sensor, lamp, task.exposure.iso)
 
 

@@ -5,16 +5,19 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
 from acquisition.chart.layout import design_chart
 from acquisition.lights.illuminations import plan_illuminations
+from sim.spectral.sensitivities import describe_sensitivities, read_sensitivities
 from sim.world.body_settings import find_body
-from sim.world.sensitivities import describe_sensitivities, read_sensitivities
+from synthesis.light_spectra import LightSpectra, illuminations_of
 from synthesis.settings import NOT_COMPUTED, TableSettings, room_of
 from synthesis.table import TableTask
 
 
-def table_task(camera: str, settings: TableSettings, where: str) -> TableTask:
-    """Return the table of a camera under the 707 lights of the simulated projector.
+def table_task(camera: str, settings: TableSettings, where: str, lights: LightSpectra | None = None) -> TableTask:
+    """Return the table of a camera under lights.
 
     Parameters
     ----------
@@ -24,6 +27,8 @@ def table_task(camera: str, settings: TableSettings, where: str) -> TableTask:
         The rest.
     where
         What the settings were read from, for messages.
+    lights
+        Spectra; None for the 707 lights of the simulated projector.
 
     Raises
     ------
@@ -40,7 +45,7 @@ def table_task(camera: str, settings: TableSettings, where: str) -> TableTask:
         "how": "no frame was taken: counts of the photosites under each cell were computed from spectra and a model of "
         "the sensor, and sampled as those of a frame",
         "sensitivities": describe_sensitivities(read_sensitivities(body.sensitivities)),
-        "lights": {"from": "simulated projector", "count": 0},
+        "lights": {"from": "simulated projector"} if lights is None else lights.source,
         "body": asdict(body),
         "exposure": settings.exposure.model_dump(mode="json"),
         "room": {name: value for name, value in asdict(room).items() if name not in (*NOT_COMPUTED, "seed")},
@@ -48,6 +53,7 @@ def table_task(camera: str, settings: TableSettings, where: str) -> TableTask:
         "window": settings.window,
         "seed": settings.seed,
     }
-    lights = plan_illuminations()
-    record["lights"]["count"] = len(lights)
-    return TableTask(chart, body, room, settings.exposed, lights, settings.window, record)
+    planned = plan_illuminations() if lights is None else illuminations_of(lights.lights)
+    powers = None if lights is None else np.array([light.power for light in lights.lights])
+    record["lights"] |= {"count": len(planned)}
+    return TableTask(chart, body, room, settings.exposed, planned, powers, settings.window, record)

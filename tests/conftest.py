@@ -87,6 +87,7 @@ SLOW = (
     "sim/world/test_geometry.py",
     "sim/world/test_profile.py",
     "sim/world/test_world.py",
+    "synthesis/test_spectral_table.py",
     "synthesis/test_table.py",
 )
 """Folders and files, below this one, whose tests take more than their share of the minute."""

@@ -23,9 +23,12 @@ from foundation.errors import FormatError, InputError
 from foundation.files import write_whole
 from foundation.srgb import encode_srgb
 
-Kind = Literal["uniform", "blackbody"]
+Kind = Literal["uniform", "blackbody", "spectrum"]
 COLUMNS = ("index", "kind", "cct_k", "red", "green", "blue")
 """Columns of `illuminations.csv` (docs/formats.md)."""
+
+NAME = "name"
+"""A further column where lights have names: those of computed tables under spectra of their own."""
 
 GRID = 35
 """Steps along an edge of the chromaticity triangle: 666 points, which with 41 black bodies are the paper's 707."""
@@ -39,12 +42,17 @@ MOST_CCTS = 10_000
 
 @dataclass(frozen=True)
 class Illumination:
-    """One light of the plan: its number, its kind, its temperature if a black body, and the codes shown."""
+    """One light of the plan: its number, its kind, its temperature if a black body, and the codes shown.
+
+    Where light has a spectrum of its own (`kind` ``spectrum``, or a black body that was computed and not shown by a
+    projector), the codes are those that would show its colour, and it has a `name`, such as ``D65``.
+    """
 
     index: int
     kind: Kind
     cct_k: float | None
     colour: Colour
+    name: str | None = None
 
     @property
     def codes(self) -> tuple[int, int, int]:
@@ -117,8 +125,16 @@ def save_illuminations(illuminations: Sequence[Illumination], path: Path) -> Non
     write_whole(path, illuminations_to_csv(illuminations))
 
 
-def load_illuminations(path: Path) -> tuple[Illumination, ...]:
+def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illumination, ...]:
     """Read `illuminations.csv`; further columns are ignored.
+
+    Parameters
+    ----------
+    path
+        The file.
+    computed
+        Whether lights may have spectra of their own, and names: those of a table. A plan's may not, as a projector
+        shows codes.
 
     Raises
     ------
@@ -139,7 +155,7 @@ def load_illuminations(path: Path) -> tuple[Illumination, ...]:
     for number, row in enumerate(rows):
         try:
             kind = row["kind"]
-            if kind not in ("uniform", "blackbody"):
+            if kind not in ("uniform", "blackbody", "spectrum") or (kind == "spectrum" and not computed):
                 raise ValueError(f"kind is {kind!r}, expected uniform or blackbody")
             if _whole(row, "index") != number:
                 raise ValueError(f"index is {row['index']}, expected {number}")
@@ -147,7 +163,7 @@ def load_illuminations(path: Path) -> tuple[Illumination, ...]:
             codes = Colour(_whole(row, "red"), _whole(row, "green"), _whole(row, "blue"))
         except ValueError as error:
             raise FormatError(f"{path}, light {number}: {error}") from error
-        lights.append(Illumination(number, kind, cct_k, codes))
+        lights.append(Illumination(number, kind, cct_k, codes, (row.get(NAME) or None) if computed else None))
     return tuple(lights)
 
 

@@ -190,6 +190,8 @@ def frame_faults(lut: Lut, session: Session, progress: ReportProgress | None = N
     FormatError
         The table lists no frames: it was made before they were recorded.
     """
+    if lut.provenance.computed is not None:
+        raise FormatError(f"{lut.folder} was computed, no frame was taken for it; verify it without a session")
     if not lut.frames:
         raise FormatError(f"{lut.folder} lists no frames; build it again from its session to have them listed")
     faults: list[str] = []

@@ -10,9 +10,12 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
     """Return what a table is and what it was made from: names and values, for people to read."""
     known, lights = lut.provenance, lut.illuminations
     black_bodies = [light.cct_k for light in lights if light.cct_k is not None]
-    kinds = f"{len(lights) - len(black_bodies)} uniform, {len(black_bodies)} black bodies"
+    spectra = sum(light.kind == "spectrum" for light in lights)
+    kinds = f"{len(lights) - len(black_bodies) - spectra} uniform, {len(black_bodies)} black bodies"
     if black_bodies:
         kinds += f" {min(black_bodies):g} to {max(black_bodies):g} K"
+    if spectra:
+        kinds += f", {spectra} spectra"
     causes: dict[str, int] = {}
     for cell in known.unfit:
         cause = cell.cause.split(":")[0]
@@ -24,7 +27,14 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
         for channel, least, most in zip("rgb", low.tolist(), high.tolist(), strict=True)
     )
     frames = f"{len(lut.frames)}, listed in {FRAMES}" if lut.frames else "not listed"
+    origin: list[tuple[str, str]] = []
+    session = known.session_sha256
+    if known.computed is not None:
+        by = known.computed.get("by", "a program")
+        origin = [("Origin", f"computed by {by} from spectra and a model of the sensor; nothing was photographed")]
+        frames = session = "none: computed"
     return [
+        *origin,
         ("Camera", known.camera),
         ("Lights", f"{len(lights)}: {kinds}"),
         ("Colours", f"{8**known.bits} ({known.bits} bits a channel), {lut.samples.shape[2]} samples each"),
@@ -42,7 +52,7 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
         ("Corrections", ", ".join(str(correction.get("name", "?")) for correction in known.corrections)),
         ("Software", known.software),
         ("Frames", frames),
-        ("Session", known.session_sha256),
+        ("Session", session),
         ("Chart", known.chart_sha256),
         ("Samples", known.samples_sha256 or "no hash recorded"),
         ("Table", lut.sha256),

@@ -129,7 +129,7 @@ def open_lut(folder: Path) -> Lut:
             f"{folder} is no table: cannot read {PROVENANCE} ({error.strerror}); make one with build-lut"
         ) from error
     provenance = parse_provenance(text, path)
-    lights = load_illuminations(folder / ILLUMINATIONS)
+    lights = load_illuminations(folder / ILLUMINATIONS, computed=True)
     white = _load_white(folder / ILLUMINATIONS)
     try:
         samples = np.load(folder / SAMPLES, mmap_mode="r", allow_pickle=False)

@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.lights.illuminations import COLUMNS, Illumination
+from acquisition.lights.illuminations import COLUMNS, NAME, Illumination
 from calibration.table.file_names import FRAMES, ILLUMINATIONS, PROVENANCE, SAMPLES
 from calibration.table.lut import WHITE_COLUMNS
 from calibration.table.provenance import Provenance
@@ -158,7 +158,8 @@ def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[
     """Return the text of `illuminations.csv`: the lights with their whites (L, 3), six decimals."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*COLUMNS, *WHITE_COLUMNS])
+    named = any(light.name is not None for light in illuminations)
+    writer.writerow([*COLUMNS, *WHITE_COLUMNS, *([NAME] if named else [])])
     for light, values in zip(illuminations, white, strict=True):
         writer.writerow(
             [
@@ -167,6 +168,7 @@ def _ground_truth_csv(illuminations: Sequence[Illumination], white: npt.NDArray[
                 "" if light.cct_k is None else f"{light.cct_k:g}",
                 *light.codes,
                 *(f"{value:.6f}" for value in values),
+                *([light.name or ""] if named else []),
             ]
         )
     return text.getvalue()

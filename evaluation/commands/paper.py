@@ -128,10 +128,16 @@ def table1(
     raised = hot_rows(chosen, shares, seed, threads)
     conditions = (
         f"Pictures: {says}. Images: longest side {side} px. Lights like those of {truths.name}. Seed {seed}.",
-        f"Tables: {'; '.join(f'{lut.provenance.camera}, {len(lut.white)} lights, {lut.folder}' for lut in opened)}.",
+        f"Tables: {'; '.join(map(_says, opened))}.",
         *(() if names == ("C1", "C1") else (_NOT_C1,)),
     )
     _finish(table1_report(blocks, opened, conditions, error, found, raised), conditions, out)
+
+
+def _says(lut: Lut) -> str:
+    """Return what a report says of a table."""
+    origin = "" if lut.provenance.computed is None else ", computed and not photographed"
+    return f"{lut.provenance.camera}, {len(lut.white)} lights{origin}, {lut.folder}"
 
 
 _TABLE2 = f"""Learned methods trained on real and on generated images (table 2).

@@ -76,7 +76,10 @@ def open_generated(place: Path | str) -> SceneSet:
         There is no dataset in that place.
     """
     dataset = open_dataset(place)
-    white = dataset.description.table.white_level
+    table = dataset.description.table
+    white = table.white_level
+    # Whoever reads results must see that no camera took a photograph of these colours.
+    computed = {} if table.computed is None else {"table": "computed from spectra and a model of the sensor"}
     return SceneSet(
         name=_name_of(str(place)),
         layout="generated",
@@ -86,6 +89,7 @@ def open_generated(place: Path | str) -> SceneSet:
             for entry in dataset.entries
         ),
         treatment={
+            **computed,
             "black level": "subtracted when the table was made",
             "saturation": f"from {white:g}, the white level of the table",
             "mask": "none",

@@ -282,7 +282,7 @@ class VariationOptions:
         option(
             "N/BASE",
             "Add the noise of ISO speed N to that of the table, which was photographed with speed BASE: 1600/100, or "
-            "1600/100:read=2.5, electrons of read noise before the amplifier.",
+            "1600/100:read=2.5, electrons of read noise before the amplifier. Computed tables know BASE.",
             _VARIATION,
         ),
     ] = None
@@ -291,14 +291,14 @@ class VariationOptions:
         """Return the variation of images of a table; an InputError says which option cannot be used."""
         from generator.variation.exposures import parse_exposure
         from generator.variation.gradients import parse_gradient
-        from generator.variation.iso_speed import parse_iso
+        from generator.variation.iso_speed import known_of_table, parse_iso
         from generator.variation.variation import varied_by
 
         return varied_by(
             lut,
             None if self.exposure is None else parse_exposure(self.exposure),
             None if self.gradient is None else parse_gradient(self.gradient),
-            None if self.iso is None else parse_iso(self.iso),
+            None if self.iso is None else parse_iso(self.iso, *known_of_table(lut)),
         )
 
 

@@ -111,7 +111,8 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
         axes.add_patch(Circle((0, 0), 1, facecolor=_colour(light, table_lights), edgecolor=_FAINT, linewidth=0.4))
 
     table = dataset.description.table
-    put(margin, 0.5, table.camera, 13, weight="bold")
+    camera = table.camera if table.computed is None else f"{table.camera}, computed"
+    put(margin, 0.5, camera, 13, weight="bold")
     put(
         margin,
         0.74,

@@ -284,8 +284,9 @@ def parse_lights(text: str, total: int) -> ListedLights:
 def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: OutsideGamut = "refuse") -> Mixture:
     """Return the light that a text names.
 
-    ``12`` and ``12:0.25+40:0.75`` are lights of the table, ``cct=4500`` or ``4500K`` a black body in kelvin
-    (`lights.gamut.black_body`), ``r=.3,b=.25`` a chromaticity in linear RGB of the table's camera.
+    ``12`` and ``12:0.25+40:0.75`` are lights of the table, as is a name (``D65``) where they have names, ``cct=4500``
+    or ``4500K`` a black body in kelvin (`lights.gamut.black_body`), ``r=.3,b=.25`` a chromaticity in linear RGB of the
+    table's camera.
 
     Parameters
     ----------
@@ -303,6 +304,9 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
     InputError
         It names none, or one that the table cannot make.
     """
+    for light in lut.illuminations:
+        if light.name is not None and light.name == text.strip():
+            return parse_mixture(str(light.index))
     kelvin = re.fullmatch(r"(\d+(?:\.\d*)?)\s*[kK]", text.strip(), re.ASCII)
     if kelvin:
         text = f"cct={kelvin[1]}"

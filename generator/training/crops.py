@@ -32,6 +32,9 @@ from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.planar import draw_batch
 from generator.lights.lighting import Mixture
 from generator.training.recycling import Recycled
+from generator.variation.iso_speed import IsoSpeed
+from generator.variation.sensor_noise import SensorNoise
+from generator.variation.training_noise import add_noise
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -95,6 +98,11 @@ class Crops:
         of memory each. None: all lights of the table.
     exposure
         Least and largest gain, > 0; drawn evenly in stops. What a gain above 1 takes past saturation is cut off there.
+    noise
+        Of the table's samples, `generator.variation.sensor_noise.measured_noise(lut)`: items of a gain below 1 are
+        then as noisy as a camera is in so much less light. None scales samples alone, noise included.
+    iso
+        ISO speed whose noise items have; needs `noise`. None for the table's. A gain above it is noisier.
     flip
         Whether half of the items are mirrored.
     seed
@@ -128,6 +136,8 @@ class Crops:
         length: int = 1 << 20,
         lights: Sequence[int | Mixture] | None = None,
         exposure: tuple[float, float] = (1.0, 1.0),
+        noise: SensorNoise | None = None,
+        iso: IsoSpeed | None = None,
         flip: bool = True,
         seed: int = 0,
         epoch: int = 0,
@@ -147,6 +157,8 @@ class Crops:
             raise InputError(f"an epoch of {length} items was asked for, expected 1 to 2^32")
         if not (0 < exposure[0] <= exposure[1] < np.inf):
             raise InputError(f"the exposure is {exposure}, expected least and largest gain above 0")
+        if iso is not None and noise is None:
+            raise InputError("an ISO speed was given without the noise of the table; give noise=measured_noise(lut)")
         philox.key_of(seed)
         chosen = range(len(lut.samples)) if lights is None else lights
         if not chosen:
@@ -159,6 +171,8 @@ class Crops:
         self.length = length
         self.lights = tuple(mixtures)
         self.exposure = exposure
+        self.noise = noise
+        self.iso = iso
         self.flip = flip
         self.seed = seed
         self.epoch = self._checked_epoch(epoch)
@@ -224,6 +238,8 @@ class Crops:
         windows[:, 2:] = width, height
         lights = _below(light, len(self.lights))
         least, most = np.log2(self.exposure)
+        gains = np.exp2(least + (most - least) * (stops / 2.0**32))
+        seeds = low.astype(np.uint64) | high.astype(np.uint64) << _HALF
         images = draw_batch(
             self._tables,
             self._rows[lights],
@@ -231,11 +247,18 @@ class Crops:
             windows,
             white_level=self.lut.provenance.white_level,
             flips=(mirror >> 31).astype(bool) & self.flip,
-            gains=np.exp2(least + (most - least) * (stops / 2.0**32)),
-            seeds=low.astype(np.uint64) | high.astype(np.uint64) << _HALF,
+            gains=gains,
+            seeds=seeds,
             threads=self.threads,
             out=self._memory.array((numbers.size, 3, height, width)) if out is None else out,
         )
+        if self.noise is not None:
+            ratio = 1.0 if self.iso is None else self.iso.ratio
+            wanted = self.noise if self.iso is None else self.noise.at(ratio, self.iso.sensor_electrons)
+            white = self.lut.provenance.white_level
+            add_noise(
+                images, gains, self.noise, seeds, white_level=white, wanted=wanted, ratio=ratio, threads=self.threads
+            )
         return Batch(images, self._truths[lights], lights, pictures)
 
     def __getitem__(self, item: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
@@ -257,7 +280,7 @@ def _below(words: npt.NDArray[np.uint32], bound: int | npt.NDArray[np.int64]) ->
     return (words.astype(np.uint64) * np.asarray(bound, dtype=np.uint64) >> _HALF).astype(np.int64)
 
 
-_OPTIONS: Final = ("length", "lights", "exposure", "flip", "seed", "epoch", "threads")
+_OPTIONS: Final = ("length", "lights", "exposure", "noise", "iso", "flip", "seed", "epoch", "threads")
 """Keywords of `Crops`, each kept in an attribute of its name."""
 
 

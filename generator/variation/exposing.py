@@ -37,7 +37,8 @@ from generator.variation.sensor_noise import SensorNoise
 Image = npt.NDArray[np.uint16]
 Three = tuple[float, float, float]
 
-_PURPOSE: Final = np.uint32(philox.NOISE)
+PURPOSE: Final = np.uint32(philox.NOISE)
+"""Of the words that are the keys of rows, as compiled code takes it."""
 _STEP: Final = np.uint64(0x9E3779B97F4A7C15)
 _FIRST: Final = np.uint64(0xBF58476D1CE4E5B9)
 _SECOND: Final = np.uint64(0x94D049BB133111EB)
@@ -50,7 +51,7 @@ _ONE: Final = np.float32(1)
 
 
 @numba.njit(inline="always")
-def _draw_row(key: Any, width: int, table: Any, deviates: Any) -> None:
+def draw_row(key: Any, width: int, table: Any, deviates: Any) -> None:
     """Fill `deviates` (3 · width,) float32 with those of a row's pixels, red, green, blue."""
     state = key
     for x in range(width):
@@ -86,6 +87,7 @@ def _expose(
     rows, width = source.shape[0], source.shape[1]
     deviates = np.zeros(3 * width, np.float32)
     factors = np.empty(3 * width, np.float32)
+    values = np.empty(3 * width, np.float32)
     constants = np.empty((3, 3 * width), np.float32)
     for x in range(width):
         for channel in range(3):
@@ -95,26 +97,25 @@ def _expose(
     clipped = 0
     for y in range(rows):
         if noisy:
-            k0, k1, _, _ = philox4x32(uint32(first_row + y), uint32(0), uint32(image), _PURPOSE, seed)
-            _draw_row((uint64(k1) << _32) | uint64(k0), width, table, deviates)
+            k0, k1, _, _ = philox4x32(uint32(first_row + y), uint32(0), uint32(image), PURPOSE, seed)
+            draw_row((uint64(k1) << _32) | uint64(k0), width, table, deviates)
         if uneven:
             for x in range(width):
                 far = weights[y, x, 1]
                 for channel in range(3):
                     factors[3 * x + channel] = numbers[0, channel] - far * numbers[1, channel]
         row, out = source[y].reshape(3 * width), target[y].reshape(3 * width)
+        # By way of a buffer, since a loop that may write what it reads is not compiled to vectors.
+        for i in range(3 * width):
+            values[i] = factors[i] * np.float32(row[i])
         if noisy:
             for i in range(3 * width):
-                factor = factors[i]
-                light = factor * np.float32(row[i])
-                missing = (
-                    constants[0, i] - factor * factor * constants[1, i] + (ratio - factor) * constants[2, i] * light
-                )
-                value = light + np.sqrt(max(missing, _ZERO)) * deviates[i]
-                out[i] = np.uint16(min(max(np.rint(value), _ZERO), white))
-        else:
-            for i in range(3 * width):
-                out[i] = np.uint16(min(np.rint(factors[i] * np.float32(row[i])), white))
+                factor, light = factors[i], values[i]
+                shot = (ratio - factor) * constants[2, i] * light
+                missing = constants[0, i] - factor * factor * constants[1, i] + shot
+                values[i] = light + np.sqrt(max(missing, _ZERO)) * deviates[i]
+        for i in range(3 * width):
+            out[i] = np.uint16(min(max(np.rint(values[i]), _ZERO), white))
         most = np.uint16(white)
         for x in range(width):
             clipped += max(out[3 * x], out[3 * x + 1], out[3 * x + 2]) >= most

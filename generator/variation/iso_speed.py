@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from foundation.errors import InputError
 from generator.named_numbers import parse_numbers
 from generator.variation.sensor_noise import SENSOR_ELECTRONS
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
 
 
 @dataclass(frozen=True)
@@ -54,8 +57,15 @@ class IsoSpeed:
         return {"wanted": self.wanted, "table": self.base, "sensor_electrons": self.sensor_electrons}
 
 
-def parse_iso(text: str) -> IsoSpeed:
+def parse_iso(text: str, base: float | None = None, sensor_electrons: float = SENSOR_ELECTRONS) -> IsoSpeed:
     """Return the speed that a text names: ``1600/100``, wanted over the table's, with ``:read=2.8`` electrons.
+
+    Parameters
+    ----------
+    text
+        What was written; ``1600`` alone where the speed of the table is known.
+    base, sensor_electrons
+        What is known of the table, see `known_of_table`; what the text says goes before it.
 
     Raises
     ------
@@ -64,17 +74,30 @@ def parse_iso(text: str) -> IsoSpeed:
 
     Examples
     --------
-    >>> parse_iso("1600/100").ratio
-    16.0
+    >>> parse_iso("1600/100").ratio, parse_iso("1600", base=200).ratio
+    (16.0, 8.0)
     >>> parse_iso("1600/100:read=2.8").sensor_electrons
     2.8
     """
     speeds, _, rest = text.strip().partition(":")
-    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*/\s*(\d+(?:\.\d*)?)\s*", speeds, re.ASCII)
-    if not match:
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*(?:/\s*(\d+(?:\.\d*)?)\s*)?", speeds, re.ASCII)
+    own = base if match is None or match[2] is None else float(match[2])
+    if match is None or own is None:
         raise InputError(
-            f"{text!r} is no ISO speed; write the wanted one over that with which the table was photographed, such as "
-            "1600/100: a table does not say its own"
+            f"{text!r} is no ISO speed of a table that does not say its own; write the wanted one over that with which "
+            "the table was photographed, such as 1600/100"
         )
     numbers = parse_numbers(rest, {"read": (0.0, 1000.0)}, "an ISO speed")
-    return IsoSpeed(float(match[1]), float(match[2]), numbers.get("read", SENSOR_ELECTRONS))
+    return IsoSpeed(float(match[1]), own, numbers.get("read", sensor_electrons))
+
+
+def known_of_table(lut: Lut) -> tuple[float | None, float]:
+    """Return the ISO speed of a table, None if it does not say it, and the read noise before the amplifier, electrons.
+
+    Computed tables say both; of photographed ones the noise is `SENSOR_ELECTRONS`.
+    """
+    computed = lut.provenance.computed or {}
+    try:
+        return float(computed["exposure"]["iso"]), float(computed["body"]["sensor_noise_e"])
+    except (KeyError, TypeError, ValueError):
+        return None, SENSOR_ELECTRONS

@@ -15,7 +15,7 @@ from typing import Any, Final
 from pydantic import TypeAdapter, ValidationError
 
 from foundation.errors import ConfigurationError
-from sim.world.sensitivities import Sensitivities, read_sensitivities
+from sim.spectral.sensitivities import Sensitivities, read_sensitivities
 from sim.world.sensors import BODIES, Body, Rectangle
 
 _BORDER: Final = (50, 140)
@@ -63,7 +63,7 @@ def find_body(camera: str, changes: Mapping[str, Any] = MappingProxyType({}), wh
     Parameters
     ----------
     camera
-        A body of the simulated lab (``EOS 550D``), a name of `sim.world.sensitivities.known_sensitivities`, or the
+        A body of the simulated lab (``EOS 550D``), a name of `sim.spectral.sensitivities.known_sensitivities`, or the
         path of a file of sensitivities. For a file of an unknown camera the facts are those of the EOS 550D.
     changes
         Facts that differ, by the names of `sim.world.sensors.Body`; `sensor`, `visible` and `masked` may be left out
@@ -74,7 +74,7 @@ def find_body(camera: str, changes: Mapping[str, Any] = MappingProxyType({}), wh
     Raises
     ------
     InputError, FormatError
-        The camera is unknown, or its file cannot be used (`sim.world.sensitivities.read_sensitivities`).
+        The camera is unknown, or its file cannot be used (`sim.spectral.sensitivities.read_sensitivities`).
     ConfigurationError
         A fact is unknown, of the wrong type, or cannot be a body's.
     """

@@ -37,7 +37,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim.world.sensitivities import read_sensitivities
+from sim.spectral.sensitivities import read_sensitivities
 
 WAVELENGTHS_NM: NDArray[np.float64] = np.arange(380.0, 781.0, 5.0)
 """(81,) float64, the wavelengths of every spectrum here."""
@@ -259,7 +259,7 @@ def sensitivities(name: str) -> NDArray[np.float64]:
     ----------
     name
         ``Canon_EOS_600D`` (the sensor generation of the EOS 550D), ``Canon_EOS_200D`` (that of the EOS 6D Mark II),
-        another of `sim.world.sensitivities.known_sensitivities`, or the path of a file.
+        another of `sim.spectral.sensitivities.known_sensitivities`, or the path of a file.
 
     Returns
     -------
@@ -269,7 +269,7 @@ def sensitivities(name: str) -> NDArray[np.float64]:
     Raises
     ------
     InputError, FormatError
-        See `sim.world.sensitivities.read_sensitivities`.
+        See `sim.spectral.sensitivities.read_sensitivities`.
     """
     curves = read_sensitivities(name).at(WAVELENGTHS_NM)
     curves.setflags(write=False)

@@ -218,9 +218,12 @@ def _card(description: Description) -> str:
     files = "".join(
         f"  - split: {'train' if part == 'data' else part}\n    path: {part}/*.{ending}\n" for part in parts
     )
+    origin = ""
+    if description.table.computed is not None:
+        origin = " The table behind them was computed from spectra and a model of the sensor, not photographed."
     return (
         f"---\nconfigs:\n- config_name: default\n  data_files:\n{files}---\n\n"
         f"{description.images} raw linear images of the {description.table.camera} with the ground truth of their "
         f"light, made by {description.software}. Black is 0, saturation {description.table.white_level}; nothing is "
-        "white balanced.\n"
+        f"white balanced.{origin}\n"
     )

@@ -238,6 +238,7 @@ def table_of(lut: Lut) -> TableRecord:
         samples=lut.samples.shape[2],
         white_level=provenance.white_level,
         software=provenance.software,
+        computed=provenance.computed,
     )
 
 
@@ -251,4 +252,5 @@ def light_of(lut: Lut, light: int) -> Light:
         cct_k=shown.cct_k,
         codes=(shown.colour.red, shown.colour.green, shown.colour.blue),
         white=(red, green, blue),
+        name=shown.name,
     )

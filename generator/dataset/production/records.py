@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer
 
 FORMAT: Final = "crop.dataset"
 VERSION: Final = 2
@@ -39,8 +39,21 @@ class _Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class TableRecord(_Record):
-    """The table a dataset was made from; `sha256` as `calibration.table.lut.Lut.sha256`."""
+class _RecordWithOptional(_Record):
+    """A record of which keys that are None are left out, so that records without them stay as they were."""
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        left_out = {name for name, field in type(self).model_fields.items() if field.default is None}
+        return {key: value for key, value in serialise(self).items() if value is not None or key not in left_out}
+
+
+class TableRecord(_RecordWithOptional):
+    """The table a dataset was made from; `sha256` as `calibration.table.lut.Lut.sha256`.
+
+    `computed` is what the table says of itself where nothing was photographed for it
+    (`calibration.table.provenance.Provenance.computed`).
+    """
 
     sha256: str
     camera: str
@@ -48,20 +61,27 @@ class TableRecord(_Record):
     samples: int
     white_level: int
     software: str
+    computed: dict[str, Any] | None = None
 
 
-class Light(_Record):
-    """A light of the table that was used; `codes` as projected, `white` the ground truth in linear camera RGB."""
+class Light(_RecordWithOptional):
+    """A light of the table that was used; `codes` as projected, `white` the ground truth in linear camera RGB.
+
+    Lights of a table that was computed under spectra of its own have a `name`, and codes that would show their colour.
+    """
 
     illumination: int
     kind: str
     cct_k: float | None
     codes: tuple[int, int, int]
     white: Triple
+    name: str | None = None
 
     @property
     def label(self) -> str:
-        """Return its name for a reader: its temperature if a black body, else its codes."""
+        """Return what to call it for a reader: its name, its temperature if a black body, else its codes."""
+        if self.name is not None:
+            return self.name
         return f"{self.cct_k:.0f} K" if self.cct_k is not None else "{} {} {}".format(*self.codes)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from calibration.table.lut import Lut
 from foundation.errors import InputError
-from generator.variation.iso_speed import parse_iso
+from generator.variation.iso_speed import known_of_table, parse_iso
 from generator.variation.sensor_noise import SensorNoise, Three, measured_noise
 from sim.world.sensors import BODIES
 
@@ -32,7 +32,7 @@ def table(read: float, shot: float, response: float = 0.0, texture: float = 0.0,
             folder=Path("lut"),
             samples=np.rint(samples).clip(0).astype(np.uint16),
             white=means[:, -1:].repeat(3, axis=1),
-            provenance=SimpleNamespace(unfit=[SimpleNamespace(colour=colour) for colour in unfit]),
+            provenance=SimpleNamespace(computed=None, unfit=[SimpleNamespace(colour=colour) for colour in unfit]),
         ),
     )
 
@@ -83,6 +83,22 @@ def _of_body(body: Any, iso: int) -> tuple[Three, Three]:
 def test_read_noise_before_the_amplifier_is_no_more_than_all() -> None:
     assert SensorNoise((2.0, 2.0, 2.0), (1.0, 1.0, 1.0)).at(10, 100.0).read == pytest.approx([20.0] * 3)
     assert SensorNoise((2.0, 2.0, 2.0), (1.0, 1.0, 1.0)).at(10, 0.0).read == pytest.approx([2.0] * 3)
+
+
+def test_a_computed_table_says_its_speed() -> None:
+    lut = table(6.0, 0.55)
+    assert known_of_table(lut) == (None, 2.5)
+    computed = {"exposure": {"iso": 200}, "body": {"sensor_noise_e": 2.8}}
+    object.__setattr__(lut.provenance, "computed", computed)
+    iso = parse_iso("1600", *known_of_table(lut))
+    assert (iso.ratio, iso.sensor_electrons) == (8.0, 2.8)
+    assert parse_iso("1600/100:read=3", *known_of_table(lut)).describe() == {
+        "wanted": 1600.0,
+        "table": 100.0,
+        "sensor_electrons": 3.0,
+    }
+    with pytest.raises(InputError, match="below the ISO 200"):
+        parse_iso("100", *known_of_table(lut))
 
 
 @pytest.mark.parametrize("text", ["50/100", "1600", "0/100", "1600/100:read=-1", "a/b", "", "1600/100:gain=1"])

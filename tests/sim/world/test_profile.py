@@ -70,6 +70,27 @@ def test_what_no_ink_reaches_keeps_its_hue(on: PaperName) -> None:
     assert np.median(turned[outside & (chroma > 10)]) < 6
 
 
+def test_no_ink_code_comes_nearer_than_the_profile_s() -> None:
+    axis = np.linspace(0, 255, 33)
+    inks = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    every = relative_lab(print_reflectance(inks, "glossy"), "glossy")
+    # Nodes of the profile's table, so that nothing is interpolated.
+    codes = np.random.default_rng(8).integers(0, 33, (60, 3)) * 255 / 32
+    wanted = intended_lab(codes, "glossy")
+    lab = relative_lab(printed_reflectance(codes, "managed", "glossy"), "glossy")
+    for target, found in zip(wanted, lab, strict=True):
+        along = target[1:] / np.hypot(*target[1:])
+
+        def away(
+            seen: NDArray[np.float64], target: NDArray[np.float64] = target, along: NDArray[np.float64] = along
+        ) -> NDArray[np.float64]:
+            off = seen - target
+            hue = off[..., 2] * along[0] - off[..., 1] * along[1]
+            return np.sqrt((off**2).sum(axis=-1) + 3 * hue**2)
+
+        assert float(away(found)) < float(away(every).min()) + 0.5
+
+
 @pytest.mark.parametrize("on", PAPERS)
 def test_white_is_bare_paper_and_reflectances_are_between_surface_and_one(on: PaperName) -> None:
     for profile in ("unmanaged", "managed"):

@@ -23,16 +23,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from foundation.errors import FormatError, InputError
 from foundation.hashing import sha256_of
+from sim.spectral.grids import regridded, require_grid
 
 SUFFIX: Final = "_380_780_5.json"
 """What the names of the files in `sim.data` end in: first and last wavelength, and the step (as rawtoaces-data)."""
-
-NEEDED_NM: Final = (400.0, 700.0)
-"""Wavelengths that a file must cover: beyond them a camera with its infrared filter sees under 2 % of its light."""
-
-WIDEST_STEP_NM: Final = 20.0
-"""Distance of two wavelengths that may be bridged by a straight line: filters' edges rise over some 40 nm, and bench
-measurements are taken every 5 or 10 nm (ISO 17321-1 asks for 10 at most)."""
 
 EDGE_SHARE: Final = 0.05
 """Share of a channel's peak that may be left at the first and the last wavelength of a file, beyond which the channel
@@ -96,11 +90,8 @@ class Sensitivities:
         return " ".join(f"{self.maker} {self.model}".split()) if self.model else self.name
 
     def at(self, wavelengths_nm: _Array) -> _Array:
-        """Return the curves (N, 3) float64 at wavelengths (N,) nm: straight lines between those measured, 0 beyond."""
-        found = np.zeros((len(wavelengths_nm), 3))
-        for channel in range(3):
-            found[:, channel] = np.interp(wavelengths_nm, self.wavelengths_nm, self.curves[:, channel], left=0, right=0)
-        return found
+        """Return the curves (N, 3) float64 on another grid (N,) nm of even steps (`regridded`), 0 beyond their own."""
+        return regridded(self.wavelengths_nm, self.curves, wavelengths_nm)
 
 
 def known_sensitivities() -> tuple[str, ...]:
@@ -208,23 +199,7 @@ def _sorted(table: Mapping[str, list[float]], where: str) -> tuple[_Array, _Arra
 
 def _require_camera(wavelengths: _Array, curves: _Array, where: str) -> None:
     """Refuse numbers that cannot be a camera's sensitivities."""
-    low, high = NEEDED_NM
-    if len(wavelengths) < 2 or wavelengths[0] > low or wavelengths[-1] < high:
-        span = "none" if not len(wavelengths) else f"{wavelengths[0]:g} to {wavelengths[-1]:g}"
-        raise FormatError(
-            f"{where}: its wavelengths are {span}, {low:g} to {high:g} nm at least expected; "
-            "convert them to nanometres if they are not, or measure the rest"
-        )
-    steps = np.diff(wavelengths)
-    if steps.min() <= 0:
-        raise FormatError(f"{where}: {wavelengths[int(steps.argmin())]:g} nm stands there twice; leave one out")
-    inside = (wavelengths[:-1] < high) & (wavelengths[1:] > low)
-    if steps[inside].max() > WIDEST_STEP_NM:
-        at = int(np.flatnonzero(inside)[steps[inside].argmax()])
-        raise FormatError(
-            f"{where}: there is a gap from {wavelengths[at]:g} to {wavelengths[at + 1]:g} nm, {WIDEST_STEP_NM:g} nm at "
-            "most expected; measure what lies between"
-        )
+    require_grid(wavelengths, where)
     if curves.min() < 0:
         row, channel = np.unravel_index(int(curves.argmin()), curves.shape)
         raise FormatError(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import FormatError, InputError
-from sim.world.sensitivities import known_sensitivities, parse_sensitivities, read_sensitivities
+from sim.spectral.sensitivities import known_sensitivities, parse_sensitivities, read_sensitivities
 from sim.world.spectra import WAVELENGTHS_NM, sensitivities
 
 
@@ -39,7 +39,7 @@ def test_those_that_come_with_the_suite_are_known_by_name() -> None:
 def test_another_grid_is_resampled_by_straight_lines_and_is_blind_beyond() -> None:
     found = parsed(document())
     assert found.camera == "Maker M1"
-    at = found.at(np.array([380.0, 455.0, 460.0, 780.0]))
+    at = found.at(WAVELENGTHS_NM)[[0, 15, 16, 80]]
     assert at[0].tolist() == at[3].tolist() == [0, 0, 0]
     middle = (found.curves[found.wavelengths_nm == 450] + found.curves[found.wavelengths_nm == 460])[0] / 2
     assert at[1] == pytest.approx(middle)

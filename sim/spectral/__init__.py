@@ -1,0 +1,1 @@
+"""Measured spectra: which are read, and how they come to the grid on which the simulation works."""

@@ -1,0 +1,120 @@
+"""Lights by their spectra: files, published ones, black bodies, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquisition.lights.illuminations import blackbody_light, shown_colour
+from foundation.errors import FormatError, InputError
+from sim.world.spectra import WAVELENGTHS_NM
+from synthesis.light_spectra import illuminations_of, parse_spectra, read_lights
+
+
+def table(step: int = 5, low: int = 380, high: int = 780, **lights: float) -> str:
+    """Return a file of flat spectra of these powers."""
+    rows = [",".join(["wavelength", *lights])]
+    rows += [",".join([str(at), *map(str, lights.values())]) for at in range(low, high + 1, step)]
+    return "\n".join(rows) + "\n"
+
+
+def test_a_file_has_a_light_in_every_column(tmp_path: Path) -> None:
+    path = tmp_path / "lamps.csv"
+    path.write_text(table(hall=2.0, stage=7.0), encoding="utf-8-sig")
+    found = read_lights(str(path))
+    assert [light.name for light in found.lights] == ["hall", "stage"]
+    # Proportions within a light count, its brightness does not.
+    assert np.array_equal(found.lights[0].power, np.ones(81))
+    assert np.array_equal(found.lights[1].power, np.ones(81))
+    assert found.source["file"] == "lamps.csv"
+    assert len(found.source["sha256"]) == 64
+
+
+@pytest.mark.parametrize(("step", "low", "high"), [(1, 380, 780), (5, 400, 700), (10, 350, 900), (20, 400, 700)])
+def test_any_grid_gives_the_same_light_where_it_is_given(step: int, low: int, high: int) -> None:
+    (light,) = parse_spectra(table(step, low, high, hall=3.0).encode(), "lamps.csv")
+    inside = (max(low, 380) + 5 < WAVELENGTHS_NM) & (min(high, 780) - 5 > WAVELENGTHS_NM)
+    assert light.power[inside] == pytest.approx(np.ones(int(inside.sum())))
+    beyond = (low - 5 > WAVELENGTHS_NM) | (high + 5 < WAVELENGTHS_NM)
+    assert not light.power[beyond].any()
+
+
+def test_published_illuminants_are_those_of_the_cie() -> None:
+    found = {light.name: light for light in read_lights("A,D65,FL2,LED-B3").lights}
+    # CIE 15, illuminants A and D65: relative power at 400, 500, 560 and 700 nm, over that at 560 nm.
+    at = np.searchsorted(WAVELENGTHS_NM, [400, 500, 560, 700])
+    assert found["A"].power[at] / found["A"].power[at[2]] == pytest.approx([0.147080, 0.598611, 1, 1.98261], rel=1e-4)
+    assert found["D65"].power[at] / found["D65"].power[at[2]] == pytest.approx(
+        [0.827549, 1.09354, 1, 0.716091], rel=1e-4
+    )
+    assert all(light.cct_k is None for light in found.values())
+
+
+def test_a_black_body_is_plancks_and_keeps_its_temperature() -> None:
+    lights = read_lights("2000:10000:4000K").lights
+    assert [light.cct_k for light in lights] == [2000, 6000, 10_000]
+    planck = [w**-5 / np.expm1(1.4387769e7 / (w * 6000)) for w in (450.0, 650.0)]
+    at = np.searchsorted(WAVELENGTHS_NM, [450, 650])
+    assert lights[1].power[at[0]] / lights[1].power[at[1]] == pytest.approx(planck[0] / planck[1], rel=2e-3)
+    shown = illuminations_of(lights)
+    assert [light.kind for light in shown] == ["blackbody"] * 3
+    # The projector's black body of the same temperature has the same codes, to rounding.
+    for light, cct_k in zip(shown, (2000, 6000, 10_000), strict=True):
+        expected = shown_colour(blackbody_light(cct_k))
+        assert np.abs(np.subtract(light.codes, (expected.red, expected.green, expected.blue))).max() <= 1
+
+
+def test_a_set_names_several_and_daylight_any_temperature() -> None:
+    assert [light.name for light in read_lights("cie-hp").lights] == ["HP1", "HP2", "HP3", "HP4", "HP5"]
+    assert len(read_lights("cie").lights) == 52
+    (light,) = read_lights("daylight:6504").lights
+    (d65,) = read_lights("D65").lights
+    assert np.abs(light.power - d65.power).max() < 0.01
+
+
+def test_spectra_that_are_no_black_bodies_have_names_and_no_temperature() -> None:
+    (light,) = illuminations_of(read_lights("D65").lights)
+    assert (light.kind, light.cct_k, light.name, light.codes) == ("spectrum", None, "D65", (255, 255, 255))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("D66", "no published light 'D66'; did you mean 'D65'"),
+        ("D65,A,D65", "'D65' is there twice"),
+        ("nowhere.csv", "cannot read spectra nowhere.csv: No such file"),
+        ("daylight:3000", "daylight of 3000 K; the CIE defines it from 4000 to 25000 K"),
+        ("200K", "200 K is not within 1000"),
+        ("", "there is no file and no published light ''"),
+    ],
+)
+def test_what_is_no_light_is_refused(given: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_lights(given)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "its first line is ''; 'wavelength' expected"),
+        ("nm,hall\n400,1\n", "its first line is 'nm,hall'"),
+        (table(hall=1.0).replace("500,1.0", "500,-0.1"), "'hall' is -0.1 at 500 nm, 0 or more expected"),
+        (table(hall=1.0).replace("500,1.0", "500,"), "line 26: 2 numbers expected"),
+        (table(hall=1.0).replace("500,1.0", "500,1.0,2.0"), "line 26: 2 numbers expected"),
+        (table(hall=1.0).replace("500,1.0", "500,nan"), "a number is not finite"),
+        (table(hall=1.0, cellar=0.0), "'cellar' is dark from 400 to 700 nm"),
+        (table(low=410, hall=1.0), "its wavelengths are 410 to 780"),
+        (table(step=40, hall=1.0), "a gap from 380 to 420 nm"),
+        (table(hall=1.0) + "500,2\n", "500 nm stands there twice"),
+    ],
+)
+def test_what_cannot_be_a_spectrum_is_refused(text: str, message: str) -> None:
+    with pytest.raises(FormatError, match=rf"lamps\.csv.*{message}"):
+        parse_spectra(text.encode(), "lamps.csv")
+
+
+def test_what_is_no_text_is_refused() -> None:
+    with pytest.raises(FormatError, match="no CSV in UTF-8"):
+        parse_spectra(b"\xff\xfe\x00", "lamps.csv")
