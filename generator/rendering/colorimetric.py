@@ -68,8 +68,8 @@ def black_point(profile: PrintProfile) -> float:
     """Return what black is mapped to: the darkest grey that cells near to it make; 1 = ideal white.
 
     At the very edge of the gamut cells of unlike colours would have to be mixed. So the darkest is taken, of greys from
-    the print's own black to one a quarter brighter, that is off by no more than `BLACK_WITHIN_DEG`; if there is none, as
-    on charts of few cells, the print's own black.
+    the print's own black to one a quarter brighter, that is off by no more than `BLACK_WITHIN_DEG`; if there is none,
+    as on charts of few cells, the print's own black.
 
     Parameters
     ----------
