@@ -1,10 +1,10 @@
 """Halve an archive of thumbnails at random: the lights of one half to generate under, the other half to test on.
 
-`python examples/halves.py nus_canon_600d_64x64.npz [FOLDER] [--names PART]` writes for each half, 0 and 1, into the folder
-(the working folder by default): `lights_H.csv` (r,g,b a line, of sum 1) for `generate --match`, and `images_H.csv` (column
-image) for `evaluate transfer --only`. A set that was generated under `lights_0.csv` is tested on `images_1.csv` and the
-reverse, so that every image is tested once and no test light was looked at. With `--names` only images are taken whose
-names contain PART, and `ARCHIVE.npz` holds them.
+`python examples/halves.py nus_canon_600d_64x64.npz [FOLDER] [--names PART]` writes for each half H, 0 and 1, into the
+folder (the working folder by default): `half_H.npz`, the images, for `evaluate describe` and `generate --like`;
+`lights_H.csv` (r,g,b a line, of sum 1) for `generate --match`; and `images_H.csv` (column image) for `evaluate transfer
+--only`. A set that was made by half 0 is tested on the images of half 1 and the reverse, so that every image is tested
+once and no test light was looked at. `all.npz` holds both halves; with `--names` only images whose names contain PART.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ def main() -> None:
     if given.names:
         chosen = np.array([given.names in name for name in data["names"].tolist()])
         data = {name: values[chosen] for name, values in data.items()}
-        np.savez(given.folder / given.archive.name, **data)
+    np.savez(given.folder / "all.npz", **data)
     order = np.random.default_rng(SEED).permutation(len(data["gt"]))
     chromaticities = data["gt"] / data["gt"].sum(axis=1, keepdims=True)
     for half, places in enumerate(np.array_split(order, [len(order) // 2])):
         kept = np.sort(places)
+        np.savez(given.folder / f"half_{half}.npz", **{name: values[kept] for name, values in data.items()})
         lights = "".join("{:.6f},{:.6f},{:.6f}\n".format(*row) for row in chromaticities[kept])
         (given.folder / f"lights_{half}.csv").write_text(f"r,g,b\n{lights}")
         (given.folder / f"images_{half}.csv").write_text("image\n" + "\n".join(data["names"][kept].tolist()) + "\n")
