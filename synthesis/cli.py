@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from foundation import console
-from foundation.console import EXIT_CODES, orderly_end
+from foundation.console import EXIT_CODES, orderly_end, progress
 from sim.cli import app
 
 
@@ -42,6 +42,14 @@ def table(
     settings: Annotated[
         Path | None, typer.Option(help="TOML file with facts of the body, exposure, room, chart; defaults else.")
     ] = None,
+    profile: Annotated[
+        str | None,
+        typer.Option("--print", help="The print: unmanaged (codes are ink codes) or managed (a shop's profile)."),
+    ] = None,
+    paper: Annotated[str | None, typer.Option(help="Paper and its inks: poster, matt or glossy.")] = None,
+    hot: Annotated[
+        float | None, typer.Option(min=0, help="Hot photosites of a million, which every frame has; none else.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of response and noise, in place of the settings'.")] = None,
     threads: Annotated[
         int | None, typer.Option(min=1, help="Lights computed at a time; by default one a processor.")
@@ -51,7 +59,7 @@ def table(
 
     Reads the sensitivities, the spectra of lights and the settings. Writes OUT/samples.npy, illuminations.csv,
     references.csv and lut.json, which says that the table was computed: a table for generate like one that build-lut
-    makes of a session in the simulated lab, in minutes.
+    makes of a session in the simulated lab, in minutes. Options come before what the settings say.
     """
     from foundation.processors import processor_count
     from synthesis.light_spectra import read_lights
@@ -59,13 +67,12 @@ def table(
     from synthesis.table import compute_table
     from synthesis.tasks import table_task
 
-    given = load_settings(settings)
-    if seed is not None:
-        given = given.model_copy(update={"seed": seed})
+    changes = {"profile": profile, "paper": paper, "hot_per_million": hot}
+    given = load_settings(settings).changed(seed, {name: value for name, value in changes.items() if value is not None})
     spectra = None if lights is None else read_lights(lights)
-    task = table_task(camera, given, str(settings or "the settings"), spectra)
-    with orderly_end():
-        done = compute_table(task, out, threads or processor_count())
+    task = table_task(camera, given, str(settings or "the command line"), spectra)
+    with orderly_end(), progress("lights") as told:
+        done = compute_table(task, out, threads or processor_count(), told)
     print(
         f"{out}: computed, {done.lights} lights, {done.cells} colours, {task.window**2} samples each; "
         f"{done.unfit} cells unfit for use"

@@ -14,11 +14,12 @@ import numpy.typing as npt
 
 from calibration.pipeline.baseline import usable_means
 from calibration.pipeline.registered_frame import ChartPoints
-from calibration.radiometry.paper import MAX_ORDER, MAX_ORDER_AROUND, Paper, PaperReader
+from calibration.radiometry.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
 from calibration.radiometry.primaries import Primaries
 from calibration.radiometry.sensor_range import saturation
 from calibration.sampling.patch_statistics import patch_means
 from calibration.sampling.samples import Sites, gather, gather_values
+from foundation.errors import QualityError
 from synthesis.lamps import ChartLamp
 from synthesis.patch_frames import PatchSensor
 
@@ -126,6 +127,7 @@ class PatchMeasurement:
         samples, highest = gather(mosaic, black, references)
         seen = usable_means(samples, highest, references, saturation(mosaic))
         whites, greys = np.split(seen, [len(self.points.whites_mm)])
+        _require_unclipped(whites, f"light {light}")
         paper, shape = self.reader.read(whites, f"light {light}")
         if self.primaries is not None:
             shape = shape * self.primaries.field_ratio(paper.white)
@@ -137,7 +139,9 @@ class PatchMeasurement:
         mosaic, black = self.sensor.expose(*self.lamp.even(), self.iso, 0)
         _, references = self._sites()
         seen = usable_means(*gather(mosaic, black, references), references, saturation(mosaic))
-        return self.reader.read(seen[: len(self.points.whites_mm)], "the even frame")[0]
+        whites = seen[: len(self.points.whites_mm)]
+        _require_unclipped(whites, "the frame of white")
+        return self.reader.read(whites, "the frame of white")[0]
 
     def _sites(self) -> tuple[Sites, Sites]:
         """Return where the cells lie in a frame of patches, and where the references."""
@@ -145,4 +149,14 @@ class PatchMeasurement:
         return (
             Sites(sites.rows[:count], sites.columns[:count], sites.inside[:count], sites.window),
             Sites(sites.rows[count:], sites.columns[count:], sites.inside[count:], sites.window),
+        )
+
+
+def _require_unclipped(whites: _Array, what: str) -> None:
+    """Refuse white references (W, 3), NaN where clipped, of which too few are left."""
+    left = int(np.isfinite(whites).all(axis=1).sum())
+    if left < MIN_REFERENCES:
+        raise QualityError(
+            f"{what}: bare paper is clipped in {len(whites) - left} of {len(whites)} white references; expose less: a "
+            "smaller exposure.shutter_s or room.white_level_share in the settings"
         )

@@ -65,6 +65,10 @@ class TableSettings(_Settings):
     """Parameters of the room that differ; see `sim.world.room.Room`."""
     chart: ComputedChart = ComputedChart()
 
+    def changed(self, seed: int | None, room: dict[str, str | float]) -> TableSettings:
+        """Return the settings with another seed, where one is given, and changes of the room that come before its."""
+        return self.model_copy(update={"room": {**self.room, **room}} | ({} if seed is None else {"seed": seed}))
+
     @property
     def exposed(self) -> ExposureSettings:
         """The exposure as the simulated room takes it."""

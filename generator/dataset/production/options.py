@@ -50,6 +50,8 @@ class DatasetOptions:
         Crops of each picture, 1 or more; of more than one the sources must have as many.
     reading
         How sources were read, as plain values; recorded only.
+    weighted
+        Whether sources were drawn by weights, which are recorded of each image.
     rendering
         ``"codes"``: codes of a picture are those of the print, the paper's way; ``"colorimetric"``: the print shows
         the camera the picture's colours.
@@ -80,6 +82,7 @@ class DatasetOptions:
     variation: Variation = NO_VARIATION
     crops: int = 1
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    weighted: bool = False
     rendering: Rendering = RENDERING
     matrix: ColourMatrix | None = None
     black_point: BlackPoint = KEEP
@@ -87,7 +90,7 @@ class DatasetOptions:
     @property
     def has_details(self) -> bool:
         """Whether options do something to each image that is recorded of it: `images.csv` lists it then."""
-        return self.variation.is_on or self.crops > 1 or self.is_rendered
+        return self.variation.is_on or self.crops > 1 or self.weighted or self.is_rendered
 
     @property
     def is_rendered(self) -> bool:

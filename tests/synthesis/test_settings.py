@@ -1,0 +1,118 @@
+"""Settings of computed tables: a file's, the command line's before them, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from foundation.errors import ConfigurationError
+from sim.world.body_settings import FACTS, find_body
+from sim.world.sensors import BODIES
+from synthesis.settings import TableSettings, load_settings, parse_settings, room_of
+
+FILE = """
+seed = 3
+window = 7
+
+[camera]
+model = "Maker M2"
+pixels = [6000, 4000]
+electrons_per_dn = 2.5
+
+[exposure]
+iso = 400
+
+[room]
+vignetting = 0.1
+profile = "managed"
+"""
+
+
+def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
+    path = tmp_path / "table.toml"
+    path.write_text(FILE)
+    settings = load_settings(path)
+    assert (settings.seed, settings.window, settings.exposed.iso, settings.exposed.shutter_s) == (3, 7, 400, 0.5)
+    room = room_of(settings, "here")
+    assert (room.seed, room.vignetting, room.profile, room.lamp_drift_per_hour) == (3, 0.1, "managed", 0)
+    body = find_body("Canon_EOS_5DS", settings.camera, "here")
+    assert (body.model, body.electrons_per_dn, body.saturation) == ("Maker M2", 2.5, FACTS["Canon_EOS_5DS"].saturation)
+    assert body.half_size == (2000, 3000)
+    assert body.sensitivities == "Canon_EOS_5DS"
+
+
+def test_the_command_line_comes_before_the_file() -> None:
+    settings = parse_settings({"seed": 3, "room": {"paper": "matt", "vignetting": 0.1}}, "here")
+    changed = settings.changed(9, {"paper": "glossy"})
+    room = room_of(changed, "here")
+    assert (room.seed, room.paper, room.vignetting) == (9, "glossy", 0.1)
+    assert settings.changed(None, {}) == settings
+
+
+def test_without_a_file_all_is_as_in_the_simulated_lab() -> None:
+    assert load_settings(None) == TableSettings()
+
+
+def test_a_body_of_the_lab_and_one_of_sensitivities_are_found() -> None:
+    assert find_body("EOS 550D") is not None
+    assert find_body("EOS 550D") == BODIES["EOS 550D"]
+    assert {name: body.camera for name, body in FACTS.items()} == {name: name.replace("_", " ") for name in FACTS}
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ({"sead": 1}, "unknown key 'sead'; did you mean 'seed'"),
+        ({"exposure": {"isso": 100}}, r"unknown key 'exposure\.isso'; did you mean 'iso'"),
+        ({"chart": {"bits": 6}}, r"here: chart\.bits = 6"),
+        ({"window": 4}, "window = 4: 3, 5, 7, 9 expected"),
+        ({"exposure": {"iso": 0}}, r"exposure\.iso = 0"),
+    ],
+)
+def test_what_cannot_be_set_is_refused(document: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        parse_settings(document, "here")
+
+
+@pytest.mark.parametrize(
+    ("room", "message"),
+    [
+        ({"blur_px": 1.0}, r"room\.blur_px has no effect on a computed table"),
+        ({"vignetin": 0.1}, r"unknown key 'room\.vignetin'; did you mean 'vignetting'"),
+        ({"vignetting": 2.0}, "vignetting is 2.0; 0 … below 1 is expected"),
+        ({"paper": "silk"}, r"room\.paper: "),
+        ({"seed": 5}, r"unknown key 'room\.seed'"),
+    ],
+)
+def test_what_a_room_has_not_is_refused(room: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        room_of(parse_settings({"room": room}, "here"), "here")
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        ({"modell": "x"}, r"unknown key 'camera\.modell'; did you mean 'model'"),
+        ({"black": "x"}, r"camera\.black: "),
+        ({"black": 20000}, r"camera\.black is 20000; 0 to below saturation"),
+        ({"saturation": 20000}, r"camera\.saturation is 20000; 16383 at most with 14 bits"),
+        ({"electrons_per_dn": 0}, r"camera\.electrons_per_dn is 0; more than 0"),
+        ({"sensor_noise_e": 99.0}, r"camera\.sensor_noise_e is 99; 0 to the whole read noise"),
+        ({"pixels": [10]}, r"camera\.pixels = \[10\]: two whole numbers"),
+        ({"pixels": [4, 4]}, "at least 16 columns and rows"),
+        ({"pattern": "RGBW"}, "pattern is 'RGBW'"),
+    ],
+)
+def test_what_no_sensor_has_is_refused(camera: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        find_body("Canon_EOS_600D", camera, "here")
+
+
+def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="cannot read settings"):
+        load_settings(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("seed = \n")
+    with pytest.raises(ConfigurationError, match="is not TOML"):
+        load_settings(tmp_path / "bad.toml")
