@@ -1,11 +1,4 @@
-"""Separable filters of tiles of images, with sums and neighbours kept in registers.
-
-Vectors lie one after the other along the axis that is filtered, so that every load is aligned: rows are filtered in
-groups of 16 that are transposed first, which costs 4 shuffles a vector, where loads that begin between two cache lines
-would cost 2 cycles a tap. `OUTPUTS` neighbouring vectors are found at a time. From tap to tap the neighbours they need
-move on by one, so a tap loads two vectors, not two for each of them: what bounds the loop is additions and
-multiplications, not loads. Taps that lie symmetrically are combined before they are multiplied: a derivative of
-constant whole numbers is exactly zero.
+"""Gaussian derivatives of tiles of images, by separable filters whose inner loops are in `taps.py`.
 
 Rows filtered along x stand in columns of 16 numbers: (columns, rows, 16), one cache line a row, which is what the
 filter along y reads from top to bottom. An image is filtered in tiles whose columns fit a core's cache, from top to
@@ -14,246 +7,36 @@ bottom; the rows that a tile shares with the one above are kept, and those beyon
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from llvmlite import ir
-from numba.core import cgutils
-from numba.extending import intrinsic
 
+from evaluation.methods.filters.taps import (
+    CHUNK,
+    OUTPUTS,
+    across_all,
+    across_even,
+    across_even_odd,
+    beside_all,
+    copy_line,
+    down_curvature,
+    down_even,
+    down_gradient,
+    transpose,
+)
 from foundation.compiled import compiled
-from generator.kernels.vector import ADDRESS, F32, FLOATS, I32, I64, LANES, LINE, broadcast, constant, load, store, void
+from generator.kernels.vector import LANES, LINE
 
-OUTPUTS: Final = 4
-"""Vectors that are found at a time: as many sums as a multiplication takes cycles, so that none waits for another."""
 GROUP: Final = LANES
 """Rows that are filtered along x at a time: one a lane."""
-CHUNK: Final = 16
-"""Pixels of a row that are filtered before they are transposed back: three whole vectors of 16 numbers."""
+NEAR: Final = 9
+"""Reach of kernels up to which rows are not transposed for order 2: its four transpositions a vector take longer than
+loads that begin between two cache lines. Orders 0 and 1 have two and three, and are not faster so."""
 STRETCH: Final = 4 * 3 * CHUNK
 """Numbers of a row that are converted before they are transposed: 16 rows of them take 12 KB of the nearest cache."""
 _BYTES: Final = 4
 """Of a float32."""
-_PIXEL: Final = 3 * LINE
-"""Bytes from pixel to pixel of 16 rows."""
-
-EVEN, ODD, BEND = 0, 1, 2
-"""Kinds of kernels: Σ w(k) (x(k) + x(-k)) + w(0) x(0); Σ w(k) (x(k) - x(-k)); Σ w(k) (x(k) + x(-k) - 2 x(0)).
-
-Those of a Gaussian and of its first two derivatives."""
-
-
-def _call(builder: Any, name: str, *arguments: Any) -> Any:
-    """Return what an LLVM intrinsic on vectors of 16 float32 gives."""
-    whole = f"{name}.v{LANES}f32"
-    known = builder.module.globals.get(whole)
-    function = known or ir.Function(builder.module, ir.FunctionType(FLOATS, [FLOATS] * len(arguments)), whole)
-    return builder.call(function, arguments)
-
-
-def _fused(builder: Any, first: Any, second: Any, third: Any) -> Any:
-    """Return first · second + third, rounded once."""
-    return _call(builder, "llvm.fma", first, second, third)
-
-
-def _root(builder: Any, value: Any) -> Any:
-    return _call(builder, "llvm.sqrt", value)
-
-
-def _emit(
-    builder: Any, source: Any, step: Any, weights: Sequence[Any], reach: Any, kinds: Sequence[int]
-) -> list[list[Any]]:
-    """Return the `OUTPUTS` filtered vectors at `source` and after for each kind.
-
-    Neighbours lie `step` bytes apart; `weights` are addresses of reach + 1 float32 a kind. Read are `reach` neighbours
-    before the first and after the last vector.
-    """
-
-    def slot_of(value: Any) -> Any:
-        slot = cgutils.alloca_once(builder, FLOATS)
-        builder.store(value, slot)
-        return slot
-
-    def times(number: Any, count: int) -> Any:
-        return builder.mul(number, ir.Constant(I64, count))
-
-    outputs = range(OUTPUTS)
-    centre = [load(builder, builder.add(source, times(step, at)), 0, FLOATS) for at in outputs]
-    sums: list[list[Any]] = []
-    for kind, table in zip(kinds, weights, strict=True):
-        first = broadcast(builder, load(builder, table, 0, F32), FLOATS)
-        zero = ir.Constant(FLOATS, [0.0] * LANES)
-        sums.append([slot_of(builder.fmul(one, first) if kind == EVEN else zero) for one in centre])
-    doubled = [builder.fadd(one, one) for one in centre] if BEND in kinds else []
-    lows, highs = [slot_of(one) for one in centre], [slot_of(one) for one in centre]
-    last = builder.add(source, times(step, OUTPUTS - 1))
-    with cgutils.for_range(builder, reach) as loop:
-        tap = builder.add(loop.index, ir.Constant(I64, 1))
-        offset = builder.mul(tap, step)
-        below, above = builder.sub(source, offset), builder.add(last, offset)
-        low = [load(builder, below, 0, FLOATS), *[builder.load(slot) for slot in lows[:-1]]]
-        high = [*[builder.load(slot) for slot in highs[1:]], load(builder, above, 0, FLOATS)]
-        for slots, values in ((lows, low), (highs, high)):
-            for slot, value in zip(slots, values, strict=True):
-                builder.store(value, slot)
-        factors = [
-            broadcast(builder, load(builder, builder.add(table, times(tap, _BYTES)), 0, F32), FLOATS)
-            for table in weights
-        ]
-        for at in outputs:
-            both = builder.fadd(low[at], high[at]) if EVEN in kinds or BEND in kinds else None
-            for kind, factor, slots in zip(kinds, factors, sums, strict=True):
-                if kind == EVEN:
-                    part = both
-                elif kind == ODD:
-                    part = builder.fsub(high[at], low[at])
-                else:
-                    part = builder.fsub(both, doubled[at])
-                builder.store(_fused(builder, part, factor, builder.load(slots[at])), slots[at])
-    return [[builder.load(slot) for slot in slots] for slots in sums]
-
-
-def _write(builder: Any, values: Sequence[Any], target: Any, step: Any) -> None:
-    for at, value in enumerate(values):
-        store(builder, value, builder.add(target, builder.mul(step, ir.Constant(I64, at))), 0)
-
-
-def _across(kinds: Sequence[int]) -> Any:
-    """Return what numba wants of an intrinsic that filters `OUTPUTS` pixels of 16 rows by each of some kinds."""
-    count = len(kinds)
-
-    def emit(builder: Any, source: Any, reach: Any, *places: Any) -> None:
-        step = ir.Constant(I64, _PIXEL)
-        found = _emit(builder, source, step, places[:count], reach, kinds)
-        for values, target in zip(found, places[count:], strict=True):
-            _write(builder, values, target, step)
-
-    return void(emit, *[ADDRESS] * (2 + 2 * count))
-
-
-@intrinsic
-def _across_even(typing: Any, source: Any, reach: Any, even: Any, target: Any) -> Any:
-    """Write four pixels of 16 rows from `source` on, smoothed along x, to `target`."""
-    del typing, source, reach, even, target
-    return _across((EVEN,))
-
-
-@intrinsic
-def _across_even_odd(typing: Any, source: Any, reach: Any, even: Any, odd: Any, smooth: Any, slope: Any) -> Any:
-    """Write four pixels of 16 rows, smoothed and derived once."""
-    del typing, source, reach, even, odd, smooth, slope
-    return _across((EVEN, ODD))
-
-
-@intrinsic
-def _across_all(
-    typing: Any, source: Any, reach: Any, even: Any, odd: Any, bend: Any, smooth: Any, slope: Any, curve: Any
-) -> Any:
-    """Write four pixels of 16 rows, smoothed, derived once and derived twice."""
-    del typing, source, reach, even, odd, bend, smooth, slope, curve
-    return _across((EVEN, ODD, BEND))
-
-
-@intrinsic
-def _down_even(typing: Any, smooth: Any, reach: Any, even: Any, target: Any, pitch: Any) -> Any:
-    """Write four rows of 16 numbers, smoothed along y, `pitch` bytes apart."""
-    del typing, smooth, reach, even, target, pitch
-
-    def emit(builder: Any, smooth: Any, reach: Any, even: Any, target: Any, pitch: Any) -> None:
-        (found,) = _emit(builder, smooth, ir.Constant(I64, LINE), (even,), reach, (EVEN,))
-        _write(builder, found, target, pitch)
-
-    return void(emit, *[ADDRESS] * 5)
-
-
-@intrinsic
-def _down_gradient(
-    typing: Any, smooth: Any, slope: Any, reach: Any, even: Any, odd: Any, target: Any, pitch: Any
-) -> Any:
-    """Write the gradient's length from rows smoothed and derived along x."""
-    del typing, smooth, slope, reach, even, odd, target, pitch
-
-    def emit(builder: Any, smooth: Any, slope: Any, reach: Any, even: Any, odd: Any, target: Any, pitch: Any) -> None:
-        step = ir.Constant(I64, LINE)
-        (along_x,) = _emit(builder, slope, step, (even,), reach, (EVEN,))
-        (along_y,) = _emit(builder, smooth, step, (odd,), reach, (ODD,))
-        lengths = [
-            _root(builder, _fused(builder, x, x, builder.fmul(y, y))) for x, y in zip(along_x, along_y, strict=True)
-        ]
-        _write(builder, lengths, target, pitch)
-
-    return void(emit, *[ADDRESS] * 7)
-
-
-@intrinsic
-def _down_curvature(
-    typing: Any,
-    smooth: Any,
-    slope: Any,
-    curve: Any,
-    reach: Any,
-    even: Any,
-    odd: Any,
-    bend: Any,
-    target: Any,
-    pitch: Any,
-) -> Any:
-    """Write √(f_xx² + 4 f_xy² + f_yy²) from rows smoothed, derived once, and derived twice along x."""
-    del typing, smooth, slope, curve, reach, even, odd, bend, target, pitch
-
-    def emit(
-        builder: Any,
-        smooth: Any,
-        slope: Any,
-        curve: Any,
-        reach: Any,
-        even: Any,
-        odd: Any,
-        bend: Any,
-        target: Any,
-        pitch: Any,
-    ) -> None:
-        step = ir.Constant(I64, LINE)
-        (xx,) = _emit(builder, curve, step, (even,), reach, (EVEN,))
-        (xy,) = _emit(builder, slope, step, (odd,), reach, (ODD,))
-        (yy,) = _emit(builder, smooth, step, (bend,), reach, (BEND,))
-        sizes: list[Any] = []
-        for a, b, c in zip(xx, xy, yy, strict=True):
-            mixed = builder.fadd(b, b)
-            total = _fused(builder, a, a, _fused(builder, mixed, mixed, builder.fmul(c, c)))
-            sizes.append(_root(builder, total))
-        _write(builder, sizes, target, pitch)
-
-    return void(emit, *[ADDRESS] * 9)
-
-
-@intrinsic
-def _transpose(typing: Any, source: Any, pitch: Any, target: Any) -> Any:
-    """Write the 16 x 16 numbers whose rows stand `pitch` bytes apart, transposed, to 16 cache lines at `target`."""
-    del typing, source, pitch, target
-
-    def emit(builder: Any, source: Any, pitch: Any, target: Any) -> None:
-        rows = [
-            load(builder, builder.add(source, builder.mul(pitch, ir.Constant(I64, row))), 0, FLOATS)
-            for row in range(LANES)
-        ]
-        size = LANES // 2
-        while size:
-            # Squares of `size` numbers change places across the diagonal.
-            upper = [lane if not lane & size else LANES + lane - size for lane in range(LANES)]
-            lower = [lane + size if not lane & size else LANES + lane for lane in range(LANES)]
-            for row in range(LANES):
-                if not row & size:
-                    pair = rows[row], rows[row + size]
-                    for at, lanes in ((row, upper), (row + size, lower)):
-                        rows[at] = builder.shuffle_vector(*pair, constant(ir.VectorType(I32, LANES), lanes))
-            size //= 2
-        for row, value in enumerate(rows):
-            store(builder, value, target, LINE * row)
-
-    return void(emit, *[ADDRESS] * 3)
 
 
 @compiled
@@ -287,11 +70,58 @@ def _turn_rows(
                     line[j] = np.float32(values[j] * scale)
         for at in range(0, count, LANES):
             target = turned.ctypes.data + (start - 3 * left + at) * LINE
-            _transpose(lines.ctypes.data + at * _BYTES, STRETCH * _BYTES, target)
+            transpose(lines.ctypes.data + at * _BYTES, STRETCH * _BYTES, target)
     for at in range(before):
         turned[at] = turned[before + at % 3]
     for at in range(end - 3 * left, turned.shape[0]):
         turned[at] = turned[at - 3]
+
+
+@compiled
+def _convert_row(
+    image: npt.NDArray[np.uint16] | npt.NDArray[np.float32] | npt.NDArray[np.float64],
+    scale: float,
+    y: int,
+    left: int,
+    line: npt.NDArray[np.float32],
+) -> None:
+    """Write a row of an image (H, 3 W) times `scale`, from pixel `left` on, to `line` (3 P,) float32.
+
+    Beyond the image stand copies of its first and last pixels and of its last row.
+    """
+    height, length = image.shape
+    begin = max(0, 3 * left)
+    end = min(length, 3 * left + line.size)
+    values = image[min(y, height - 1), begin:end]
+    before = begin - 3 * left
+    inside = line[before : before + end - begin]
+    if scale == 1:
+        for j in range(values.size):
+            inside[j] = np.float32(values[j])
+    else:
+        for j in range(values.size):
+            inside[j] = np.float32(values[j] * scale)
+    for at in range(before):
+        line[at] = inside[at % 3]
+    for at in range(before + inside.size, line.size):
+        line[at] = line[at - 3]
+
+
+@compiled
+def _filter_row(
+    row: int, weights: npt.NDArray[np.float32], line: npt.NDArray[np.float32], columns: npt.NDArray[np.float32]
+) -> None:
+    """Filter a row, as `_convert_row` wrote it from `reach` pixels before the tile on, to a row of three columns."""
+    reach = weights.shape[1] - 1
+    even = weights.ctypes.data
+    odd = even + weights.shape[1] * _BYTES
+    bend = odd + weights.shape[1] * _BYTES
+    column = columns.shape[2] * LINE
+    field = columns.shape[1] * column
+    for at in range(0, columns.shape[1], 3):
+        source = line.ctypes.data + 3 * reach * _BYTES + at * LINE
+        smooth = columns.ctypes.data + at * column + row * LINE
+        beside_all(source, reach, even, odd, bend, smooth, smooth + field, smooth + 2 * field, column)
 
 
 @compiled
@@ -351,11 +181,18 @@ def filter_rows(
     column = columns.shape[2] * LINE
     field = columns.shape[1] * column
     if top:
-        for one in range(order + 1):
-            for at in range(columns.shape[1]):
-                for row in range(done - start):
-                    columns[one, at, row] = columns[one, at, row + rows]
+        for at in range(columns.shape[1] * (order + 1)):
+            first = columns.ctypes.data + at * column
+            for row in range(done - start):
+                copy_line(first + (row + rows) * LINE, first + row * LINE)
+    line = turned.reshape(-1)[: columns.shape[1] * LANES + 6 * reach]
     while done < min(height, top + rows + reach):
+        if order == 2 and reach <= NEAR:
+            for row in range(GROUP):
+                _convert_row(image, scale, done + row, left - reach, line)
+                _filter_row(done + row - start, weights, line, columns)
+            done += GROUP
+            continue
         _turn_rows(image, scale, done, left - reach, lines, turned)
         to = columns.ctypes.data + (done - start) * LINE
         for at in range(0, columns.shape[1], 3):
@@ -364,22 +201,22 @@ def filter_rows(
                     source = turned.ctypes.data + (3 * reach + at * LANES + 3 * pixel + channel) * LINE
                     smooth = kept + (3 * pixel + channel) * LINE
                     if order == 0:
-                        _across_even(source, reach, even, smooth)
+                        across_even(source, reach, even, smooth)
                     elif order == 1:
-                        _across_even_odd(source, reach, even, odd, smooth, smooth + plane)
+                        across_even_odd(source, reach, even, odd, smooth, smooth + plane)
                     else:
-                        _across_all(source, reach, even, odd, bend, smooth, smooth + plane, smooth + 2 * plane)
+                        across_all(source, reach, even, odd, bend, smooth, smooth + plane, smooth + 2 * plane)
             for one in range(order + 1):
                 for part in range(3):
-                    _transpose(kept + one * plane + part * LANES * LINE, LINE, to + one * field + (at + part) * column)
+                    transpose(kept + one * plane + part * LANES * LINE, LINE, to + one * field + (at + part) * column)
         done += GROUP
-    for one in range(order + 1):
-        for at in range(columns.shape[1]):
-            if not top:
-                for row in range(reach):
-                    columns[one, at, row] = columns[one, at, reach]
-            for row in range(done - start, rows + 2 * reach):
-                columns[one, at, row] = columns[one, at, row - 1]
+    for at in range(columns.shape[1] * (order + 1)):
+        first = columns.ctypes.data + at * column
+        if not top:
+            for row in range(reach):
+                copy_line(first + reach * LINE, first + row * LINE)
+        for row in range(done - start, rows + 2 * reach):
+            copy_line(first + (row - 1) * LINE, first + row * LINE)
     return done
 
 
@@ -418,8 +255,8 @@ def filter_columns(
             smooth = columns.ctypes.data + at * column + (y + reach) * LINE
             target = out.ctypes.data + y * pitch + at * LINE
             if order == 0:
-                _down_even(smooth, reach, even, target, pitch)
+                down_even(smooth, reach, even, target, pitch)
             elif order == 1:
-                _down_gradient(smooth, smooth + field, reach, even, odd, target, pitch)
+                down_gradient(smooth, smooth + field, reach, even, odd, target, pitch)
             else:
-                _down_curvature(smooth, smooth + field, smooth + 2 * field, reach, even, odd, bend, target, pitch)
+                down_curvature(smooth, smooth + field, smooth + 2 * field, reach, even, odd, bend, target, pitch)

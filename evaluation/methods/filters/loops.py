@@ -10,23 +10,32 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import uint32, uint64
+from llvmlite import ir
+from numba import types, uint32, uint64
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from foundation.compiled import compiled
+from generator.kernels.vector import ADDRESS, FLOATS, I32, I64, LINE, broadcast, constant, load, store, void
 
 if TYPE_CHECKING:
     from evaluation.scene import Image
 
-BINS = 4096
-"""Of the histogram of projections: the two that hold the limits have some thousand pixels of 18 million."""
 SPAN = 64
 """Pixels of a row that are added at a time where none is left out: a few vectors in each of three channels."""
 SPANS_OF_A_SUM = 60_000
 """Values of uint16 that a sum of uint32 holds, less those of one more row of 350 000 px."""
 CHUNK = 256
 """Pixels whose powers are found at a time, in the nearest cache."""
+BLOCK = 16
+"""Pixels of float32 whose whole powers are found at a time: three vectors, which become six of float64."""
 MOST_PRODUCTS = 64
 """Powers up to which products are used."""
+
+
+_BYTES = 4
+"""Of a float32."""
+_DOUBLES = ir.VectorType(ir.DoubleType(), 8)
 
 
 @compiled
@@ -171,6 +180,49 @@ def _raise(factors: npt.NDArray[np.float64], powers: npt.NDArray[np.float64], le
                 factors[j] *= factors[j]
 
 
+@intrinsic
+def _add_powers(typing: Any, source: Any, blocks: Any, scale: Any, p: Any, bits: Any, sums: Any) -> Any:
+    """Add to 48 float64 at `sums` the powers `p` of `blocks` times 48 float32 from `source` on, times `scale`.
+
+    `p` is whole and of `bits` bits. Factors, powers and sums stay in registers.
+    """
+    del typing, source, blocks, scale, p, bits, sums
+
+    def emit(builder: Any, source: Any, blocks: Any, scale: Any, p: Any, bits: Any, sums: Any) -> None:
+        one, places = ir.Constant(I64, 1), range(6)
+        halves = [constant(ir.VectorType(I32, 8), range(first, first + 8)) for first in (0, 8)]
+
+        def slot_of(value: Any) -> Any:
+            slot = cgutils.alloca_once(builder, _DOUBLES)
+            builder.store(value, slot)
+            return slot
+
+        def multiply(slots: list[Any], by: list[Any]) -> None:
+            for slot, other in zip(slots, by, strict=True):
+                builder.store(builder.fmul(builder.load(slot), builder.load(other)), slot)
+
+        totals = [slot_of(load(builder, sums, LINE * at, _DOUBLES)) for at in places]
+        factor = broadcast(builder, scale, _DOUBLES)
+        with cgutils.for_range(builder, blocks) as loop:
+            start = builder.add(source, builder.mul(loop.index, ir.Constant(I64, 3 * LINE)))
+            vectors = [load(builder, start, LINE * at, FLOATS) for at in range(3)]
+            parts = [builder.shuffle_vector(vectors[at // 2], vectors[at // 2], halves[at % 2]) for at in places]
+            factors = [slot_of(builder.fmul(builder.fpext(part, _DOUBLES), factor)) for part in parts]
+            powers = [slot_of(ir.Constant(_DOUBLES, [1.0] * 8)) for _ in places]
+            with cgutils.for_range(builder, bits) as bit:
+                wanted = builder.and_(builder.lshr(p, bit.index), one)
+                with builder.if_then(builder.icmp_unsigned("!=", wanted, ir.Constant(I64, 0))):
+                    multiply(powers, factors)
+                with builder.if_then(builder.icmp_unsigned("<", builder.add(bit.index, one), bits)):
+                    multiply(factors, factors)
+            for total, power in zip(totals, powers, strict=True):
+                builder.store(builder.fadd(builder.load(total), builder.load(power)), total)
+        for at, total in enumerate(totals):
+            store(builder, builder.load(total), sums, LINE * at)
+
+    return void(emit, ADDRESS, ADDRESS, types.float64, ADDRESS, ADDRESS, ADDRESS)
+
+
 @compiled
 def sum_powers(
     values: Image,
@@ -209,6 +261,10 @@ def sum_powers(
     factors = np.empty(3 * CHUNK, np.float64)
     powers = np.empty(3 * CHUNK, np.float64)
     found = np.zeros(3 * CHUNK, np.float64)
+    whole = int(p) if 1 < p <= MOST_PRODUCTS and values.itemsize == _BYTES else 0
+    bits = 0
+    while whole == p and whole >> bits:
+        bits += 1
     right = min(width - border, first + values.shape[1] // 3)
     for row in range(values.shape[0]):
         y = top + row
@@ -224,6 +280,10 @@ def sum_powers(
                 for j in range(span.size):
                     found[j] += span[j] * scale
                 continue
+            if bits and usable == length:
+                blocks = length // BLOCK
+                _add_powers(span.ctypes.data, blocks, scale, whole, bits, found.ctypes.data)
+                span = span[3 * BLOCK * blocks :]
             for j in range(span.size):
                 factors[j] = span[j] * scale
             if usable < length:
@@ -242,60 +302,3 @@ def sum_powers(
             sums[j % 3] = max(sums[j % 3], found[j])
         else:
             sums[j % 3] += found[j]
-
-
-@compiled
-def count_projections(
-    image: Image, free: npt.NDArray[np.bool_], direction: npt.NDArray[np.float64], step: float
-) -> npt.NDArray[np.int64]:
-    """Return (BINS,) int64, the histogram of the projections of an image's pixels (H, W, 3) on a direction (3,)."""
-    counts = np.zeros(BINS, np.int64)
-    for y in range(image.shape[0]):
-        for x in range(image.shape[1]):
-            if free.size and not free[y, x]:
-                continue
-            along = image[y, x, 0] * direction[0] + image[y, x, 1] * direction[1] + image[y, x, 2] * direction[2]
-            counts[min(BINS - 1, int(along * step))] += 1
-    return counts
-
-
-@compiled
-def sum_outer_bins(
-    image: Image,
-    free: npt.NDArray[np.bool_],
-    direction: npt.NDArray[np.float64],
-    step: float,
-    low: int,
-    high: int,
-    bordering: npt.NDArray[np.float64],
-) -> npt.NDArray[np.float64]:
-    """Return (3, 3) float64, the sum of x xᵀ over the pixels whose bin is below `low` or above `high`.
-
-    The pixels of the bins `low` and `high` themselves are written to `bordering` (N, 4) float64: red, green, blue and
-    the projection, in reading order. Image and direction are those of `count_projections`.
-    """
-    total = np.zeros((3, 3), np.float64)
-    found = 0
-    for y in range(image.shape[0]):
-        a, b, c, ab, ac, bc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for x in range(image.shape[1]):
-            if free.size and not free[y, x]:
-                continue
-            red, green, blue = float(image[y, x, 0]), float(image[y, x, 1]), float(image[y, x, 2])
-            along = red * direction[0] + green * direction[1] + blue * direction[2]
-            at = min(BINS - 1, int(along * step))
-            if at < low or at > high:
-                a += red * red
-                b += green * green
-                c += blue * blue
-                ab += red * green
-                ac += red * blue
-                bc += green * blue
-            elif at in (low, high):
-                bordering[found, 0] = red
-                bordering[found, 1] = green
-                bordering[found, 2] = blue
-                bordering[found, 3] = along
-                found += 1
-        total += np.array([[a, ab, ac], [ab, b, bc], [ac, bc, c]])
-    return total

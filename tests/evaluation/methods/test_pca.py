@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from evaluation.methods import BrightDark
@@ -27,13 +28,41 @@ def test_the_svd_of_sorted_pixels_gives_the_same_light(share: float, kind: type[
     values = random.gamma(2, 900, (300, 500, 3)) * LIGHT * random.uniform(0.3, 1, (300, 500, 1))
     image: Any = values.astype(kind)
     mask = random.uniform(size=(300, 500)) < 0.05
-    pixels = image[~mask].astype(np.float64)
-    mean = pixels.mean(axis=0)
-    order = np.argsort(pixels @ mean, kind="stable")
+    expected = by_sorting(image[~mask].astype(np.float64), share)
+    np.testing.assert_allclose(BrightDark(share=share).estimate(image, mask=mask), expected, rtol=1e-6)
+
+
+def by_sorting(pixels: npt.NDArray[np.float64], share: float) -> npt.NDArray[np.float64]:
+    order = np.argsort(pixels @ pixels.mean(axis=0), kind="stable")
     count = int(np.ceil(len(pixels) * share))
     ends = pixels[np.unique(np.concatenate([order[:count], order[-count:]]))]
-    expected = np.abs(np.linalg.svd(ends, full_matrices=False)[2][0])
-    np.testing.assert_allclose(BrightDark(share=share).estimate(image, mask=mask), expected, rtol=1e-6)
+    return np.abs(np.linalg.svd(ends, full_matrices=False)[2][0])
+
+
+@pytest.mark.parametrize("extreme", ["bright", "dark", "hidden", "even"])
+def test_pixels_that_were_not_counted_may_be_anything(extreme: str) -> None:
+    # Of a large image every 16th pixel of a row, moved on by 5 from row to row, says where the limits may be.
+    random = np.random.default_rng(3)
+    image = random.uniform(900, 1100, (300, 400, 3)) * LIGHT
+    y, x = np.indices((300, 400))
+    counted = (x - 5 * y) % 16 == 0
+    if extreme == "hidden":
+        image[~counted] *= random.gamma(1, 2, ((~counted).sum(), 1))
+    elif extreme == "even":
+        image[counted] = 500 * LIGHT
+    else:
+        image[counted] *= (random.uniform(2, 3, (counted.sum(), 1)), 0.1)[extreme == "dark"]
+    image *= random.uniform(0.8, 1.2, image.shape)
+    mask = random.uniform(size=counted.shape) < 0.01
+    expected = by_sorting(image[~mask], 0.035)
+    np.testing.assert_allclose(BrightDark().estimate(image, mask=mask), expected, rtol=1e-6)
+
+
+def test_images_of_which_no_counted_pixel_may_be_used() -> None:
+    image = np.random.default_rng(4).uniform(0, 1000, (300, 400, 3)) * LIGHT
+    y, x = np.indices((300, 400))
+    mask = np.asarray((x - 5 * y) % 16 == 0)
+    np.testing.assert_allclose(BrightDark().estimate(image, mask=mask), by_sorting(image[~mask], 0.035), rtol=1e-6)
 
 
 def test_many_equal_pixels() -> None:
