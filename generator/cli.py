@@ -15,6 +15,7 @@ from foundation.console import EXIT_CODES, run
 from foundation.errors import InputError
 from foundation.processors import processor_count
 from generator.command.grouping import grouped
+from generator.command.likeness_options import LikenessOptions, choose
 from generator.command.options import (
     ImageOptions,
     LightOptions,
@@ -54,6 +55,7 @@ def generate(
     places: Places,
     pictures: PictureOptions,
     light: LightOptions,
+    likeness: LikenessOptions,
     variation: VariationOptions,
     images: ImageOptions,
     work: WorkOptions,
@@ -75,7 +77,7 @@ def generate(
         if places.lut is None or places.out is None:
             raise InputError("the table and the place of the dataset are missing; write generate LUT OUT --sources DIR")
         workers = work.makers()
-        plan = _plan(places.lut, places.out, pictures, light, variation, images, work)
+        plan = _plan(places.lut, places.out, pictures, light, likeness, variation, images, work)
         if work.shard is not None:
             _make_share(plan, places.out, work.shard, workers)
         else:
@@ -97,6 +99,7 @@ def _plan(
     out: str,
     pictures: PictureOptions,
     light: LightOptions,
+    likeness: LikenessOptions,
     variation: VariationOptions,
     images: ImageOptions,
     work: WorkOptions,
@@ -108,12 +111,12 @@ def _plan(
 
     require_free_place(out)
     table = open_lut(lut)
-    sources = pictures.find(images.seed)
-    options = images.dataset_options(
-        work.shard_images, pictures.preparation(images.seed).describe(), variation.variation(table), pictures.crops
-    )
-    choice = light.request().choose(table, images.seed, [source.name for source in sources], pictures.crops)
-    return Plan(table, sources, choice, images.seed, options)
+    chosen = choose(table, likeness, pictures, light, variation, images.seed, processor_count())
+    for line in chosen.told:
+        print(line)
+    varied = variation.variation(table, chosen.exposure)
+    options = images.dataset_options(work.shard_images, chosen.reading, varied, chosen.crops, chosen.weighted)
+    return Plan(table, chosen.sources, chosen.choice, images.seed, options)
 
 
 def _make_whole(plan: Plan, out: str, workers: Workers) -> Dataset:

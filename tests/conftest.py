@@ -79,6 +79,8 @@ SLOW = (
     "generator/dataset/test_varied_datasets.py",
     "generator/kernels/test_choice_statistics.py",
     "generator/kernels/test_patches.py",
+    "generator/likeness/test_like.py",
+    "generator/likeness/test_same_lights.py",
     "generator/test_cli.py",
     "generator/test_library.py",
     "house/test_commands.py",

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from generator.lights.request import LightRequest
     from generator.pictures.picture import Preparation
     from generator.pictures.sources import Source
+    from generator.variation.exposures import ExposureChoice
     from generator.variation.variation import Variation
 
 _SOURCES = "Source pictures"
@@ -236,7 +237,7 @@ class ImageOptions:
     ] = None
 
     def dataset_options(
-        self, shard_images: int, reading: Mapping[str, Any], variation: Variation, crops: int
+        self, shard_images: int, reading: Mapping[str, Any], variation: Variation, crops: int, weighted: bool = False
     ) -> DatasetOptions:
         """Return what the dataset is to be; an InputError says which option cannot be used."""
         from generator.dataset.production.options import DatasetOptions, parse_split
@@ -250,6 +251,7 @@ class ImageOptions:
             variation=variation,
             crops=crops,
             reading=reading,
+            weighted=weighted,
         )
 
 
@@ -287,8 +289,14 @@ class VariationOptions:
         ),
     ] = None
 
-    def variation(self, lut: Lut) -> Variation:
-        """Return the variation of images of a table; an InputError says which option cannot be used."""
+    def variation(self, lut: Lut, like: ExposureChoice | None = None) -> Variation:
+        """Return the variation of images of a table, exposed like a data set unless an option says how.
+
+        Raises
+        ------
+        InputError
+            An option cannot be used.
+        """
         from generator.variation.exposures import parse_exposure
         from generator.variation.gradients import parse_gradient
         from generator.variation.iso_speed import known_of_table, parse_iso
@@ -296,7 +304,7 @@ class VariationOptions:
 
         return varied_by(
             lut,
-            None if self.exposure is None else parse_exposure(self.exposure),
+            like if self.exposure is None else parse_exposure(self.exposure),
             None if self.gradient is None else parse_gradient(self.gradient),
             None if self.iso is None else parse_iso(self.iso, *known_of_table(lut)),
         )

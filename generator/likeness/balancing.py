@@ -1,11 +1,10 @@
 """Weights of images by which a set of them gets the moments of another set: entropy balancing.
 
 J. Hainmueller, "Entropy balancing for causal effects", Political Analysis 20 (2012) 25-46: of all weights that give the
-wanted moments, those nearest to equal ones (least Kullback-Leibler divergence). Wanted moments are means over M real
-images and known to their standard errors only, so they are met as far as that is worth it: the dual gets a quadratic
-penalty with each moment's own variance over M (M. Dudík, S. J. Phillips, R. E. Schapire, "Maximum entropy density
-estimation with generalized regularization", JMLR 8 (2007) 1217-1260). Of few real images little is learned, and weights
-stay near equal.
+wanted moments, those nearest to equal ones (least Kullback-Leibler divergence). They are exponentials of a sum of the
+moments, each times a multiplier. The wanted moments are means over M real images and known so well only: multipliers
+have a normal prior of spread 1, which M images overrule (S. F. Chen, R. Rosenfeld, "A Gaussian prior for smoothing
+maximum entropy models", CMU-CS-99-108, 1999). Of few real images little is learned, and weights stay nearer to equal.
 
 What is left of images is told by the effective sample size, (Σw)² / Σw² (L. Kish, Survey Sampling, 1965): as many
 equally weighted images would give means as precise. If it falls below a floor, the multipliers are bounded, ever more
@@ -64,7 +63,7 @@ def effective_size(weights: _Array) -> float:
     return float(weights.sum() ** 2 / np.square(weights).sum())
 
 
-def balance(moments: _Array, wanted: _Array, errors: _Array, least_effective: float = LEAST_EFFECTIVE) -> Balance:
+def balance(moments: _Array, wanted: _Array, real: float, least_effective: float = LEAST_EFFECTIVE) -> Balance:
     """Return the weights of N images by which the means of their moments come near to the wanted ones.
 
     Parameters
@@ -73,25 +72,32 @@ def balance(moments: _Array, wanted: _Array, errors: _Array, least_effective: fl
         (N, K) float64, the moments of each image.
     wanted
         (K,) float64, their wanted means.
-    errors
-        (K,) float64 above 0, the standard errors of those.
+    real
+        M, of how many real images those are means; infinite where they are exact.
     least_effective
         Least effective sample size as a share of N, 0 … 1.
 
     Examples
     --------
-    >>> found = balance(np.arange(100.0)[:, None] / 100, np.array([0.6]), np.array([0.001]))
+    >>> found = balance(np.arange(100.0)[:, None] / 100, np.array([0.6]), np.inf)
     >>> round(float(found.weights @ np.arange(100.0)) / 100, 3), round(found.effective)
     (0.6, 88)
     """
     aside = moments - wanted
-    start = np.zeros(len(wanted))
-    for bound in (None, *_BOUNDS):
-        start = _dual(aside, np.square(errors), start, bound)
-        found = Balance(_weights(aside, start), bound)
-        if found.effective >= least_effective * len(moments):
-            return found
-    return Balance(np.full(len(moments), 1 / len(moments)), 0.0)
+    penalty, least = 1 / real, least_effective * len(moments)
+    free = _dual(aside, penalty, np.zeros(len(wanted)), None)
+    found = Balance(_weights(aside, free), None)
+    if found.effective >= least:
+        return found
+    best, low, high = Balance(np.full(len(moments), 1 / len(moments)), 0.0), 0, len(_BOUNDS) - 1
+    while low <= high:
+        middle = (low + high) // 2
+        found = Balance(_weights(aside, _dual(aside, penalty, free, _BOUNDS[middle])), _BOUNDS[middle])
+        if found.effective >= least:
+            best, high = found, middle - 1
+        else:
+            low = middle + 1
+    return best
 
 
 def _weights(aside: _Array, multipliers: _Array) -> _Array:
@@ -100,8 +106,8 @@ def _weights(aside: _Array, multipliers: _Array) -> _Array:
     return parts / parts.sum()
 
 
-def _dual(aside: _Array, penalties: _Array, start: _Array, bound: float | None) -> _Array:
-    """Return the multipliers (K,) that minimise ln of the mean of exp(aside · λ), plus half of Σ penalty λ²."""
+def _dual(aside: _Array, penalty: float, start: _Array, bound: float | None) -> _Array:
+    """Return the multipliers (K,) that minimise ln of the mean of exp(aside · λ), plus half of penalty · λ²."""
     from scipy.optimize import minimize
 
     def value(multipliers: _Array) -> tuple[float, _Array]:
@@ -109,8 +115,8 @@ def _dual(aside: _Array, penalties: _Array, start: _Array, bound: float | None) 
         top = exponents.max()
         parts = np.exp(exponents - top)
         total = parts.sum()
-        slope = parts @ aside / total + penalties * multipliers
-        return float(top + np.log(total) + 0.5 * penalties @ np.square(multipliers)), slope
+        slope = parts @ aside / total + penalty * multipliers
+        return float(top + np.log(total) + 0.5 * penalty * np.square(multipliers).sum()), slope
 
     bounds = None if bound is None else [(-bound, bound)] * len(start)
     begin = start if bound is None else np.clip(start, -bound, bound)
@@ -121,6 +127,6 @@ def _dual(aside: _Array, penalties: _Array, start: _Array, bound: float | None) 
         jac=True,
         method="L-BFGS-B",
         bounds=bounds,
-        options={"maxiter": 2000, "ftol": 1e-13, "gtol": 1e-8},
+        options={"maxiter": 500, "ftol": 1e-10, "gtol": 1e-6},
     )
     return np.asarray(found.x, dtype=np.float64)

@@ -48,12 +48,15 @@ class SourcePicture:
         How its colour profile was treated, in words; None where there is no file.
     cuts
         The crops, where several were asked for.
+    weight
+        By which it was drawn; None where pictures were not drawn by weights.
     """
 
     picture: Picture
     sha256: str | None = None
     profile: str | None = None
     cuts: tuple[Cut, ...] = ()
+    weight: float | None = None
 
 
 class Source(Protocol):

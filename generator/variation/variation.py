@@ -25,6 +25,11 @@ if TYPE_CHECKING:
 
 Three = tuple[float, float, float]
 
+_TRIALS: Final = 2
+"""Exposures tried until the share of the pixels that reach a level is the one asked for, noise included: of 60
+photographs at ISO 3200 a share of .02 was .85 to 3.8 times as large without, within 3 % with one, .5 % with two."""
+_LARGEST: Final = 65535
+"""Largest value of 16 bits."""
 _EVEN: Final[Three] = (1.0, 1.0, 1.0)
 """Light that is the same everywhere."""
 
@@ -118,29 +123,43 @@ class Variation:
             falloff = self.gradient.of_image(seed, number)
             weights, end = falloff.weights(*image.shape[:2]), falloff.end
             details |= dict(zip(("end_r", "end_g", "end_b"), end, strict=True))
-        factor = 1.0
-        if self.exposure is not None:
-            seen = self.exposure.seen
-            brightness = 0.0 if seen is None else brightness_reached(image, seen, weights, end) / white_level
-            factor = self.exposure.factor(seed, number, brightness)
-            details["exposure"] = factor
         ratio, electrons = (1.0, None) if self.iso is None else (self.iso.ratio, self.iso.sensor_electrons)
         wanted = noise if electrons is None else noise.at(ratio, electrons)
+
+        def exposed(factor: float, saturation: int, out: npt.NDArray[np.uint16]) -> float:
+            """Fill `out` with the image exposed anew; return the share of its pixels at saturation."""
+            return expose(
+                image,
+                factor,
+                noise,
+                wanted=wanted,
+                ratio=ratio,
+                weights=weights,
+                end=end,
+                white_level=saturation,
+                seed=seed,
+                number=number,
+                out=out,
+            )
+
+        factor = 1.0
+        if self.exposure is not None:
+            seen, brightness = self.exposure.seen, 0.0
+            if seen is not None:
+                brightness = brightness_reached(image, seen, weights, end) / white_level
+            factor = self.exposure.factor(seed, number, brightness)
+            if seen is not None and (factor < 1 or weights is not None or self.iso is not None):
+                # Noise lifts what the brightest pixels reach, so what they reach with it decides.
+                trial = np.empty_like(image)
+                for _ in range(_TRIALS):
+                    exposed(factor, _LARGEST, trial)
+                    brightness = brightness_reached(trial, seen) / white_level / factor
+                    factor = self.exposure.factor(seed, number, brightness)
+            details["exposure"] = factor
         if self.iso is not None:
             # With more light than the wanted speed allows, the noise is that of a higher one.
             details["iso"] = self.iso.base * max(ratio, factor)
-        details["clipped"] = expose(
-            image,
-            factor,
-            noise,
-            wanted=wanted,
-            ratio=ratio,
-            weights=weights,
-            end=end,
-            white_level=white_level,
-            seed=seed,
-            number=number,
-        )
+        details["clipped"] = exposed(factor, white_level, image)
         return Varied(details, weights, end)
 
     def describe(self) -> dict[str, Any]:

@@ -37,6 +37,8 @@ class DatasetOptions:
         Crops of each picture, 1 or more; of more than one the sources must have as many.
     reading
         How sources were read, as plain values; recorded only.
+    weighted
+        Whether sources were drawn by weights, which are recorded of each image.
 
     Raises
     ------
@@ -60,11 +62,12 @@ class DatasetOptions:
     variation: Variation = NO_VARIATION
     crops: int = 1
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    weighted: bool = False
 
     @property
     def has_details(self) -> bool:
         """Whether options do something to each image that is recorded of it: `images.csv` lists it then."""
-        return self.variation.is_on or self.crops > 1
+        return self.variation.is_on or self.crops > 1 or self.weighted
 
     def __post_init__(self) -> None:
         for what, value, known in (("format", self.form, FORMATS), ("layout", self.layout, get_args(Layout))):

@@ -102,6 +102,8 @@ class SourceRecord(_Record):
         Pixels of colours that the table lists as unfit, which took the nearest fit colour.
     split
         The part of the dataset that its images belong to; None where it was not divided.
+    weight
+        By which it was drawn, 1 that of a picture neither favoured nor disfavoured; None where pictures were not drawn.
     """
 
     position: int
@@ -112,6 +114,7 @@ class SourceRecord(_Record):
     height: int
     replaced_pixels: int
     split: Split | None = None
+    weight: float | None = None
 
 
 class Skipped(_Record):

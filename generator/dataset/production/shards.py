@@ -30,6 +30,7 @@ from generator.dataset.production.layouts.by_name import open_writer
 from generator.dataset.production.layouts.samples import Sample, ShardWriter
 from generator.dataset.production.plan import ShardJob, light_of, split_of, versions
 from generator.dataset.production.records import (
+    Details,
     ImageRecord,
     ShardRecord,
     Skipped,
@@ -254,6 +255,7 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
         height=height,
         replaced_pixels=sum(replaced for _, replaced in fit),
         split=split_of(job.options.split, job.seed, scene.sha256, source.name),
+        weight=scene.weight,
     )
     cuts = tuple(replace(cut, picture=picture) for cut, (picture, _) in zip(whole, fit, strict=True))
     return _ReadSource(cuts, record)
@@ -280,12 +282,15 @@ def _make(
     ]
     if options.previews:
         files.append(("previews", ".jpg", (encode_preview(preview_of(image, white_level)),)))
+    details: Details = {"crop": crop, "left": cut.left, "top": cut.top} if options.crops > 1 else {}
+    if source.record.weight is not None:
+        details["weight"] = source.record.weight
     record = ImageRecord(
         number=number,
         position=source.record.position,
         truth=light.truth,
         lights=light.rows,
-        details=({"crop": crop, "left": cut.left, "top": cut.top} if options.crops > 1 else {}) | varied.details,
+        details=details | varied.details,
     )
     return writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
 

@@ -1,0 +1,300 @@
+"""The options of `generate` that make a dataset like a real one, or like another camera's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from foundation.errors import InputError
+from generator.command.grouping import option
+from generator.command.options import LightOptions, PictureOptions, VariationOptions
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from calibration.table.lut import Lut
+    from generator.lights.lighting import LightChoice
+    from generator.likeness.drawing import DrawnPictures
+    from generator.pictures.sources import Source
+    from generator.statistics.statistics_file import RealStatistics
+    from generator.variation.exposures import ExposureChoice
+
+_LIKENESS = "Likeness"
+
+PARTS: Final = ("lights", "pictures", "exposure", "size")
+"""What of a real data set can be followed."""
+
+
+@dataclass(frozen=True)
+class LikenessOptions:
+    """What the dataset is to be like."""
+
+    like: Annotated[
+        Path | None,
+        option(
+            "STATS.json",
+            "Make the dataset like the real one that evaluate describe --out wrote this of: lights drawn from a "
+            "density of its lights, pictures drawn by weights that bring luminance, chroma and grey-world offsets to "
+            "its own, exposures drawn from its exposures, and images cut to its most frequent size. Prints how far "
+            "that went.",
+            _LIKENESS,
+        ),
+    ] = None
+    like_in: Annotated[
+        str | None,
+        option(
+            "LIST",
+            "In which of lights,pictures,exposure,size. \\[default: in all that no other option says]",
+            _LIKENESS,
+        ),
+    ] = None
+    draw: Annotated[
+        int | None,
+        option("N", "Draw N pictures, some several times. \\[default: as many as are found]", _LIKENESS, min=1),
+    ] = None
+    lights_of: Annotated[
+        str | None,
+        option(
+            "DATASET",
+            "Make the scenes of this dataset under the same lights for another camera, whose table LUT has the same "
+            "lights; --sources names the same pictures, which are prepared in the same way.",
+            _LIKENESS,
+        ),
+    ] = None
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Sources and lights of a dataset, and what is recorded and told of how they were chosen.
+
+    Attributes
+    ----------
+    sources, choice
+        The sources and the lights.
+    reading
+        How sources were read, as plain values.
+    told
+        Lines to print.
+    crops
+        Crops of each picture.
+    weighted
+        Whether sources were drawn by weights.
+    exposure
+        How images are exposed; None as the table.
+    """
+
+    sources: tuple[Source, ...]
+    choice: LightChoice
+    reading: Mapping[str, Any]
+    told: tuple[str, ...] = ()
+    crops: int = 1
+    weighted: bool = False
+    exposure: ExposureChoice | None = None
+
+
+def choose(
+    lut: Lut,
+    likeness: LikenessOptions,
+    pictures: PictureOptions,
+    light: LightOptions,
+    variation: VariationOptions,
+    seed: int,
+    workers: int,
+) -> Chosen:
+    """Return the sources and lights that the options ask for.
+
+    Raises
+    ------
+    InputError
+        Options exclude one another, or ask for what is not there.
+    FormatError
+        A file of statistics, or a dataset, cannot be read.
+    """
+    if likeness.lights_of is not None:
+        if likeness.like is not None:
+            raise InputError("--like and --lights-of were both given; the second takes pictures and lights as they are")
+        return _same_scenes(lut, likeness.lights_of, pictures, light)
+    if likeness.like is None:
+        for name, given in (("--like-in", likeness.like_in), ("--draw", likeness.draw)):
+            if given is not None:
+                raise InputError(f"{name} {given} says what --like is to do; give --like STATS.json")
+        sources = pictures.find(seed)
+        choice = light.request().choose(lut, seed, [source.name for source in sources], pictures.crops)
+        return Chosen(sources, choice, pictures.preparation(seed).describe(), crops=pictures.crops)
+    parts = _parts(likeness, pictures, light, variation)
+    return _like(lut, likeness, likeness.like, parts, pictures, light, seed, workers)
+
+
+def _like(
+    lut: Lut,
+    likeness: LikenessOptions,
+    path: Path,
+    parts: list[str],
+    pictures: PictureOptions,
+    light: LightOptions,
+    seed: int,
+    workers: int,
+) -> Chosen:
+    from generator.likeness.drawing import cautions, drawn_sources
+    from generator.likeness.exposing import exposure_sentence, like_exposure
+    from generator.likeness.sizes import like_size
+    from generator.statistics.statistics_file import read_statistics
+
+    target = read_statistics(path)
+    record: dict[str, Any] = {
+        "file": target.file,
+        "sha256": target.sha256,
+        "data": target.name,
+        "images": target.images,
+        "in": parts,
+    }
+    told = cautions(target)
+    if "size" in parts:
+        size = like_size(target, pictures.find(seed))
+        if size is None:
+            told.append(f"size: {target.name} is of thumbnails, whose size is not followed; pictures keep theirs")
+        else:
+            pictures = replace(pictures, crop=f"{size.width}x{size.height}", cover=True)
+            record["size"] = size.describe()
+            told.append(size.sentence())
+    if "lights" in parts:
+        light = replace(light, distribution=str(path))
+        record["lights"], sentence = _lights_within(lut, target)
+        told.append(sentence)
+    exposure = None
+    if "exposure" in parts:
+        exposure = like_exposure(target)
+        if exposure is None and likeness.like_in is not None:
+            raise InputError(
+                f"{target.file} knows no exposure, since the saturation of {target.name} was not known; describe it "
+                "with --saturation, or leave exposure out of --like-in"
+            )
+        told.append(exposure_sentence(target))
+    sources = pictures.find(seed)
+    if "pictures" in parts:
+        drawn = _drawn(lut, target, sources, likeness.draw, seed, workers)
+        sources = drawn_sources(sources, drawn)
+        record["pictures"] = drawn.describe()
+        told += drawn.sentences()
+    choice = light.request().choose(lut, seed, [source.name for source in sources], pictures.crops)
+    reading = {**pictures.preparation(seed).describe(), "like": record}
+    return Chosen(sources, choice, reading, tuple(told), pictures.crops, "pictures" in parts, exposure)
+
+
+def _parts(
+    likeness: LikenessOptions, pictures: PictureOptions, light: LightOptions, variation: VariationOptions
+) -> list[str]:
+    """Return in what the dataset is to be like the real one."""
+    said = {
+        "lights": [
+            name
+            for name, given in (
+                ("--illuminations", light.illuminations),
+                ("--light", light.light),
+                ("--distribution", light.distribution),
+                ("--nearest", light.nearest),
+                ("--match", light.match),
+                ("--lights-by-name", light.lights_by_name),
+            )
+            if given
+        ],
+        "pictures": [],
+        "exposure": [] if variation.exposure is None else ["--exposure"],
+        "size": [name for name, given in (("--crop", pictures.crop), ("--max-side", pictures.max_side)) if given],
+    }
+    if likeness.like_in is None:
+        parts = [part for part in PARTS if not said[part]]
+    else:
+        parts = list(dict.fromkeys(part.strip() for part in likeness.like_in.split(",")))
+        for part in parts:
+            if part not in PARTS:
+                raise InputError(f"--like-in has {part!r}, expected some of {','.join(PARTS)}")
+            if said[part]:
+                raise InputError(f"{' and '.join(said[part])} says the {part}, and so does --like; leave one out")
+    if likeness.draw is not None and "pictures" not in parts:
+        raise InputError(f"--draw {likeness.draw} is for pictures, in which --like-in does not follow the real data")
+    return parts
+
+
+def _lights_within(lut: Lut, target: RealStatistics) -> tuple[dict[str, Any], str]:
+    """Return how many of the target's lights a table can make, as a record and a sentence."""
+    from generator.lights.gamut import Gamut
+
+    outside = float(1 - Gamut.of(lut).contains(target.lights).mean())
+    sentence = (
+        f"lights: {outside:.1%} of the {len(target.lights)} of {target.name} lie outside what {lut.folder} can make"
+    )
+    if outside:
+        sentence += "; others are drawn for them"
+    return {"count": len(target.lights), "outside": float(f"{outside:.6g}")}, sentence
+
+
+def _drawn(
+    lut: Lut, target: RealStatistics, sources: tuple[Source, ...], count: int | None, seed: int, workers: int
+) -> DrawnPictures:
+    """Return which pictures are drawn by what they look like under the light nearest to the target's."""
+    from foundation.console import progress
+    from generator.likeness.drawing import draw_pictures
+    from generator.likeness.pictures import measure_pictures, reference_light
+
+    reference = reference_light(lut, target.lights)
+    photograph = partial(_photograph, lut, reference, seed)
+    with progress("pictures") as shown:
+        measured = measure_pictures(sources, photograph, lut.white[reference], target.cells, workers, shown)
+    return draw_pictures(measured, target, count, seed)
+
+
+def _photograph(lut: Lut, light: int, seed: int, picture: npt.NDArray[np.uint8], number: int) -> npt.NDArray[np.uint16]:
+    from generator.kernels.rendering import render
+
+    return render(lut, picture, light, seed=seed, image=number)
+
+
+def _same_scenes(lut: Lut, place: str, pictures: PictureOptions, light: LightOptions) -> Chosen:
+    """Return the scenes of another dataset, under its lights."""
+    from generator.likeness.same_lights import lights_of, open_scenes, scenes_of
+
+    if light != LightOptions():
+        raise InputError(f"--lights-of {place} says the lights, and so does another option; leave one out")
+    dataset = open_scenes(place)
+    prepared = _prepared_as(pictures, dataset.description.options, place)
+    seed = dataset.description.seed
+    found = prepared.find(seed) if prepared.sources else ()
+    sources = scenes_of(dataset, found)
+    reading = {**prepared.preparation(seed).describe(), "lights_of": {"pictures_seed": seed}}
+    told = [
+        f"{place} was made with {name.replace('_', ' ')}; here it is what the options say"
+        for name in ("variation", "rendering", "black_point")
+        if name in dataset.description.options
+    ]
+    return Chosen(sources, lights_of(dataset, lut), reading, tuple(told), prepared.crops)
+
+
+def _prepared_as(pictures: PictureOptions, made: Mapping[str, Any], place: str) -> PictureOptions:
+    """Return the options of pictures as a dataset was made with; an InputError if others are given."""
+    if pictures.random_scenes:
+        raise InputError(
+            f"--lights-of {place} says the pictures; leave --random-scenes out, those of it are made again"
+        )
+    crop = made.get("crop")
+    wanted: dict[str, Any] = {
+        "max_side": made.get("max_side"),
+        "crop": None if crop is None else "{}x{}".format(*crop),
+        "cover": bool(made.get("cover", False)),
+        "crop_at": made.get("crop_at", "centre"),
+        "profiles": made.get("profiles", "honour"),
+        "crops": int(made.get("crops", 1)),
+    }
+    plain = PictureOptions()
+    for name, value in wanted.items():
+        given = getattr(pictures, name)
+        if given not in (value, getattr(plain, name)):
+            raise InputError(
+                f"--{name.replace('_', '-')} is {given}, where {place} was made with {value}; leave it out, pictures "
+                "are prepared as there"
+            )
+    return replace(pictures, **wanted)

@@ -1,0 +1,50 @@
+"""Tables without noise, of cameras and lights whose every number is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.lights.illuminations import Illumination
+from calibration.table.lut import Lut, open_lut
+from calibration.table.provenance import Provenance
+from calibration.table.writer import LutWriter
+from drivers.presenter import Colour
+
+SPECTRA: dict[int, tuple[float, float, float]] = {0: (9, 5, 2), 1: (7, 6, 4), 2: (5, 6, 6), 3: (3, 5, 9), 4: (4, 9, 3)}
+"""Light in three bands, by the blue code that the projector shows."""
+
+CAMERAS: dict[str, npt.NDArray[np.float64]] = {
+    "one": np.array([[1.0, 0.2, 0.0], [0.1, 1.0, 0.2], [0.0, 0.1, 0.8]]),
+    "two": np.array([[0.7, 0.3, 0.0], [0.2, 0.9, 0.1], [0.1, 0.1, 1.1]]),
+}
+"""Sensitivities of two cameras in those bands."""
+
+
+def make_table(folder: Path, camera: str, order: tuple[int, ...]) -> Lut:
+    """Make a table of 2 bits without noise: every cell's samples are the light it reflects, as the camera sees it."""
+    folder.mkdir()
+    index = np.arange(64)
+    reflected = 0.1 + 0.9 * np.stack([index >> 4 & 3, index >> 2 & 3, index & 3], axis=1) / 3
+    writer = LutWriter(folder, len(order), 64, 25)
+    white: list[npt.NDArray[np.float64]] = []
+    for place, light in enumerate(order):
+        seen = 400 * (reflected * SPECTRA[light]) @ CAMERAS[camera].T
+        writer.put(place, np.rint(seen)[:, None, :].repeat(25, axis=1).astype(np.uint16))
+        white.append(seen[-1])
+    plan = [Illumination(place, "uniform", None, Colour(9, 8, light)) for place, light in enumerate(order)]
+    writer.finish(
+        plan,
+        np.array(white),
+        Provenance(
+            camera=f"Camera {camera}",
+            bits=2,
+            white_level=12000,
+            session_sha256="1" * 64,
+            chart_sha256="2" * 64,
+            software="test 1",
+        ),
+    )
+    return open_lut(folder)
