@@ -7,7 +7,7 @@ For a wanted colour t the weights w of the cells near to it are to make their me
 R being what the camera sees of a cell. Weights are whole 32nds from the start, since a pixel takes one of 32 cells:
 from all 32 on the nearest cell, one 32nd at a time moves from a cell to another, each time by the move that lowers
 the sum most, until none does (an exchange algorithm, V. V. Fedorov, *Theory of Optimal Experiments*, 1972, chapter
-3). Rounding weights that are best as real numbers is worse: each of some four weights is off by up to a 64th.
+3). It is as good as rounding the weights that are best as real numbers, and needs no solver for those.
 
 Differences are relative to t, channel by channel, and those of brightness count less than those of chromaticity: the
 field measures lights by angles, and where the print cannot show a colour, its hue is to stay rather than its
@@ -37,8 +37,8 @@ WIDE_NEIGHBOURS: Final = 384
 """The same where the nearest do not surround a colour near grey."""
 
 SPREAD_COST: Final = 0.03
-"""λ: what a mixture's spread costs against its error; small, so that the mean is right within a hundredth of the
-distance of cells, and above 0, so that of all mixtures that are right the narrowest is taken."""
+"""λ: what a mixture's spread costs against its error. Between 0.1 and 0.001 errors hardly differ, and the spread by a
+fifth: docs/reference/rendering.md."""
 
 WIDE_SPREAD_COST: Final = 0.003
 """The same for colours near grey that are not met with the nearest cells; their chromaticity matters most."""
@@ -48,8 +48,8 @@ BRIGHTNESS_COST: Final = 0.5
 docs/reference/rendering.md."""
 
 MET_WITHIN: Final = 0.02
-"""Largest relative difference in a channel of a mixture that shows the wanted colour: two in a hundred, a tenth of what
-neighbouring cells of the chart differ."""
+"""Largest relative difference in a channel of a mixture that shows the wanted colour: a fifth of what neighbouring
+cells of a chart of five bits differ."""
 
 NEAR_GREY_DEG: Final = 6.0
 """Angle to grey below which a colour is near grey: greys of a picture are shared out among nodes as far as that."""

@@ -36,6 +36,13 @@ from generator.rendering.table_matrix import matrix_for
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
 
+BLACK_WITHIN_DEG: Final = 0.4
+"""Angle to grey of the black that is asked of a print, degrees: a little less than the half that greys may be off."""
+
+MOST_LIFT: Final = 1.25
+"""Black point over the darkest grey that cells make at most. Simulated unmanaged prints need 1.0 to 1.2; a lift of 1.25
+makes the contrast of a print less by a hundredth of white."""
+
 _MIXTURES_AT_HAND: Final = 16
 """Lights whose mixtures are kept in memory, 3 MB each: pictures that follow each other share some."""
 
@@ -53,8 +60,32 @@ def wanted_colours(profile: PrintProfile, matrix: ColourMatrix) -> npt.NDArray[n
     matrix
         Linear sRGB to the camera's RGB.
     """
-    seen = source_colours.source_colours(matrix)
-    return profile.black + (profile.white - profile.black) * seen
+    black = black_point(profile)
+    return black + (profile.white - black) * source_colours.source_colours(matrix)
+
+
+def black_point(profile: PrintProfile) -> float:
+    """Return what black is mapped to: the darkest grey that cells near to it make; 1 = ideal white.
+
+    At the very edge of the gamut cells of unlike colours would have to be mixed. So the darkest is taken, of greys from
+    the print's own black to one a quarter brighter, that is off by no more than `BLACK_WITHIN_DEG`; if there is none,
+    as on charts of few cells, the print's own black.
+
+    Parameters
+    ----------
+    profile
+        The print under a light.
+
+    Examples
+    --------
+    >>> ramp = np.linspace(0.04, 0.9, 8)[:, None] * np.ones(3)
+    >>> round(black_point(PrintProfile(ramp, np.ones(8, bool))), 6)
+    0.04
+    """
+    levels = profile.black * np.linspace(1.0, MOST_LIFT, 26)
+    levels = levels[levels <= profile.white]
+    met = mix_cells(profile, levels[:, None] * np.ones(3)).distance <= BLACK_WITHIN_DEG
+    return float(levels[int(met.argmax())])
 
 
 def colorimetric_mixtures(

@@ -36,13 +36,9 @@ one photosite of 25 that is clipped beside a cell of a tenth of saturation moves
 ODD_SHIFT: Final = 0.02
 """Least shift of a mean, relative to the median, that matters: 0.02 is a degree of hue at most."""
 
-BLACK_MARGIN: Final = 1.1
-"""Black point over the darkest grey that the print's cells can make: at the very edge of the gamut, cells of unlike
-colours would have to be mixed. On simulated unmanaged prints black is then half a degree off grey at most; without the
-margin it is up to 0.9, with a quarter 0.2, but blacks would be that much paler."""
-
 WHITE_MARGIN: Final = 0.99
-"""White point over the brightest grey that the print's cells can make, for the same reason."""
+"""White point over the brightest grey that the print's cells can make: at the very edge of the gamut, cells of unlike
+colours would have to be mixed. Greys near white are then within 0.1 degrees on simulated unmanaged prints."""
 
 PAPER_MARGIN: Final = 0.97
 """White point over the mean of the paper at most, so that white, too, is drawn from several cells."""
@@ -70,19 +66,19 @@ class PrintProfile:
         """Bits of a channel of the chart, 1 … 5."""
         return (len(self.colours).bit_length() - 1) // 3
 
-    @cached_property
+    @property
     def black(self) -> float:
-        """The black point: how bright the darkest grey is that is asked of the print; 1 = ideal white."""
+        """The darkest grey that mixtures of cells make, or how bright the print's black is; 1 = ideal white."""
         return self._neutral[0]
 
-    @cached_property
+    @property
     def white(self) -> float:
-        """The white point: how bright the brightest grey is that is asked of the print; 1 = ideal white."""
+        """The white point: the brightest grey that is asked of the print; 1 = ideal white."""
         return self._neutral[1]
 
     @cached_property
     def _neutral(self) -> tuple[float, float]:
-        """Return the black and the white point."""
+        """Return the black and the white."""
         brightness = self.colours.mean(axis=1)
         usable = np.flatnonzero(self.usable)
         darkest, brightest = (float(pick(brightness[usable])) for pick in (np.min, np.max))
@@ -93,10 +89,8 @@ class PrintProfile:
         ends = neutral_ends(self.colours[usable])
         if ends is not None:
             darkest, brightest = max(darkest, ends[0]), min(brightest * PAPER_MARGIN, ends[1] * WHITE_MARGIN)
-        if brightest <= BLACK_MARGIN * darkest:
-            # A print without contrast, or one that has no grey between its black and its paper.
-            return darkest, max(darkest, brightest)
-        return BLACK_MARGIN * darkest, brightest
+        # A print without contrast, or one that has no grey between its black and its paper, is one grey.
+        return darkest, max(darkest, brightest)
 
 
 def profile_of(lut: Lut, light: int) -> PrintProfile:

@@ -26,6 +26,7 @@ def make_table(tmp_path: Path) -> MakeTable:
     def make(
         bits: int = 3,
         tint: float = 0.0,
+        blue_of_green: float = 0.0,
         lights: int = 3,
         change: Callable[[npt.NDArray[np.uint16]], None] | None = None,
         camera: str = "Canon EOS 550D",
@@ -38,7 +39,11 @@ def make_table(tmp_path: Path) -> MakeTable:
         rng = np.random.default_rng(20191127)
         plan: list[Illumination] = []
         for light, kelvin in zip(range(lights), (2000.0, 5600.0, 10000.0), strict=False):
-            means = printed(bits, tint) * WHITES[light]
+            seen = printed(bits, tint)
+            if light == 0:
+                # A warm light has no blue: what the blue channel sees of it is mostly green.
+                seen[:, 2] += blue_of_green * (seen[:, 1] - seen[:, 2])
+            means = seen * WHITES[light]
             drawn = np.asarray(rng.poisson(np.repeat(means[:, None], 25, axis=1)), np.int64)
             samples: npt.NDArray[np.uint16] = np.minimum(drawn, white_level).astype(np.uint16)
             if change is not None:

@@ -12,9 +12,16 @@ from foundation.angles import angles_deg
 from foundation.errors import InputError
 from generator.lights.lighting import Lighting, Mixture, plain
 from generator.masks.request import parse_masks
-from generator.rendering.colorimetric import ColorimetricRendering, colorimetric_mixtures
+from generator.rendering.cell_mixtures import CellMixtures, mix_cells
+from generator.rendering.colorimetric import (
+    BLACK_WITHIN_DEG,
+    ColorimetricRendering,
+    black_point,
+    colorimetric_mixtures,
+    wanted_colours,
+)
 from generator.rendering.matrices import ColourMatrix
-from generator.rendering.print_profiles import profile_of
+from generator.rendering.print_profiles import PrintProfile, profile_of
 from generator.rendering.source_colours import NODES
 from generator.rendering.table_matrix import fitted_matrix, matrix_for
 from tests.generator.rendering.conftest import MakeTable
@@ -39,6 +46,34 @@ def test_greys_of_a_source_are_of_the_light(make_table: MakeTable) -> None:
     assert mixtures.cells.shape == (NODES, 32)
     shown = samples[mixtures.cells[GREYS]].mean(axis=(1, 2))
     assert angles_deg(shown, lut.white[1]).max() < 0.5
+
+
+def test_a_warm_light_has_cells_of_its_own(make_table: MakeTable) -> None:
+    lut = make_table(bits=4, blue_of_green=0.5)
+    matrix = ColourMatrix("mine", MATRIX, "")
+    own, daylight = (colorimetric_mixtures(lut, light, matrix) for light in (0, 1))
+    seen = profile_of(lut, 0).colours
+    # What all of these want is well within what the print can show in daylight.
+    pale = np.flatnonzero((angles_deg(own.wanted, np.ones(3)) < 15) & (own.wanted.mean(axis=1) > 0.2))
+
+    def kept(mixtures: CellMixtures) -> float:
+        shown = seen[mixtures.cells[pale]].mean(axis=1)
+        x, y = (np.log(colours[:, 2] / colours[:, 1]) for colours in (own.wanted[pale], shown))
+        return float(np.polyfit(x, y, 1)[0])
+
+    # Half of green in blue leaves half of the chroma, but for cells that are bluer.
+    assert kept(daylight) < 0.65
+    assert kept(own) > 0.8
+
+
+def test_black_is_as_dark_as_it_can_be_grey(make_table: MakeTable) -> None:
+    profile = profile_of(make_table(bits=4), 1)
+    assert black_point(profile) == pytest.approx(profile.black, rel=0.1)
+    tinted = PrintProfile(profile.colours * np.array([1.1, 1.0, 0.9]), profile.usable)
+    darker = tinted.colours[tinted.colours.mean(axis=1) < tinted.black]
+    assert angles_deg(darker, np.ones(3)).min() > BLACK_WITHIN_DEG
+    lifted = wanted_colours(tinted, ColourMatrix("mine", MATRIX, ""))[0]
+    assert mix_cells(tinted, lifted[None]).distance[0] <= BLACK_WITHIN_DEG
 
 
 def test_a_second_run_takes_what_the_first_kept(make_table: MakeTable, cache: Path) -> None:
