@@ -1,31 +1,47 @@
 """Halve an archive of thumbnails at random: the lights of one half to generate under, the other half to test on.
 
-`python examples/halves.py nus_canon_600d_64x64.npz` writes `lights_of_one_half.csv` (r,g,b a line, of sum 1), for
-`generate --match`, and `other_half.npz`, for `evaluate transfer --test`, into the working folder.
+`python examples/halves.py nus_canon_600d_64x64.npz [FOLDER] [--names PART]` writes for each half H, 0 and 1, into the
+folder (the working folder by default): `half_H.npz`, the images, for `evaluate describe` and `generate --like`;
+`lights_H.csv` (r,g,b a line, of sum 1) for `generate --match`; and `images_H.csv` (column image) for `evaluate transfer
+--only`. A set that was made by half 0 is tested on the images of half 1 and the reverse, so that every image is tested
+once and no test light was looked at. `all.npz` holds both halves; with `--names` only images whose names contain PART.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
 
 SEED = 0
-"""Of the division: that of the figures in docs/how-to/transfer.md."""
+"""Of the division: that of the figures in docs/transfer.md."""
 
 
-def main(archive: str) -> None:
+def main() -> None:
     """Divide the archive, which holds `images` (N, H, W, 3), `gt` (N, 3) and `names` (N,)."""
-    with np.load(archive) as content:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("archive", type=Path)
+    parser.add_argument("folder", type=Path, nargs="?", default=Path())
+    parser.add_argument("--names", help="take images alone whose names contain this")
+    given = parser.parse_args()
+    with np.load(given.archive) as content:
         data = {name: content[name] for name in ("images", "gt", "names")}
+    given.folder.mkdir(parents=True, exist_ok=True)
+    if given.names:
+        chosen = np.array([given.names in name for name in data["names"].tolist()])
+        data = {name: values[chosen] for name, values in data.items()}
+    np.savez(given.folder / "all.npz", **data)
     order = np.random.default_rng(SEED).permutation(len(data["gt"]))
-    lights, test = (np.sort(part) for part in np.array_split(order, [len(order) // 2]))
-    chromaticities = data["gt"][lights] / data["gt"][lights].sum(axis=1, keepdims=True)
-    rows = "".join("{:.6f},{:.6f},{:.6f}\n".format(*row) for row in chromaticities)
-    Path("lights_of_one_half.csv").write_text(f"r,g,b\n{rows}")
-    np.savez("other_half.npz", **{name: values[test] for name, values in data.items()})
+    chromaticities = data["gt"] / data["gt"].sum(axis=1, keepdims=True)
+    for half, places in enumerate(np.array_split(order, [len(order) // 2])):
+        kept = np.sort(places)
+        np.savez(given.folder / f"half_{half}.npz", **{name: values[kept] for name, values in data.items()})
+        lights = "".join("{:.6f},{:.6f},{:.6f}\n".format(*row) for row in chromaticities[kept])
+        (given.folder / f"lights_{half}.csv").write_text(f"r,g,b\n{lights}")
+        (given.folder / f"images_{half}.csv").write_text("image\n" + "\n".join(data["names"][kept].tolist()) + "\n")
+    print(f"{given.folder}: {len(order) // 2} and {len(order) - len(order) // 2} images")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -1,0 +1,59 @@
+#!/usr/bin/env bash
+# What training on generated images is worth on three real cameras: the figures of docs/transfer.md.
+#
+#   examples/worth.sh PICTURES ARCHIVES OUT [SEEDS]
+#
+# PICTURES  a folder of sRGB photographs: there BSDS500 (500) and imagenet-sample-images (1000), which you fetch yourself
+#           and which are not part of this software.
+# ARCHIVES  a folder with nus_canon_600d_64x64.npz, nus_canon_1ds_mk3_64x64.npz and intel_tau_5dsr_64x64.npz.
+# OUT       tables (3.5 GB each), generated sets and results. What is there already is kept: the script goes on where it was.
+# SEEDS     of learners, training images and folds, by default 5.
+#
+# LEVERS (environment) chooses some of the renderings below, by default all. Naive rows are made for each of them, of the same
+# pictures under the same lights.
+set -euo pipefail
+pictures=$(realpath "$1") archives=$(realpath "$2") out=$3 seeds=${4:-5}
+here=$(realpath "$(dirname "$0")")
+mkdir -p "$out" && cd "$out"
+
+declare -A archive=([600d]=nus_canon_600d_64x64 [1ds]=nus_canon_1ds_mk3_64x64 [5dsr]=intel_tau_5dsr_64x64)
+declare -A part=([600d]=Canon [1ds]=Canon [5dsr]=field)
+declare -A sensitivities=([600d]=Canon_EOS_600D [1ds]=Canon_EOS-1Ds_Mark_III [5dsr]=Canon_EOS_5DS)
+declare -A matrix=([600d]="Canon EOS 600D" [1ds]="Canon EOS-1Ds Mark III" [5dsr]="Canon EOS 5DS R")
+learners=regression-trees,kernel-ridge,log-chroma
+
+once() { # RESULT COMMAND...: run the command unless its result is there
+    [ -e "$1" ] || "${@:2}"
+}
+
+for camera in 600d 1ds 5dsr; do
+    half=halves/$camera
+    once "$half" python "$here/halves.py" "$archives/${archive[$camera]}.npz" "$half" --names "${part[$camera]}"
+    [ -e "$half/$camera.npz" ] || mv "$half/all.npz" "$half/$camera.npz"
+    once "tables/$camera" sim table --camera "${sensitivities[$camera]}" "tables/$camera"
+    for test in 0 1; do
+        other=$((1 - test))
+        once "$half/stats_$other.json" evaluate describe "$half/half_$other.npz" --out "$half/stats_$other.json"
+        colorimetric=(--rendering colorimetric --matrix "${matrix[$camera]}")
+        like=(--like "$half/stats_$other.json" --like-in pictures)
+        sets=()
+        for lever in ${LEVERS:-codes colorimetric compensate random random-like}; do
+            case $lever in
+                codes) options=(--rendering codes) ;;
+                colorimetric) options=("${colorimetric[@]}") ;;
+                compensate) options=("${colorimetric[@]}" --black-point compensate) ;;
+                random) options=("${colorimetric[@]}" --black-point random) ;;
+                random-like) options=("${colorimetric[@]}" --black-point random "${like[@]}") ;;
+                *) echo "no lever $lever" >&2; exit 2 ;;
+            esac
+            set=sets/$camera$test/$lever
+            once "$set" generate "tables/$camera" "$set" --sources "$pictures" --max-side 160 --no-preview \
+                --match "$half/lights_$other.csv" --outside nearest --seed 1 "${options[@]}"
+            sets+=(--train "$set")
+        done
+        once "results/$camera$test" evaluate transfer "${sets[@]}" --test "$half/$camera.npz" \
+            --only "$half/images_$test.csv" --side 64 --images 900 --seeds "$seeds" --error recovery --statistics none \
+            --methods "$learners" --naive "$pictures" --matrix "${matrix[$camera]}" --out "results/$camera$test"
+    done
+done
+once pool evaluate pool results/* --error recovery --out pool
