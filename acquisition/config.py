@@ -73,7 +73,9 @@ class SimulatedSettings(_Settings):
     """The simulated lab."""
 
     body: str = "EOS 550D"
-    """Camera body in it: EOS 550D, EOS 6D Mark II, Test."""
+    """Camera body in it: EOS 550D, EOS 6D Mark II, Test; or sensitivities by name or file, as `sim table --camera`."""
+    camera: dict[str, Any] | None = None
+    """Facts of the body that differ, by the names of sim.world.sensors.Body."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of everything that chance decides: paper, noise."""
     room: dict[str, bool | int | float | str] = {}

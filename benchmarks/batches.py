@@ -15,9 +15,11 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.generator import natural_picture, noisy_table, report
+from benchmarks.generator import natural_picture, nearby_cells, noisy_table, report
 from calibration.table.lut import Lut, open_lut
 from foundation.processors import processor_count
+from generator.kernels.dithering import CellTable, checked_cells
+from generator.rendering.black_points import BlackPoint
 from generator.training.crops import Crops
 from generator.training.gallery import Gallery, gallery_of
 
@@ -52,6 +54,16 @@ def rate(seconds: list[float], crops: int) -> float:
     return crops / median(seconds)
 
 
+def _by_colour(crops: Crops, cells: CellTable) -> Crops:
+    """Return the same crops rendered by colour, a random share of the print's black taken out."""
+    black_point = BlackPoint("random")
+    rendered = Crops(
+        crops.lut, crops.gallery, crops.size, exposure=crops.exposure, threads=crops.threads, black_point=black_point
+    )
+    rendered.__dict__["_cells"] = [cells] * len(rendered.lights)
+    return rendered
+
+
 def measure(lut: Lut) -> None:
     """Print every figure of a table."""
     gallery = gallery_of([np.roll(natural_picture(1536, 1024), 97 * turn, axis=1) for turn in range(8)])
@@ -64,7 +76,11 @@ def measure(lut: Lut) -> None:
         threads: Crops(lut, gallery, (SIDE, SIDE), exposure=(0.5, 1.0), threads=threads)
         for threads in sorted({1, processor_count()})
     }
+    # Cells of one kind for all lights: what is asked is how fast they are drawn, not how they are found.
+    cells = checked_cells(nearby_cells(), lut.provenance.bits)
+    coloured: dict[int, list[float]] = {threads: [] for threads in ours}
     spent: dict[int, list[float]] = {threads: [] for threads in ours}
+    by_colour = {threads: _by_colour(crops, cells) for threads, crops in ours.items()}
     peer: list[float] = []
     for turn in range(ROUNDS + 1):
         start = time.perf_counter()
@@ -77,12 +93,19 @@ def measure(lut: Lut) -> None:
                 crops.batch(np.arange(number * BATCH, (number + 1) * BATCH))
                 if number % IN_A_ROW:
                     spent[threads].append(time.perf_counter() - start)
+                start = time.perf_counter()
+                by_colour[threads].batch(np.arange(number * BATCH, (number + 1) * BATCH))
+                if number % IN_A_ROW:
+                    coloured[threads].append(time.perf_counter() - start)
     slow = rate(peer[1:], BATCH // 4)
     report("numpy take, one thread", slow, "crops/s", what)
     for threads, seconds in spent.items():
         fast = rate(seconds[IN_A_ROW - 1 :], BATCH)
         report(f"batches, {threads} threads", fast, "crops/s", what)
         report(f"batches, {threads} threads", fast / slow, "ratio", "numpy take, one thread")
+        with_cells = rate(coloured[threads][IN_A_ROW - 1 :], BATCH)
+        report(f"batches by colour, black taken out, {threads} threads", with_cells, "crops/s", what)
+        report(f"batches by colour, black taken out, {threads} threads", with_cells / fast, "ratio", "batches by codes")
 
 
 def main() -> None:

@@ -7,6 +7,10 @@ clock's. So ratios hold on a machine with other work to do, the clock's less so.
 Two lights are mixed by random weights in each pixel, which is the most work, and by masks of two kinds. Their weights,
 8 bytes a pixel, are read beside what the copy reads and writes.
 
+By colour, each pixel takes one of 32 cells around its code, as colorimetric rendering does; the ratio is to the same
+kernel by codes, in the same turns. How cells lie around a code is made up here: what a table's profile gives, of a
+simulated print, needs a table of full size, and gives the same speed within what turns differ.
+
 The bound of fetching is a compiled loop that does nothing but copy the samples which the kernel draws, their places
 being known, to one place in the nearest cache: what the caches allow, whoever chooses. Two lights have a sample each.
 """
@@ -36,11 +40,13 @@ from calibration.table.writer import LutWriter
 from drivers.presenter import Colour
 from foundation.compiled import compiled
 from generator.kernels.choice import SCRATCH_BYTES, choose_group, row_keys
+from generator.kernels.dithering import checked_cells
 from generator.kernels.mixing import mix_samples
 from generator.kernels.planar import draw_planar
 from generator.kernels.rendering import draw_mosaic, draw_samples
 from generator.kernels.vector import GROUP, LINE, copy8, offset_at, prefetch_once
 from generator.masks.request import parse_masks
+from generator.rendering.black_points import Veil, without_veil
 
 SAMPLES = 25
 REPEATS = 7
@@ -152,6 +158,17 @@ def fetching(tables: npt.NDArray[np.uint16], picture: npt.NDArray[np.uint8]) -> 
     )
 
 
+def nearby_cells() -> npt.NDArray[np.uint16]:
+    """Return 32 cells (32768, 32) uint16 for each source node, some six distinct ones within two codes of it."""
+    rng = np.random.default_rng(6)
+    node = np.arange(32768)
+    codes = np.stack([node >> 10, node >> 5 & 31, node & 31], axis=-1)
+    some = codes[:, None] + rng.integers(-2, 3, (32768, 6, 3))
+    taken = rng.choice(6, (32768, 32), p=(0.4, 0.25, 0.15, 0.1, 0.06, 0.04))
+    red, green, blue = np.clip(np.take_along_axis(some, taken[..., None], 1), 0, 31).transpose(2, 0, 1)
+    return (red << 10 | green << 5 | blue).astype(np.uint16)
+
+
 def in_turns(calls: Mapping[str, Call], clock: Callable[[], float], repeats: int = REPEATS) -> dict[str, float]:
     """Return the seconds of each call's fastest turn, after one that does not count."""
     fastest = dict.fromkeys(calls, np.inf)
@@ -174,7 +191,9 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
     planes = np.empty((3, height, width), np.float32)
     weights = np.random.default_rng(4).random((height, width, 2), dtype=np.float32)
     masks = {kind: mask_weights(kind, height, width) for kind in ("soft-edge", "half-plane")}
+    cells = checked_cells(nearby_cells(), 5)
     calls: dict[str, Call] = {
+        "kernel by colour": lambda: draw_samples(samples, picture, cells=cells, out=out),
         "streaming copy": lambda: np.copyto(out, picture),
         "bound of fetching": fetching(tables[:1], picture),
         "bound of fetching for two lights": fetching(tables, picture),
@@ -193,6 +212,8 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
     for call in (name for name in calls if name != "streaming copy"):
         report(f"{call}, {name}, one thread", limit / seconds[call], "ratio", "streaming copy, 3 bytes in and 6 out")
     report(f"kernel, {name}, one thread", seconds["numpy take"] / seconds["kernel"], "ratio", "numpy take")
+    by_colour = seconds["kernel"] / seconds["kernel by colour"]
+    report(f"kernel by colour, {name}, one thread", by_colour, "ratio", "kernel by codes")
 
     threads = os.cpu_count() or 1
     with ThreadPoolExecutor(threads) as pool:
@@ -210,6 +231,7 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
         together: dict[str, Call] = {
             "streaming copy": copy_together,
             "kernel": lambda: draw_samples(samples, picture, threads=threads, out=out),
+            "kernel by colour": lambda: draw_samples(samples, picture, cells=cells, threads=threads, out=out),
             "two lights": partial(mix_together, weights),
             **{f"two lights, {kind}": partial(mix_together, mask) for kind, mask in masks.items()},
         }
@@ -219,6 +241,8 @@ def measure_picture(name: str, picture: npt.NDArray[np.uint8], tables: npt.NDArr
     for call in (name for name in together if name != "streaming copy"):
         ratio = seconds["streaming copy"] / seconds[call]
         report(f"{call}, {name}, {threads} threads", ratio, "ratio", "streaming copy in as many threads")
+    by_colour = seconds["kernel"] / seconds["kernel by colour"]
+    report(f"kernel by colour, {name}, {threads} threads", by_colour, "ratio", "kernel by codes in as many threads")
 
 
 def measure_small(samples: npt.NDArray[np.uint16]) -> None:
@@ -239,6 +263,13 @@ middle = time.process_time()
 kernel.draw_samples(np.zeros((8, 25, 3), np.uint16), np.zeros((9, 99, 3), np.uint8))
 print(middle - begin, time.process_time() - middle)
 """
+
+
+def measure_black(samples: npt.NDArray[np.uint16]) -> None:
+    """Report how long taking the print's black out of all samples of a light takes."""
+    veil = Veil(np.array([300.0, 380.0, 330.0]), np.array([1.04, 1.04, 1.04]))
+    call = partial(without_veil, samples, veil, WHITE)
+    report("black taken out of a light's samples, one thread", in_turns({"": call}, time.thread_time)[""], "s")
 
 
 def measure_start() -> None:
@@ -268,6 +299,7 @@ def main() -> None:
         tables = np.array(noisy_table(Path(scratch) / "lut", 2).samples)
     measure_start()
     measure_small(tables[0])
+    measure_black(tables[0])
     pictures = {
         "photograph of 18 Mpx": photograph(5184, 3456),
         "synthetic picture of 18 Mpx": natural_picture(5184, 3456),

@@ -21,6 +21,7 @@ from generator.command.options import (
     LightOptions,
     PictureOptions,
     Places,
+    RenderingOptions,
     VariationOptions,
     WorkOptions,
 )
@@ -56,6 +57,7 @@ def generate(
     pictures: PictureOptions,
     light: LightOptions,
     likeness: LikenessOptions,
+    rendering: RenderingOptions,
     variation: VariationOptions,
     images: ImageOptions,
     work: WorkOptions,
@@ -77,7 +79,7 @@ def generate(
         if places.lut is None or places.out is None:
             raise InputError("the table and the place of the dataset are missing; write generate LUT OUT --sources DIR")
         workers = work.makers()
-        plan = _plan(places.lut, places.out, pictures, light, likeness, variation, images, work)
+        plan = _plan(places.lut, places.out, pictures, light, likeness, rendering, variation, images, work)
         if work.shard is not None:
             _make_share(plan, places.out, work.shard, workers)
         else:
@@ -100,6 +102,7 @@ def _plan(
     pictures: PictureOptions,
     light: LightOptions,
     likeness: LikenessOptions,
+    rendering: RenderingOptions,
     variation: VariationOptions,
     images: ImageOptions,
     work: WorkOptions,
@@ -116,7 +119,7 @@ def _plan(
         print(line)
     varied = variation.variation(table, chosen.exposure)
     options = images.dataset_options(work.shard_images, chosen.reading, varied, chosen.crops, chosen.weighted)
-    return Plan(table, chosen.sources, chosen.choice, images.seed, options)
+    return Plan(table, chosen.sources, chosen.choice, images.seed, rendering.of(options, table))
 
 
 def _make_whole(plan: Plan, out: str, workers: Workers) -> Dataset:

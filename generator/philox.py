@@ -40,6 +40,10 @@ CROPS: Final = 6
 """Purpose of the words that choose where pictures are cut."""
 ITEMS: Final = 7
 """Purpose of the words that choose what a training item shows."""
+DITHERING: Final = 8
+"""Purpose of the words that choose which cell of the chart stands for a source colour."""
+VEILS: Final = 9
+"""Purpose of the words that choose which share of the print's veil is taken out of an image."""
 EXPOSURES: Final = 12
 """Purpose of the words that draw how much light an image is exposed to."""
 GRADIENTS: Final = 13

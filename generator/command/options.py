@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -253,6 +253,50 @@ class ImageOptions:
             reading=reading,
             weighted=weighted,
         )
+
+
+@dataclass(frozen=True)
+class RenderingOptions:
+    """How the codes of a picture become what the camera sees of its print."""
+
+    rendering: Annotated[
+        Literal["codes", "colorimetric"] | None,
+        option(
+            None,
+            "Take a picture's codes as those of the print, as the paper did; or let each pixel be a cell that looks "
+            "to the camera as the picture's colour should. \\[default: codes]",
+            _IMAGES,
+        ),
+    ] = None
+    matrix: Annotated[
+        str | None,
+        option(
+            "NAME",
+            "For colorimetric rendering: linear sRGB to the camera's RGB, of a camera by its name, of a file of 3 x 3 "
+            "numbers, or table for the one fitted from the table. \\[default: that of the table's camera, else table]",
+            _IMAGES,
+        ),
+    ] = None
+    black_point: Annotated[
+        str,
+        option(
+            "WHAT",
+            "The print's own black: keep it, compensate for it (take it out), or take out a random share of it of "
+            "each image, random or random:MAX. The ground truth stays.",
+            _IMAGES,
+        ),
+    ] = "keep"
+
+    def of(self, options: DatasetOptions, table: Lut) -> DatasetOptions:
+        """Return the options of a dataset with these; an InputError says which cannot be used."""
+        from generator.rendering.black_points import parse_black_point
+        from generator.rendering.table_matrix import matrix_for
+
+        rendering = self.rendering or options.rendering
+        if rendering == "codes" and self.matrix is not None:
+            raise InputError("--matrix is for --rendering colorimetric; add that, or leave --matrix out")
+        matrix = matrix_for(table, self.matrix) if rendering == "colorimetric" else None
+        return replace(options, rendering=rendering, matrix=matrix, black_point=parse_black_point(self.black_point))
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,19 @@ a gain, in units of the sensor's saturation and cut off there:
 
     out[c, y, x] = min(float32(sample) · float32(gain / white_level), 1)
 
-A gain is digital: it scales signal and noise alike, and saturated pixels darken with it.
+A gain is digital: it scales signal and noise alike, and saturated pixels darken with it. Where a share of the print's
+black is taken out of a crop (`generator.rendering.black_points`), s[c] = gain · stretch[c] / white_level and
+
+    out[c, y, x] = min(float32(sample) · float32(s[c]) + float32(-taken[c] · s[c]), float32(min(gain, 1)))
+
+What noise takes below 0 stays below 0: cut off there, black would be too bright.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -29,10 +34,14 @@ from generator.kernels.arguments import (
     run_in_threads,
 )
 from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, choose_group, row_keys
+from generator.kernels.dithering import PLACES_BYTES, Cells, CellTable, checked_cells, choose_dithered, dither_keys
 from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, planes8_mirrored, prefetch
 
 Window = tuple[int, int, int, int]
 """x and y of a window's first pixel in the picture, and its width and height, px."""
+
+SCALES: Final = 7
+"""Numbers of an item that `vector.planes8` takes: factors and summands of three channels, and a limit."""
 
 
 @compiled
@@ -40,6 +49,7 @@ def _crop(
     plan: Any,
     seeds: Any,
     scales: Any,
+    lines: int,
     tables: int,
     light_bytes: int,
     last: int,
@@ -56,21 +66,28 @@ def _crop(
     """Fill the items `first` to `end` of a batch.
 
     The offsets of a row are chosen, and their samples prefetched, before the row above is fetched: the samples may lie
-    in memory that is in no cache. `last` is the table's last light as `arguments.readable` returns it.
+    in memory that is in no cache. `last` is the table's last light as `arguments.readable` returns it. Of each item
+    `scales`, (N, 7) float32 at address `lines`, has what `planes8` takes.
     """
     row_bytes = OFFSETS_BYTES * (width // GROUP + 2)
     for item in range(first, end):
-        light, picture, pitch, picture_width, x0, y0, flip, image, lights = plan[item]
+        light, picture, pitch, picture_width, x0, y0, flip, image, lights, cells = plan[item]
         samples = last if light == lights - 1 else tables + light * light_bytes
-        scale = scales[item]
+        line = lines + 4 * SCALES * item
+        spare = scratch + EDGE_BYTES + 2 * row_bytes
         low, high = x0 // GROUP, (x0 + width - 1) // GROUP
         for y in range(height + 1):
             if y < height:
                 keys = row_keys(y0 + y, 0, image, seeds[item])
+                inks = dither_keys(cells, y0 + y, image, seeds[item])
+                row = picture + y * pitch
                 chosen = scratch + EDGE_BYTES + row_bytes * (y & 1)
                 for group in range(low, high + 1):
                     to = chosen + OFFSETS_BYTES * (group - low)
-                    choose_group(picture + y * pitch, picture_width, group, keys, count, bits, scratch, to)
+                    if cells:
+                        choose_dithered(row, picture_width, group, inks, keys, count, scratch, spare, to)
+                    else:
+                        choose_group(row, picture_width, group, keys, count, bits, scratch, to)
                     for i in range(GROUP):
                         prefetch(samples + offset_at(to + 4 * i))
             if y == 0:
@@ -83,17 +100,17 @@ def _crop(
             if width < EIGHT:
                 for x in range(width):
                     sample = samples + offset_at(offsets - 4 * x if flip else offsets + 4 * x)
-                    plane1(sample, scale, red + 4 * x)
-                    plane1(sample + 2, scale, green + 4 * x)
-                    plane1(sample + 4, scale, blue + 4 * x)
+                    for channel in range(3):
+                        factor, summand, limit = scales[item, channel], scales[item, 3 + channel], scales[item, 6]
+                        plane1(sample + 2 * channel, factor, summand, limit, red + channel * pitches[1] + 4 * x)
             else:
                 for start in range(0, width, EIGHT):
                     # The last eight may overlap the ones before.
                     x = min(start, width - EIGHT)
                     if flip:
-                        planes8_mirrored(samples, offsets - 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
+                        planes8_mirrored(samples, offsets - 4 * x, line, red + 4 * x, green + 4 * x, blue + 4 * x)
                     else:
-                        planes8(samples, offsets + 4 * x, scale, red + 4 * x, green + 4 * x, blue + 4 * x)
+                        planes8(samples, offsets + 4 * x, line, red + 4 * x, green + 4 * x, blue + 4 * x)
 
 
 def _checked_window(window: Sequence[int], picture: npt.NDArray[np.uint8]) -> Window:
@@ -199,6 +216,9 @@ def draw_batch(
     gains: npt.ArrayLike = 1.0,
     seeds: npt.ArrayLike = 0,
     images: npt.ArrayLike = 0,
+    cells: Sequence[Cells | CellTable] | None = None,
+    taken: npt.ArrayLike | None = None,
+    stretches: npt.ArrayLike = 1.0,
     threads: int = 1,
     out: npt.NDArray[np.float32] | None = None,
 ) -> npt.NDArray[np.float32]:
@@ -221,6 +241,14 @@ def draw_batch(
         As for `draw_planar`.
     flips, gains, seeds, images
         (N,) bool, float, int and int, or one for all, as for `draw_planar`.
+    cells
+        N tables of cells (32768, 32) uint16, by which the pictures are dithered as by `dithering.dither`; one may
+        serve many items, or what `checked_cells` made of them. None: the pictures are codes.
+    taken
+        (N, 3) float ≥ 0, counts that are taken out of the channels of each item's samples; None takes out nothing.
+    stretches
+        (N, 3) float > 0, or one for all: what the rest is then multiplied by. Nothing is multiplied where `taken` is
+        None.
     threads
         Threads that share the items; no byte depends on it.
     out
@@ -278,18 +306,20 @@ def draw_batch(
     outside = (frames[:, :2] < 0).any(axis=1) | (frames[:, :2] + frames[:, 2:] > shown[:, 2:]).any(axis=1)
     for item in np.flatnonzero(outside | (min(width, height) < 1))[:1]:
         _checked_window(frames[item].tolist(), pictures[int(item)])
-    plan = np.empty((count, 9), np.int64)
+    plan = np.zeros((count, 10), np.int64)
     plan[:, 0], plan[:, 1], plan[:, 2:4] = numbers, shown[:, 0] + frames[:, 1] * shown[:, 1], shown[:, 1:3]
     plan[:, 4:6], plan[:, 6] = frames[:, :2], np.broadcast_to(flips, count)
     plan[:, 7], plan[:, 8] = imaged, len(tables)
-    scales = (gained / white_level).astype(np.float32)
+    inks = _addresses(cells, count, bits, plan)
+    scales = _scales(gained, white_level, taken, stretches)
 
     def fill(first: int, end: int) -> None:
-        scratch = np.empty(EDGE_BYTES + 2 * OFFSETS_BYTES * (width // GROUP + 2), np.uint8)
+        scratch = np.empty(EDGE_BYTES + 2 * OFFSETS_BYTES * (width // GROUP + 2) + PLACES_BYTES, np.uint8)
         _crop(
             plan,
             seeded,
             scales,
+            scales.ctypes.data,
             tables.ctypes.data,
             tables.strides[0],
             last.ctypes.data,
@@ -305,9 +335,45 @@ def draw_batch(
         )
 
     run_in_threads(fill, count, threads)
+    del inks
     if work is not target:
         target[...] = work
     return target
+
+
+def _addresses(
+    cells: Sequence[Cells | CellTable] | None, count: int, bits: int, plan: npt.NDArray[np.int64]
+) -> dict[int, CellTable]:
+    """Write the address of each item's table of cells into the plan; return the tables, to be kept until they are used.
+
+    Most items of a batch share a table; each is checked once.
+    """
+    if cells is None:
+        return {}
+    if len(cells) != count:
+        raise InputError(f"{len(cells)} tables of cells were given for {count} items, expected one each")
+    checked = {id(table): table for table in cells}
+    inks = {identity: checked_cells(table, bits) for identity, table in checked.items()}
+    plan[:, 9] = [inks[id(table)].cells.ctypes.data for table in cells]
+    return inks
+
+
+def _scales(
+    gains: npt.NDArray[np.float64], white_level: int, taken: npt.ArrayLike | None, stretches: npt.ArrayLike
+) -> npt.NDArray[np.float32]:
+    """Return (N, 7) float32: what `vector.planes8` takes of each item."""
+    scales = np.empty((len(gains), SCALES), np.float32)
+    if taken is None:
+        # A number is itself with -0 added to it.
+        scales[:, :3], scales[:, 3:6], scales[:, 6] = (gains / white_level)[:, None], -0.0, 1.0
+        return scales
+    counts = np.broadcast_to(np.asarray(taken, np.float64), (len(gains), 3))
+    factors = np.broadcast_to(np.asarray(stretches, np.float64), counts.shape)
+    if not ((counts >= 0) & (factors > 0) & np.isfinite(counts) & np.isfinite(factors)).all():
+        raise InputError("what is taken out of samples is to be finite numbers from 0, stretches numbers above 0")
+    exact = (gains / white_level)[:, None] * factors
+    scales[:, :3], scales[:, 3:6], scales[:, 6] = exact, -counts * exact, np.minimum(gains, 1)
+    return scales
 
 
 def _whole_numbers(numbers: npt.ArrayLike, count: int, bits: int, name: str) -> npt.NDArray[np.uint64]:

@@ -35,7 +35,8 @@ from generator.kernels.arguments import (
     writable,
 )
 from generator.kernels.choice import LEAD, SCRATCH_BYTES, choose_group, offsets_slot, prefetch_group, row_keys
-from generator.kernels.drawing import choose_first_groups, draw_groups
+from generator.kernels.dithering import DITHER_BYTES, Cells, CellTable, checked_cells, dither_keys
+from generator.kernels.drawing import choose_first_groups, draw_dithered, draw_groups
 from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.streaming import first_line, line_buffer_bytes, stream_lines
 from generator.kernels.vector import (
@@ -77,26 +78,34 @@ def _gather(
     target: int,
     target_pitch: int,
     streamed: bool,
+    cells: int,
     scratch: int,
 ) -> None:
     """Fill rows of 3-channel pixels; picture, samples, target and scratch are addresses, pitches bytes from row to row.
+
+    `cells` is the address of a table of cells by which the picture is dithered, or 0.
 
     Picture and image leave the caches to the samples: the picture is prefetched as data that are read once; the image,
     if `streamed`, is put together in scratch memory and written past the caches, a line at a time.
     """
     groups = (width + GROUP - 1) // GROUP
-    lines = first_line(scratch + SCRATCH_BYTES)
+    lines = first_line(scratch + SCRATCH_BYTES + DITHER_BYTES)
     for y in range(rows):
         keys = row_keys(first_row + y, 0, image, seed)
+        inks = dither_keys(cells, first_row + y, image, seed)
         row, to = picture + y * pitch, target + y * target_pitch
         begin, held = to, to & (LINE - 1)
-        choose_first_groups(row, width, keys, count, bits, scratch, 0, groups)
+        if not cells:
+            choose_first_groups(row, width, keys, count, bits, scratch, 0, groups)
         done = 0
         while done < groups:
             end, base = groups, to
             if streamed:
                 end, base = min(done + _SEGMENT_GROUPS, groups), lines + held - SAMPLE_BYTES * GROUP * done
-            draw_groups(row, width, keys, samples, count, bits, scratch, done, end, groups, 0, 0, base)
+            if cells:
+                draw_dithered(row, width, inks, keys, samples, count, scratch, done, end, groups, base)
+            else:
+                draw_groups(row, width, keys, samples, count, bits, scratch, done, end, groups, 0, 0, base)
             if streamed:
                 stop = to + SAMPLE_BYTES * min(GROUP * end, width)
                 held = stream_lines(lines, begin, stop, end == groups)
@@ -162,6 +171,7 @@ def draw_samples(
     image: int = 0,
     first_row: int = 0,
     threads: int = 1,
+    cells: Cells | CellTable | None = None,
     out: npt.NDArray[np.uint16] | None = None,
 ) -> npt.NDArray[np.uint16]:
     """Return the raw linear image of `picture` under one light; the rule stands at the head of this file.
@@ -180,6 +190,8 @@ def draw_samples(
         The row of the whole picture that `picture` begins with: a picture done in bands is the same picture.
     threads
         Threads that share the rows; no byte depends on it.
+    cells
+        (32768, 32) uint16, by which the picture is dithered first, as `dithering.dither` does; None: it is codes.
     out
         (H, W, 3) uint16 to fill instead of a new array.
 
@@ -209,9 +221,11 @@ def draw_samples(
     target = check_out(out, picture.shape, np.uint16)
     key = check_seed(seed, image)
     source, table, work = packed_rows(picture), readable(samples), writable(target)
+    inks = None if cells is None else checked_cells(cells, bits)
+    size = SCRATCH_BYTES + DITHER_BYTES + line_buffer_bytes(SAMPLE_BYTES * GROUP * _SEGMENT_GROUPS)
 
     def fill(top: int, bottom: int) -> None:
-        scratch = np.empty(SCRATCH_BYTES + line_buffer_bytes(SAMPLE_BYTES * GROUP * _SEGMENT_GROUPS), np.uint8)
+        scratch = np.empty(size, np.uint8)
         _gather(
             source[top:].ctypes.data,
             source.strides[0],
@@ -226,6 +240,7 @@ def draw_samples(
             work[top:].ctypes.data,
             work.strides[0],
             work.nbytes >= streaming.STREAMED_BYTES,
+            0 if inks is None else inks.cells.ctypes.data,
             scratch.ctypes.data,
         )
 

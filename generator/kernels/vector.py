@@ -175,6 +175,19 @@ def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, coun
 
 
 @intrinsic
+def write_choices(typing: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, target: Any) -> Any:
+    """Write the offsets, uint32 bytes, of the samples chosen for a group's 32 pixels within those of their colours."""
+    del typing, word, k0, k1, k2, count, target
+    number = types.uint32
+
+    def emit(builder: Builder, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value) -> None:
+        for half, choices in enumerate(_digits(builder, word, (k0, k1, k2), count)):
+            store(builder, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)), target, 4 * LANES * half)
+
+    return void(emit, number, number, number, number, number, ADDRESS)
+
+
+@intrinsic
 def write_colours(
     typing: Any, picture: Any, bits: Any, stride: Any, target: Any, other_stride: Any, other_target: Any
 ) -> Any:
@@ -329,39 +342,46 @@ def _planes8(step: int) -> Callable[..., None]:
     """Return what emits the writing of eight pixels whose offsets are `step` bytes apart."""
 
     def emit(
-        builder: Builder, samples: Value, offsets: Value, scale: Value, red: Value, green: Value, blue: Value
+        builder: Builder, samples: Value, offsets: Value, line: Value, red: Value, green: Value, blue: Value
     ) -> None:
-        factor, one = broadcast(builder, scale, _EIGHT_FLOATS), ir.Constant(_EIGHT_FLOATS, [1.0] * EIGHT)
-        for channel, target in zip(_channels(builder, samples, offsets, step), (red, green, blue), strict=True):
-            store(builder, minimum(builder, builder.fmul(channel, factor), one), target, 0)
+        def number(place: int) -> Value:
+            return broadcast(builder, load(builder, line, 4 * place, F32), _EIGHT_FLOATS)
+
+        channels = _channels(builder, samples, offsets, step)
+        for place, (channel, target) in enumerate(zip(channels, (red, green, blue), strict=True)):
+            value = builder.fadd(builder.fmul(channel, number(place)), number(3 + place))
+            store(builder, minimum(builder, value, number(6)), target, 0)
 
     return emit
 
 
 @intrinsic
-def planes8(typing: Any, samples: Any, offsets: Any, scale: Any, red: Any, green: Any, blue: Any) -> Any:
-    """Write eight pixels as float32 to three planes: sample times `scale`, at most 1."""
-    del typing, samples, offsets, scale, red, green, blue
-    return void(_planes8(4), ADDRESS, ADDRESS, types.float32, ADDRESS, ADDRESS, ADDRESS)
+def planes8(typing: Any, samples: Any, offsets: Any, line: Any, red: Any, green: Any, blue: Any) -> Any:
+    """Write eight pixels as float32 to three planes: sample times factor, plus summand, at most a limit.
+
+    At `line` are seven float32: factors and summands of red, green and blue, and the limit.
+    """
+    del typing, samples, offsets, line, red, green, blue
+    return void(_planes8(4), ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
 
 
 @intrinsic
-def planes8_mirrored(typing: Any, samples: Any, offsets: Any, scale: Any, red: Any, green: Any, blue: Any) -> Any:
+def planes8_mirrored(typing: Any, samples: Any, offsets: Any, line: Any, red: Any, green: Any, blue: Any) -> Any:
     """Do `planes8` from right to left: `offsets` points to the first pixel's offset, the others' stand before it."""
-    del typing, samples, offsets, scale, red, green, blue
-    return void(_planes8(-4), ADDRESS, ADDRESS, types.float32, ADDRESS, ADDRESS, ADDRESS)
+    del typing, samples, offsets, line, red, green, blue
+    return void(_planes8(-4), ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS, ADDRESS)
 
 
 @intrinsic
-def plane1(typing: Any, source: Any, scale: Any, target: Any) -> Any:
+def plane1(typing: Any, source: Any, factor: Any, summand: Any, limit: Any, target: Any) -> Any:
     """Write one channel of one pixel as float32: `planes8` for what is narrower."""
-    del typing, source, scale, target
+    del typing, source, factor, summand, limit, target
 
-    def emit(builder: Builder, source: Value, scale: Value, target: Value) -> None:
-        value = builder.uitofp(load(builder, source, 0, I16), F32)
-        store(builder, minimum(builder, builder.fmul(value, scale), ir.Constant(F32, 1.0)), target, 0)
+    def emit(builder: Builder, source: Value, factor: Value, summand: Value, limit: Value, target: Value) -> None:
+        value = builder.fmul(builder.uitofp(load(builder, source, 0, I16), F32), factor)
+        store(builder, minimum(builder, builder.fadd(value, summand), limit), target, 0)
 
-    return void(emit, ADDRESS, types.float32, ADDRESS)
+    return void(emit, ADDRESS, types.float32, types.float32, types.float32, ADDRESS)
 
 
 def _prefetching(locality: int) -> Callable[..., None]:

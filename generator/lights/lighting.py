@@ -212,7 +212,7 @@ class Lighting:
         weights
             (H, W, lights) float32 ≥ 0, as `weights_of` returns them.
         """
-        from generator.kernels.whites import mean_weights
+        from generator.masks.whites import mean_weights
 
         return np.asarray(mean_weights(weights) @ self.whites(lut))
 
@@ -232,7 +232,7 @@ class Lighting:
             (H, W, 3) float32, r + g + b = 1: the chromaticity of the sum of the lights' whites, each times its weight
             in the pixel.
         """
-        from generator.kernels.whites import chromaticities
+        from generator.masks.whites import chromaticities
 
         return chromaticities(weights, self.whites(lut))
 

@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from foundation.errors import FormatError
 from generator.files.formats import encode_map
-from generator.kernels.whites import quantised_chromaticities, quantised_weights
 from generator.masks.decoding import decode_values
 from generator.masks.weights import FULL, Weights
+from generator.masks.whites import quantised_chromaticities, quantised_weights
 
 
 def encode_maps(weights: Weights, whites: npt.NDArray[np.float64]) -> list[tuple[str, str, bytes]]:

@@ -2,8 +2,8 @@
 
 `Crops` is the endless set of items a table and a gallery allow. Which picture, window, light, mirror image, gain and
 samples item i of an epoch has is a pure function of (seed, epoch, i): the words of Philox4x32-10 with counter
-(i, epoch, k, 7), k = 0 picture, column, row, light; k = 1 mirror and gain; k = 2 the kernel's seed. So the items are
-the same however many workers share them.
+(i, epoch, k, 7), k = 0 picture, column, row, light; k = 1 mirror, gain and the share of the print's black that is taken
+out; k = 2 the kernel's seed. So the items are the same however many workers share them.
 
 Needs no PyTorch; `torch_crops` has the data sets that do::
 
@@ -21,16 +21,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from foundation.errors import InputError
 from generator import philox
+from generator.kernels.dithering import CellTable, checked_cells
 from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.planar import draw_batch
-from generator.lights.lighting import Mixture
+from generator.lights.lighting import Lighting, Mixture
+from generator.rendering.black_points import BlackPoint, black_of, veil_of
 from generator.training.recycling import Recycled
 from generator.variation.iso_speed import IsoSpeed
 from generator.variation.sensor_noise import SensorNoise
@@ -40,9 +42,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from calibration.table.lut import Lut
+    from generator.rendering.matrices import ColourMatrix
     from generator.training.gallery import Gallery
 
 __all__ = ["Batch", "Crops"]
+
+Rendering = Literal["codes", "colorimetric"]
+
+KEEP: Final = BlackPoint()
+"""The print's black is kept."""
 
 _HALF: Final = np.uint64(32)
 """Bits of a random word."""
@@ -55,13 +63,17 @@ class Batch:
     Attributes
     ----------
     images
-        (N, 3, height, width) float32, linear camera RGB, 0 … 1 = saturation of the sensor.
+        (N, 3, height, width) float32, linear camera RGB, 0 … 1 = saturation of the sensor. Where the print's black is
+        taken out, noise reaches below 0, some thousandths: cut off there, black would be too bright. Whoever takes
+        logarithms or roots has to do it.
     illuminants
         (N, 3) float32, the ground truth, r + g + b = 1.
     lights
         (N,) int64, place of each item's light in `Crops.lights`.
     pictures
         (N,) int64, place of each item's picture in the gallery.
+    black_taken
+        (N,) float64, share of the print's black that was taken out, 0 … 1.
 
     Examples
     --------
@@ -77,6 +89,7 @@ class Batch:
     illuminants: npt.NDArray[np.float32]
     lights: npt.NDArray[np.int64]
     pictures: npt.NDArray[np.int64]
+    black_taken: npt.NDArray[np.float64]
 
 
 class Crops:
@@ -111,6 +124,15 @@ class Crops:
         0 … 2³² − 1; see `at_epoch`.
     threads
         Threads that share a batch; no value depends on it.
+    rendering
+        ``"codes"``: a picture's codes are those of the print; ``"colorimetric"``: each pixel is a cell that looks to
+        the camera as the picture's colour should. Which, is found when a light is first drawn: it takes some seconds a
+        light the first time, later they lie in the user's cache folder; and 2 MB of memory for each light. So name the
+        lights, rather than leave it at all of a large table.
+    matrix
+        Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
+    black_point
+        What becomes of the print's black.
 
     Raises
     ------
@@ -142,6 +164,9 @@ class Crops:
         seed: int = 0,
         epoch: int = 0,
         threads: int = 1,
+        rendering: Rendering = "codes",
+        matrix: ColourMatrix | None = None,
+        black_point: BlackPoint = KEEP,
     ) -> None:
         height, width = size
         if min(height, width) < 1:
@@ -177,12 +202,24 @@ class Crops:
         self.seed = seed
         self.epoch = self._checked_epoch(epoch)
         self.threads = threads
+        self.rendering = rendering
+        self.matrix = matrix
+        self.black_point = black_point
         self._memory = Recycled()
         self._truths = (whites / whites.sum(axis=1, keepdims=True)).astype(np.float32)
         self._tables, self._rows = _tables_of(lut, self.lights, seed)
+        self._cells = _cells_of(lut, self.lights, rendering, matrix)
         self._pictures = [
-            replace_unfit_colours(gallery.picture(number), lut.provenance)[0] for number in range(len(gallery))
+            gallery.picture(number)
+            if self._cells
+            else replace_unfit_colours(gallery.picture(number), lut.provenance)[0]
+            for number in range(len(gallery))
         ]
+        veiled = black_point.kind != "keep"
+        self._blacks = np.stack([black_of(lut, mixture) for mixture in mixtures]) if veiled else None
+        self._whites = np.minimum(whites, lut.provenance.white_level)
+        for mixture in mixtures if veiled else ():
+            veil_of(lut, mixture, 1.0)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The table is gigabytes; its folder is enough to map it again.
@@ -229,7 +266,7 @@ class Crops:
         if numbers.ndim != 1 or not numbers.size or numbers.min() < 0 or numbers.max() >= self.length:
             raise InputError(f"items {items} were asked for, expected a list of numbers from 0 to {self.length - 1}")
         words = philox.words(self.seed, numbers, self.epoch, np.arange(3)[:, None], philox.ITEMS)
-        (which, mirror, low), (across, stops, high), (down, _, _), (light, _, _) = words
+        (which, mirror, low), (across, stops, high), (down, veil, _), (light, _, _) = words
         pictures = _below(which, len(self.gallery))
         height, width = self.size
         free = self.gallery.sizes[pictures] - self.size + 1
@@ -240,6 +277,11 @@ class Crops:
         least, most = np.log2(self.exposure)
         gains = np.exp2(least + (most - least) * (stops / 2.0**32))
         seeds = low.astype(np.uint64) | high.astype(np.uint64) << _HALF
+        shares = self.black_point.shares(veil)
+        taken, stretches = None, np.float64(1)
+        if self._blacks is not None:
+            taken = shares[:, None] * self._blacks[lights]
+            stretches = 1 / (1 - taken / self._whites[lights])
         images = draw_batch(
             self._tables,
             self._rows[lights],
@@ -249,6 +291,9 @@ class Crops:
             flips=(mirror >> 31).astype(bool) & self.flip,
             gains=gains,
             seeds=seeds,
+            cells=[self._cells[light] for light in map(int, lights)] if self._cells else None,
+            taken=taken,
+            stretches=stretches,
             threads=self.threads,
             out=self._memory.array((numbers.size, 3, height, width)) if out is None else out,
         )
@@ -259,7 +304,7 @@ class Crops:
             add_noise(
                 images, gains, self.noise, seeds, white_level=white, wanted=wanted, ratio=ratio, threads=self.threads
             )
-        return Batch(images, self._truths[lights], lights, pictures)
+        return Batch(images, self._truths[lights], lights, pictures, shares)
 
     def __getitem__(self, item: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         """Return the image (3, height, width) float32 and the illuminant (3,) float32 of one item.
@@ -280,7 +325,20 @@ def _below(words: npt.NDArray[np.uint32], bound: int | npt.NDArray[np.int64]) ->
     return (words.astype(np.uint64) * np.asarray(bound, dtype=np.uint64) >> _HALF).astype(np.int64)
 
 
-_OPTIONS: Final = ("length", "lights", "exposure", "noise", "iso", "flip", "seed", "epoch", "threads")
+_OPTIONS: Final = (
+    "length",
+    "lights",
+    "exposure",
+    "noise",
+    "iso",
+    "flip",
+    "seed",
+    "epoch",
+    "threads",
+    "rendering",
+    "matrix",
+    "black_point",
+)
 """Keywords of `Crops`, each kept in an attribute of its name."""
 
 
@@ -295,3 +353,33 @@ def _tables_of(lut: Lut, lights: Sequence[Mixture], seed: int) -> tuple[npt.NDAr
     if all(len(mixture.lights) == 1 for mixture in lights):
         return lut.samples, np.array([mixture.lights[0] for mixture in lights], dtype=np.int64)
     return np.stack([mixture.samples(lut, seed) for mixture in lights]), np.arange(len(lights))
+
+
+class _Cells:
+    """For each light the cells that stand for source colours under it, found when they are first asked for."""
+
+    def __init__(self, lut: Lut, lights: Sequence[Mixture], matrix: ColourMatrix | None) -> None:
+        from generator.rendering.colorimetric import ColorimetricRendering
+        from generator.rendering.table_matrix import matrix_for
+
+        self._lights = lights
+        self._bits = lut.provenance.bits
+        self._rendering = ColorimetricRendering(lut, matrix or matrix_for(lut))
+        self._found: dict[int, CellTable] = {}
+
+    def __getitem__(self, light: int) -> CellTable:
+        if light not in self._found:
+            mixtures = self._rendering.mixtures_for(Lighting((self._lights[light],)))
+            self._found[light] = checked_cells(mixtures.cells, self._bits)
+        return self._found[light]
+
+
+def _cells_of(lut: Lut, lights: Sequence[Mixture], rendering: Rendering, matrix: ColourMatrix | None) -> _Cells | None:
+    """Return the cells that stand for source colours; None where codes are those of the print."""
+    if rendering not in get_args(Rendering):
+        raise InputError(f"{rendering!r} is no rendering; use one of {', '.join(get_args(Rendering))}")
+    if rendering == "colorimetric":
+        return _Cells(lut, lights, matrix)
+    if matrix is not None:
+        raise InputError("a colour matrix is for colorimetric rendering; choose that, or leave the matrix out")
+    return None

@@ -31,6 +31,8 @@ _COLOUR_MATRICES = {
     "Canon_EOS_600D": (6461, -907, -882, -4300, 12184, 2378, -819, 1944, 5931),
     "Canon_EOS_200D": (7377, -742, -998, -4235, 11981, 2549, -673, 1918, 5538),
 }
+_LINEAR_SRGB = (32406, -15372, -4986, -9689, 18758, 415, 557, -2040, 10570)
+"""XYZ to linear sRGB (IEC 61966-2-1): neutral things stay neutral for a camera that no converter knows."""
 
 
 def write_dng(
@@ -79,7 +81,7 @@ def write_dng(
         TiffTag.OFFSET_TIME_ORIGINAL: text("+00:00"),
         TiffTag.BODY_SERIAL_NUMBER: text(serial),
     }
-    matrix = _COLOUR_MATRICES[body.sensitivities]
+    matrix = _colour_matrix(body)
     main: Tags = {
         TiffTag.NEW_SUBFILE_TYPE: (ValueType.LONG, [0]),  # the picture itself
         TiffTag.IMAGE_WIDTH: (ValueType.LONG, [columns]),
@@ -125,3 +127,14 @@ def _neutral(matrix: Sequence[int]) -> list[Fraction]:
     white = (Fraction(9505, 10000), Fraction(1), Fraction(10891, 10000))
     seen = [sum(m * w for m, w in zip(matrix[i : i + 3], white, strict=True)) for i in (0, 3, 6)]
     return [Fraction(value) / Fraction(max(seen)) for value in seen]
+
+
+def _colour_matrix(body: Body) -> tuple[int, ...]:
+    """Return XYZ to camera RGB in ten-thousandths: of the known bodies, as LibRaw has it, or that of linear sRGB."""
+    known = _COLOUR_MATRICES.get(body.sensitivities)
+    if known is not None:
+        return known
+    from drivers.raw.camera_matrix import camera_matrix
+
+    rows = camera_matrix(body.camera)
+    return _LINEAR_SRGB if rows is None else tuple(round(10_000 * value) for row in rows for value in row)

@@ -57,7 +57,9 @@ FACTS: Final[Mapping[str, Body]] = MappingProxyType(
 """Bodies by the name of their sensitivities; the EOS 600D has the sensor generation of the EOS 550D, and its facts."""
 
 
-def find_body(camera: str, changes: Mapping[str, Any] = MappingProxyType({}), where: str = "--settings") -> Body:
+def find_body(
+    camera: str, changes: Mapping[str, Any] = MappingProxyType({}), where: str = "--settings", key: str = "camera"
+) -> Body:
     """Return the body that a name or a file of sensitivities stands for.
 
     Parameters
@@ -70,6 +72,8 @@ def find_body(camera: str, changes: Mapping[str, Any] = MappingProxyType({}), wh
         and `pixels` given instead, columns and rows that see light.
     where
         What the changes were read from, for messages.
+    key
+        Where they stand there.
 
     Raises
     ------
@@ -81,23 +85,23 @@ def find_body(camera: str, changes: Mapping[str, Any] = MappingProxyType({}), wh
     body = BODIES.get(camera) or _of_sensitivities(camera, read_sensitivities(camera))
     given = dict(changes)
     known = [field.name for field in fields(Body)] + ["pixels"]
-    for key in given:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
             hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-            raise ConfigurationError(f"{where}: unknown key 'camera.{key}'; {hint}")
+            raise ConfigurationError(f"{where}: unknown key '{key}.{name}'; {hint}")
     pixels = given.pop("pixels", None)
     if pixels is not None:
-        given = _areas(pixels, where) | given
+        given = _areas(pixels, where, key) | given
     try:
         changed = TypeAdapter(Body).validate_python(
             {field.name: given.get(field.name, getattr(body, field.name)) for field in fields(Body)}
         )
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(["camera", *(str(part) for part in first["loc"][:1])])
-        raise ConfigurationError(f"{where}: {key}: {first['msg']}, got {first['input']!r}") from error
-    _require_sensor(changed, where)
+        at = ".".join([key, *(str(part) for part in first["loc"][:1])])
+        raise ConfigurationError(f"{where}: {at}: {first['msg']}, got {first['input']!r}") from error
+    _require_sensor(changed, where, key)
     return changed
 
 
@@ -108,16 +112,16 @@ def _of_sensitivities(camera: str, found: Sensitivities) -> Body:
     return replace(usual, maker=found.maker or "unknown", model=found.camera, sensitivities=camera)
 
 
-def _areas(pixels: Any, where: str) -> dict[str, Any]:
+def _areas(pixels: Any, where: str, key: str) -> dict[str, Any]:
     """Return sensor, visible and masked areas for so many columns and rows that see light."""
     try:
         width, height = TypeAdapter(tuple[int, int]).validate_python(pixels)
     except ValidationError as error:
         raise ConfigurationError(
-            f"{where}: camera.pixels = {pixels!r}: two whole numbers expected, columns and rows, such as [5184, 3456]"
+            f"{where}: {key}.pixels = {pixels!r}: two whole numbers expected, columns and rows, such as [5184, 3456]"
         ) from error
     if min(width, height) < 16:
-        raise ConfigurationError(f"{where}: camera.pixels = {pixels!r}: at least 16 columns and rows expected")
+        raise ConfigurationError(f"{where}: {key}.pixels = {pixels!r}: at least 16 columns and rows expected")
     top, left = _BORDER
     sensor = height + top, width + left
     return {
@@ -127,7 +131,7 @@ def _areas(pixels: Any, where: str) -> dict[str, Any]:
     }
 
 
-def _require_sensor(body: Body, where: str) -> None:
+def _require_sensor(body: Body, where: str, key: str) -> None:
     """Refuse numbers that no sensor has."""
     top = 2**body.bits - 1
     limits = (
@@ -145,4 +149,4 @@ def _require_sensor(body: Body, where: str) -> None:
     )
     for name, value, allowed, expected in limits:
         if not allowed:
-            raise ConfigurationError(f"{where}: camera.{name} is {value:g}; {expected} expected")
+            raise ConfigurationError(f"{where}: {key}.{name} is {value:g}; {expected} expected")

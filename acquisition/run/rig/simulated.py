@@ -33,6 +33,8 @@ from sim.clock import OPENING, SimulatedClock
 from sim.projectors.pjlink import PjLinkPeer, memory_link
 from sim.projectors.projector import SimulatedProjector
 from sim.projectors.screen import Screen, SimulatedPresenter
+from sim.spectral.sensitivities import known_sensitivities
+from sim.world.body_settings import find_body
 from sim.world.drawing import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES, Body
@@ -76,7 +78,9 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
         film = ReplayFilm(_recording(settings.replay.session), lambda: screen.colour, exposed)
         film.accept(settings.camera.exposure)
     # On mains power, as a camera that takes 707 frames is.
-    body = replace(EOS_BODIES[settings.simulated.body], shots_per_charge=10**9)
+    # A body of sensitivities alone speaks as an EOS 550D does: only what its sensor sees is its own.
+    spoken = EOS_BODIES.get(settings.simulated.body, EOS_BODIES["EOS 550D"])
+    body = replace(spoken, shots_per_charge=10**9)
     eos = SimulatedEos(body, film, clock, serial=SERIAL, auto_power_off_s=0)
     peer = PjLinkPeer(simulated)
     projector = PjLinkProjector(lambda: memory_link(peer))
@@ -102,10 +106,11 @@ def simulated_body(settings: LabSettings) -> Body:
     ConfigurationError
         There is no such body.
     """
-    name = settings.simulated.body
-    if name not in BODIES:
-        raise ConfigurationError(f"{settings.file}: simulated.body = {name!r}: known are {', '.join(sorted(BODIES))}")
-    return BODIES[name]
+    name, changes = settings.simulated.body, settings.simulated.camera or {}
+    if name not in BODIES and name not in known_sensitivities() and not Path(name).is_file():
+        known = ", ".join([*sorted(BODIES), *known_sensitivities()])
+        raise ConfigurationError(f"{settings.file}: simulated.body = {name!r}: known are {known}")
+    return find_body(name, changes, settings.file, "simulated.camera")
 
 
 def simulated_room(settings: LabSettings) -> Room:

@@ -28,8 +28,10 @@ from generator.dataset.production.records import (
     SUMS,
     TRUTHS,
     Description,
+    Details,
     ImageRecord,
     Light,
+    RenderingSummary,
     ShardRecord,
     Skipped,
     SourceRecord,
@@ -44,6 +46,32 @@ from generator.stores.store import Store
 
 class NothingMadeError(FormatError):
     """None of the sources can be read, so there is no dataset."""
+
+
+class _RenderingSums:
+    """Adds up how images were rendered."""
+
+    def __init__(self) -> None:
+        self._sums = dict.fromkeys(("images", "pixels", "black_taken", "outside", "distance"), 0.0)
+
+    def add(self, details: Details, pixels: int) -> None:
+        """Add what is recorded of an image of so many pixels."""
+        self._sums["images"] += 1
+        self._sums["black_taken"] += float(details.get("black_taken", 0))
+        if "cells" in details:
+            self._sums["pixels"] += pixels
+            for name in ("outside", "distance"):
+                self._sums[name] += pixels * float(details[name])
+
+    def summary(self) -> RenderingSummary:
+        """Return means over pixels and images."""
+        by_colour = {
+            name: round(self._sums[name] / self._sums["pixels"], 6)
+            for name in ("outside", "distance")
+            if self._sums["pixels"]
+        }
+        black_taken = round(self._sums["black_taken"] / max(self._sums["images"], 1), 6)
+        return RenderingSummary(**by_colour, black_taken=black_taken)
 
 
 class _ListedFile:
@@ -90,6 +118,7 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
     skipped: list[Skipped] = []
     used: dict[int, Light] = {}
     details: _ListedFile | None = None
+    rendered = _RenderingSums()
     with ExitStack() as stack:
         truths = _ListedFile(stack, place.files, TRUTHS)
         table = _ListedFile(stack, place.files, GROUND_TRUTH)
@@ -116,6 +145,7 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
                 table.write(_image_rows(name, source.name, image))
                 truths.write("{:.9f} {:.9f} {:.9f}\n".format(*image.truth))
                 if image.details:
+                    rendered.add(image.details, source.width * source.height)
                     if details is None:
                         details = _ListedFile(stack, place.files, IMAGES)
                         details.write(_row(("image", *image.details)))
@@ -145,6 +175,7 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
             splits={part: splits[part] for part in parts},
             lights=[used[light] for light in sorted(used)],
             skipped=skipped,
+            rendering=rendered.summary() if {"rendering", "black_point"} & options.keys() else None,
         )
         text = (description.model_dump_json(indent=2) + "\n").encode()
         written = [table, truths, listed, *parts.values()]

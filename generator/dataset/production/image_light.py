@@ -58,8 +58,8 @@ def image_light(
     tints
         Whether its light falls off with a tint; then it is one light.
     """
-    from generator.kernels.whites import mean_weights
     from generator.masks.maps import encode_maps
+    from generator.masks.whites import mean_weights
 
     labels = [mixture.label for mixture in lighting.mixtures]
     whites = lighting.whites(lut)

@@ -4,15 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from foundation.errors import InputError
 from generator.dataset.production.records import Layout
 from generator.files.formats import FORMATS, Format
+from generator.rendering.black_points import BlackPoint
+from generator.rendering.matrices import ColourMatrix
 from generator.variation.variation import NO_VARIATION, Variation
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
 
 SHARD_IMAGES: Final = 256
 """Images of a shard unless said otherwise: all that a kill can cost, for each shard that was being made."""
+
+Rendering = Literal["codes", "colorimetric"]
+RENDERING: Final[Rendering] = "codes"
+"""Rendering unless said otherwise: the paper's."""
+RENDERING_VERSION: Final = 1
+"""Of colorimetric rendering: rises when its rules change, so that other pixels come of the same options."""
+KEEP: Final = BlackPoint()
+"""The print's black is kept."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +52,13 @@ class DatasetOptions:
         How sources were read, as plain values; recorded only.
     weighted
         Whether sources were drawn by weights, which are recorded of each image.
+    rendering
+        ``"codes"``: codes of a picture are those of the print, the paper's way; ``"colorimetric"``: the print shows
+        the camera the picture's colours.
+    matrix
+        Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
+    black_point
+        What becomes of the print's black.
 
     Raises
     ------
@@ -63,16 +83,44 @@ class DatasetOptions:
     crops: int = 1
     reading: Mapping[str, Any] = field(default_factory=dict[str, Any])
     weighted: bool = False
+    rendering: Rendering = RENDERING
+    matrix: ColourMatrix | None = None
+    black_point: BlackPoint = KEEP
 
     @property
     def has_details(self) -> bool:
         """Whether options do something to each image that is recorded of it: `images.csv` lists it then."""
-        return self.variation.is_on or self.crops > 1 or self.weighted
+        return self.variation.is_on or self.crops > 1 or self.weighted or self.is_rendered
+
+    @property
+    def is_rendered(self) -> bool:
+        """Whether images are not rendered by codes with the print's black kept."""
+        return self.rendering != "codes" or self.black_point.kind != "keep"
+
+    def describe_rendering(self, lut: Lut) -> dict[str, Any]:
+        """Return how images are rendered as plain values; nothing for codes with the print's black kept."""
+        from generator.rendering.table_matrix import matrix_for
+
+        described: dict[str, Any] = {}
+        if self.rendering == "colorimetric":
+            used = self.matrix or matrix_for(lut)
+            rows = [[float(part) for part in row] for row in used.rows]
+            matrix = {"name": used.name, "source": used.source, "rows": rows}
+            described["rendering"] = {"name": self.rendering, "version": RENDERING_VERSION, "matrix": matrix}
+        if self.black_point.kind != "keep":
+            described["black_point"] = self.black_point.label
+        return described
 
     def __post_init__(self) -> None:
-        for what, value, known in (("format", self.form, FORMATS), ("layout", self.layout, get_args(Layout))):
+        for what, value, known in (
+            ("format", self.form, FORMATS),
+            ("layout", self.layout, get_args(Layout)),
+            ("rendering", self.rendering, get_args(Rendering)),
+        ):
             if value not in known:
                 raise InputError(f"{value!r} is no {what} of a dataset; use one of {', '.join(known)}")
+        if self.rendering == "codes" and self.matrix is not None:
+            raise InputError("a colour matrix is for colorimetric rendering; choose that, or leave the matrix out")
         if self.shard_images < 1:
             raise InputError(f"shards of {self.shard_images} images were asked for, expected 1 or more")
         if self.crops < 1:

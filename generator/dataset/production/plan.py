@@ -162,6 +162,7 @@ class Plan:
             "format": options.form,
             "layout": options.layout,
             **options.reading,
+            **options.describe_rendering(self.lut),
             "lights": self.choice.describe(),
             "previews": options.previews,
             "split": dict(zip(SPLITS, options.split, strict=True)) if options.split else None,

@@ -148,6 +148,23 @@ class FileSum(_Record):
     sha256: str
 
 
+class RenderingSummary(_Record):
+    """How the images of a dataset were rendered, where that is not by codes with the print's black kept.
+
+    Attributes
+    ----------
+    outside, distance
+        Means over all pixels of the columns of `images.csv`: the share of colours that the print cannot show, and by
+        how many degrees they are missed. None where images were rendered by codes.
+    black_taken
+        Mean over all images of the share of the print's black that was taken out.
+    """
+
+    outside: float | None = None
+    distance: float | None = None
+    black_taken: float = 0.0
+
+
 class ShardRecord(_Record):
     """What a shard made; images and files in the order of their numbers, sources in that of their positions.
 
@@ -179,6 +196,8 @@ class Description(_Record):
         The lights of the table that were used, alone or mixed.
     skipped
         Sources that could not be read.
+    rendering
+        How images were rendered; None by codes with the print's black kept.
     """
 
     format: Literal["crop.dataset"] = FORMAT
@@ -196,6 +215,12 @@ class Description(_Record):
     splits: dict[str, int] = {}
     lights: list[Light]
     skipped: list[Skipped]
+    rendering: RenderingSummary | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave `rendering` out where there is none: datasets are then described as before it was known."""
+        return {key: value for key, value in handler(self).items() if key != "rendering" or value is not None}
 
 
 @dataclass(frozen=True, slots=True)

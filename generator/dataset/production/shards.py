@@ -10,7 +10,6 @@ Rules that hold inside:
 
 from __future__ import annotations
 
-import math
 import threading
 from collections import deque
 from collections.abc import Generator
@@ -21,13 +20,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-import numpy.typing as npt
-
 from foundation.errors import FormatError, InputError
 from generator.dataset.production.image_light import image_light
 from generator.dataset.production.layouts.by_name import open_writer
 from generator.dataset.production.layouts.samples import Sample, ShardWriter
+from generator.dataset.production.photographing import photograph
 from generator.dataset.production.plan import ShardJob, light_of, split_of, versions
 from generator.dataset.production.records import (
     Details,
@@ -39,7 +36,7 @@ from generator.dataset.production.records import (
 from generator.dataset.production.workers import SILENT, Callbacks
 from generator.dataset.production.workplace import Workplace
 from generator.lights.lighting import Lighting
-from generator.pictures.picture import Cut, Picture
+from generator.pictures.picture import Cut
 from generator.pictures.sources import Source
 from generator.stores.store import Pieces
 
@@ -49,12 +46,13 @@ if TYPE_CHECKING:
 LARGEST_COUNT: Final = 65535
 """Largest value of 16 bits."""
 
-_threads = threading.local()
-
 
 @dataclass(frozen=True)
 class _ReadSource:
-    """The crops of a source, sRGB codes that the table has samples of, or all of it, and what is recorded of it."""
+    """The crops of a source, or all of it, and what is recorded of it.
+
+    Where sRGB codes are those of the print, they are codes that the table has samples of.
+    """
 
     cuts: tuple[Cut, ...]
     record: SourceRecord
@@ -238,7 +236,11 @@ def _read(job: ShardJob, lut: Lut, place: int) -> _ReadSource:
             f"{source.name} has {max(1, len(whole))} crops, expected {job.options.crops}; give the preparation of "
             "pictures and the options of the dataset the same number, and leave random scenes out"
         )
-    fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in whole]
+    if job.options.rendering == "codes":
+        fit = [replace_unfit_colours(cut.picture, lut.provenance) for cut in whole]
+    else:
+        # Mixtures of cells hold fit ones alone.
+        fit = [(cut.picture, 0) for cut in whole]
     height, width = scene.picture.shape[:2]
     least = smallest_side(job.options.form)
     if min(height, width) < least:
@@ -272,7 +274,7 @@ def _make(
     white_level = lut.provenance.white_level
     # What exceeds saturation may be below it once it is exposed anew, and is cut then.
     most = LARGEST_COUNT if options.variation.is_on else white_level
-    image, weights = _photograph(lut, cut.picture, lighting, job.seed, number, most)
+    image, weights, rendered = photograph(lut, cut.picture, lighting, options, job.seed, number, most)
     varied = options.variation.apply(image, white_level, job.seed, number)
     light = image_light(lut, lighting, weights, varied, options.variation.tints)
     metadata = ImageMetadata(white_level, light.truth, lut.provenance.camera)
@@ -290,36 +292,6 @@ def _make(
         position=source.record.position,
         truth=light.truth,
         lights=light.rows,
-        details=details | varied.details,
+        details=details | rendered | varied.details,
     )
     return writer.store(Sample(record, source.record.name, source.record.split, width, height, tuple(files)))
-
-
-def _photograph(
-    lut: Lut, picture: Picture, lighting: Lighting, seed: int, number: int, white_level: int
-) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.float32] | None]:
-    """Return the raw image (H, W, 3) uint16, and of several lights the weights (H, W, K) of each in each pixel."""
-    from generator.kernels.mixing import mix_samples
-    from generator.kernels.rendering import draw_samples
-
-    # The hash of the table stands for its samples in the dataset's description.
-    for mixture in lighting.mixtures:
-        for light in mixture.lights:
-            lut.require_unchanged(light)
-    tables = [mixture.samples(lut, seed, picture) for mixture in lighting.mixtures]
-    if lighting.masks is None:
-        return draw_samples(tables[0], picture, seed=seed, image=number, out=_reused(picture.shape)), None
-    weights = lighting.weights_of(*picture.shape[:2])
-    return mix_samples(tables, picture, weights, white_level=white_level, seed=seed, image=number), weights
-
-
-def _reused(shape: tuple[int, ...]) -> npt.NDArray[np.uint16]:
-    """Return an array uint16 of any content in memory of the calling thread, which its next call overwrites.
-
-    Fresh pages take as long to map as the drawing into them.
-    """
-    size = math.prod(shape)
-    memory: npt.NDArray[np.uint16] | None = getattr(_threads, "memory", None)
-    if memory is None or memory.size < size:
-        _threads.memory = memory = np.empty(size, np.uint16)
-    return memory[:size].reshape(shape)

@@ -7,13 +7,18 @@ from pathlib import Path
 import pytest
 
 from acquisition.chart.layout import design_chart
-from acquisition.config import LabSettings, load_lab, parse_lab
+from acquisition.config import LabSettings, SimulatedSettings, load_lab, parse_lab
+from acquisition.lights.illuminations import plan_illuminations, save_illuminations
 from acquisition.run.rig.attached import attached_devices
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.rig.simulated import simulated_body, simulated_room
+from acquisition.run.run import run_session
+from acquisition.session.folder import Session
+from drivers.raw.rawfile import read_raw
 from foundation.clock import Clock
 from foundation.errors import ConfigurationError
 from sim.projectors.screen import Screen, SimulatedPresenter
+from sim.world.body_settings import FACTS
 
 HEAD = 'rig = "simulated"\nchart = "c.json"\nilluminations = "l.csv"\n'
 
@@ -60,6 +65,37 @@ def test_the_file_that_is_wrong_is_named(tmp_path: Path) -> None:
 def test_an_unknown_body_is_named_with_the_known_ones() -> None:
     with pytest.raises(ConfigurationError, match="EOS 550D, EOS 6D Mark II"):
         simulated_body(settings('[simulated]\nbody = "EOS 7D"\n'))
+
+
+def test_a_body_may_be_sensitivities_and_facts() -> None:
+    text = '[simulated]\nbody = "Canon_EOS_5DS"\n[simulated.camera]\npixels = [800, 556]\nelectrons_per_dn = 2.0\n'
+    body = simulated_body(settings(text))
+    assert (body.camera, body.sensitivities, body.half_size) == ("Canon EOS 5DS", "Canon_EOS_5DS", (278, 400))
+    assert body.electrons_per_dn == 2.0
+    with pytest.raises(ConfigurationError, match=r"^LAB.toml: unknown key 'simulated\.camera\.gain'"):
+        simulated_body(settings("[simulated.camera]\ngain = 2.0\n"))
+
+
+@pytest.mark.slow
+def test_a_session_taken_with_such_a_body_is_its(tmp_path: Path) -> None:
+    design_chart(1, (148, 105)).save(tmp_path / "chart.json")
+    save_illuminations(plan_illuminations(0, (3000, 6000)), tmp_path / "lights.csv")
+    lab = LabSettings(
+        rig="simulated",
+        chart=tmp_path / "chart.json",
+        illuminations=tmp_path / "lights.csv",
+        simulated=SimulatedSettings(body="Canon_EOS-1Ds_Mark_III", camera={"pixels": [800, 556]}),
+    )
+    run_session(lab, tmp_path / "session", lambda done, total: None)
+    with Session.open(tmp_path / "session") as session:
+        frames = [frame for frame in session.frames() if frame.kind == "light"]
+        assert len(frames) == 2
+        mosaic = read_raw(session.folder / frames[0].file)
+    assert mosaic.camera == "Canon EOS-1Ds Mark III"
+    assert mosaic.counts.shape == (556, 800)
+    black = mosaic.masked_black()
+    assert black is not None
+    assert black == pytest.approx(FACTS["Canon_EOS-1Ds_Mark_III"].black, abs=1)
 
 
 def test_an_imported_session_cannot_be_taken() -> None:

@@ -119,6 +119,17 @@ def test_greys_are_grey_under_mixtures_of_lights_and_several_lights(make_table: 
     np.testing.assert_array_equal(rendering.mixtures_for(lighting).cells, mixtures.cells)
 
 
+def test_greys_are_mixed_anew_for_a_mixture_of_unlike_lights(make_table: MakeTable) -> None:
+    lut = make_table(bits=4, tint=0.15, blue_of_green=0.8)
+    matrix = ColourMatrix("mine", MATRIX, "")
+    mixture = Mixture((0, 2), (0.8, 0.2))
+    seen = mixture.samples(lut).mean(axis=1) / mixture.white(lut)
+    by_one = [colorimetric_mixtures(lut, light, matrix).cells[GREYS] for light in range(3)]
+    assert min(angles_deg(seen[cells].mean(axis=1), np.ones(3)).max() for cells in by_one) > 0.7
+    own = colorimetric_mixtures(lut, mixture, matrix).cells[GREYS]
+    assert angles_deg(seen[own].mean(axis=1), np.ones(3)).max() < 0.5
+
+
 def test_several_lights_count_alike_however_bright(make_table: MakeTable) -> None:
     lut = make_table(bits=1)
     rendering = ColorimetricRendering(lut, ColourMatrix("mine", MATRIX, ""))

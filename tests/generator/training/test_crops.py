@@ -6,6 +6,7 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,11 +17,14 @@ from foundation.errors import FormatError, InputError
 from generator.lights.lighting import Mixture
 from generator.pictures.picture import Picture
 from generator.pictures.sources import random_scenes
+from generator.rendering.black_points import BlackPoint, veil_of
+from generator.rendering.matrices import ColourMatrix
 from generator.training.crops import Crops
 from generator.training.gallery import Gallery, gallery_of, open_gallery, save_gallery
 from tests.generator.conftest import MakeLut
 
 BITS = 2
+MATRIX = ColourMatrix("mine", np.array([[0.6, 0.3, 0.1], [0.1, 0.7, 0.2], [0.05, 0.25, 0.7]]), "a test")
 
 
 def ramp(height: int, width: int) -> Picture:
@@ -205,3 +209,38 @@ except ImportError as error:
 def test_pytorch_that_is_missing_is_an_import_error_and_named() -> None:
     done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH], capture_output=True, text=True, check=False)
     assert (done.stdout, done.stderr) == ("training batches for PyTorch need it: pip install 'croplab[torch]'\n", "")
+
+
+def test_crops_by_colour_are_windows_of_the_image_that_is_rendered_so(
+    make_lut: MakeLut, gallery: Gallery, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    lut = make_lut(bits=BITS)
+    black_point = BlackPoint("random")
+    options: dict[str, Any] = {"lights": [1, 3], "length": 30, "seed": 8, "matrix": MATRIX}
+    crops = Crops(lut, gallery, (7, 8), rendering="colorimetric", black_point=black_point, **options)
+    batch = crops.batch(np.arange(30))
+    kept = Crops(lut, gallery, (7, 8), rendering="colorimetric", **options).batch(np.arange(30))
+    by_codes = Crops(lut, gallery, (7, 8), lights=[1, 3], length=30, seed=8).batch(np.arange(30))
+    np.testing.assert_array_equal(batch.illuminants, by_codes.illuminants)
+    np.testing.assert_array_equal(batch.lights, by_codes.lights)
+    assert (kept.images != by_codes.images).mean() > 0.5
+    assert not kept.black_taken.any()
+    assert 0 < batch.black_taken.min() < batch.black_taken.max() < 0.97
+    level = lut.provenance.white_level
+    for image, before, light, share in zip(batch.images, kept.images, batch.lights, batch.black_taken, strict=True):
+        veil = veil_of(lut, crops.lights[int(light)], float(share))
+        wanted = (before.astype(np.float64) * level - veil.taken[:, None, None]) * veil.stretch[:, None, None] / level
+        np.testing.assert_allclose(image, wanted, atol=2e-6)
+    again = pickle.loads(pickle.dumps(crops)).batch(np.arange(30))
+    np.testing.assert_array_equal(again.images, batch.images)
+    for part in ([29, 3], [3]):
+        np.testing.assert_array_equal(crops.batch(part).images, batch.images[part])
+
+
+def test_renderings_that_cannot_be_are_named(make_lut: MakeLut, gallery: Gallery) -> None:
+    lut = make_lut(bits=BITS)
+    with pytest.raises(InputError, match="'inks' is no rendering; use one of codes, colorimetric"):
+        Crops(lut, gallery, (5, 6), rendering="inks")  # pyright: ignore[reportArgumentType] - the fault under test
+    with pytest.raises(InputError, match="a colour matrix is for colorimetric rendering"):
+        Crops(lut, gallery, (5, 6), matrix=MATRIX)

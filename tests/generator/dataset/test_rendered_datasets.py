@@ -1,0 +1,254 @@
+"""Datasets rendered by colour, and without the print's black: what is in them, what is recorded, who makes them."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import pytest
+
+from foundation.errors import InputError
+from generator.dataset.making import finish_dataset, generate_dataset, make_share
+from generator.dataset.production.options import DatasetOptions
+from generator.dataset.production.plan import Plan
+from generator.dataset.production.shards import make_shard
+from generator.dataset.production.workplace import workplace
+from generator.dataset.reader import open_dataset
+from generator.kernels.dithering import dither
+from generator.kernels.mixing import mix_samples
+from generator.kernels.rendering import draw_samples
+from generator.lights.choices import ListedLights
+from generator.lights.lighting import Lighting, Mixture, plain
+from generator.lights.request import LightRequest
+from generator.pictures.sources import find_pictures
+from generator.rendering.black_points import BlackPoint, veil_of, without_veil
+from generator.rendering.colorimetric import ColorimetricRendering
+from generator.rendering.matrices import ColourMatrix
+
+if TYPE_CHECKING:
+    from calibration.table.lut import Lut
+    from tests.generator.conftest import MakeLut
+
+MATRIX = ColourMatrix("mine", np.array([[0.6, 0.3, 0.1], [0.1, 0.7, 0.2], [0.05, 0.25, 0.7]]), "a test")
+BY_COLOUR = DatasetOptions(rendering="colorimetric", matrix=MATRIX, black_point=BlackPoint("random"), previews=False)
+
+BY_CODES = "0d79ec9438b4255ee6852ce3fe2b00713a20332b0d2d3210c9fdf5ed8323ddc6"
+"""Of the first image of `made` by codes, as it was before there was any other rendering."""
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    rng = np.random.default_rng(2)
+    for name, shape in (("a.png", (40, 70, 3)), ("b.png", (51, 38, 3)), ("c.png", (36, 100, 3))):
+        codes = rng.integers(0, 256, shape).astype(np.uint8)
+        (folder / name).write_bytes(cv2.imencode(".png", codes)[1].tobytes())
+    return folder
+
+
+def made(lut: Lut, pictures: Path, out: Path, options: DatasetOptions, **more: Any) -> dict[str, str]:
+    """Make a dataset under lights 1 and 2 and return the hash of every file."""
+    generate_dataset(lut, out, find_pictures(pictures), [1, 2], seed=5, options=options, **more)
+    return {
+        path.relative_to(out).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in out.rglob("*")
+        if path.is_file()
+    }
+
+
+def rows_of(out: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader((out / "images.csv").read_text().splitlines()))
+
+
+def test_an_image_is_drawn_from_its_code_picture_without_a_share_of_black(
+    make_lut: MakeLut, pictures: Path, tmp_path: Path
+) -> None:
+    lut = make_lut(bits=3)
+    made(lut, pictures, tmp_path / "codes", DatasetOptions(previews=False))
+    made(lut, pictures, tmp_path / "colours", BY_COLOUR)
+    of_codes, dataset = open_dataset(tmp_path / "codes"), open_dataset(tmp_path / "colours")
+    rendering = ColorimetricRendering(lut, MATRIX)
+    sources = {source.name: source.read().picture for source in find_pictures(pictures)}
+    rows = rows_of(tmp_path / "colours")
+    assert dataset.details == {row["image"]: {key: row[key] for key in row if key != "image"} for row in rows}
+    for number, (entry, before, row) in enumerate(zip(dataset.entries, of_codes.entries, rows, strict=True)):
+        light = plain(int(entry.lights[0]))
+        share = BY_COLOUR.black_point.share(5, number)
+        mixtures = rendering.mixtures_for(Lighting((light,)))
+        cells = mixtures.cells
+        assert row["cells"] == hashlib.sha256(cells.tobytes()).hexdigest()[:16]
+        codes = dither(sources[entry.source], cells, 3, 5, number)
+        samples = without_veil(light.samples(lut), veil_of(lut, light, share), lut.provenance.white_level)
+        np.testing.assert_array_equal(dataset.read_image(entry), draw_samples(samples, codes, seed=5, image=number))
+        assert float(row["black_taken"]) == pytest.approx(share, abs=1e-8)
+        assert 0 <= float(row["outside"]) <= 1
+        assert float(row["distance"]) >= 0
+        assert row["image"] == entry.image
+        # The ground truth is the light's, whatever becomes of the print.
+        assert (entry.truth, entry.truths) == (before.truth, before.truths)
+    made_of = dataset.description
+    assert made_of.options["rendering"] == {
+        "name": "colorimetric",
+        "version": 1,
+        "matrix": {"name": "mine", "source": "a test", "rows": MATRIX.rows.tolist()},
+    }
+    assert made_of.options["black_point"] == "random:0.97"
+    assert made_of.rendering is not None
+    pixels = [sources[entry.source].size for entry in dataset.entries]
+    for name in ("outside", "distance"):
+        mean = np.average([float(row[name]) for row in rows], weights=pixels)
+        assert getattr(made_of.rendering, name) == pytest.approx(mean, abs=1e-6)
+
+
+def test_by_codes_with_black_kept_a_dataset_says_nothing_of_rendering(
+    make_lut: MakeLut, pictures: Path, tmp_path: Path
+) -> None:
+    files = made(make_lut(), pictures, tmp_path / "out", DatasetOptions())
+    assert "images.csv" not in files
+    described = json.loads((tmp_path / "out" / "dataset.json").read_text())
+    assert "rendering" not in described
+    assert not {"rendering", "black_point", "matrix"} & described["options"].keys()
+    assert open_dataset(tmp_path / "out").description.rendering is None
+    image = open_dataset(tmp_path / "out").read_image(open_dataset(tmp_path / "out").entries[0])
+    assert hashlib.sha256(image.tobytes()).hexdigest() == BY_CODES
+
+
+def test_black_alone_is_recorded_and_needs_no_profile(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
+    lut = make_lut()
+    made(lut, pictures, tmp_path / "out", DatasetOptions(black_point=BlackPoint("compensate")))
+    dataset = open_dataset(tmp_path / "out")
+    assert rows_of(tmp_path / "out")[0] == {"image": "000000.png", "black_taken": "1"}
+    assert dataset.description.rendering is not None
+    assert (dataset.description.rendering.black_taken, dataset.description.rendering.outside) == (1, None)
+    made(lut, pictures, tmp_path / "kept", DatasetOptions())
+    before = open_dataset(tmp_path / "kept")
+    for one, other in zip(dataset.entries, before.entries, strict=True):
+        assert dataset.read_image(one).mean() < before.read_image(other).mean()
+
+
+def test_workers_shards_shares_and_other_processes_change_no_byte(
+    make_lut: MakeLut, pictures: Path, tmp_path: Path
+) -> None:
+    lut = make_lut()
+    one = made(lut, pictures, tmp_path / "one", BY_COLOUR, workers=1)
+    assert made(lut, pictures, tmp_path / "three", BY_COLOUR, workers=3) == one
+    plan = Plan(lut, find_pictures(pictures), ListedLights((1, 2)), 5, BY_COLOUR)
+    job = pickle.loads(pickle.dumps(plan.job(0)))
+    out = tmp_path / "shares"
+    with workplace(out, plan.identity(), alone=False) as place, ThreadPoolExecutor(1) as pool:
+        make_shard(job, lut, place, pool, 1)
+    make_share(plan, out, (0, 1))
+    finish_dataset(out)
+    assert {name: one[name] for name in ("images.csv", "dataset.json", "images/000003.png")} == {
+        name: hashlib.sha256((out / name).read_bytes()).hexdigest()
+        for name in ("images.csv", "dataset.json", "images/000003.png")
+    }
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        DatasetOptions(previews=False),
+        DatasetOptions(previews=False, rendering="colorimetric", matrix=MATRIX),
+        DatasetOptions(
+            previews=False,
+            rendering="colorimetric",
+            matrix=ColourMatrix("mine", MATRIX.rows[::-1].copy(), "a test"),
+            black_point=BlackPoint("random"),
+        ),
+    ],
+)
+def test_work_that_was_begun_with_another_rendering_is_refused(
+    make_lut: MakeLut, pictures: Path, tmp_path: Path, other: DatasetOptions
+) -> None:
+    lut = make_lut()
+    sources, lights = find_pictures(pictures), ListedLights((1, 2))
+    make_share(Plan(lut, sources, lights, 5, BY_COLOUR), tmp_path / "out", (0, 1))
+    with pytest.raises(InputError, match=r"was begun with another plan \(options (rendering|black_point)"):
+        make_share(Plan(lut, sources, lights, 5, other), tmp_path / "out", (0, 1))
+
+
+def test_several_lights_see_the_same_cell_of_a_pixel(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
+    lut = make_lut(bits=3)
+    choice = LightRequest(random=1, lights_per_image=2, masks="half-plane").choose(lut, 5)
+    sources = find_pictures(pictures)
+    plan_options = DatasetOptions(rendering="colorimetric", matrix=MATRIX, black_point=BlackPoint("compensate"))
+    dataset = generate_dataset(lut, tmp_path / "out", sources, choice, seed=5, options=plan_options)
+    rendering = ColorimetricRendering(lut, MATRIX)
+    for number, (entry, source) in enumerate(zip(dataset.entries, sources, strict=True)):
+        lighting = choice.lightings_of(number)[0]
+        cells = rendering.mixtures_for(lighting).cells
+        codes = dither(source.read().picture, cells, 3, 5, number)
+        level = lut.provenance.white_level
+        tables = [
+            without_veil(mixture.samples(lut, 5), veil_of(lut, mixture, 1.0), level) for mixture in lighting.mixtures
+        ]
+        weights = dataset.read_weights(entry)
+        wanted = mix_samples(tables, codes, weights, white_level=level, seed=5, image=number)
+        np.testing.assert_array_equal(dataset.read_image(entry), wanted)
+        np.testing.assert_allclose(
+            dataset.read_ground_truth_map(entry), lighting.ground_truth_map(lut, weights), atol=2e-5
+        )
+
+
+@pytest.mark.parametrize("layout", ["webdataset", "parquet"])
+def test_images_in_shards_are_those_of_files_and_say_how_they_were_rendered(
+    make_lut: MakeLut, pictures: Path, tmp_path: Path, layout: Any
+) -> None:
+    lut = make_lut()
+    made(lut, pictures, tmp_path / "files", BY_COLOUR)
+    options = DatasetOptions(rendering="colorimetric", matrix=MATRIX, black_point=BlackPoint("random"), layout=layout)
+    made(lut, pictures, tmp_path / "shards", options)
+    files, shards = open_dataset(tmp_path / "files"), open_dataset(tmp_path / "shards")
+    for one, other in zip(files.entries, shards.entries, strict=True):
+        np.testing.assert_array_equal(files.read_image(one), shards.read_image(other))
+    assert files.details == shards.details
+    assert files.description.rendering == shards.description.rendering
+
+
+def test_a_raw_file_holds_the_sites_of_the_image(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
+    import rawpy
+
+    lut = make_lut()
+    made(lut, pictures, tmp_path / "png", BY_COLOUR)
+    options = DatasetOptions(
+        rendering="colorimetric", matrix=MATRIX, black_point=BlackPoint("random"), form="dng", previews=False
+    )
+    made(lut, pictures, tmp_path / "dng", options)
+    image = open_dataset(tmp_path / "png").read_image(open_dataset(tmp_path / "png").entries[0])
+    with rawpy.imread(str(tmp_path / "dng" / "images" / "000000.dng")) as raw:
+        sites = raw.raw_image.copy()
+    np.testing.assert_array_equal(sites[0::2, 0::2], image[0::2, 0::2, 0])
+    np.testing.assert_array_equal(sites[1::2, 1::2], image[1::2, 1::2, 2])
+
+
+def test_a_mixture_of_lights_has_the_black_of_the_mixture(make_lut: MakeLut, pictures: Path, tmp_path: Path) -> None:
+    lut = make_lut()
+    mixture = Mixture((0, 3), (0.25, 0.75))
+    options = DatasetOptions(black_point=BlackPoint("compensate"))
+    request = LightRequest(light=(mixture.label,)).choose(lut, 5)
+    dataset = generate_dataset(lut, tmp_path / "out", find_pictures(pictures), request, seed=5, options=options)
+    picture = next(iter(find_pictures(pictures))).read().picture
+    samples = without_veil(mixture.samples(lut, 5), veil_of(lut, mixture, 1.0), lut.provenance.white_level)
+    image = dataset.read_image(dataset.entries[0])
+    np.testing.assert_array_equal(image, draw_samples(samples, picture, seed=5, image=0))
+
+
+def test_faults_are_named() -> None:
+    with pytest.raises(InputError, match="a colour matrix is for colorimetric rendering"):
+        DatasetOptions(matrix=MATRIX)
+    with pytest.raises(InputError, match="'inks' is no rendering of a dataset; use one of codes, colorimetric"):
+        DatasetOptions(rendering="inks")  # pyright: ignore[reportArgumentType] - the fault under test
