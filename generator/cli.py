@@ -109,12 +109,14 @@ def _plan(
 ) -> Plan:
     """Return the plan of a dataset whose place is free."""
     from calibration.table.lut import open_lut
+    from generator.dataset.production.options import DatasetOptions
     from generator.dataset.production.plan import Plan
     from generator.dataset.production.workplace import require_free_place
 
     require_free_place(out)
     table = open_lut(lut)
-    chosen = choose(table, likeness, pictures, light, variation, images.seed, processor_count())
+    rendered = rendering.of(DatasetOptions(), table)
+    chosen = choose(table, likeness, pictures, light, variation, rendered, images.seed, processor_count())
     for line in chosen.told:
         print(line)
     varied = variation.variation(table, chosen.exposure)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from calibration.table.lut import Lut
+    from generator.dataset.production.options import DatasetOptions
     from generator.lights.lighting import LightChoice
     from generator.likeness.drawing import DrawnPictures
     from generator.pictures.sources import Source
@@ -102,6 +103,7 @@ def choose(
     pictures: PictureOptions,
     light: LightOptions,
     variation: VariationOptions,
+    rendered: DatasetOptions,
     seed: int,
     workers: int,
 ) -> Chosen:
@@ -126,7 +128,7 @@ def choose(
         choice = light.request().choose(lut, seed, [source.name for source in sources], pictures.crops)
         return Chosen(sources, choice, pictures.preparation(seed).describe(), crops=pictures.crops)
     parts = _parts(likeness, pictures, light, variation)
-    return _like(lut, likeness, likeness.like, parts, pictures, light, seed, workers)
+    return _like(lut, likeness, likeness.like, parts, pictures, light, rendered, seed, workers)
 
 
 def _like(
@@ -136,6 +138,7 @@ def _like(
     parts: list[str],
     pictures: PictureOptions,
     light: LightOptions,
+    rendered: DatasetOptions,
     seed: int,
     workers: int,
 ) -> Chosen:
@@ -176,7 +179,7 @@ def _like(
         told.append(exposure_sentence(target))
     sources = pictures.find(seed)
     if "pictures" in parts:
-        drawn = _drawn(lut, target, sources, likeness.draw, seed, workers)
+        drawn = _drawn(lut, target, sources, rendered, likeness.draw, seed, workers)
         sources = drawn_sources(sources, drawn)
         record["pictures"] = drawn.describe()
         told += drawn.sentences()
@@ -234,7 +237,13 @@ def _lights_within(lut: Lut, target: RealStatistics) -> tuple[dict[str, Any], st
 
 
 def _drawn(
-    lut: Lut, target: RealStatistics, sources: tuple[Source, ...], count: int | None, seed: int, workers: int
+    lut: Lut,
+    target: RealStatistics,
+    sources: tuple[Source, ...],
+    rendered: DatasetOptions,
+    count: int | None,
+    seed: int,
+    workers: int,
 ) -> DrawnPictures:
     """Return which pictures are drawn by what they look like under the light nearest to the target's."""
     from foundation.console import progress
@@ -242,16 +251,24 @@ def _drawn(
     from generator.likeness.pictures import measure_pictures, reference_light
 
     reference = reference_light(lut, target.lights)
-    photograph = partial(_photograph, lut, reference, seed)
+    photograph = partial(_photograph, lut, reference, rendered, seed)
     with progress("pictures") as shown:
         measured = measure_pictures(sources, photograph, lut.white[reference], target.cells, workers, shown)
     return draw_pictures(measured, target, count, seed)
 
 
-def _photograph(lut: Lut, light: int, seed: int, picture: npt.NDArray[np.uint8], number: int) -> npt.NDArray[np.uint16]:
-    from generator.kernels.rendering import render
+def _photograph(
+    lut: Lut, light: int, rendered: DatasetOptions, seed: int, picture: npt.NDArray[np.uint8], number: int
+) -> npt.NDArray[np.uint16]:
+    """Return the raw image of a picture as the dataset renders it, under one of the table's lights."""
+    from generator.dataset.production.photographing import photograph
+    from generator.kernels.palette import replace_unfit_colours
+    from generator.lights.lighting import Lighting, plain
 
-    return render(lut, picture, light, seed=seed, image=number)
+    if rendered.rendering == "codes":
+        picture, _ = replace_unfit_colours(picture, lut.provenance)
+    white_level = lut.provenance.white_level
+    return photograph(lut, picture, Lighting((plain(light),)), rendered, seed, number, white_level)[0]
 
 
 def _same_scenes(lut: Lut, place: str, pictures: PictureOptions, light: LightOptions) -> Chosen:

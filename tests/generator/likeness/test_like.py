@@ -205,3 +205,19 @@ def test_an_encoded_and_a_small_real_set_are_told_of(table: Lut, capsys: pytest.
     printed = capsys.readouterr().out
     assert "if they are encoded for a display, describe linear ones" in printed
     assert "real has 5 images" in printed
+
+
+def test_pictures_are_measured_as_they_will_be_rendered(table: Lut) -> None:
+    """Without the print's black, which is a tenth of white in this table, shadows are darker, and so measured."""
+    write_stats(Path("s.json"), lights_of(table), real_numbers(table, 0.5))
+    found: dict[str, float] = {}
+    for black in ("keep", "compensate"):
+        wish = ("--sources", "pictures", "--no-preview", "--like", "s.json", "--like-in", "pictures")
+        assert main(("lut", black, *wish, "--black-point", black, "--illuminations", "2")) == 0
+        figure = recorded(black)["like"]["pictures"]["figures"]["luminance_1"]
+        dataset = open_dataset(black)
+        images = [(dataset.read_image(entry), entry.truth) for entry in dataset.entries]
+        seen = [numbers_of_cells(cell_means(image, truth))[0]["luminance_1"] for image, truth in images]
+        assert np.median(seen) == pytest.approx(figure["after"], rel=0.05)
+        found[black] = figure["before"]
+    assert found["compensate"] < 0.7 * found["keep"]
