@@ -394,7 +394,7 @@ def dither(
 
     Examples
     --------
-    A chart of one bit a channel, whose cells stand for the nodes nearest to them: half of the pixels of a middle grey
+    A chart of one bit a channel, whose cells stand for the nodes nearest to them: .44 of the pixels of a middle grey
     become white.
 
     >>> node = np.arange(32768)
@@ -402,7 +402,7 @@ def dither(
     >>> cells = np.repeat(near[:, None], 32, axis=1).astype(np.uint16)
     >>> codes = dither(np.full((64, 64, 3), 127, np.uint8), cells, bits=1)
     >>> np.unique(codes[..., 0]), round(float((codes[..., 0] > 0).mean()), 1)
-    (array([  0, 128], dtype=uint8), np.float64(0.4))
+    (array([  0, 128], dtype=uint8), 0.4)
     """
     check_picture(picture)
     table = checked_cells(cells, bits)
