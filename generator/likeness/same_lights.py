@@ -8,8 +8,8 @@ Rules that hold inside:
 - Image number i of the second dataset shows what image number i of the first shows. A picture that the first could not
   read is left out of the second, and its numbers stay free.
 - Weights of a mixture are shares of the lights as they were photographed. In a photographed table all lights have one
-  exposure, so they are the same shares of the same lights for both cameras. Spectra are exposed each by itself; mixtures
-  of them are refused.
+  exposure, so they are the same shares of the same lights for both cameras. Spectra are exposed each by itself, and
+  mixtures of them are refused.
 """
 
 from __future__ import annotations
@@ -249,7 +249,7 @@ def _same_lights(used: Sequence[Light], lut: Lut, place: str) -> dict[int, int]:
 
 
 def _require_single(dataset: Dataset, tinted: bool) -> None:
-    """Refuse mixtures of lights that were each exposed by itself: in another table their weights mean another mixture."""
+    """Refuse mixtures of lights that were each exposed by itself: elsewhere their weights mean another mixture."""
     if all(light.name is None for light in dataset.description.lights):
         return
     mixed = [

@@ -106,4 +106,7 @@ def _filled(wavelengths_nm: _Array, curves: _Array, step: float) -> tuple[_Array
     widths = np.repeat(np.diff(wavelengths_nm) / parts, parts)
     within = np.arange(len(starts)) - np.repeat(np.cumsum(parts) - parts, parts)
     filled = np.append(starts + within * widths, wavelengths_nm[-1])
-    return filled, np.stack([np.interp(filled, wavelengths_nm, curve) for curve in curves.T], axis=1)
+    found = np.empty((len(filled), curves.shape[1]))
+    for number in range(curves.shape[1]):
+        found[:, number] = np.interp(filled, wavelengths_nm, curves[:, number])
+    return filled, found
