@@ -14,6 +14,9 @@ inside:
   have one. Cut off at 0, black would be too bright by .4 σ. So of a cell with samples below 0 these become 0, and all
   above are lowered by one number that keeps the cell's mean. Where a cell is darker than what is taken out, it is 0.
 - Rounding keeps the mean of a cell: each sample takes over what rounding the one before has left.
+- Black ink has a tint. Of images rendered by codes the black cell's b is taken out whole. Rendered by colour, greys lie
+  between one grey black point and one white point; taking out a tinted b would tint them, the darkest most. There b is
+  the grey in it: W times the least b / W of the channels.
 - What is saturated stays saturated: with W above the white level, the white level is taken for it.
 - Several lights on a pixel: each light's samples lose that light's veil before they are mixed, since light adds. To
   take the veil out of the mixture instead is the same where b / W is that of all its lights, and else differs by less
@@ -136,10 +139,19 @@ class Veil:
     stretch: _Array
 
 
-def black_of(lut: Lut, light: Mixture) -> _Array:
+def black_of(lut: Lut, light: Mixture, grey: bool = False) -> _Array:
     """Return what the camera sees of the chart's black cell under a light: (3,) float64, counts, the samples' mean.
 
     Where the table lists black as unfit, it is that of the nearest fit cell.
+
+    Parameters
+    ----------
+    lut
+        The table.
+    light
+        The light.
+    grey
+        Whether only the grey in it is wanted: the light's white times the channels' least share of it.
 
     Raises
     ------
@@ -150,11 +162,26 @@ def black_of(lut: Lut, light: Mixture) -> _Array:
     unfit = sorted({cell.colour for cell in lut.provenance.unfit})
     cell = int(nearest_fit_colours(unfit, lut.provenance.bits)[0]) if unfit and unfit[0] == 0 else 0
     means = [lut.samples[number, cell].mean(axis=0, dtype=np.float64) for number in light.lights]
-    return np.asarray(light.weights) @ np.array(means)
+    black = np.asarray(light.weights) @ np.array(means)
+    if not grey:
+        return black
+    white = light.white(lut)
+    return white * float((black / white).min())
 
 
-def veil_of(lut: Lut, light: Mixture, share: float) -> Veil:
-    """Return what taking out a share 0 … 1 of the print's black means under a light.
+def veil_of(lut: Lut, light: Mixture, share: float, grey: bool = False) -> Veil:
+    """Return what taking out a share of the print's black means under a light.
+
+    Parameters
+    ----------
+    lut
+        The table.
+    light
+        The light.
+    share
+        0 … 1.
+    grey
+        Whether only the grey in black is meant, as of images rendered by colour.
 
     Raises
     ------
@@ -163,7 +190,7 @@ def veil_of(lut: Lut, light: Mixture, share: float) -> Veil:
     QualityError
         Black is half as bright as white or brighter in a channel.
     """
-    black = black_of(lut, light)
+    black = black_of(lut, light, grey)
     white = np.minimum(light.white(lut), lut.provenance.white_level)
     if (2 * black >= white).any():
         shown = " ".join(f"{part:.3g}" for part in black / white)

@@ -215,11 +215,11 @@ class Crops:
             else replace_unfit_colours(gallery.picture(number), lut.provenance)[0]
             for number in range(len(gallery))
         ]
-        veiled = black_point.kind != "keep"
-        self._blacks = np.stack([black_of(lut, mixture) for mixture in mixtures]) if veiled else None
+        veiled, grey = black_point.kind != "keep", rendering == "colorimetric"
+        self._blacks = np.stack([black_of(lut, mixture, grey) for mixture in mixtures]) if veiled else None
         self._whites = np.minimum(whites, lut.provenance.white_level)
         for mixture in mixtures if veiled else ():
-            veil_of(lut, mixture, 1.0)
+            veil_of(lut, mixture, 1.0, grey)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The table is gigabytes; its folder is enough to map it again.

@@ -91,7 +91,8 @@ def photograph(
     if cells is not None and not (alone or (lighting.masks is None and picture.size >= 3 * WHOLE_LIGHT_PIXELS)):
         # Which samples are to be mixed, or freed of black, is known by the cells.
         picture, cells = dither(picture, cells, lut.provenance.bits, seed, number), None
-    tables = [_samples(lut, mixture, picture, share, seed, cells is not None) for mixture in lighting.mixtures]
+    by_colour, drawn_dithered = options.rendering == "colorimetric", cells is not None
+    tables = [_samples(lut, mixture, picture, share, seed, drawn_dithered, by_colour) for mixture in lighting.mixtures]
     if lighting.masks is None:
         out = _reused(picture.shape)
         return draw_samples(tables[0], picture, seed=seed, image=number, cells=cells, out=out), None, details
@@ -101,7 +102,7 @@ def photograph(
 
 
 def _samples(
-    lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int, dithered: bool
+    lut: Lut, mixture: Mixture, picture: Picture, share: float, seed: int, dithered: bool, by_colour: bool
 ) -> npt.NDArray[np.uint16]:
     """Return the samples of a light without a share of the print's black, at least those of a picture's colours.
 
@@ -116,7 +117,8 @@ def _samples(
         return samples
     small = not dithered and picture.size < 3 * WHOLE_LIGHT_PIXELS
     colours = colours_in(picture, lut.provenance.bits) if small else None
-    return without_veil(samples, veil_of(lut, mixture, share), lut.provenance.white_level, colours)
+    veil = veil_of(lut, mixture, share, grey=by_colour)
+    return without_veil(samples, veil, lut.provenance.white_level, colours)
 
 
 @lru_cache(maxsize=4)

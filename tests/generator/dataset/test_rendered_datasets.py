@@ -91,7 +91,8 @@ def test_an_image_is_drawn_from_its_code_picture_without_a_share_of_black(
         cells = mixtures.cells
         assert row["cells"] == hashlib.sha256(cells.tobytes()).hexdigest()[:16]
         codes = dither(sources[entry.source], cells, 3, 5, number)
-        samples = without_veil(light.samples(lut), veil_of(lut, light, share), lut.provenance.white_level)
+        veil = veil_of(lut, light, share, grey=True)
+        samples = without_veil(light.samples(lut), veil, lut.provenance.white_level)
         np.testing.assert_array_equal(dataset.read_image(entry), draw_samples(samples, codes, seed=5, image=number))
         assert float(row["black_taken"]) == pytest.approx(share, abs=1e-8)
         assert 0 <= float(row["outside"]) <= 1
@@ -194,7 +195,8 @@ def test_several_lights_see_the_same_cell_of_a_pixel(make_lut: MakeLut, pictures
         codes = dither(source.read().picture, cells, 3, 5, number)
         level = lut.provenance.white_level
         tables = [
-            without_veil(mixture.samples(lut, 5), veil_of(lut, mixture, 1.0), level) for mixture in lighting.mixtures
+            without_veil(mixture.samples(lut, 5), veil_of(lut, mixture, 1.0, grey=True), level)
+            for mixture in lighting.mixtures
         ]
         weights = dataset.read_weights(entry)
         wanted = mix_samples(tables, codes, weights, white_level=level, seed=5, image=number)

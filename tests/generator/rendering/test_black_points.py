@@ -201,3 +201,19 @@ def test_faults_are_named(make_lut: MakeLut) -> None:
     object.__setattr__(lut, "white", bright)
     with pytest.raises(QualityError, match=r"under light 1 the table .* has a black of 0\.6.* of white"):
         veil_of(lut, plain(1), 0.5)
+
+
+def test_of_a_tinted_black_only_its_grey_is_taken_out_of_greys(make_lut: MakeLut) -> None:
+    lut = make_lut()
+    light = Mixture((1, 3), (0.25, 0.75))
+    white, black = light.white(lut), black_of(lut, light)
+    shares = black / white
+    assert shares.max() > 1.1 * shares.min()
+    grey, whole = veil_of(lut, light, 1.0, grey=True), veil_of(lut, light, 1.0)
+    np.testing.assert_allclose(grey.taken, white * shares.min())
+    for brightness in (shares.max(), 0.2, 0.9):
+        seen = (white * brightness - grey.taken) * grey.stretch / white
+        assert np.ptp(seen) < 1e-12
+    # What would be wrong: a dark grey takes on the complement of the black's tint.
+    seen = (white * shares.max() - whole.taken) * whole.stretch / white
+    assert np.ptp(seen) > 0.05 * seen.max()
