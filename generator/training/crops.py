@@ -302,7 +302,15 @@ class Crops:
             wanted = self.noise if self.iso is None else self.noise.at(ratio, self.iso.sensor_electrons)
             white = self.lut.provenance.white_level
             add_noise(
-                images, gains, self.noise, seeds, white_level=white, wanted=wanted, ratio=ratio, threads=self.threads
+                images,
+                gains,
+                self.noise,
+                seeds,
+                white_level=white,
+                wanted=wanted,
+                ratio=ratio,
+                below_black=taken is not None,
+                threads=self.threads,
             )
         return Batch(images, self._truths[lights], lights, pictures, shares)
 
