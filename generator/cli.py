@@ -137,7 +137,7 @@ def _tint_caution(table: Lut, rendering: str | None) -> tuple[str, ...]:
         return ()
     return (
         f"greys of this print are up to {tint[0]:.1f} degrees off the light (under light {tint[1]}), and by codes so "
-        "are those of the pictures; for training add --rendering colorimetric, or --rendering codes to leave it at that",
+        "are those of pictures; for training add --rendering colorimetric, or --rendering codes to leave it at that",
     )
 
 
