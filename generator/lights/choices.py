@@ -46,6 +46,8 @@ _BATCH: Final = 32
 _BATCHES: Final = 2048
 """Batches drawn at most for a light: 65 536 draws, of which none is in the gamut with probability e⁻⁶⁵ where a share of
 `_LEAST_WITHIN` is."""
+_NAMES_SHOWN: Final = 12
+"""Names of lights in a message: enough to see how they are written."""
 _LEAST_WITHIN: Final = 1e-3
 """Share of a distribution that must lie in the gamut; with less, a light would take thousands of draws."""
 
@@ -311,6 +313,12 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
     if kelvin:
         text = f"cct={kelvin[1]}"
     if "=" not in text:
+        names = [light.name for light in lut.illuminations if light.name is not None]
+        if names and not re.match(r"[\d.]", text.strip(), re.ASCII):
+            shown = ", ".join(names[:_NAMES_SHOWN]) + (" …" if len(names) > _NAMES_SHOWN else "")
+            raise InputError(
+                f"{text!r} is no light of the table, whose lights are called {shown}; its illuminations.csv lists them"
+            )
         mixture = parse_mixture(text.strip())
         mixture.white(lut)
         return mixture

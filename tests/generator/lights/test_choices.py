@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -127,6 +128,17 @@ def test_texts_of_lights(make_lut: Callable[..., Lut]) -> None:
     r, _, b = lut.ground_truth[2]
     assert parse_light(f"r={r},b={b}", lut) == plain(2)
     assert parse_light("r=.9,b=.05", lut, outside="nearest") == plain(4)
+
+
+def test_a_table_of_named_lights_tells_their_names(make_lut: Callable[..., Lut]) -> None:
+    lut = make_lut(lights=3)
+    names = ("D65", "LED-B3", "HP1")
+    lights = tuple(replace(light, name=name) for light, name in zip(lut.illuminations, names, strict=True))
+    named = replace(lut, illuminations=lights)
+    assert parse_light("LED-B3", named) == plain(1)
+    assert parse_light("2", named) == plain(2)
+    with pytest.raises(InputError, match="'LED-B9' is no light of the table, whose lights are called D65, LED-B3"):
+        parse_light("LED-B9", named)
 
 
 @pytest.mark.parametrize(
