@@ -20,10 +20,10 @@ import numpy.typing as npt
 
 from calibration.table.lut import Lut, open_lut
 from foundation.angles import angles_deg
+from generator.kernels.dithering import nearest_nodes
 from generator.lights.choices import parse_lights
 from generator.pictures.picture import open_picture
 from generator.rendering.colorimetric import colorimetric_mixtures
-from generator.rendering.gamut_summaries import node_shares
 from generator.rendering.matrices import ColourMatrix
 from generator.rendering.print_profiles import profile_of
 from generator.rendering.source_colours import NODES
@@ -72,7 +72,7 @@ def main() -> int:
     """Print the table; return 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("lut", type=Path)
-    parser.add_argument("--lights", default="", help="numbers, as in generate --lights")
+    parser.add_argument("--lights", default="", help="numbers, as in generate --illuminations")
     parser.add_argument("--every", type=int, default=50, help="or each so-maniest light, from the last")
     parser.add_argument("--picture", type=Path, nargs="*", default=[])
     given = parser.parse_args()
@@ -81,7 +81,8 @@ def main() -> int:
     lights = parse_lights(given.lights, total).lights if given.lights else range(total - 1, -1, -given.every)
     shares = np.full(NODES, 1 / NODES)
     if given.picture:
-        shares = np.mean([node_shares(open_picture(path).picture) for path in given.picture], axis=0)
+        counts = [nearest_nodes(open_picture(path).picture) for path in given.picture]
+        shares = np.mean([count / count.sum() for count in counts], axis=0)
     matrix = matrix_for(lut)
     print(f"matrix of {matrix.name}: {matrix.source}")
     head = ["light", "shown as", "greys: codes", "by 5600 K", "by its own", "chroma: 5600 K", "its own", "outside"]

@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 SEED = 0
 """Of the division: that of the figures in docs/transfer.md."""
@@ -25,18 +27,19 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?", default=Path())
     parser.add_argument("--names", help="take images alone whose names contain this")
     given = parser.parse_args()
+    save: Any = np.savez
     with np.load(given.archive) as content:
-        data = {name: content[name] for name in ("images", "gt", "names")}
+        data: dict[str, npt.NDArray[Any]] = {name: content[name] for name in ("images", "gt", "names")}
     given.folder.mkdir(parents=True, exist_ok=True)
     if given.names:
         chosen = np.array([given.names in name for name in data["names"].tolist()])
         data = {name: values[chosen] for name, values in data.items()}
-    np.savez(given.folder / "all.npz", **data)
+    save(given.folder / "all.npz", **data)
     order = np.random.default_rng(SEED).permutation(len(data["gt"]))
     chromaticities = data["gt"] / data["gt"].sum(axis=1, keepdims=True)
     for half, places in enumerate(np.array_split(order, [len(order) // 2])):
         kept = np.sort(places)
-        np.savez(given.folder / f"half_{half}.npz", **{name: values[kept] for name, values in data.items()})
+        save(given.folder / f"half_{half}.npz", **{name: values[kept] for name, values in data.items()})
         lights = "".join("{:.6f},{:.6f},{:.6f}\n".format(*row) for row in chromaticities[kept])
         (given.folder / f"lights_{half}.csv").write_text(f"r,g,b\n{lights}")
         (given.folder / f"images_{half}.csv").write_text("image\n" + "\n".join(data["names"][kept].tolist()) + "\n")

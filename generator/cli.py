@@ -27,11 +27,15 @@ from generator.command.options import (
 )
 
 if TYPE_CHECKING:
+    from calibration.table.lut import Lut
     from generator.dataset.production.plan import Plan
     from generator.dataset.production.workers import Workers
     from generator.dataset.reader import Dataset
 
 app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
+
+CAUTION_DEG: Final = 1.0
+"""Tint of the print's greys that is worth a line, degrees: learned methods err by as much on real photographs."""
 
 _STORE_READERS: Final = 16
 """Threads that read the files of an object store: a reader waits for the store most of the time."""
@@ -117,11 +121,24 @@ def _plan(
     table = open_lut(lut)
     rendered = rendering.of(DatasetOptions(), table)
     chosen = choose(table, likeness, pictures, light, variation, rendered, images.seed, processor_count())
-    for line in chosen.told:
+    for line in (*chosen.told, *_tint_caution(table, rendering.rendering)):
         print(line)
     varied = variation.variation(table, chosen.exposure)
     options = images.dataset_options(work.shard_images, chosen.reading, varied, chosen.crops, chosen.weighted)
     return Plan(table, chosen.sources, chosen.choice, images.seed, rendering.of(options, table))
+
+
+def _tint_caution(table: Lut, rendering: str | None) -> tuple[str, ...]:
+    """Return a line about greys that are not grey, unless the user has said how to render."""
+    from generator.rendering.grey_tint import grey_tint_deg
+
+    tint = None if rendering else grey_tint_deg(table)
+    if tint is None or tint[0] < CAUTION_DEG:
+        return ()
+    return (
+        f"greys of this print are up to {tint[0]:.1f} degrees off the light (under light {tint[1]}), and by codes so "
+        "are those of pictures; for training add --rendering colorimetric, or --rendering codes to leave it at that",
+    )
 
 
 def _make_whole(plan: Plan, out: str, workers: Workers) -> Dataset:

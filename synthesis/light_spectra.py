@@ -1,9 +1,10 @@
 """Lights by their spectra: from a CSV file, or the illuminants that the CIE and others have published.
 
-A file has a column ``wavelength`` (nm) and one for each light, whose head is its name; any even or uneven grid from 400
-to 700 nm or beyond, in proportions that are each light's own. Published spectra are those of colour-science: CIE A to
-E, daylights D, fluorescent lamps FL1 to FL12 and FL3.1 to FL3.15, high-pressure lamps HP1 to HP5, LED-B1 to LED-V2,
-indoor daylights ID50 and ID65 (CIE 15:2018), the sources of ISO 7589, and measured light sources by their names there.
+A file has a column ``wavelength`` (nm) and one for each light, whose head is its name and no number; any even or uneven
+grid from 400 to 700 nm or beyond, in proportions that are each light's own. Published spectra are those of
+colour-science: CIE A to E, daylights D, fluorescent lamps FL1 to FL12 and FL3.1 to FL3.15, high-pressure lamps HP1 to
+HP5, LED-B1 to LED-V2, indoor daylights ID50 and ID65 (CIE 15:2018), the sources of ISO 7589, and measured light sources
+by their names there.
 ``5600K`` is a black body by Planck's law, ``daylight:6000`` the CIE daylight of a correlated colour temperature; ranges
 are ``FIRST:LAST:STEP`` with the ``K`` or the word ``daylight`` before them.
 """
@@ -137,6 +138,12 @@ def parse_spectra(data: bytes, where: str) -> tuple[LightSpectrum, ...]:
     if len(heads) < 2 or heads[0].lower().split(" ")[0].split("_")[0] != WAVELENGTH or not all(heads):
         raise FormatError(
             f"{where}: its first line is {','.join(heads)[:80]!r}; {WAVELENGTH!r} expected, then the name of each light"
+        )
+    numbered = [name for name in heads[1:] if re.fullmatch(r"[\d.:+]+", name)]
+    if numbered:
+        raise FormatError(
+            f"{where}: a light is called {numbered[0]!r}, which generate --light would take for a number in the table; "
+            f"call it lamp {numbered[0]} or the like"
         )
     table = np.empty((len(rows) - 1, len(heads)))
     for number, row in enumerate(rows[1:]):

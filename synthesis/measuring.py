@@ -158,5 +158,5 @@ def _require_unclipped(whites: _Array, what: str) -> None:
     if left < MIN_REFERENCES:
         raise QualityError(
             f"{what}: bare paper is clipped in {len(whites) - left} of {len(whites)} white references; expose less: a "
-            "smaller exposure.shutter_s or room.white_level_share in the settings"
+            "smaller room.white_level_share in the settings, or under the projector exposure.shutter_s"
         )

@@ -30,7 +30,11 @@ class _Settings(BaseModel):
 
 
 class ComputedExposure(_Settings):
-    """The exposure of every frame, as `[camera]` of LAB.toml has it."""
+    """The exposure of every frame, as `[camera]` of LAB.toml has it.
+
+    Spectra are exposed each by itself (`synthesis.lamps.SpectralLamp`): of theirs only the ISO speed counts, and for
+    hot photosites the time.
+    """
 
     iso: Annotated[int, Field(ge=50, le=25600)] = 100
     """ISO speed."""

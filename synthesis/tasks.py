@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -40,13 +40,15 @@ def table_task(camera: str, settings: TableSettings, where: str, lights: LightSp
     body = find_body(camera, settings.camera, where)
     room = room_of(settings, where)
     chart = design_chart(settings.chart.bits, settings.chart.page, settings.chart.seed)
+    seen = read_sensitivities(body.sensitivities)
     record: dict[str, Any] = {
         "by": "sim table",
         "how": "no frame was taken: counts of the photosites under each cell were computed from spectra and a model of "
         "the sensor, and sampled as those of a frame",
-        "sensitivities": describe_sensitivities(read_sensitivities(body.sensitivities)),
+        "sensitivities": describe_sensitivities(seen),
         "lights": {"from": "simulated projector"} if lights is None else lights.source,
-        "body": asdict(body),
+        # By name: where a file of sensitivities lies is no property of the table.
+        "body": asdict(replace(body, sensitivities=seen.name)),
         "exposure": settings.exposure.model_dump(mode="json"),
         "room": {name: value for name, value in asdict(room).items() if name not in (*NOT_COMPUTED, "seed")},
         "chart": settings.chart.model_dump(mode="json"),

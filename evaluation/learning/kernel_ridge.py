@@ -27,6 +27,8 @@ from evaluation.scene import Image
 
 BINS = 64
 """Bins of r and of g, each 0 … 1: one is 2 to 4 degrees wide about usual lights, the grain of what is counted."""
+_LARGEST = 255
+"""Working size up to which the counts of a histogram fit in 16 bits."""
 _IMAGES = 900
 """Training images of which `penalty` is the λ: the number of the measurement in which 1 was found to be robust."""
 
@@ -47,6 +49,8 @@ class KernelRidge(FeatureLearner):
     penalty: float = 1.0
 
     def __post_init__(self) -> None:
+        if not 1 <= self.working_size <= _LARGEST:
+            raise ValueError(f"a working size of {self.working_size} px; expected 1 to {_LARGEST}")
         if not self.penalty > 0:
             raise ValueError(f"a penalty of {self.penalty}; expected a number above 0")
 

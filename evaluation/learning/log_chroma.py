@@ -38,7 +38,7 @@ _CHANNELS = 2
 """Histograms: of pixels and of edges."""
 _SPREAD = 0.75
 """Share of the torus that the lights may span: the rest tells one turn of it from the next."""
-_LARGEST = 256
+_LARGEST = 255
 """Working size up to which the counts of a histogram fit in 16 bits."""
 
 

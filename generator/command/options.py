@@ -127,8 +127,8 @@ class LightOptions:
         list[str] | None,
         option(
             "LIGHT",
-            "A light for every picture, mixed of the table's: 12, 12:0.25+40:0.75, 5600K, or a chromaticity "
-            "r=.3,b=.25; may be repeated.",
+            "A light for every picture, mixed of the table's: 12, 12:0.25+40:0.75, 5600K, a name such as D65 where "
+            "the table's lights have names, or a chromaticity r=.3,b=.25; may be repeated.",
             _LIGHT,
         ),
     ] = None
@@ -273,7 +273,8 @@ class RenderingOptions:
         option(
             "NAME",
             "For colorimetric rendering: linear sRGB to the camera's RGB, of a camera by its name, of a file of 3 x 3 "
-            "numbers, or table for the one fitted from the table. \\[default: that of the table's camera, else table]",
+            "numbers, table for the one fitted from the table, or none. \\[default: that of the table's camera, else "
+            "table]",
             _IMAGES,
         ),
     ] = None

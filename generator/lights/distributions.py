@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from foundation.errors import FormatError, InputError
 from generator.lights.gamut import rb_of
+from generator.lights.log_kernels import LogKernels, draw_kernels
 from generator.named_numbers import parse_numbers
 from generator.philox import Words, standard_normal
 
@@ -124,12 +125,7 @@ class Fitted:
 
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
         """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words."""
-        chosen = (words[2].astype(np.uint64) * np.uint64(len(self.rb))) >> np.uint64(32)
-        normal = standard_normal(words)
-        aside = np.stack(
-            [self.root[0, 0] * normal[:, 0], self.root[1, 0] * normal[:, 0] + self.root[1, 1] * normal[:, 1]], axis=1
-        )
-        return self.rb[chosen.astype(np.intp)] + aside
+        return draw_kernels(self.rb, self.root, words)
 
     def describe(self) -> dict[str, Any]:
         """Return the distribution as plain values."""
@@ -180,8 +176,6 @@ def parse_distribution(text: str) -> Distribution:
     path = Path(rest if kind == "fit" else text)
     if (kind == "fit" and rest) or path.is_file():
         if is_statistics(path):
-            from generator.lights.log_kernels import LogKernels
-
             return LogKernels.of(load_ground_truths(path), path.name)
         return Fitted.of(load_ground_truths(path), path.name)
     if kind == "gaussian":

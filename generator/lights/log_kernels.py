@@ -81,13 +81,8 @@ class LogKernels:
 
     def draw(self, words: tuple[Words, Words, Words, Words]) -> _Array:
         """Return (N, 2) float64, r and b, from four arrays (N,) uint32 of random words."""
-        chosen = (words[2].astype(np.uint64) * np.uint64(len(self.places))) >> np.uint64(32)
-        normal = standard_normal(words)
-        aside = np.stack(
-            [self.root[0, 0] * normal[:, 0], self.root[1, 0] * normal[:, 0] + self.root[1, 1] * normal[:, 1]], axis=1
-        )
         mean = self.places.mean(axis=0)
-        drawn = mean + (self.places[chosen.astype(np.intp)] + aside - mean) / np.sqrt(1 + self.factor**2)
+        drawn = mean + (draw_kernels(self.places, self.root, words) - mean) / np.sqrt(1 + self.factor**2)
         red, blue = np.exp(drawn).T
         return rb_of(np.stack([red, np.ones_like(red), blue], axis=1))
 
@@ -101,3 +96,21 @@ class LogKernels:
             "factor": self.factor,
             "kernel": self.root.tolist(),
         }
+
+
+def draw_kernels(places: _Array, root: _Array, words: tuple[Words, Words, Words, Words]) -> _Array:
+    """Return draws from a density of Gaussian kernels, (N, 2) float64.
+
+    Parameters
+    ----------
+    places
+        (M, 2) float64, the kernels' centres, each as likely.
+    root
+        (2, 2) float64, lower triangular, times its transpose the kernels' covariance.
+    words
+        Four arrays (N,) uint32 of random words: two for the normal deviates, the third for the kernel.
+    """
+    chosen = (words[2].astype(np.uint64) * np.uint64(len(places))) >> np.uint64(32)
+    normal = standard_normal(words)
+    aside = np.stack([root[0, 0] * normal[:, 0], root[1, 0] * normal[:, 0] + root[1, 1] * normal[:, 1]], axis=1)
+    return places[chosen.astype(np.intp)] + aside

@@ -3,11 +3,13 @@
 Rules that hold inside:
 
 - Two tables have a light in common if both were photographed while the projector showed the same codes; its number may
-  differ. That the projector was the same, or an equal one, is for the user to know.
+  differ. That the projector was the same, or an equal one, is for the user to know. Lights of computed tables that have
+  spectra of their own must have the same name besides: lamps of one colour are not one light.
 - Image number i of the second dataset shows what image number i of the first shows. A picture that the first could not
   read is left out of the second, and its numbers stay free.
-- Weights of a mixture are shares of the lights as they were photographed. In a table all lights have one exposure, so
-  they are the same shares of the same lights for both cameras.
+- Weights of a mixture are shares of the lights as they were photographed. In a photographed table all lights have one
+  exposure, so they are the same shares of the same lights for both cameras. Spectra are exposed each by itself, and
+  mixtures of them are refused.
 """
 
 from __future__ import annotations
@@ -28,6 +30,10 @@ from generator.stores.places import is_remote, local_path
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
+
+
+_Shown = tuple[tuple[int, int, int], str | None]
+"""What a light is known by: codes, and its name if it has a spectrum of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,13 +146,16 @@ def lights_of(dataset: Dataset, lut: Lut) -> LightsOf:
     Raises
     ------
     InputError
-        The table lacks lights that the dataset used, or their masks lie in files of shards.
+        The table lacks lights that the dataset used, it mixes lights whose proportion is not known, or its masks lie in
+        files of shards.
     FormatError
         The dataset's masks are missing or damaged.
     """
     made = dataset.description
     numbers = _same_lights(made.lights, lut, dataset.store.place)
     tinted = _is_tinted(dataset)
+    if made.table.sha256 != lut.sha256:
+        _require_single(dataset, tinted)
     masks = None if tinted else _masks_of(dataset)
     known: dict[str, Mixture] = {}
     lightings: dict[int, Lighting] = {}
@@ -216,26 +225,44 @@ def _is_tinted(dataset: Dataset) -> bool:
 
 def _same_lights(used: Sequence[Light], lut: Lut, place: str) -> dict[int, int]:
     """Return the number in the table of each light that a dataset used."""
-    by_codes: dict[tuple[int, int, int], int] = {}
+    by_codes: dict[_Shown, int] = {}
     for shown in lut.illuminations:
-        by_codes.setdefault(shown.codes, shown.index)
+        by_codes.setdefault((shown.codes, shown.name), shown.index)
     numbers: dict[int, int] = {}
     missing: list[str] = []
     for light in used:
-        same = (
-            light.illumination < len(lut.illuminations) and lut.illuminations[light.illumination].codes == light.codes
-        )
-        number = light.illumination if same else by_codes.get(light.codes)
+        key = (light.codes, light.name)
+        found = lut.illuminations[light.illumination] if light.illumination < len(lut.illuminations) else None
+        same = found is not None and (found.codes, found.name) == key
+        number = light.illumination if same else by_codes.get(key)
         if number is None:
-            missing.append(f"number {light.illumination} of codes {' '.join(map(str, light.codes))}")
+            named = "" if light.name is None else f" called {light.name}"
+            missing.append(f"number {light.illumination}{named} of codes {' '.join(map(str, light.codes))}")
         else:
             numbers[light.illumination] = number
     if missing:
         raise InputError(
             f"the table {lut.folder} lacks {len(missing)} of the {len(used)} lights of {place}: {first_of(missing, 3)}"
-            "; take a table of the same projector and the same list of lights"
+            "; take a table of the same projector, or of the same spectra, and the same list of lights"
         )
     return numbers
+
+
+def _require_single(dataset: Dataset, tinted: bool) -> None:
+    """Refuse mixtures of lights that were each exposed by itself: elsewhere their weights mean another mixture."""
+    if all(light.name is None for light in dataset.description.lights):
+        return
+    mixed = [
+        entry.image
+        for entry in dataset.entries
+        if len(parse_mixture(entry.lights[0]).lights) > 1 or (len(entry.lights) > 1 and not tinted)
+    ]
+    if mixed:
+        raise InputError(
+            f"{len(mixed)} images of {dataset.store.place}, such as {mixed[0]}, are under several spectra at once, of "
+            "which each was exposed by itself for its camera, so that their proportion is not known; make the first "
+            "dataset under single lights (--illuminations, --light, --random, --nearest)"
+        )
 
 
 def _renumbered(label: str, numbers: Mapping[int, int]) -> Mixture:

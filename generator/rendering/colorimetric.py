@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -203,6 +204,8 @@ def _key(lut: Lut, light: Mixture, rows: tuple[float, ...]) -> str:
         "light": light.label,
         "matrix": [row.hex() for row in rows],
         "code": _code(),
+        # Of cells that are equally good the last digits choose, and other versions may have others.
+        "libraries": {name: version(name) for name in ("numpy", "scipy")},
     }
     return sha256_of(json.dumps(depends).encode())
 

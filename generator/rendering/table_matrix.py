@@ -37,8 +37,8 @@ def matrix_for(lut: Lut, text: str | None = None) -> ColourMatrix:
     lut
         The table.
     text
-        A camera's name, a file, or `table` for the one fitted from the table. None: that of the table's camera, or,
-        where it is not known, the fitted one.
+        A camera's name, a file, `table` for the one fitted from the table, or `none` for linear sRGB as it is. None:
+        that of the table's camera, or, where it is not known, the fitted one.
 
     Raises
     ------

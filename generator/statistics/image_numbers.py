@@ -81,7 +81,7 @@ def cell_means(image: npt.NDArray[np.generic], light: npt.ArrayLike, side: int =
     [[[2.5, 2.5, 2.5]]]
     """
     rows, columns = (cell_borders(size, side) for size in image.shape[:2])
-    # Rows first: whole numbers of 64 bits, so that nothing is rounded or overflows.
+    # In float64, in which sums of 16-bit counts are exact up to 2⁵³.
     sums = np.add.reduceat(np.add.reduceat(image, rows[:-1], axis=0, dtype=np.float64), columns[:-1], axis=1)
     even = np.asarray(light, dtype=np.float64)
     return sums / (np.diff(rows)[:, None] * np.diff(columns))[..., None] / (even / even.mean())

@@ -126,8 +126,8 @@ class Crops:
         Threads that share a batch; no value depends on it.
     rendering
         ``"codes"``: a picture's codes are those of the print; ``"colorimetric"``: each pixel is a cell that looks to
-        the camera as the picture's colour should. Which, is found when a light is first drawn: it takes some seconds a
-        light the first time, later they lie in the user's cache folder; and 2 MB of memory for each light. So name the
+        the camera as the picture's colour should. Which, is found when a light is first drawn: it takes about a second
+        a light the first time, later they lie in the user's cache folder; and 2 MB of memory for each. So name the
         lights, rather than leave it at all of a large table.
     matrix
         Linear sRGB to the camera's RGB, for colorimetric rendering; None for that of the table's camera.
@@ -302,7 +302,15 @@ class Crops:
             wanted = self.noise if self.iso is None else self.noise.at(ratio, self.iso.sensor_electrons)
             white = self.lut.provenance.white_level
             add_noise(
-                images, gains, self.noise, seeds, white_level=white, wanted=wanted, ratio=ratio, threads=self.threads
+                images,
+                gains,
+                self.noise,
+                seeds,
+                white_level=white,
+                wanted=wanted,
+                ratio=ratio,
+                below_black=taken is not None,
+                threads=self.threads,
             )
         return Batch(images, self._truths[lights], lights, pictures, shares)
 

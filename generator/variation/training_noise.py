@@ -20,13 +20,15 @@ from generator.variation.exposing import PURPOSE, draw_row
 from generator.variation.sensor_noise import SensorNoise
 
 _ZERO: Final = np.float32(0)
+_NO_FLOOR: Final = np.float32(-1)
+"""Least value where counts below black are kept: as far below 0 as saturation is above, where no noise reaches."""
 _ONE: Final = np.float32(1)
 _32: Final = np.uint64(32)
 
 
 @compiled
-def _add_noise(images: Any, dark: Any, shot: Any, seeds: Any, table: Any) -> None:
-    """Add to `images` (N, 3, H, W) float32 noise of variance `dark` (N, 3) + `shot` (N, 3) · value."""
+def _add_noise(images: Any, dark: Any, shot: Any, seeds: Any, table: Any, least: Any) -> None:
+    """Add to `images` (N, 3, H, W) float32 noise of variance `dark` (N, 3) + `shot` (N, 3) · value, cut at `least`."""
     height, width = images.shape[2], images.shape[3]
     deviates = np.zeros(3 * width, np.float32)
     for item in range(images.shape[0]):
@@ -41,7 +43,7 @@ def _add_noise(images: Any, dark: Any, shot: Any, seeds: Any, table: Any) -> Non
                 for x in range(width):
                     value = row[x]
                     noisy = value + np.sqrt(max(base + slope * value, _ZERO)) * deviates[3 * x + channel]
-                    row[x] = min(max(noisy, _ZERO), _ONE)
+                    row[x] = min(max(noisy, least), _ONE)
 
 
 def add_noise(
@@ -53,6 +55,7 @@ def add_noise(
     white_level: int,
     wanted: SensorNoise | None = None,
     ratio: float = 1.0,
+    below_black: bool = False,
     threads: int = 1,
 ) -> None:
     """Give items, in place, the noise of the light that their gains stand for; see `exposing`.
@@ -71,6 +74,8 @@ def add_noise(
         Counts of saturation, 1 … 65535.
     wanted, ratio
         Noise at the wanted ISO speed, and that speed over the table's; `noise` and 1 if not given.
+    below_black
+        Whether values below 0 are kept instead of cut off: those of items without the print's black.
     threads
         That share the items; no value depends on it.
 
@@ -103,8 +108,10 @@ def add_noise(
     # Where a gain exceeds the ratio, its own noise is that of a higher speed, and no less.
     dark = np.where(each > ratio, 0, dark)
     numbers = dark.astype(np.float32), shot.astype(np.float32)
+    deviates, least = normal_deviates(), _NO_FLOOR if below_black else _ZERO
 
     def fill(first: int, end: int) -> None:
-        _add_noise(images[first:end], numbers[0][first:end], numbers[1][first:end], seeds[first:end], normal_deviates())
+        some = slice(first, end)
+        _add_noise(images[some], numbers[0][some], numbers[1][some], seeds[some], deviates, least)
 
     run_in_threads(fill, count, threads)

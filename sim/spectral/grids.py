@@ -72,9 +72,9 @@ def regridded(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array
     Returns
     -------
     ndarray
-        (M, N) float64; 0 beyond the given wavelengths. Where these are finer than the new grid, each of its values is
-        the mean of the curve weighted by a triangle that reaches to the neighbouring wavelengths, which leaves the
-        curve's integral as it is; elsewhere the curve's own value.
+        (M, N) float64; 0 beyond the given wavelengths. If some of these are nearer to each other than those of the new
+        grid, each of its values is the mean of the curve weighted by a triangle that reaches to the neighbouring
+        wavelengths, which leaves the curve's integral as it is; else the curve's own value.
 
     Examples
     --------
@@ -89,8 +89,24 @@ def regridded(wavelengths_nm: _Array, curves: _Array, onto_nm: _Array) -> _Array
         for number in range(curves.shape[1]):
             found[:, number] = np.interp(onto_nm, wavelengths_nm, curves[:, number], left=0, right=0)
         return found
+    if float(np.diff(wavelengths_nm).max()) > 0.999 * step:
+        # Where steps are wider, a wavelength would stand for nodes that lie between it and the next.
+        wavelengths_nm, curves = _filled(wavelengths_nm, curves, step)
     # Each wavelength stands for half the way to its neighbours.
     edges = np.concatenate([wavelengths_nm[:1], (wavelengths_nm[1:] + wavelengths_nm[:-1]) / 2, wavelengths_nm[-1:]])
     share = np.clip(1 - np.abs(onto_nm[:, None] - wavelengths_nm[None]) / step, 0, None)
     weights = share * np.diff(edges)[None] / step
     return np.asarray(weights @ curves, dtype=np.float64)
+
+
+def _filled(wavelengths_nm: _Array, curves: _Array, step: float) -> tuple[_Array, _Array]:
+    """Return wavelengths (V,) and curves (V, N) with the gaps of an uneven grid filled to steps below `step` / 4."""
+    parts = np.maximum(np.ceil(4 * np.diff(wavelengths_nm) / step), 1).astype(np.int64)
+    starts = np.repeat(wavelengths_nm[:-1], parts)
+    widths = np.repeat(np.diff(wavelengths_nm) / parts, parts)
+    within = np.arange(len(starts)) - np.repeat(np.cumsum(parts) - parts, parts)
+    filled = np.append(starts + within * widths, wavelengths_nm[-1])
+    found = np.empty((len(filled), curves.shape[1]))
+    for number in range(curves.shape[1]):
+        found[:, number] = np.interp(filled, wavelengths_nm, curves[:, number])
+    return filled, found

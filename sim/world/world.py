@@ -108,7 +108,7 @@ class World:
         from sim.world.rendering import counts
 
         light = self._render()
-        weights = np.asarray(self._drive(colour, settings, lamp * self._turned(settings, key)), dtype=np.float32)
+        weights = np.asarray(self.drive(colour, settings, lamp * self._turned(settings, key)), dtype=np.float32)
         body, visible = self.body, self.body.visible
         black, noise_dn, gain_e = float(body.black), body.noise_dn(settings.iso), body.gain_e(settings.iso)
         frame = np.empty(body.sensor, dtype=np.uint16)
@@ -156,7 +156,7 @@ class World:
         ndarray
             (rows, columns) float32, DN above black, of the body's visible photosites, their response included.
         """
-        drive = np.asarray(self._drive(colour, settings, lamp), dtype=np.float32)
+        drive = np.asarray(self.drive(colour, settings, lamp), dtype=np.float32)
         return np.tensordot(drive, self._render(), 1)
 
     def project(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -184,7 +184,7 @@ class World:
         ndarray
             (N, 3) float64, DN above black where `field` is 1, leak and ambient light included, without clipping.
         """
-        return self._signals(self._reflectance(rgb)) @ self._drive(colour, settings, lamp)
+        return self._signals(self._reflectance(rgb)) @ self.drive(colour, settings, lamp)
 
     def seen(
         self,
@@ -211,7 +211,7 @@ class World:
             (N, 3) float64, DN above black, without clipping: what the photosites there get where nothing is blurred,
             stain and fold included.
         """
-        light = self.field(points_mm) * self._drive(colour, settings, lamp)
+        light = self.field(points_mm) * self.drive(colour, settings, lamp)
         return np.einsum("ncp,np->nc", self._signals(self._reflectance(rgb)), light) * self.worn(points_mm)
 
     def of_primaries(self, rgb: ArrayLike, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -232,12 +232,20 @@ class World:
         """
         return self._signals(self._reflectance(rgb)) * self.field(points_mm)[:, None]
 
-    def drive(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float64]:
+    def drive(
+        self, colour: Colour, settings: ExposureSettings, lamp: float | NDArray[np.float64] = 1.0
+    ) -> NDArray[np.float64]:
         """Return (3,) float64: how much of each primary's light at full drive a frame collects, gain included.
 
-        Parameters are those of `expose`.
+        Parameters are those of `expose`; `lamp` may be (3,), of each primary its own.
         """
-        return self._drive(colour, settings, lamp)
+        codes = np.array([colour.red, colour.green, colour.blue]) / 255
+        linear = decode_srgb(codes) if self.room.transfer == "srgb" else codes**self.room.transfer
+        leak = self.room.black_leak
+        shown = lamp * (leak + (1 - leak) * linear) + self.room.ambient
+        reference = REFERENCE_EXPOSURE
+        time = settings.shutter_s / reference.shutter_s
+        return shown * time * (reference.aperture / settings.aperture) ** 2 * (settings.iso / reference.iso)
 
     def worn(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return what stain and fold leave of the light of a clean flat print.
@@ -315,18 +323,6 @@ class World:
         segment = np.arange(3) / 3
         shone = np.floor(turns) / 3 + np.clip(turns - np.floor(turns) - segment, 0, 1 / 3)
         return 3 * (shone[1] - shone[0]) / (settings.shutter_s * self.room.wheel_hz)
-
-    def _drive(
-        self, colour: Colour, settings: ExposureSettings, lamp: float | NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return (3,) how much of each primary's reference light a frame collects, gain included."""
-        codes = np.array([colour.red, colour.green, colour.blue]) / 255
-        linear = decode_srgb(codes) if self.room.transfer == "srgb" else codes**self.room.transfer
-        leak = self.room.black_leak
-        shown = lamp * (leak + (1 - leak) * linear) + self.room.ambient
-        reference = REFERENCE_EXPOSURE
-        time = settings.shutter_s / reference.shutter_s
-        return shown * time * (reference.aperture / settings.aperture) ** 2 * (settings.iso / reference.iso)
 
     def _reflectance(self, rgb: ArrayLike) -> NDArray[np.float64]:
         """Return (N, 81): reflectance of the chart's codes (N, 3) on this print."""

@@ -100,6 +100,11 @@ def test_what_is_no_light_is_refused(given: str, message: str) -> None:
     [
         ("", "its first line is ''; 'wavelength' expected"),
         ("nm,hall\n400,1\n", "its first line is 'nm,hall'"),
+        (
+            table(hall=1.0).replace("hall", "12"),
+            "a light is called '12', which generate --light would take for a number",
+        ),
+        (table(hall=1.0).replace("hall", "0:.5+1:.5"), "a light is called '0:.5"),
         (table(hall=1.0).replace("500,1.0", "500,-0.1"), "'hall' is -0.1 at 500 nm, 0 or more expected"),
         (table(hall=1.0).replace("500,1.0", "500,"), "line 26: 2 numbers expected"),
         (table(hall=1.0).replace("500,1.0", "500,1.0,2.0"), "line 26: 2 numbers expected"),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -157,6 +159,18 @@ def test_the_usual_task_is_the_projectors_707_lights_under_which_a_session_is_ta
     assert task.body.model == "Canon EOS 5DS"
     assert task.exposure == SETTINGS
     assert task.room == Room(seed=TableSettings().seed, lamp_drift_per_hour=0)
+
+
+def test_where_a_file_of_sensitivities_lies_is_not_recorded(tmp_path: Path) -> None:
+    data = resources.files("sim").joinpath("data", "Canon_EOS_5DS_380_780_5.json").read_bytes()
+    records: list[dict[str, Any]] = []
+    for place in ("here", "there"):
+        path = tmp_path / place / "mine.json"
+        path.parent.mkdir()
+        path.write_bytes(data)
+        records.append(table_task(str(path), parse_settings({"chart": {"bits": 1}}, "here"), "here").record)
+    assert records[0] == records[1]
+    assert records[0]["body"]["sensitivities"] == records[0]["sensitivities"]["name"] == "mine"
 
 
 def test_hot_photosites_are_in_the_samples_of_every_light_and_in_no_list(computed: Lut, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from evaluation.learning.color_beaver import ColorBeaver, bounded
 from evaluation.learning.convnet import ConvNet
 from evaluation.learning.feature_learner import FeatureLearner
 from evaluation.learning.kernel_ridge import KernelRidge
+from evaluation.learning.log_chroma import LogChroma
 from evaluation.learning.regression_trees import RegressionTrees, consensus
 from evaluation.learning.smart_color_cat import CHOICES, FINE, SmartColorCat
 from evaluation.learning.working_size import reduce
@@ -174,6 +175,15 @@ def test_the_penalty_of_kernel_ridge_grows_with_the_images() -> None:
 def test_kernel_ridge_refuses_a_penalty_that_is_none(penalty: float) -> None:
     with pytest.raises(ValueError, match="expected a number above 0"):
         KernelRidge(penalty=penalty)
+
+
+@pytest.mark.parametrize("learner", [KernelRidge, LogChroma])
+def test_counts_of_the_largest_working_size_are_not_cut(learner: type[KernelRidge | LogChroma]) -> None:
+    image = np.full((255, 255, 3), RED, np.float32)
+    counts: Any = learner(working_size=255).features(image)
+    assert counts.max() == 255 * 255
+    with pytest.raises(ValueError, match="a working size of 256 px; expected 1 to 255"):
+        learner(working_size=256)
 
 
 @pytest.mark.parametrize(

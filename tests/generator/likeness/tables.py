@@ -23,8 +23,11 @@ CAMERAS: dict[str, npt.NDArray[np.float64]] = {
 """Sensitivities of two cameras in those bands."""
 
 
-def make_table(folder: Path, camera: str, order: tuple[int, ...]) -> Lut:
-    """Make a table of 2 bits without noise: every cell's samples are the light it reflects, as the camera sees it."""
+def make_table(folder: Path, camera: str, order: tuple[int, ...], names: tuple[str, ...] = ()) -> Lut:
+    """Make a table of 2 bits without noise: every cell's samples are the light it reflects, as the camera sees it.
+
+    Lights with names have spectra of their own, of one colour all of them.
+    """
     folder.mkdir()
     index = np.arange(64)
     reflected = 0.1 + 0.9 * np.stack([index >> 4 & 3, index >> 2 & 3, index & 3], axis=1) / 3
@@ -35,6 +38,8 @@ def make_table(folder: Path, camera: str, order: tuple[int, ...]) -> Lut:
         writer.put(place, np.rint(seen)[:, None, :].repeat(25, axis=1).astype(np.uint16))
         white.append(seen[-1])
     plan = [Illumination(place, "uniform", None, Colour(9, 8, light)) for place, light in enumerate(order)]
+    if names:
+        plan = [Illumination(place, "spectrum", None, Colour(9, 8, 7), name) for place, name in enumerate(names)]
     writer.finish(
         plan,
         np.array(white),

@@ -122,3 +122,32 @@ def test_crops_and_tints_are_scenes_of_one_light(lab: Path) -> None:
     for here, there in zip(first.entries, again.entries, strict=True):
         assert (here.lights, here.truth) == (there.lights, there.truth)
         assert first.read_image(here).tolist() == again.read_image(there).tolist()
+
+
+def test_spectra_of_one_colour_are_told_by_their_names(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make_table(lab / "lamps", "one", (0, 1), ("FL2", "LED-B1"))
+    make_table(lab / "turned", "two", (1, 0), ("LED-B1", "FL2"))
+    make_table(lab / "others", "two", (1, 0), ("LED-B1", "HP1"))
+    wish = ("--sources", "pictures", "--no-preview")
+    assert main(("lamps", "first", *wish, "--illuminations", "all")) == 0
+    assert main(("turned", "second", *wish, "--lights-of", "first")) == 0
+    first, second = open_dataset("first"), open_dataset("second")
+    assert [entry.lights for entry in first.entries[:2]] == [("0",), ("1",)]
+    assert [entry.lights for entry in second.entries[:2]] == [("1",), ("0",)]
+    capsys.readouterr()
+    assert main(("others", "third", *wish, "--lights-of", "first")) == 2
+    assert "lacks 1 of the 2 lights of first: number 0 called FL2 of codes 9 8 7" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("lights", [("--light", "0:.5+1:.5"), ("--random", "1", "--lights-per-image", "2")])
+def test_mixtures_of_spectra_are_refused_for_another_camera(
+    lab: Path, capsys: pytest.CaptureFixture[str], lights: tuple[str, ...]
+) -> None:
+    make_table(lab / "lamps", "one", (0, 1), ("FL2", "LED-B1"))
+    make_table(lab / "same", "two", (0, 1), ("FL2", "LED-B1"))
+    wish = ("--sources", "pictures", "--no-preview")
+    assert main(("lamps", "first", *wish, *lights)) == 0
+    assert main(("lamps", "again", *wish, "--lights-of", "first")) == 0
+    capsys.readouterr()
+    assert main(("same", "second", *wish, "--lights-of", "first")) == 2
+    assert "their proportion is not known" in " ".join(capsys.readouterr().err.split())

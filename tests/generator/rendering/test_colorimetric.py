@@ -76,7 +76,9 @@ def test_black_is_as_dark_as_it_can_be_grey(make_table: MakeTable) -> None:
     assert mix_cells(tinted, lifted[None]).distance[0] <= BLACK_WITHIN_DEG
 
 
-def test_a_second_run_takes_what_the_first_kept(make_table: MakeTable, cache: Path) -> None:
+def test_a_second_run_takes_what_the_first_kept(
+    make_table: MakeTable, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     matrix = ColourMatrix("mine", MATRIX, "")
     first = colorimetric_mixtures(make_table(bits=1), 0, matrix)
     (path,) = cache.iterdir()
@@ -90,6 +92,10 @@ def test_a_second_run_takes_what_the_first_kept(make_table: MakeTable, cache: Pa
     colorimetric_mixtures(make_table(bits=1, name="third"), 0, ColourMatrix("none", np.eye(3), ""))
     colorimetric_mixtures(make_table(bits=1, tint=0.1, name="fourth"), 0, matrix)
     assert len(list(cache.iterdir())) == 4
+    # Nor is what other libraries have computed.
+    monkeypatch.setattr("generator.rendering.colorimetric.version", "{} 0".format)
+    colorimetric_mixtures(make_table(bits=1, name="fifth"), 0, matrix)
+    assert len(list(cache.iterdir())) == 5
 
 
 def test_lights_have_numbers_temperatures_and_mixtures(make_table: MakeTable) -> None:

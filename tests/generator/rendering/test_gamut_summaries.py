@@ -1,31 +1,33 @@
-"""Shares of a picture's pixels among source nodes, and what a print makes of them."""
+"""Which source nodes a picture has, and what a print makes of them."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from generator.rendering.gamut_summaries import node_shares
-from generator.rendering.source_colours import node_codes
-
-
-@given(st.integers(0, 2**24 - 1), st.integers(1, 3), st.integers(1, 3))
-def test_the_nodes_of_a_colour_have_its_mean(colour: int, height: int, width: int) -> None:
-    codes = np.array([colour >> 16, colour >> 8 & 255, colour & 255], np.uint8)
-    shares = node_shares(np.broadcast_to(codes, (height, width, 3)))
-    assert shares.min() >= 0
-    assert shares.sum() == pytest.approx(1)
-    np.testing.assert_allclose(shares @ node_codes(), codes / 255, atol=1e-12)
-    assert (shares > 0).sum() <= 8
+from generator.kernels.dithering import nearest_nodes
+from generator.rendering.cell_mixtures import CellMixtures
+from generator.rendering.gamut_summaries import summarise
+from generator.rendering.source_colours import NODES, node_codes
 
 
-@pytest.mark.parametrize("shape", [(1, 200_000), (200_000, 1), (700, 500)])
-def test_large_pictures_are_looked_at_on_a_grid(shape: tuple[int, int]) -> None:
-    picture = np.zeros((*shape, 3), np.uint8)
-    flat = picture.reshape(-1, 3)
-    flat[len(flat) // 4 :] = 255
-    shares = node_shares(picture)
-    assert shares[0] == pytest.approx(0.25, abs=0.01)
-    assert shares[-1] == pytest.approx(0.75, abs=0.01)
+def test_every_pixel_counts_as_the_node_nearest_to_it() -> None:
+    picture = np.random.default_rng(5).integers(0, 256, (9, 11, 3)).astype(np.uint8)
+    nodes = [int(np.square(node_codes() - pixel / 255).sum(axis=1).argmin()) for pixel in picture.reshape(-1, 3)]
+    np.testing.assert_array_equal(nearest_nodes(picture), np.bincount(nodes, minlength=NODES))
+
+
+def test_what_is_missed_counts_by_pixels() -> None:
+    rng = np.random.default_rng(6)
+    wanted = rng.uniform(0.1, 0.9, (NODES, 3)).astype(np.float32)
+    seen = (wanted * rng.uniform(0.9, 1.1, wanted.shape)).astype(np.float32)
+    picture = rng.integers(0, 256, (20, 30, 3)).astype(np.uint8)
+    counts = nearest_nodes(picture)
+    summary = summarise(CellMixtures(np.zeros((NODES, 32), np.uint16), seen, wanted), counts.astype(np.float64))
+    each = np.repeat(np.arange(NODES), counts)
+    cosines = (seen[each] * wanted[each]).sum(axis=1, dtype=np.float64)
+    cosines /= np.linalg.norm(seen[each].astype(float), axis=1) * np.linalg.norm(wanted[each].astype(float), axis=1)
+    assert summary.distance_deg == pytest.approx(np.degrees(np.arccos(np.minimum(cosines, 1))).mean(), rel=1e-4)
+    off = np.abs(seen[each] / wanted[each] - 1).max(axis=1) > 0.02
+    assert summary.outside == pytest.approx(off.mean())
+    assert 0 < summary.outside < 1

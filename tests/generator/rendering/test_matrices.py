@@ -7,12 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.raw.camera_matrix import camera_matrix as of_libraw
 from foundation.errors import InputError
 from generator.rendering.matrices import camera_matrix, cameras, choose_matrix
+from sim.world.body_settings import FACTS
+from sim.world.sensors import BODIES, Body
 
 
 def test_every_camera_keeps_white() -> None:
-    assert len(cameras()) == 7
+    assert len(cameras()) == 8
     for name in cameras():
         found = camera_matrix(name)
         assert found is not None
@@ -32,6 +35,20 @@ def test_names_of_a_camera(name: str) -> None:
 @pytest.mark.parametrize("name", ["", "Canon", "EOS", "5D", "Nikon 550D", "50D"])
 def test_what_is_no_camera(name: str) -> None:
     assert camera_matrix(name) is None
+
+
+@pytest.mark.parametrize("body", [*FACTS.values(), BODIES["EOS 550D"], BODIES["EOS 6D Mark II"]])
+def test_bodies_of_the_suite_need_no_matrix_fitted_from_their_table(body: Body) -> None:
+    assert camera_matrix(body.camera) is not None
+
+
+def test_the_numbers_are_those_of_libraw() -> None:
+    for name in cameras():
+        listed, found = of_libraw(name), camera_matrix(name)
+        assert listed is not None
+        assert found is not None
+        rows = np.array(listed) @ [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+        np.testing.assert_allclose(found.rows, rows / rows.sum(axis=1, keepdims=True), rtol=0, atol=1e-6)
 
 
 def test_the_matrix_that_a_second_reading_found() -> None:

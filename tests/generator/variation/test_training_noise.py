@@ -10,6 +10,7 @@ import pytest
 
 from calibration.table.lut import Lut
 from foundation.errors import InputError
+from generator.rendering.black_points import BlackPoint
 from generator.training.crops import Crops
 from generator.training.gallery import gallery_of
 from generator.variation.iso_speed import IsoSpeed
@@ -57,6 +58,20 @@ def test_items_are_the_same_whoever_makes_them(make_lut: Callable[..., Lut]) -> 
     spread = loud.batch(np.arange(40)).images.std(axis=(2, 3)) / quiet.batch(np.arange(40)).images.std(axis=(2, 3))
     # The samples are Poisson's, so all noise is shot noise, and 16 times the speed has 16 times the variance.
     assert np.median(spread) == pytest.approx(4, rel=0.1)
+
+
+def test_black_that_is_taken_out_is_not_lifted_by_noise(make_lut: Callable[..., Lut]) -> None:
+    lut = make_lut(bits=3)
+    gallery = gallery_of([np.zeros((60, 60, 3), np.uint8)])
+    black = BlackPoint("random", most=0.97)
+    crops = Crops(lut, gallery, (48, 48), length=6, lights=[0], noise=NOISE, iso=IsoSpeed(6400, 100), black_point=black)
+    quiet = Crops(lut, gallery, (48, 48), length=6, lights=[0], black_point=black)
+    noisy = crops.batch(np.arange(6)).images.astype(np.float64)
+    plain = quiet.batch(np.arange(6)).images.astype(np.float64)
+    # Noise of mean 0: cut off at 0 it would lift black by .4 of its standard deviation, that is by 60 standard errors.
+    errors = (noisy - plain).std(axis=(2, 3)) / 48
+    assert np.abs((noisy - plain).mean(axis=(2, 3)) / errors).max() < 5
+    assert noisy.min() < 0
 
 
 def test_what_is_refused(make_lut: Callable[..., Lut]) -> None:

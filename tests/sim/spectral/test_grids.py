@@ -40,6 +40,13 @@ def test_uneven_steps_are_weighed_by_their_width() -> None:
     assert found[2:-2] == pytest.approx(np.ones(len(NODES) - 4), abs=0.06)
 
 
+def test_a_line_among_coarse_steps_leaves_the_rest_smooth() -> None:
+    # Measured every 10 nm, and every 1 nm about a line: nodes between the coarse steps must not stay dark.
+    grid = np.unique(np.concatenate([np.arange(380.0, 781.0, 10.0), np.arange(540.0, 551.0)]))
+    found = regridded(grid, grid[:, None] / 500, NODES)[:, 0]
+    assert found[1:-1] == pytest.approx(NODES[1:-1] / 500, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("grid", "message"),
     [
