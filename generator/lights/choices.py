@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from foundation.errors import InputError
+from foundation.errors import InputError, first_of
 from generator import philox
 from generator.lights.distributions import Distribution
 from generator.lights.gamut import Gamut, Match, OutsideGamut, OutsideGamutError, black_body, rgb_of
@@ -46,8 +46,6 @@ _BATCH: Final = 32
 _BATCHES: Final = 2048
 """Batches drawn at most for a light: 65 536 draws, of which none is in the gamut with probability e⁻⁶⁵ where a share of
 `_LEAST_WITHIN` is."""
-_NAMES_SHOWN: Final = 12
-"""Names of lights in a message: enough to see how they are written."""
 _LEAST_WITHIN: Final = 1e-3
 """Share of a distribution that must lie in the gamut; with less, a light would take thousands of draws."""
 
@@ -306,20 +304,17 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
     InputError
         It names none, or one that the table cannot make.
     """
-    for light in lut.illuminations:
-        if light.name is not None and light.name == text.strip():
-            return parse_mixture(str(light.index))
+    named = {light.name: light.index for light in lut.illuminations if light.name is not None}
+    if text.strip() in named:
+        return plain(named[text.strip()])
     kelvin = re.fullmatch(r"(\d+(?:\.\d*)?)\s*[kK]", text.strip(), re.ASCII)
     if kelvin:
         text = f"cct={kelvin[1]}"
     if "=" not in text:
-        names = [light.name for light in lut.illuminations if light.name is not None]
-        if names and not re.match(r"[\d.]", text.strip(), re.ASCII):
-            shown = ", ".join(names[:_NAMES_SHOWN]) + (" …" if len(names) > _NAMES_SHOWN else "")
-            raise InputError(
-                f"{text!r} is no light of the table, whose lights are called {shown}; its illuminations.csv lists them"
-            )
-        mixture = parse_mixture(text.strip())
+        try:
+            mixture = parse_mixture(text.strip())
+        except InputError as error:
+            raise InputError(f"{error}, or a name: {first_of(list(named))}" if named else str(error)) from error
         mixture.white(lut)
         return mixture
     numbers = parse_numbers(

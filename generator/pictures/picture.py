@@ -90,7 +90,7 @@ class Preparation:
         if self.crops < 1:
             raise InputError(f"{self.crops} crops of a picture were asked for, expected 1 or more")
         if self.crops > 1 and self.crop is None:
-            raise InputError(f"{self.crops} crops of a picture were asked for, but no size; give it, such as 512x512")
+            raise InputError(f"{self.crops} crops of a picture have no size; give that of a crop, such as 512x512")
 
     def describe(self) -> dict[str, Any]:
         """Return the options that are set, as a JSON object."""

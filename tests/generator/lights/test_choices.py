@@ -130,15 +130,14 @@ def test_texts_of_lights(make_lut: Callable[..., Lut]) -> None:
     assert parse_light("r=.9,b=.05", lut, outside="nearest") == plain(4)
 
 
-def test_a_table_of_named_lights_tells_their_names(make_lut: Callable[..., Lut]) -> None:
+def test_lights_of_a_table_may_have_names(make_lut: Callable[..., Lut]) -> None:
     lut = make_lut(lights=3)
-    names = ("D65", "LED-B3", "HP1")
-    lights = tuple(replace(light, name=name) for light, name in zip(lut.illuminations, names, strict=True))
-    named = replace(lut, illuminations=lights)
-    assert parse_light("LED-B3", named) == plain(1)
-    assert parse_light("2", named) == plain(2)
-    with pytest.raises(InputError, match="'LED-B9' is no light of the table, whose lights are called D65, LED-B3"):
-        parse_light("LED-B9", named)
+    named = [replace(light, name=name) for light, name in zip(lut.illuminations, ("A", "FL2", "D65"), strict=True)]
+    lut = replace(lut, illuminations=tuple(named))
+    assert parse_light(" FL2 ", lut) == plain(1)
+    assert parse_light("2", lut) == plain(2)
+    with pytest.raises(InputError, match=r"'fl2' is no mixture of lights; .*, or a name: A, FL2, D65"):
+        parse_light("fl2", lut)
 
 
 @pytest.mark.parametrize(
