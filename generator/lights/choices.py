@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from foundation.errors import InputError
+from foundation.errors import InputError, first_of
 from generator import philox
 from generator.lights.distributions import Distribution
 from generator.lights.gamut import Gamut, Match, OutsideGamut, OutsideGamutError, black_body, rgb_of
@@ -304,14 +304,17 @@ def parse_light(text: str, lut: Lut, gamut: Gamut | None = None, outside: Outsid
     InputError
         It names none, or one that the table cannot make.
     """
-    for light in lut.illuminations:
-        if light.name is not None and light.name == text.strip():
-            return parse_mixture(str(light.index))
+    named = {light.name: light.index for light in lut.illuminations if light.name is not None}
+    if text.strip() in named:
+        return plain(named[text.strip()])
     kelvin = re.fullmatch(r"(\d+(?:\.\d*)?)\s*[kK]", text.strip(), re.ASCII)
     if kelvin:
         text = f"cct={kelvin[1]}"
     if "=" not in text:
-        mixture = parse_mixture(text.strip())
+        try:
+            mixture = parse_mixture(text.strip())
+        except InputError as error:
+            raise InputError(f"{error}, or a name: {first_of(list(named))}" if named else str(error)) from error
         mixture.white(lut)
         return mixture
     numbers = parse_numbers(

@@ -52,26 +52,43 @@ def parse_masks(text: str, lights: int, seed: int) -> MaskPlan:
     >>> weights.shape, weights.dtype, weights.sum(axis=2).min()
     ((2, 6, 2), dtype('float32'), np.float32(1.0))
     """
-    kind, _, rest = text.strip().partition(":")
-    if kind not in _OPTIONS:
+    if text.strip().partition(":")[0] not in _OPTIONS:
         if not text.strip() or not Path(text).is_dir():
             raise InputError(f"{text!r} is neither a folder of masks nor a kind of them: {', '.join(_OPTIONS)}")
         return find_masks(Path(text).absolute(), lights)
+    return MadeMaskPlan(parse_shape(text), seed)
+
+
+def parse_shape(text: str) -> Shape:
+    """Return the shape of made masks that a text names, as of `parse_masks`.
+
+    Raises
+    ------
+    InputError
+        It names none, or a number is out of range.
+
+    Examples
+    --------
+    >>> parse_shape("soft-edge:angle=30,width=.2")
+    HalfPlanes(angle=30.0, width=0.2)
+    """
+    kind, _, rest = text.strip().partition(":")
+    if kind not in _OPTIONS:
+        raise InputError(f"{kind!r} is no kind of masks; name one of {', '.join(_OPTIONS)}")
     numbers = parse_numbers(rest, _OPTIONS[kind], f"the masks {kind}")
     whole = {name: _whole(numbers[name], name, kind) for name in ("count", "columns", "rows") if name in numbers}
     match kind:
         case "half-plane" | "soft-edge":
             width = numbers.get("width", 0.0 if kind == "half-plane" else None)
-            shape: Shape = HalfPlanes(numbers.get("angle"), width)
+            return HalfPlanes(numbers.get("angle"), width)
         case "spots":
-            shape = Spots(whole.get("count"), numbers.get("radius"), numbers.get("softness", Spots.softness))
+            return Spots(whole.get("count"), numbers.get("radius"), numbers.get("softness", Spots.softness))
         case "smooth":
-            shape = SmoothFields(
+            return SmoothFields(
                 numbers.get("scale", SmoothFields.scale), numbers.get("contrast", SmoothFields.contrast)
             )
         case _:
-            shape = Windows(whole.get("columns"), whole.get("rows"), numbers.get("softness"))
-    return MadeMaskPlan(shape, seed)
+            return Windows(whole.get("columns"), whole.get("rows"), numbers.get("softness"))
 
 
 def _whole(number: float, name: str, kind: str) -> int:

@@ -87,8 +87,10 @@ class Preparation:
             )
         if self.crop is None and (self.cover or self.crop_at == "random"):
             raise InputError("no crop was given to cover or to cut at random; give its size, such as 512x512")
-        if self.crops < 1 or (self.crops > 1 and self.crop is None):
-            raise InputError(f"{self.crops} crops were asked for, expected 1 or more, and their size, such as 512x512")
+        if self.crops < 1:
+            raise InputError(f"{self.crops} crops of a picture were asked for, expected 1 or more")
+        if self.crops > 1 and self.crop is None:
+            raise InputError(f"{self.crops} crops of a picture have no size; give that of a crop, such as 512x512")
 
     def describe(self) -> dict[str, Any]:
         """Return the options that are set, as a JSON object."""

@@ -20,8 +20,8 @@ from typing import Any, Final
 
 from foundation.errors import InputError
 from generator import philox
-from generator.masks.making import MadeMaskPlan, MadeMasks
-from generator.masks.request import parse_masks
+from generator.masks.making import MadeMasks
+from generator.masks.request import parse_shape
 from generator.masks.shapes import RandomStreams, Shape, SmoothFields
 from generator.masks.weights import Weights
 from generator.named_numbers import Range, parse_numbers
@@ -114,8 +114,6 @@ def parse_gradient(text: str) -> Gradient:
     own = [entry for entry in entries if entry.partition("=")[0].strip().lower() in _OPTIONS]
     numbers = parse_numbers(",".join(own), _OPTIONS, f"the gradient {kind}")
     others = ",".join(entry for entry in entries if entry not in own)
-    plan = parse_masks(f"{kind}:{others}" if others else kind, 2, 0)
-    if not isinstance(plan, MadeMaskPlan):
-        raise InputError(f"the gradient {text!r} is a folder of masks; name a kind: smooth, soft-edge, spots, window")
+    shape = parse_shape(f"{kind}:{others}" if others else kind)
     stops = numbers.get("stops", max(Gradient.stops, numbers.get("least", 0.0)))
-    return Gradient(plan.shape, stops, numbers.get("least", Gradient.least), numbers.get("colour", Gradient.colour))
+    return Gradient(shape, stops, numbers.get("least", Gradient.least), numbers.get("colour", Gradient.colour))

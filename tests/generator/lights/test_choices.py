@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -127,6 +128,16 @@ def test_texts_of_lights(make_lut: Callable[..., Lut]) -> None:
     r, _, b = lut.ground_truth[2]
     assert parse_light(f"r={r},b={b}", lut) == plain(2)
     assert parse_light("r=.9,b=.05", lut, outside="nearest") == plain(4)
+
+
+def test_lights_of_a_table_may_have_names(make_lut: Callable[..., Lut]) -> None:
+    lut = make_lut(lights=3)
+    named = [replace(light, name=name) for light, name in zip(lut.illuminations, ("A", "FL2", "D65"), strict=True)]
+    lut = replace(lut, illuminations=tuple(named))
+    assert parse_light(" FL2 ", lut) == plain(1)
+    assert parse_light("2", lut) == plain(2)
+    with pytest.raises(InputError, match=r"'fl2' is no mixture of lights; .*, or a name: A, FL2, D65"):
+        parse_light("fl2", lut)
 
 
 @pytest.mark.parametrize(

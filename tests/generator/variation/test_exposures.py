@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -96,6 +98,13 @@ def test_the_shape_is_not_that_of_masks_of_the_same_seed() -> None:
     assert np.abs(np.corrcoef(weights[..., 1].ravel(), masks[..., 1].ravel())[0, 1]) < 0.9
     assert np.ptp(weights[..., 1]) > 0.2
     np.testing.assert_allclose(weights.sum(axis=2), 1, atol=1e-6)
+
+
+def test_a_folder_of_masks_is_no_gradient(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "masks").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="'masks' is no kind of masks; name one of half-plane, soft-edge"):
+        parse_gradient("masks:stops=1")
 
 
 @pytest.mark.parametrize(
