@@ -166,13 +166,17 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers) -> None:
 def _print_summary(dataset: Dataset, out: str) -> None:
     made = dataset.description
     lights = len({light for entry in dataset.entries for light in entry.lights})
-    counts = _counted(made.images, "image"), _counted(made.sources, "picture"), _counted(lights, "light")
-    print("{}: {} of {} under {}".format(out, *counts))
+    # A picture that was drawn several times is a source each time; one that was made and not read has no hash.
+    different = len({source.sha256 or source.name for source in dataset.sources})
+    pictures = _counted(made.sources, "picture")
+    if different < made.sources:
+        pictures += f", {different} of them different,"
+    print(f"{out}: {_counted(made.images, 'image')} of {pictures} under {_counted(lights, 'light')}")
     if made.splits:
         print(", ".join(f"{images} for {part}" for part, images in made.splits.items()))
     if made.skipped:
         tried = made.sources + len(made.skipped)
-        print(f"{len(made.skipped)} of {tried} pictures could not be read; dataset.json lists them")
+        print(f"{len(made.skipped)} of {tried} pictures were left out; dataset.json lists them")
     if made.replaced_pixels:
         share = 100 * made.replaced_pixels / made.pixels
         print(

@@ -21,7 +21,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Simulated devices on loopback connections, until interrupted.\n\n" + EXIT_CODES,
+    help="Simulated devices on loopback connections, until interrupted; and tables that are computed.\n\n" + EXIT_CODES,
 )
 
 

@@ -148,11 +148,15 @@ def parse_spectra(data: bytes, where: str) -> tuple[LightSpectrum, ...]:
     table = np.empty((len(rows) - 1, len(heads)))
     for number, row in enumerate(rows[1:]):
         try:
-            table[number] = [float(cell) for cell in row]
+            values = [float(cell) for cell in row]
+            if len(values) != len(heads):
+                # One number alone would be taken for each of the row.
+                raise ValueError(f"{len(values)} numbers")
         except ValueError as error:
             raise FormatError(
                 f"{where}, line {number + 2}: {len(heads)} numbers expected, as the first line has heads"
             ) from error
+        table[number] = values
     if not np.isfinite(table).all():
         raise FormatError(f"{where}: a number is not finite; leave its wavelength out, or measure it")
     table = table[np.argsort(table[:, 0], kind="stable")]

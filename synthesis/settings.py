@@ -38,9 +38,9 @@ class ComputedExposure(_Settings):
 
     iso: Annotated[int, Field(ge=50, le=25600)] = 100
     """ISO speed."""
-    aperture: Annotated[float, Field(gt=0)] = 8.0
+    aperture: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 8.0
     """f-number."""
-    shutter_s: Annotated[float, Field(gt=0)] = 0.5
+    shutter_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.5
     """Shutter time, s."""
 
 

@@ -38,6 +38,9 @@ _SRGB_TO_XYZ: Final = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.072
 _LEAST_SUM: Final = 1e-6
 """Least sum of a row: that of a row that leaves white black cannot be made 1."""
 
+_LARGEST: Final = 1e6
+"""Largest number of a matrix in a file: rows in ten-thousandths have some 10⁴, and sums of such are exact enough."""
+
 
 @dataclass(frozen=True, eq=False)
 class ColourMatrix:
@@ -113,8 +116,10 @@ def read_matrix(path: Path) -> ColourMatrix:
     except (OSError, ValueError) as error:
         raise InputError(f"{path} is no colour matrix: {error}; {expected}") from error
     rows = [row for row in rows if row]
-    if [len(row) for row in rows] != [3, 3, 3] or not np.isfinite(rows).all():
+    if [len(row) for row in rows] != [3, 3, 3]:
         raise InputError(f"{path} is no colour matrix: its rows have {[len(row) for row in rows]} numbers; {expected}")
+    if not np.abs(rows).max() <= _LARGEST:
+        raise InputError(f"{path} is no colour matrix: its numbers are {rows}, up to {_LARGEST:g} expected; {expected}")
     return ColourMatrix(path.name, _normalised(np.array(rows), str(path)), f"the file {path.name}")
 
 

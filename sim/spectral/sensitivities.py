@@ -154,9 +154,11 @@ def parse_sensitivities(data: bytes, name: str, where: str) -> Sensitivities:
         See `read_sensitivities`.
     """
     try:
-        document = _Document.model_validate(json.loads(data))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        document = _Document.model_validate(json.loads(data, object_pairs_hook=_unlike))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise FormatError(f"{where} is no JSON: {error}; expected a file of rawtoaces-data's layout") from error
+    except _TwiceError as error:
+        raise FormatError(f"{where}: {error.args[0]!r} stands there twice; leave one out") from error
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"])) or "document"
@@ -179,6 +181,20 @@ def parse_sensitivities(data: bytes, name: str, where: str) -> Sensitivities:
     _require_camera(wavelengths, curves, where)
     header = document.header
     return Sensitivities(name, header.manufacturer, header.model, wavelengths, curves, sha256_of(data))
+
+
+class _TwiceError(Exception):
+    """A key of a JSON object is there twice; its argument is the key."""
+
+
+def _unlike(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object whose keys differ; of two alike `json` would take the last without a word."""
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise _TwiceError(key)
+        found[key] = value
+    return found
 
 
 def _sorted(table: Mapping[str, list[float]], where: str) -> tuple[_Array, _Array]:

@@ -108,6 +108,7 @@ def test_what_is_no_light_is_refused(given: str, message: str) -> None:
         (table(hall=1.0).replace("500,1.0", "500,-0.1"), "'hall' is -0.1 at 500 nm, 0 or more expected"),
         (table(hall=1.0).replace("500,1.0", "500,"), "line 26: 2 numbers expected"),
         (table(hall=1.0).replace("500,1.0", "500,1.0,2.0"), "line 26: 2 numbers expected"),
+        (table(hall=1.0).replace("500,1.0", "500"), "line 26: 2 numbers expected"),
         (table(hall=1.0).replace("500,1.0", "500,nan"), "a number is not finite"),
         (table(hall=1.0, cellar=0.0), "'cellar' is dark from 400 to 700 nm"),
         (table(low=410, hall=1.0), "its wavelengths are 410 to 780"),

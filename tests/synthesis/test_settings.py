@@ -69,6 +69,7 @@ def test_a_body_of_the_lab_and_one_of_sensitivities_are_found() -> None:
         ({"chart": {"bits": 6}}, r"here: chart\.bits = 6"),
         ({"window": 4}, "window = 4: 3, 5, 7, 9 expected"),
         ({"exposure": {"iso": 0}}, r"exposure\.iso = 0"),
+        ({"exposure": {"shutter_s": float("inf")}}, r"exposure\.shutter_s = inf"),
     ],
 )
 def test_what_cannot_be_set_is_refused(document: dict[str, Any], message: str) -> None:

@@ -71,6 +71,7 @@ def pool_transfers(parts: Sequence[TransferResults]) -> Pool:
             "of the same methods, whose training sets have the same names"
         )
     notes = [f"Left out, since not all of the results have them: {'; '.join(missing)}"] if missing else []
+    notes += _differences(parts)
     labels = _short_names([part.place for part in parts])
     rows = [_joined([rows[key] for rows in keyed], [part.place for part in parts], single) for key in common]
     return Pool(
@@ -80,6 +81,23 @@ def pool_transfers(parts: Sequence[TransferResults]) -> Pool:
         rows=tuple(rows),
         notes=tuple(notes),
     )
+
+
+def _differences(parts: Sequence[TransferResults]) -> list[str]:
+    """Return sentences on conditions that are not the same in all folders, and on test images that are not real."""
+    notes: list[str] = []
+    for name in dict.fromkeys(name for part in parts for name in part.conditions):
+        places: dict[str, list[str]] = {}
+        for part in parts:
+            if name in part.conditions:
+                places.setdefault(part.conditions[name], []).append(part.place)
+        if len(places) > 1:
+            told = "; ".join(f"{value} in {', '.join(named)}" for value, named in places.items())
+            notes.append(f"The results do not have the same conditions: {name} is {told}")
+    made = list(dict.fromkeys(part.test for part in parts if part.generated))
+    if made:
+        notes.append(f"Made by generate, so that they say nothing of real images: the test sets {', '.join(made)}")
+    return notes
 
 
 def _joined(rows: Sequence[TransferRow], places: Sequence[str], single: bool) -> TransferRow:
@@ -114,15 +132,15 @@ def _key(row: TransferRow, single: bool) -> tuple[str, Kind, str]:
 
 def _require_apart(parts: Sequence[TransferResults]) -> None:
     """Refuse results of which two hold one image: it would count twice, and intervals would be too narrow."""
-    seen: dict[tuple[str, tuple[float, ...]], str] = {}
-    for part in parts:
+    seen: dict[tuple[str, tuple[float, ...]], int] = {}
+    for number, part in enumerate(parts):
         for image, truth in zip(part.images, part.truths, strict=True):
             share = tuple(round(float(each / truth.sum()), 6) for each in truth)
-            other = seen.setdefault((image, share), part.place)
-            if other != part.place:
+            other = seen.setdefault((image, share), number)
+            if other != number:
                 raise InputError(
-                    f"{image} is a test image of {other} and of {part.place}; pool results of different images, such "
-                    "as of different cameras, or of parts of one data set (evaluate transfer --only)"
+                    f"{image} is a test image of {parts[other].place} and of {part.place}; pool results of different "
+                    "images, such as of different cameras, or of parts of one data set (evaluate transfer --only)"
                 )
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -38,6 +39,10 @@ class TransferResults:
         Its rows, the images in that order.
     error
         The kind of error that it was summed up by.
+    conditions
+        What of its settings would make its rows other ones, each as JSON text by its name.
+    generated
+        Whether the test images were generated.
     """
 
     place: str
@@ -46,6 +51,8 @@ class TransferResults:
     truths: npt.NDArray[np.float64]
     rows: tuple[TransferRow, ...]
     error: ErrorKind
+    conditions: Mapping[str, str] = field(default_factory=dict[str, str])
+    generated: bool = False
 
 
 def read_transfer(place: Path | str) -> TransferResults:
@@ -84,9 +91,24 @@ def read_transfer(place: Path | str) -> TransferResults:
         raise FormatError(f"{folder / 'results.csv'} has no row; run the transfer again")
     try:
         test, error = str(about["test"]["name"]), about["settings"]["error"]
-    except (KeyError, TypeError) as fault:
+        generated = about["test"].get("generated") is not None
+        conditions = _conditions(about["settings"])
+    except (AttributeError, KeyError, TypeError) as fault:
         raise FormatError(f"{folder / 'run.json'} does not say the {fault} of the transfer; run it again") from fault
-    return TransferResults(str(place), test, first.images, _lights(first.truths), tuple(rows), error)
+    return TransferResults(
+        str(place), test, first.images, _lights(first.truths), tuple(rows), error, conditions, generated
+    )
+
+
+def _conditions(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Return what of a transfer's settings is to be the same in those that are pooled.
+
+    Not the colour matrix, which each camera has of its own, nor which images were tested.
+    """
+    found = {f"--{name}": settings.get(name) for name in ("folds", "images", "side", "shared")}
+    for method in (*settings.get("methods", ()), *settings.get("statistics", ())):
+        found[f"the settings of {method['name']}"] = method.get("settings")
+    return {name: json.dumps(value, sort_keys=True) for name, value in found.items()}
 
 
 def _about(folder: Path) -> dict[str, Any]:

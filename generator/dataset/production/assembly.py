@@ -159,7 +159,8 @@ def assemble(place: Workplace, identity: Mapping[str, Any]) -> None:
             used.update((light.illumination, light) for light in record.lights)
         if not counts["images"]:
             raise NothingMadeError(
-                f"none of the {identity['sources']['count']} pictures can be read; name a folder of other pictures"
+                f"none of the {identity['sources']['count']} pictures can be used: all were "
+                "left out, each with its reason; name others, or ask for a smaller crop if they are too small"
             )
         description = Description(
             software=software(),

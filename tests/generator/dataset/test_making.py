@@ -189,7 +189,7 @@ def test_nothing_is_left_of_a_dataset_that_cannot_be(
     before, threads = contents(tmp_path), threading.active_count()
     with pytest.raises(InputError, match="there is no light 9"):
         generate_dataset(lut, tmp_path / "out", sources, [0, 9], workers=2)
-    with pytest.raises(FormatError, match="none of the 1 pictures can be read"):
+    with pytest.raises(FormatError, match="none of the 1 pictures can be used"):
         generate_dataset(lut, tmp_path / "out", find_pictures([pictures / "broken.jpg"]), [0])
     unlike: Any = (1, 2)
     with pytest.raises(InputError, match="the split 1,2 is to be three shares from 0 that sum to 1"):

@@ -78,6 +78,8 @@ def test_pictures_lights_and_what_is_recorded(table: Lut, capsys: pytest.Capture
     assert "200 draws of" in printed
     assert "of 60 measured" in printed
     dataset = open_dataset("out")
+    different = len({entry.source for entry in dataset.entries})
+    assert f"out: 200 images of 200 pictures, {different} of them different, under " in printed
     assert len(dataset.entries) == 200
     reddish = [int(entry.source.removesuffix(".png")) % 2 for entry in dataset.entries]
     # 100 real images say .75 within .04, and the prior draws it a little towards the half that it is without.

@@ -157,6 +157,7 @@ def test_the_matrix_is_that_of_the_camera_or_of_the_table(make_table: MakeTable)
     np.testing.assert_allclose(unknown.rows, MATRIX, atol=0.01)
     assert matrix_for(lut, "table").name == "table"
     assert matrix_for(lut, "eos 5ds r").name == "Canon EOS 5DS R"
+    assert matrix_for(make_table(camera="Canon EOS 5DS", name="5ds")).name == "Canon EOS 5DS"
     np.testing.assert_array_equal(matrix_for(lut, "none").rows, np.eye(3))
     with pytest.raises(InputError, match="neither a file nor a camera"):
         matrix_for(lut, "pinhole")

@@ -71,6 +71,8 @@ def test_files(tmp_path: Path) -> None:
         ("1 0 0\n0 1 0\n", "expected three rows"),
         ("1 0 0\n0 x 0\n0 0 1", "could not convert"),
         ("1 0 0\n0 nan 0\n0 0 1", "is no colour matrix"),
+        # The sum is infinite, and what is divided by it 0: a channel that sees nothing.
+        ("1e308 1e308 0\n0 1 0\n0 0 1", r"up to 1e\+06 expected"),
         ("1 0 0\n0 1 0\n1 0 -1", "sums 1 1 0, expected sums above 0"),
     ):
         path.write_text(text)

@@ -94,6 +94,18 @@ def test_what_cannot_be_a_cameras_is_refused(content: Any, message: str) -> None
     assert str(refused.value).startswith("m1.json")
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (json.dumps(document()).replace('"500"', '"490"'), "'490' stands there twice"),
+        ("[" * 100_000, "is no JSON"),
+    ],
+)
+def test_what_json_would_pass_over_or_fall_over_is_refused(text: str, message: str) -> None:
+    with pytest.raises(FormatError, match=message):
+        parse_sensitivities(text.encode(), "m1", "m1.json")
+
+
 def test_a_blind_channel_is_refused() -> None:
     content = document()
     for row in content["spectral_data"]["data"]["main"].values():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,24 @@ def test_an_image_that_would_count_twice_is_refused() -> None:
         pool_transfers([part("a", rows), part("b", rows, first=8)])
     with pytest.raises(InputError, match="no results to pool"):
         pool_transfers([])
+
+
+def test_a_folder_that_is_named_twice_is_refused() -> None:
+    same = part("a", row("cross-validation", errors(9)))
+    with pytest.raises(InputError, match=r"0\.png is a test image of a and of a"):
+        pool_transfers([same, same])
+
+
+def test_conditions_that_differ_are_told() -> None:
+    made = [part(name, row("cross-validation", errors(9)), first=20 * at) for at, name in enumerate("abc")]
+    alike = {"--side": "64", "the settings of Trees": "null"}
+    parts = [replace(one, conditions=alike) for one in made]
+    assert pool_transfers(parts).notes == ()
+    parts[1] = replace(parts[1], conditions=alike | {"--side": "null"}, generated=True)
+    assert pool_transfers(parts).notes == (
+        "The results do not have the same conditions: --side is 64 in a, c; null in b",
+        "Made by generate, so that they say nothing of real images: the test sets b",
+    )
 
 
 def test_the_same_name_under_another_light_is_another_image() -> None:
