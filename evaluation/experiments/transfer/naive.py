@@ -3,7 +3,8 @@
 For each image of a generated data set a scene of the same picture under the same light, as bright and as finely
 quantised, without a print, a camera or noise: codes become linear light by the sRGB curve, colours those of the camera
 by its matrix if one is given, and each channel is multiplied by the light. What a learned method gains by training on
-the generated image instead is what the table is worth.
+the generated image instead is what the table is worth. What `generate --exposure`, `--iso`, and a `--gradient` without
+a tint did to the generated image is not done to its counterpart.
 """
 
 from __future__ import annotations
@@ -118,7 +119,16 @@ class NaiveScene:
                 )
             level = sum(weight * levels[light] for light, weight in zip(mixture.lights, mixture.weights, strict=True))
             whites.append(np.array(truth) * level)
+        end = [float(self._details.get(f"end_{channel}", 1)) for channel in "rgb"]
+        if len(set(entry.lights)) == 1 and len(whites) == 2 and len(set(end)) > 1:
+            # One light that falls off with a tint: the second is what is left of the first at the far end.
+            whites[1] = whites[0] * end
         return np.array(whites)
+
+    @property
+    def _details(self) -> Mapping[str, str]:
+        """What options did to the generated image, by column of `images.csv`."""
+        return self.generated.dataset.details.get(self.generated.entry.image, {})
 
     def read(self) -> tuple[npt.NDArray[np.uint16], None]:
         """Return the image (H, W, 3) uint16, counts, and no mask."""
@@ -126,7 +136,8 @@ class NaiveScene:
         if len(self.whites) > 1:
             light = self.generated.dataset.read_weights(self.generated.entry) @ self.whites
         matrix = None if self.matrix is None else self.matrix.rows
-        return naive_image(self.picture.codes(), light, self.saturation, matrix), None
+        codes = self.picture.codes(int(self._details.get("crop", 0)))
+        return naive_image(codes, light, self.saturation, matrix), None
 
 
 def naive_scenes(

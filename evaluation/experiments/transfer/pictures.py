@@ -40,8 +40,8 @@ class FoundPicture:
     width: int
     preparation: Preparation
 
-    def codes(self) -> npt.NDArray[np.uint8]:
-        """Return the sRGB codes (H, W, 3) uint8 that the images of the data set were made of.
+    def codes(self, crop: int = 0) -> npt.NDArray[np.uint8]:
+        """Return the sRGB codes (H, W, 3) uint8 that images of the data set were made of: those of one of its crops.
 
         Raises
         ------
@@ -51,7 +51,8 @@ class FoundPicture:
         if self.path is None:
             number = int(self.name.rpartition("-")[2])
             return RandomScene(number, self.width, self.height, self.preparation.seed).read().picture
-        picture = open_picture(self.path, self.preparation, self.name).picture
+        reading = open_picture(self.path, self.preparation, self.name)
+        picture = reading.cuts[crop].picture if reading.cuts else reading.picture
         if picture.shape[:2] != (self.height, self.width):
             raise FormatError(
                 f"{self.path} comes to {picture.shape[1]}x{picture.shape[0]} px where images of it are "
@@ -102,7 +103,9 @@ def preparation_of(dataset: Dataset) -> Preparation:
         cover=bool(options.get("cover", False)),
         crop_at=options.get("crop_at", "centre"),
         profiles=options.get("profiles", "honour"),
-        seed=dataset.description.seed,
+        # Scenes that another data set had first are cut where its seed said.
+        seed=options.get("lights_of", {}).get("pictures_seed", dataset.description.seed),
+        crops=int(options.get("crops", 1)),
     )
 
 

@@ -23,6 +23,9 @@ from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.lights.choices import LightChoice, ListedLights
 from generator.pictures.picture import UNPREPARED, Preparation
 from generator.pictures.sources import find_pictures
+from generator.variation.gradients import parse_gradient
+from generator.variation.sensor_noise import SensorNoise
+from generator.variation.variation import NO_VARIATION, Variation
 
 LIGHTS = np.array([[4000.0, 8000, 3000], [3000, 8000, 6000]])
 """Counts of white under the two lights of the table."""
@@ -49,9 +52,16 @@ class Maker:
         split: tuple[float, float, float] | None = None,
         pictures: Path | None = None,
         seed: int = 0,
+        gradient: str | None = None,
     ) -> SceneSet:
         reading = {} if preparation == UNPREPARED else preparation.describe()
-        options = DatasetOptions(previews=False, split=split, reading=reading)
+        if seed != preparation.seed:
+            reading["lights_of"] = {"pictures_seed": preparation.seed}
+        silent = SensorNoise((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        variation = NO_VARIATION if gradient is None else Variation(gradient=parse_gradient(gradient), noise=silent)
+        options = DatasetOptions(
+            previews=False, split=split, reading=reading, crops=preparation.crops, variation=variation
+        )
         sources = find_pictures(pictures or self.pictures, preparation)
         generate_dataset(self.lut, self.folder / name, sources, lights, seed=seed, options=options)
         return open_generated(self.folder / name)

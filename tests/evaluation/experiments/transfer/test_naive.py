@@ -99,3 +99,26 @@ def test_pictures_are_prepared_as_they_were(maker: Maker, preparation: Preparati
     assert image.shape == made[0].read()[0].shape
     if preparation.crop:
         np.testing.assert_allclose(image.astype(int), made[0].read()[0].astype(int), atol=1)
+
+
+def test_every_crop_has_the_counterpart_of_its_own_place(maker: Maker) -> None:
+    made = _generated(maker.make(preparation=Preparation(crop=(9, 7), crops=3)).scenes)
+    found, _ = find_sources(made[0].dataset, maker.pictures)
+    naive = [scene.read()[0].astype(int) for scene in naive_scenes(made, found)]
+    for image, scene in zip(naive, made, strict=True):
+        np.testing.assert_allclose(image, scene.read()[0].astype(int), atol=1)
+    assert any(np.abs(image - naive[0]).max() > 500 for image in naive[2:6:2])
+
+
+def test_scenes_of_another_dataset_are_cut_where_that_one_cut_them(maker: Maker) -> None:
+    made = _generated(maker.make(preparation=Preparation(crop=(9, 7), crop_at="random", seed=3), seed=8).scenes)
+    found, _ = find_sources(made[0].dataset, maker.pictures)
+    for naive, scene in zip(naive_scenes(made, found), made, strict=True):
+        np.testing.assert_allclose(naive.read()[0].astype(int), scene.read()[0].astype(int), atol=1)
+
+
+def test_light_that_falls_off_with_a_tint_does_so_in_the_counterpart(maker: Maker) -> None:
+    made = _generated(maker.make(gradient="soft-edge:width=.5,stops=2,least=2,colour=.4").scenes)
+    found, _ = find_sources(made[0].dataset, maker.pictures)
+    for naive, scene in zip(naive_scenes(made, found), made, strict=True):
+        np.testing.assert_allclose(naive.read()[0].astype(int), scene.read()[0].astype(int), atol=2)
