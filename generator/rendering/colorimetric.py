@@ -174,8 +174,8 @@ def _mixtures(lut: Lut, light: Mixture, rows: tuple[float, ...], folder: Path | 
         if 2 * profile.black >= profile.white:
             raise QualityError(
                 f"under light {first} the table {lut.folder} has a black as bright as {profile.black:.2g} of white, "
-                "expected less than half of its paper: its cell is spoilt or the print has no contrast; leave the light "
-                "out, build the table again, or render by codes"
+                "expected less than half of its paper: its cell is spoilt or the print has no contrast; leave the "
+                "light out, build the table again, or render by codes"
             )
         found = mix_cells(profile, wanted_colours(profile, matrix))
         keep_mixtures(key, found, folder)
