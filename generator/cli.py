@@ -183,6 +183,11 @@ def _print_summary(dataset: Dataset, out: str) -> None:
             f"{made.replaced_pixels} source pixels ({share:.2g} %) are of colours that the table lists as unfit; they "
             "took the nearest fit colour"
         )
+    if made.rendering is not None and made.rendering.outside:
+        print(
+            f"{100 * made.rendering.outside:.2g} % of the pixels are of colours that the print cannot show; colours "
+            f"are {made.rendering.distance or 0:.2g} degrees off in the mean"
+        )
 
 
 def _counted(number: int, thing: str) -> str:

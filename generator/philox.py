@@ -25,7 +25,7 @@ ROUNDS: Final = 10
 """The authors' recommendation: three more than pass every statistical test."""
 
 SAMPLES: Final = 0
-"""Purpose of the words that choose one of the table's samples for each pixel."""
+"""Purpose of the words that choose which cell of the chart stands for a pixel, and one of the table's samples of it."""
 LIGHTS: Final = 1
 """Purpose of the words that choose the lights of a source picture."""
 SCENES: Final = 2
@@ -40,8 +40,6 @@ CROPS: Final = 6
 """Purpose of the words that choose where pictures are cut."""
 ITEMS: Final = 7
 """Purpose of the words that choose what a training item shows."""
-DITHERING: Final = 8
-"""Purpose of the words that choose which cell of the chart stands for a source colour."""
 VEILS: Final = 9
 """Purpose of the words that choose which share of the print's veil is taken out of an image."""
 EXPOSURES: Final = 12

@@ -119,16 +119,22 @@ def choose(
     if likeness.lights_of is not None:
         if likeness.like is not None:
             raise InputError("--like and --lights-of were both given; the second takes pictures and lights as they are")
+        _refuse_more(likeness)
         return _same_scenes(lut, likeness.lights_of, pictures, light)
     if likeness.like is None:
-        for name, given in (("--like-in", likeness.like_in), ("--draw", likeness.draw)):
-            if given is not None:
-                raise InputError(f"{name} {given} says what --like is to do; give --like STATS.json")
+        _refuse_more(likeness)
         sources = pictures.find(seed)
         choice = light.request().choose(lut, seed, [source.name for source in sources], pictures.crops)
         return Chosen(sources, choice, pictures.preparation(seed).describe(), crops=pictures.crops)
     parts = _parts(likeness, pictures, light, variation)
     return _like(lut, likeness, likeness.like, parts, pictures, light, rendered, seed, workers)
+
+
+def _refuse_more(likeness: LikenessOptions) -> None:
+    """Refuse what says more of `--like`, which is not given."""
+    for name, given in (("--like-in", likeness.like_in), ("--draw", likeness.draw)):
+        if given is not None:
+            raise InputError(f"{name} {given} says what --like is to do; give --like STATS.json, or leave it out")
 
 
 def _like(
@@ -225,9 +231,12 @@ def _parts(
 
 def _lights_within(lut: Lut, target: RealStatistics) -> tuple[dict[str, Any], str]:
     """Return how many of the target's lights a table can make, as a record and a sentence."""
-    from generator.lights.gamut import Gamut
+    from generator.lights.gamut import TOLERANCE_DEG, Gamut
 
-    outside = float(1 - Gamut.of(lut).contains(target.lights).mean())
+    gamut = Gamut.of(lut)
+    # A light of the very table lies at its edge, and beyond by what a file rounds.
+    beyond = target.lights[~gamut.contains(target.lights)]
+    outside = sum(gamut.match(light, "nearest").angle > TOLERANCE_DEG for light in beyond) / len(target.lights)
     sentence = (
         f"lights: {outside:.1%} of the {len(target.lights)} of {target.name} lie outside what {lut.folder} can make"
     )

@@ -65,10 +65,16 @@ def philox4x32(c0: Any, c1: Any, c2: Any, c3: Any, seed: Any) -> Any:
 
 
 @numba.njit(inline="always")
+def row_words(y: Any, place: Any, image: Any, seed: Any) -> Any:
+    """Return the three keys (uint32) of row `y`, and the word that `dithering.py` has for its own; `seed` is uint64."""
+    k0, k1, k2, k3 = philox4x32(uint32(y), uint32(place), uint32(image), _PURPOSE, seed)
+    return (k0, k1, k2), k3
+
+
+@numba.njit(inline="always")
 def row_keys(y: Any, place: Any, image: Any, seed: Any) -> Any:
     """Return the three keys (uint32) of row `y`; `seed` is uint64."""
-    k0, k1, k2, _ = philox4x32(uint32(y), uint32(place), uint32(image), _PURPOSE, seed)
-    return k0, k1, k2
+    return row_words(y, place, image, seed)[0]
 
 
 @numba.njit(inline="always")

@@ -1,22 +1,23 @@
 """Which cell of the chart a pixel gets so that the camera sees its colour: a pure function of (seed, image, x, y).
 
 Colorimetric rendering wants each pixel to look as its source colour should. No cell shows just any colour, so a pixel
-takes one of several whose mean does: the picture is dithered. For each of 32 x 32 x 32 source nodes there are 32
+takes one of several whose mean does: the picture is dithered. For each of 32 x 32 x 32 source nodes there are 16
 equally likely cells (`generator.rendering`); node n of a channel stands for the source code 255 n / 31. The rule is
-part of the dataset format; all arithmetic is modulo 2³² but for products with 255::
+part of the dataset format; all arithmetic is modulo 2³² but for products with 63489::
 
-    keys     k0 … k3: the words of Philox4x32-10 with counter (y, 0, image, 8) and the seed as key
-    word     i = 16 ⌊x/32⌋ + x mod 16,  h = (i ⊕ k0) · 0x21F0AAAD ⊕ k1,  h = (h ⊕ ⌊h/2¹⁶⌋) · 0x735A2D97 ⊕ k2,
-             h = (h ⊕ ⌊h/2¹⁵⌋) · 0x31848BAB,  g = h ⊕ k3,  g = (g ⊕ ⌊g/2¹⁴⌋) · 0x21F0AAAD,
-             e = h ⊕ ⌊h/2¹⁶⌋,  f = g ⊕ ⌊g/2¹⁶⌋; of both the lower half where x mod 32 < 16, else the upper
-    digits   p = 255 e and q = 255 f: u = ⌊p/2¹⁶⌋ for blue, ⌊255 (p mod 2¹⁶)/2¹⁶⌋ for red, ⌊q/2¹⁶⌋ for green
-    node     ⌊(31 v + u)/255⌋ of each channel's code v: one of its two neighbours
-    cell     number ⌊(q mod 2¹⁶)/2¹¹⌋ of the node's 32
+    word     h as in `choice.py`, with place 0; k3 the fourth word of its keys
+             g = h ⊕ k3,  g = (g ⊕ ⌊g/2¹⁴⌋) · 0x21F0AAAD,  g ⊕ ⌊g/2¹⁶⌋
+    number   e: the lower half of that word where x mod 16 < 8, else the upper
+    node     ⌊(⌊63489 · 257 v / 2¹⁶⌋ + ⌊e/2⁵⌋) / 2¹¹⌋ of each channel's code v: one of its two neighbours
+    cell     number e mod 16 of the node's 16
 
-u is one of 0 … 254, each as likely within 2⁻¹⁶, so that the node's mean is 31 v/255 less at most 2⁻¹⁶. Two channels
-round up together, and a channel with a certain cell, with a probability within .001 of what independent ones have.
-Rows are keyed by 128 random bits of a purpose of their own, so that cells depend neither on other rows nor on the
-samples that `choice.py` draws. All lights of a mixture see the same cell.
+⌊e/2⁵⌋ is uniform on 0 … 2047, so that the node's mean is 31 v/255 within 2⁻¹¹. It is one number for the three
+channels: a pixel takes one of the four corners of a tetrahedron around its colour and not of the eight of a cube
+(tetrahedral interpolation: J. M. Kasson et al., "Performing color space conversions with three-dimensional linear
+interpolation", Journal of Electronic Imaging 4, 1995). So greys come from the cells of greys alone, and the mean of
+each channel is what it would be with three numbers. Number and sample of a pixel come from one word by a keyed round
+of multiplying; `docs/decisions/0023-one-number-dithers-three-channels.md` says what else was tried. All lights of a
+mixture see the same cell.
 """
 
 from __future__ import annotations
@@ -34,9 +35,10 @@ from numba.extending import intrinsic
 from foundation.compiled import compiled
 from foundation.errors import InputError
 from generator.kernels.arguments import Picture, check_picture, check_seed, packed_rows, run_in_threads
-from generator.kernels.choice import OFFSETS_BYTES, SCRATCH_BYTES, group_address, philox4x32
+from generator.kernels.choice import OFFSETS_BYTES, SCRATCH_BYTES, group_address, row_words
 from generator.kernels.vector import (
     ADDRESS,
+    EIGHT,
     GROUP,
     I8,
     I16,
@@ -52,50 +54,39 @@ from generator.kernels.vector import (
     concatenated,
     constant,
     copy1,
+    digits,
+    hashed,
     load,
     store,
     void,
-    write_choices,
 )
-from generator.philox import DITHERING
 
 Cells = npt.NDArray[np.uint16]
-"""(32768, 32) uint16: for each source node its equally likely cells, as `dither` takes them."""
+"""(32768, 16) uint16: for each source node its equally likely cells, as `dither` takes them."""
 
 NODES: Final = 32
 """Source nodes of a channel: 5 bits, the paper's."""
-SLOTS: Final = 32
-"""Equally likely cells of a node: 64 bytes of uint16, a line of the cache."""
+SLOTS: Final = 16
+"""Equally likely cells of a node: 32 bytes of uint16, so that all nodes' fill the second-level cache and no more."""
 PLACES_BYTES: Final = OFFSETS_BYTES
 """Bytes of where a group's cells stand in the table of cells, uint32 each."""
-DITHER_BYTES: Final = 4 * PLACES_BYTES
-"""Bytes of scratch memory behind `choice.SCRATCH_BYTES`: the places of four groups."""
-
-_PURPOSE: Final = np.uint32(DITHERING)
-_MULTIPLIERS: Final = (0x21F0AAAD, 0x735A2D97, 0x31848BAB)
-"""Of the rounds; those of `choice.py`, where their source stands. The fourth round has the first's."""
+DITHER_BYTES: Final = 4 * (PLACES_BYTES + OFFSETS_BYTES)
+"""Bytes of scratch memory for the places and choices of four groups, LOCATE_LEAD - LEAD + 1 in use."""
+LOCATE_LEAD: Final = 4
+"""Groups by which finding where cells stand leads fetching samples; fetching cells leads it by `choice.LEAD`."""
+_MULTIPLIER: Final = 0x21F0AAAD
+"""Of the round that makes g of h: the first one of `choice.py`, where its source stands."""
+_SPREAD: Final = 63489
+"""2048 · 31 + 1, by which 255 becomes 31 whole nodes: ⌊65535 · 63489 / 2¹⁶⌋ = 2048 · 31."""
 _SHORTS: Final = ir.VectorType(I16, GROUP)
 _WIDE: Final = ir.VectorType(I32, GROUP)
 
 
-def _mixed(builder: Builder, h: Value, shift: int) -> Value:
-    return builder.xor(h, builder.lshr(h, constant(WORDS, shift)))
-
-
-def _random(builder: Builder, word: Value, keys: Any) -> tuple[Value, Value]:
-    """Return e and f of the 32 pixels of a group: 16-bit numbers of pixels 0, 16, 1, 17 and so on."""
-    k0, k1, k2, k3 = (broadcast(builder, key, WORDS) for key in keys)
-    m0, m1, m2 = (constant(WORDS, multiplier) for multiplier in _MULTIPLIERS)
-    h = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
-    h = builder.xor(builder.mul(builder.xor(h, k0), m0), k1)
-    h = builder.xor(builder.mul(_mixed(builder, h, 16), m1), k2)
-    h = builder.mul(_mixed(builder, h, 15), m2)
-    g = builder.mul(_mixed(builder, builder.xor(h, k3), 14), m0)
-    return builder.bitcast(_mixed(builder, h, 16), _SHORTS), builder.bitcast(_mixed(builder, g, 16), _SHORTS)
-
-
 def _planes(builder: Builder, picture: Value) -> list[Value]:
-    """Return red, green and blue of the 32 pixels at `picture` (96 bytes), in the order of `_random`."""
+    """Return red, green and blue, each code twice, of the 32 pixels at `picture` (96 bytes), in the order of words.
+
+    Pixels 8 apart share a word, so that the order is 0, 8, 1, 9 … 7, 15 and the same from 16 on.
+    """
     halves: list[Value] = []
     for half in range(2):
         # Four pixels for each 16 bytes of the vector; the last four are loaded so that nothing behind them is.
@@ -104,21 +95,43 @@ def _planes(builder: Builder, picture: Value) -> list[Value]:
     planes: list[Value] = []
     for channel in range(3):
         lanes: list[int] = []
-        for pixel in range(LANES):
-            at = 16 * (pixel // 4) + 3 * (pixel % 4) + channel + (4 if pixel >= 12 else 0)
-            lanes += [at, at, 4 * LANES + at, 4 * LANES + at]
+        for half in range(2):
+            for pixel in (pixel for first in range(EIGHT) for pixel in (first, first + EIGHT)):
+                at = 4 * LANES * half + 16 * (pixel // 4) + 3 * (pixel % 4) + channel + (4 if pixel >= 12 else 0)
+                lanes += [at, at]
         both = builder.shuffle_vector(*halves, constant(ir.VectorType(I32, 4 * LANES), lanes))
-        planes.append(builder.and_(builder.bitcast(both, _SHORTS), constant(_SHORTS, 0xFF)))
+        planes.append(builder.bitcast(both, _SHORTS))
     return planes
 
 
-def _digit(builder: Builder, numbers: Value) -> tuple[Value, Value]:
-    """Return the first digits in base 255 of 16-bit fractions, and the fractions that are left."""
-    wide = builder.mul(builder.zext(numbers, _WIDE), constant(_WIDE, 255))
-    return (
-        builder.trunc(builder.lshr(wide, constant(_WIDE, 16)), _SHORTS),
-        builder.mul(numbers, constant(_SHORTS, 255)),
-    )
+def _places(builder: Builder, picture: Value, h: Value, k3: Value, target: Value) -> None:
+    """Write where the cells of the pixels at `picture` stand, whose words are `h`."""
+
+    def mixed(word: Value, shift: int) -> Value:
+        return builder.xor(word, builder.lshr(word, constant(WORDS, shift)))
+
+    g = builder.mul(mixed(builder.xor(h, broadcast(builder, k3, WORDS)), 14), constant(WORDS, _MULTIPLIER))
+    e = builder.bitcast(mixed(g, 16), _SHORTS)
+    up, slot = builder.lshr(e, constant(_SHORTS, 5)), builder.and_(e, constant(_SHORTS, SLOTS - 1))
+
+    def position(code: Value) -> Value:
+        wide = builder.mul(builder.zext(code, _WIDE), constant(_WIDE, _SPREAD))
+        return builder.add(builder.trunc(builder.lshr(wide, constant(_WIDE, 16)), _SHORTS), up)
+
+    def moved(number: Value, by: int) -> Value:
+        return builder.lshr(number, constant(_SHORTS, by))
+
+    red, green, blue = map(position, _planes(builder, picture))
+    green = builder.and_(moved(green, 6), constant(_SHORTS, 0x3E0))
+    red = builder.and_(moved(red, 1), constant(_SHORTS, 0x7C00))
+    node = builder.or_(builder.or_(moved(blue, 11), green), red)
+    # A place has 19 bits: five of red, green and blue each, and four of the slot.
+    low = builder.or_(builder.shl(node, constant(_SHORTS, 4)), slot)
+    high = moved(node, 12)
+    for half in range(2):
+        order = [16 * half + 2 * (pixel % EIGHT) + pixel // EIGHT for pixel in range(LANES)]
+        lanes = [lane for at in order for lane in (at, GROUP + at)]
+        store(builder, builder.shuffle_vector(low, high, constant(_WIDE, lanes)), target, 4 * LANES * half)
 
 
 @intrinsic
@@ -133,69 +146,66 @@ def find_places(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any,
     def emit(
         builder: Builder, picture: Value, word: Value, k0: Value, k1: Value, k2: Value, k3: Value, target: Value
     ) -> None:
-        e, f = _random(builder, word, (k0, k1, k2, k3))
-        up_blue, rest = _digit(builder, e)
-        up_red, _ = _digit(builder, rest)
-        up_green, rest = _digit(builder, f)
-        slot = builder.lshr(rest, constant(_SHORTS, 11))
-
-        def node(code: Value, up: Value) -> Value:
-            # ⌊s/255⌋ of 0 ≤ s < 65280 is ⌊(t + ⌊t/256⌋)/256⌋ with t = s + 1.
-            t = builder.add(builder.mul(code, constant(_SHORTS, NODES - 1)), builder.add(up, constant(_SHORTS, 1)))
-            eighth = constant(_SHORTS, 8)
-            return builder.lshr(builder.add(t, builder.lshr(t, eighth)), eighth)
-
-        red, green, blue = map(node, _planes(builder, picture), (up_red, up_green, up_blue))
-        # A place has 20 bits: five of red, green, blue and slot each.
-        low = builder.or_(
-            builder.or_(builder.shl(red, constant(_SHORTS, 15)), builder.shl(green, constant(_SHORTS, 10))),
-            builder.or_(builder.shl(blue, constant(_SHORTS, 5)), slot),
-        )
-        high = builder.lshr(red, constant(_SHORTS, 1))
-        for half in range(2):
-            lanes = [lane for pixel in range(LANES) for lane in (2 * pixel + half, GROUP + 2 * pixel + half)]
-            store(builder, builder.shuffle_vector(low, high, constant(_WIDE, lanes)), target, 4 * LANES * half)
+        _places(builder, picture, hashed(builder, word, (k0, k1, k2)), k3, target)
 
     return void(emit, ADDRESS, number, number, number, number, number, ADDRESS)
 
 
-def _cell(builder: Builder, places: Value, cells: Value, pixel: int) -> Value:
-    """Return the cell, i16, of a pixel whose place `find_places` wrote."""
-    place = builder.zext(load(builder, places, 4 * pixel, I32), I64)
-    return load(builder, builder.add(cells, builder.shl(place, ir.Constant(I64, 1))), 0, I16)
-
-
-def _offset(builder: Builder, places: Value, cells: Value, stride: Value, choices: Value, pixel: int) -> Value:
-    """Return the offset, i32, of the sample of a pixel; `stride` is the bytes of a colour's samples."""
-    colour = builder.zext(_cell(builder, places, cells, pixel), I32)
-    return builder.add(builder.mul(colour, stride), load(builder, choices, 4 * pixel, I32))
-
-
 @intrinsic
-def write_offsets(typing: Any, places: Any, cells: Any, stride: Any, choices: Any) -> Any:
-    """Replace the 32 offsets at `choices` within a colour's samples, by those in the samples of each pixel's cell."""
-    del typing, places, cells, stride, choices
-
-    def emit(builder: Builder, places: Value, cells: Value, stride: Value, choices: Value) -> None:
-        for pixel in range(GROUP):
-            store(builder, _offset(builder, places, cells, stride, choices, pixel), choices, 4 * pixel)
-
-    return void(emit, ADDRESS, ADDRESS, types.uint32, ADDRESS)
-
-
-@intrinsic
-def copy_dithered(typing: Any, places: Any, cells: Any, stride: Any, choices: Any, samples: Any, target: Any) -> Any:
-    """Write the samples of a group's 32 pixels, and two bytes more."""
-    del typing, places, cells, stride, choices, samples, target
+def find_places_and_choose(
+    typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, k3: Any, count: Any, target: Any, choices: Any
+) -> Any:
+    """Do `find_places`, and write to `choices` the offsets, uint32 bytes, of the samples among those of a colour."""
+    del typing, picture, word, k0, k1, k2, k3, count, target, choices
+    number = types.uint32
 
     def emit(
-        builder: Builder, places: Value, cells: Value, stride: Value, choices: Value, samples: Value, target: Value
+        builder: Builder,
+        picture: Value,
+        word: Value,
+        k0: Value,
+        k1: Value,
+        k2: Value,
+        k3: Value,
+        count: Value,
+        target: Value,
+        choices: Value,
     ) -> None:
-        for pixel in range(GROUP):
-            offset = builder.zext(_offset(builder, places, cells, stride, choices, pixel), I64)
-            store(builder, load(builder, builder.add(samples, offset), 0, I64), target, SAMPLE_BYTES * pixel)
+        h = hashed(builder, word, (k0, k1, k2))
+        _places(builder, picture, h, k3, target)
+        for half, chosen in enumerate(digits(builder, h, count)):
+            store(builder, builder.mul(chosen, constant(WORDS, SAMPLE_BYTES)), choices, 4 * LANES * half)
 
-    return void(emit, ADDRESS, ADDRESS, types.uint32, ADDRESS, ADDRESS, ADDRESS)
+    return void(emit, ADDRESS, number, number, number, number, number, number, ADDRESS, ADDRESS)
+
+
+def _cells(builder: Builder, places: Value, cells: Value, half: int) -> Value:
+    """Return the cells, i16, of 16 pixels whose places `find_places` wrote.
+
+    They are put together in a vector: storing each would fill the queue of stores, which then holds too few pixels for
+    the processor to wait for many samples at once.
+    """
+    named: Value = ir.Constant(ir.VectorType(I16, LANES), ir.Undefined)
+    for lane in range(LANES):
+        place = builder.zext(load(builder, places, 4 * (LANES * half + lane), I32), I64)
+        cell = load(builder, builder.add(cells, builder.shl(place, ir.Constant(I64, 1))), 0, I16)
+        named = builder.insert_element(named, cell, ir.Constant(I32, lane))
+    return named
+
+
+@intrinsic
+def write_offsets(typing: Any, places: Any, cells: Any, stride: Any, choices: Any, target: Any) -> Any:
+    """Write the offsets of the samples of 32 pixels: their cells times `stride`, plus choices."""
+    del typing, places, cells, stride, choices, target
+
+    def emit(builder: Builder, places: Value, cells: Value, stride: Value, choices: Value, target: Value) -> None:
+        factor = broadcast(builder, stride, WORDS)
+        for half in range(2):
+            named = builder.zext(_cells(builder, places, cells, half), WORDS)
+            chosen = load(builder, choices, 4 * LANES * half, WORDS)
+            store(builder, builder.add(builder.mul(named, factor), chosen), target, 4 * LANES * half)
+
+    return void(emit, ADDRESS, ADDRESS, types.uint32, ADDRESS, ADDRESS)
 
 
 @intrinsic
@@ -204,8 +214,8 @@ def fetch_cells(typing: Any, places: Any, cells: Any, target: Any) -> Any:
     del typing, places, cells, target
 
     def emit(builder: Builder, places: Value, cells: Value, target: Value) -> None:
-        for pixel in range(GROUP):
-            store(builder, _cell(builder, places, cells, pixel), target, 2 * pixel)
+        for half in range(2):
+            store(builder, _cells(builder, places, cells, half), target, 2 * LANES * half)
 
     return void(emit, ADDRESS, ADDRESS, ADDRESS)
 
@@ -236,35 +246,35 @@ def write_codes(typing: Any, cells: Any, bits: Any, target: Any) -> Any:
 
 
 @numba.njit(inline="always")
-def dither_keys(cells: int, y: Any, image: Any, seed: Any) -> Any:
-    """Return the table of cells and the four keys (uint32) of row `y`; without a table, 0, the keys do not matter."""
-    if cells:
-        k0, k1, k2, k3 = philox4x32(uint32(y), uint32(0), uint32(image), _PURPOSE, seed)
-    else:
-        k0 = k1 = k2 = k3 = uint32(0)
-    return cells, k0, k1, k2, k3
+def dither_row(cells: int, y: Any, image: Any, seed: Any) -> Any:
+    """Return the keys of row `y` that `choice.row_keys` returns, and the table of cells with the row's fourth word."""
+    keys, k3 = row_words(y, 0, image, seed)
+    return keys, (cells, k3)
 
 
 @numba.njit(inline="always")
-def places_slot(scratch: int, group: int) -> int:
-    """Return where in a thread's scratch memory the places of `group` stand until they are used."""
-    return scratch + SCRATCH_BYTES + PLACES_BYTES * (group & 3)
+def _slots(scratch: int, group: int) -> Any:
+    """Return where in `DITHER_BYTES` of memory a group's places and choices stand until they are used."""
+    slot = scratch + (PLACES_BYTES + OFFSETS_BYTES) * (group & 3)
+    return slot, slot + PLACES_BYTES
 
 
 @numba.njit(inline="always")
-def find_group(source: int, group: int, inks: Any, places: int) -> None:
-    """Write where the cells of the 32 pixels at `source` stand; `inks` is the row's, from `dither_keys`."""
-    find_places(source, uint32(LANES * group), inks[1], inks[2], inks[3], inks[4], places)
+def locate(row: int, width: int, group: int, inks: Any, keys: Any, count: Any, scratch: int, memory: int) -> None:
+    """Do the first step of a group: find where the cells of a row's pixels from x = 32 `group` on stand.
+
+    The two steps are to be one to three groups apart, so that neither waits. `memory` is `DITHER_BYTES` long.
+    """
+    places, choices = _slots(memory, group)
+    source, word = group_address(row, width, group, scratch), uint32(LANES * group)
+    find_places_and_choose(source, word, keys[0], keys[1], keys[2], inks[1], count, places, choices)
 
 
 @numba.njit(inline="always")
-def choose_dithered(
-    row: int, width: int, group: int, inks: Any, keys: Any, count: Any, scratch: int, places: int, target: int
-) -> None:
-    """Do what `choice.choose_group` does, for the cells that stand for the pixels; `places` is memory for a group."""
-    find_group(group_address(row, width, group, scratch), group, inks, places)
-    write_choices(uint32(LANES * group), keys[0], keys[1], keys[2], count, target)
-    write_offsets(places, inks[0], uint32(SAMPLE_BYTES * count), target)
+def offset_cells(group: int, inks: Any, stride: Any, memory: int, target: int) -> None:
+    """Do the second step: write what `choice.choose_group` writes, for the cells; `stride` is a colour's bytes."""
+    places, choices = _slots(memory, group)
+    write_offsets(places, inks[0], stride, choices, target)
 
 
 @compiled
@@ -284,15 +294,17 @@ def _dither(
 ) -> None:
     """Fill rows of codes; scratch memory holds a group's pixels, the places of four, and the cells of a row."""
     groups, whole = (width + GROUP - 1) // GROUP, width // GROUP
-    named = scratch + SCRATCH_BYTES + DITHER_BYTES
+    memory = scratch + SCRATCH_BYTES
+    named = memory + DITHER_BYTES
     for y in range(rows):
-        inks = dither_keys(cells, first_row + y, image, seed)
+        keys, inks = dither_row(cells, first_row + y, image, seed)
         row, to = picture + y * pitch, target + y * target_pitch
         for group in range(groups + 1):
             if group < groups:
-                find_group(group_address(row, width, group, scratch), group, inks, places_slot(scratch, group))
+                source, word = group_address(row, width, group, scratch), uint32(LANES * group)
+                find_places(source, word, keys[0], keys[1], keys[2], inks[1], _slots(memory, group)[0])
             if group:
-                fetch_cells(places_slot(scratch, group - 1), cells, named + 2 * GROUP * (group - 1))
+                fetch_cells(_slots(memory, group - 1)[0], cells, named + 2 * GROUP * (group - 1))
         for group in range(groups):
             # Four bytes behind a group are written, which are the next one's or nobody's.
             safe = group < whole - 1
@@ -310,7 +322,7 @@ class CellTable:
     Attributes
     ----------
     cells
-        (32768, 32) uint16, those of a node in a line of the cache; read-only.
+        (32768, 16) uint16, those of a node in half a line of the cache; read-only.
     bits
         Bits of a channel of the chart that has them.
     """
@@ -325,7 +337,7 @@ def checked_cells(cells: Cells | CellTable, bits: int) -> CellTable:
     Parameters
     ----------
     cells
-        (32768, 32) uint16, cells of a chart of `bits` bits a channel.
+        (32768, 16) uint16, cells of a chart of `bits` bits a channel.
     bits
         1 … 5.
 
@@ -372,7 +384,7 @@ def dither(
     picture
         (H, W, 3) uint8, sRGB codes.
     cells
-        (32768, 32) uint16: for each source node, (red << 10) | (green << 5) | blue, 32 equally likely cells of the
+        (32768, 16) uint16: for each source node, (red << 10) | (green << 5) | blue, 16 equally likely cells of the
         chart, ((r << 2n) | (g << n) | b) for n bits a channel; such as `CellMixtures.cells` of `generator.rendering`,
         or what `checked_cells` made of them, which is quicker for many small pictures.
     bits
@@ -399,7 +411,7 @@ def dither(
 
     >>> node = np.arange(32768)
     >>> near = (node >> 14 & 1) << 2 | (node >> 9 & 1) << 1 | node >> 4 & 1
-    >>> cells = np.repeat(near[:, None], 32, axis=1).astype(np.uint16)
+    >>> cells = np.repeat(near[:, None], 16, axis=1).astype(np.uint16)
     >>> codes = dither(np.full((64, 64, 3), 127, np.uint8), cells, bits=1)
     >>> np.unique(codes[..., 0]), round(float((codes[..., 0] > 0).mean()), 1)
     (array([  0, 128], dtype=uint8), 0.4)

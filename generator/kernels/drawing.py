@@ -8,8 +8,8 @@ import numba
 from numba import uint32
 
 from foundation.compiled import compiled
-from generator.kernels.choice import LEAD, choose_group, group_address, offsets_slot, prefetch_group
-from generator.kernels.dithering import copy_dithered, find_group, places_slot, write_offsets
+from generator.kernels.choice import LEAD, SCRATCH_BYTES, choose_group, offsets_slot, prefetch_group
+from generator.kernels.dithering import LOCATE_LEAD, locate, offset_cells
 from generator.kernels.vector import (
     GROUP,
     LANES,
@@ -20,7 +20,6 @@ from generator.kernels.vector import (
     copy8,
     offset_at,
     prefetch,
-    write_choices,
 )
 
 
@@ -78,14 +77,6 @@ def draw_groups(
             done += 1
 
 
-@numba.njit(inline="always")
-def _write_places(row: int, width: int, group: int, inks: Any, keys: Any, count: Any, scratch: int, limit: int) -> None:
-    """Write where the cells of a group, if it is below `limit`, and their samples are found."""
-    if group < limit:
-        find_group(group_address(row, width, group, scratch), group, inks, places_slot(scratch, group))
-        write_choices(uint32(LANES * group), keys[0], keys[1], keys[2], count, offsets_slot(scratch, group))
-
-
 @compiled
 def draw_dithered(
     row: int,
@@ -97,34 +88,29 @@ def draw_dithered(
     scratch: int,
     begin: int,
     end: int,
-    limit: int,
     base: int,
 ) -> None:
     """Do what `draw_groups` does, for the cells that stand for a row's pixels; `inks` are the row's.
 
-    Nothing needs to be chosen before. A function of its own: within the loop of rows it is a third slower, since it is
-    more than the registers hold.
+    Nothing needs to be chosen before; segments of a row are to come in turn. A function of its own: within the loop of
+    rows it is a third slower, since it is more than the registers hold.
     """
-    done, whole, stride = begin, min(limit, width // GROUP), uint32(SAMPLE_BYTES * count)
-    if begin == 0:
-        for group in range(LEAD):
-            _write_places(row, width, group, inks, keys, count, scratch, limit)
-    while done < end:
-        while done < min(end, whole - LEAD):
-            group = done + LEAD
+    groups, stride, memory = (width + GROUP - 1) // GROUP, uint32(SAMPLE_BYTES * count), scratch + SCRATCH_BYTES
+    for step in range(-LOCATE_LEAD if begin == 0 else begin, end):
+        group = step + LOCATE_LEAD
+        if group < groups:
             prefetch_group(row, group)
-            find_group(row + 3 * GROUP * group, group, inks, places_slot(scratch, group))
-            write_choices(uint32(LANES * group), keys[0], keys[1], keys[2], count, offsets_slot(scratch, group))
-            at = base + SAMPLE_BYTES * GROUP * done
-            copy_dithered(places_slot(scratch, done), inks[0], stride, offsets_slot(scratch, done), samples, at)
-            done += 1
-        if done < end:
-            _write_places(row, width, done + LEAD, inks, keys, count, scratch, limit)
-            offsets, at = offsets_slot(scratch, done), base + SAMPLE_BYTES * GROUP * done
-            write_offsets(places_slot(scratch, done), inks[0], stride, offsets)
-            for i in range(min(GROUP, width - GROUP * done)):
-                copy6(samples + offset_at(offsets + 4 * i), at + SAMPLE_BYTES * i)
-            done += 1
+            locate(row, width, group, inks, keys, count, scratch, memory)
+        group = step + LEAD
+        if 0 <= group < groups:
+            offset_cells(group, inks, stride, memory, offsets_slot(scratch, group))
+        if step >= 0:
+            offsets, at, pixels = offsets_slot(scratch, step), base + SAMPLE_BYTES * GROUP * step, width - GROUP * step
+            if pixels > GROUP:
+                _copy_group(samples, offsets, at)
+            else:
+                for i in range(pixels):
+                    copy6(samples + offset_at(offsets + 4 * i), at + SAMPLE_BYTES * i)
 
 
 @numba.njit(inline="always")

@@ -21,6 +21,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from numba import uint32
 
 from foundation.compiled import compiled
 from foundation.errors import InputError
@@ -33,15 +34,48 @@ from generator.kernels.arguments import (
     readable,
     run_in_threads,
 )
-from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, choose_group, row_keys
-from generator.kernels.dithering import PLACES_BYTES, Cells, CellTable, checked_cells, choose_dithered, dither_keys
-from generator.kernels.vector import EIGHT, GROUP, offset_at, plane1, planes8, planes8_mirrored, prefetch
+from generator.kernels.choice import EDGE_BYTES, OFFSETS_BYTES, choose_group
+from generator.kernels.dithering import (
+    DITHER_BYTES,
+    Cells,
+    CellTable,
+    checked_cells,
+    dither_row,
+    locate,
+    offset_cells,
+)
+from generator.kernels.vector import EIGHT, GROUP, SAMPLE_BYTES, offset_at, plane1, planes8, planes8_mirrored, prefetch
 
 Window = tuple[int, int, int, int]
 """x and y of a window's first pixel in the picture, and its width and height, px."""
 
+_STEP: Final = 2
+"""Groups between the two steps of dithering: the processor computes while it waits for cells."""
 SCALES: Final = 7
 """Numbers of an item that `vector.planes8` takes: factors and summands of three channels, and a limit."""
+
+
+@compiled
+def _choose_dithered(
+    row: int,
+    width: int,
+    low: int,
+    high: int,
+    inks: Any,
+    keys: Any,
+    count: Any,
+    scratch: int,
+    memory: int,
+    target: int,
+) -> None:
+    """Do what `choice.choose_group` does for each of the groups `low` to `high`, for the cells."""
+    stride = uint32(SAMPLE_BYTES * count)
+    for step in range(low, high + 1 + _STEP):
+        if step <= high:
+            locate(row, width, step, inks, keys, count, scratch, memory)
+        if low <= step - _STEP:
+            group = step - _STEP
+            offset_cells(group, inks, stride, memory, target + OFFSETS_BYTES * (group - low))
 
 
 @compiled
@@ -74,19 +108,18 @@ def _crop(
         light, picture, pitch, picture_width, x0, y0, flip, image, lights, cells = plan[item]
         samples = last if light == lights - 1 else tables + light * light_bytes
         line = lines + 4 * SCALES * item
-        spare = scratch + EDGE_BYTES + 2 * row_bytes
+        memory = scratch + EDGE_BYTES + 2 * row_bytes
         low, high = x0 // GROUP, (x0 + width - 1) // GROUP
         for y in range(height + 1):
             if y < height:
-                keys = row_keys(y0 + y, 0, image, seeds[item])
-                inks = dither_keys(cells, y0 + y, image, seeds[item])
+                keys, inks = dither_row(cells, y0 + y, image, seeds[item])
                 row = picture + y * pitch
                 chosen = scratch + EDGE_BYTES + row_bytes * (y & 1)
+                if cells:
+                    _choose_dithered(row, picture_width, low, high, inks, keys, count, scratch, memory, chosen)
                 for group in range(low, high + 1):
                     to = chosen + OFFSETS_BYTES * (group - low)
-                    if cells:
-                        choose_dithered(row, picture_width, group, inks, keys, count, scratch, spare, to)
-                    else:
+                    if not cells:
                         choose_group(row, picture_width, group, keys, count, bits, scratch, to)
                     for i in range(GROUP):
                         prefetch(samples + offset_at(to + 4 * i))
@@ -242,7 +275,7 @@ def draw_batch(
     flips, gains, seeds, images
         (N,) bool, float, int and int, or one for all, as for `draw_planar`.
     cells
-        N tables of cells (32768, 32) uint16, by which the pictures are dithered as by `dithering.dither`; one may
+        N tables of cells (32768, 16) uint16, by which the pictures are dithered as by `dithering.dither`; one may
         serve many items, or what `checked_cells` made of them. None: the pictures are codes.
     taken
         (N, 3) float ≥ 0, counts that are taken out of the channels of each item's samples; None takes out nothing.
@@ -314,7 +347,7 @@ def draw_batch(
     scales = _scales(gained, white_level, taken, stretches)
 
     def fill(first: int, end: int) -> None:
-        scratch = np.empty(EDGE_BYTES + 2 * OFFSETS_BYTES * (width // GROUP + 2) + PLACES_BYTES, np.uint8)
+        scratch = np.empty(EDGE_BYTES + 2 * OFFSETS_BYTES * (width // GROUP + 2) + DITHER_BYTES, np.uint8)
         _crop(
             plan,
             seeded,

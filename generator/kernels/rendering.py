@@ -35,7 +35,7 @@ from generator.kernels.arguments import (
     writable,
 )
 from generator.kernels.choice import LEAD, SCRATCH_BYTES, choose_group, offsets_slot, prefetch_group, row_keys
-from generator.kernels.dithering import DITHER_BYTES, Cells, CellTable, checked_cells, dither_keys
+from generator.kernels.dithering import DITHER_BYTES, Cells, CellTable, checked_cells, dither_row
 from generator.kernels.drawing import choose_first_groups, draw_dithered, draw_groups
 from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.streaming import first_line, line_buffer_bytes, stream_lines
@@ -91,8 +91,7 @@ def _gather(
     groups = (width + GROUP - 1) // GROUP
     lines = first_line(scratch + SCRATCH_BYTES + DITHER_BYTES)
     for y in range(rows):
-        keys = row_keys(first_row + y, 0, image, seed)
-        inks = dither_keys(cells, first_row + y, image, seed)
+        keys, inks = dither_row(cells, first_row + y, image, seed)
         row, to = picture + y * pitch, target + y * target_pitch
         begin, held = to, to & (LINE - 1)
         if not cells:
@@ -103,7 +102,7 @@ def _gather(
             if streamed:
                 end, base = min(done + _SEGMENT_GROUPS, groups), lines + held - SAMPLE_BYTES * GROUP * done
             if cells:
-                draw_dithered(row, width, inks, keys, samples, count, scratch, done, end, groups, base)
+                draw_dithered(row, width, inks, keys, samples, count, scratch, done, end, base)
             else:
                 draw_groups(row, width, keys, samples, count, bits, scratch, done, end, groups, 0, 0, base)
             if streamed:
@@ -191,7 +190,7 @@ def draw_samples(
     threads
         Threads that share the rows; no byte depends on it.
     cells
-        (32768, 32) uint16, by which the picture is dithered first, as `dithering.dither` does; None: it is codes.
+        (32768, 16) uint16, by which the picture is dithered first, as `dithering.dither` does; None: it is codes.
     out
         (H, W, 3) uint16 to fill instead of a new array.
 

@@ -103,8 +103,8 @@ def _colours(builder: Builder, picture: Value, bits: Value) -> Value:
     return builder.or_(builder.or_(field(0), field(1)), field(2))
 
 
-def _digits(builder: Builder, word: Value, keys: Sequence[Value], count: Value) -> tuple[Value, ...]:
-    """Return the choices of the first and the second 16 pixels of a group; the rule is that of `choice.py`."""
+def hashed(builder: Builder, word: Value, keys: Sequence[Value]) -> Value:
+    """Return the words h of a group; the rule is that of `choice.py`."""
     numbers = builder.add(broadcast(builder, word, WORDS), constant(WORDS, range(LANES)))
     h = builder.xor(numbers, broadcast(builder, keys[0], WORDS))
     h = builder.mul(h, constant(WORDS, _MULTIPLIERS[0]))
@@ -112,6 +112,11 @@ def _digits(builder: Builder, word: Value, keys: Sequence[Value], count: Value) 
         h = builder.xor(h, broadcast(builder, key, WORDS))
         h = builder.xor(h, builder.lshr(h, constant(WORDS, shift)))
         h = builder.mul(h, constant(WORDS, multiplier))
+    return h
+
+
+def digits(builder: Builder, h: Value, count: Value) -> tuple[Value, ...]:
+    """Return the choices of the first and the second 16 pixels of a group, from its words."""
     counts = broadcast(builder, count, WORDS)
 
     def upper(numbers: Value) -> Value:
@@ -165,26 +170,13 @@ def choose(typing: Any, picture: Any, word: Any, k0: Any, k1: Any, k2: Any, coun
         target: Value,
     ) -> None:
         stride = broadcast(builder, builder.mul(count, ir.Constant(I32, SAMPLE_BYTES)), WORDS)
-        for half, choices in enumerate(_digits(builder, word, (k0, k1, k2), count)):
+        for half, choices in enumerate(digits(builder, hashed(builder, word, (k0, k1, k2)), count)):
             begin = builder.add(picture, ir.Constant(I64, 3 * LANES * half))
             colours = builder.mul(_colours(builder, begin, bits), stride)
             offsets = builder.add(colours, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
             store(builder, offsets, target, 4 * LANES * half)
 
     return void(emit, ADDRESS, number, number, number, number, number, number, ADDRESS)
-
-
-@intrinsic
-def write_choices(typing: Any, word: Any, k0: Any, k1: Any, k2: Any, count: Any, target: Any) -> Any:
-    """Write the offsets, uint32 bytes, of the samples chosen for a group's 32 pixels within those of their colours."""
-    del typing, word, k0, k1, k2, count, target
-    number = types.uint32
-
-    def emit(builder: Builder, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value) -> None:
-        for half, choices in enumerate(_digits(builder, word, (k0, k1, k2), count)):
-            store(builder, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)), target, 4 * LANES * half)
-
-    return void(emit, number, number, number, number, number, ADDRESS)
 
 
 @intrinsic
@@ -220,7 +212,7 @@ def choose_for_colours(typing: Any, colours: Any, word: Any, k0: Any, k1: Any, k
     def emit(
         builder: Builder, colours: Value, word: Value, k0: Value, k1: Value, k2: Value, count: Value, target: Value
     ) -> None:
-        for half, choices in enumerate(_digits(builder, word, (k0, k1, k2), count)):
+        for half, choices in enumerate(digits(builder, hashed(builder, word, (k0, k1, k2)), count)):
             named = load(builder, colours, 4 * LANES * half, WORDS)
             offsets = builder.add(named, builder.mul(choices, constant(WORDS, SAMPLE_BYTES)))
             store(builder, offsets, target, 4 * LANES * half)

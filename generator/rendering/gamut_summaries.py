@@ -39,7 +39,7 @@ def summarise(mixtures: CellMixtures, shares: npt.NDArray[np.float64]) -> GamutS
 
     Examples
     --------
-    >>> cells, seen = np.zeros((32768, 32), np.uint16), np.full((32768, 3), 0.5, np.float32)
+    >>> cells, seen = np.zeros((32768, 16), np.uint16), np.full((32768, 3), 0.5, np.float32)
     >>> wanted = seen.copy()
     >>> wanted[32767] = 1, 0.5, 0.5
     >>> shares = np.zeros(32768)

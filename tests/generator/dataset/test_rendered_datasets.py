@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from foundation.errors import InputError
+from generator.cli import main
 from generator.dataset.making import finish_dataset, generate_dataset, make_share
 from generator.dataset.production.options import DatasetOptions
 from generator.dataset.production.plan import Plan
@@ -247,6 +248,20 @@ def test_a_mixture_of_lights_has_the_black_of_the_mixture(make_lut: MakeLut, pic
     samples = without_veil(mixture.samples(lut, 5), veil_of(lut, mixture, 1.0), lut.provenance.white_level)
     image = dataset.read_image(dataset.entries[0])
     np.testing.assert_array_equal(image, draw_samples(samples, picture, seed=5, image=0))
+
+
+def test_what_the_print_cannot_show_is_told(
+    make_lut: MakeLut, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lut = make_lut()
+    wish = (str(lut.folder), str(tmp_path / "out"), "--sources", str(pictures), "--no-preview")
+    assert main((*wish, "--rendering", "colorimetric")) == 0
+    told = capsys.readouterr().out
+    rows = rows_of(tmp_path / "out")
+    pixels = [70 * 40, 38 * 51, 100 * 36]
+    outside = np.average([float(row["outside"]) for row in rows], weights=pixels)
+    assert outside > 0
+    assert f"{100 * outside:.2g} % of the pixels are of colours that the print cannot show" in told
 
 
 def test_faults_are_named() -> None:

@@ -148,6 +148,15 @@ def test_what_other_options_say_is_not_followed(table: Lut) -> None:
     assert not Path("lights/images.csv").exists()
 
 
+def test_lights_of_the_very_table_are_not_outside_by_what_a_file_rounds(
+    table: Lut, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rounded: npt.NDArray[np.float64] = np.round(table.ground_truth, 6)
+    write_stats(Path("s.json"), rounded, real_numbers(table, 0.5))
+    assert main(("lut", "out", *WISH, "--like-in", "lights")) == 0
+    assert "lights: 0.0% of the 5 of real lie outside" in capsys.readouterr().out
+
+
 def test_lights_outside_the_gamut_are_counted_and_others_drawn(table: Lut, capsys: pytest.CaptureFixture[str]) -> None:
     far = np.array([[0.9, 0.05, 0.05], [0.89, 0.06, 0.05], [0.9, 0.06, 0.04], [0.88, 0.06, 0.06]])
     lights = np.concatenate([lights_of(table, 12), far])

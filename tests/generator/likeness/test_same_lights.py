@@ -151,3 +151,14 @@ def test_mixtures_of_spectra_are_refused_for_another_camera(
     capsys.readouterr()
     assert main(("same", "second", *wish, "--lights-of", "first")) == 2
     assert "their proportion is not known" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("more", [("--draw", "2"), ("--like-in", "lights")])
+def test_what_is_for_like_is_not_passed_over(
+    lab: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, str]
+) -> None:
+    del lab
+    wish = ("--sources", "pictures", "--no-preview")
+    assert main(("one", "first", *wish)) == 0
+    assert main(("two", "second", *wish, "--lights-of", "first", *more)) == 2
+    assert f"{more[0]} {more[1]} says what --like is to do" in capsys.readouterr().err

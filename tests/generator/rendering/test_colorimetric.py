@@ -43,7 +43,7 @@ def test_greys_of_a_source_are_of_the_light(make_table: MakeTable) -> None:
     own = samples[np.arange(16) * 273].mean(axis=1)
     assert angles_deg(own, lut.white[1]).max() > 4
     mixtures = colorimetric_mixtures(lut, 1)
-    assert mixtures.cells.shape == (NODES, 32)
+    assert mixtures.cells.shape == (NODES, 16)
     shown = samples[mixtures.cells[GREYS]].mean(axis=(1, 2))
     assert angles_deg(shown, lut.white[1]).max() < 0.5
 

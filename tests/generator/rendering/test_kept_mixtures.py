@@ -16,7 +16,7 @@ from generator.rendering.kept_mixtures import cache_folder, keep_mixtures, load_
 def mixtures() -> CellMixtures:
     rng = np.random.default_rng(4)
     return CellMixtures(
-        np.sort(rng.integers(0, 32768, (7, 32)), axis=1).astype(np.uint16),
+        np.sort(rng.integers(0, 32768, (7, 16)), axis=1).astype(np.uint16),
         rng.random((7, 3)).astype(np.float32),
         rng.random((7, 3)).astype(np.float32),
     )
