@@ -1,8 +1,11 @@
-"""The contact sheet: a page of tone-mapped previews, one row a source picture, one column a light."""
+"""The contact sheet: a page of tone-mapped previews, one row a source picture, one column a light.
+
+Of a dataset with one light a picture, the usual one for training, the images fill a grid instead.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -22,6 +25,12 @@ MAX_ROWS: Final = 12
 """Sources of a sheet: what is still recognised where the page fills a screen."""
 MAX_COLUMNS: Final = 8
 """Lights of a sheet, for the same reason."""
+_ALONE: Final = 2
+"""Images of one light each over rows of several: 24 in a grid of 6 by 4 fill a screen as 12 rows of 8 lights do."""
+_WIDE: Final = 1.5
+"""Columns over rows of that grid: most pictures and screens are about as wide, and captions stand below."""
+_NAME: Final = 26
+"""Characters of a name below one image of the grid: more would run into its neighbour's."""
 _PAPER: Final = "#16171a"
 _INK: Final = "#e8e6e1"
 _FAINT: Final = "#8d8f96"
@@ -30,7 +39,8 @@ _FAINT: Final = "#8d8f96"
 def contact_sheet(dataset: Dataset, max_rows: int = MAX_ROWS, max_columns: int = MAX_COLUMNS) -> npt.NDArray[np.uint8]:
     """Return the contact sheet of a dataset as a picture (H, W, 3) uint8.
 
-    Of more sources than `max_rows`, or more lights a source than `max_columns`, an even choice is shown.
+    Of more sources than `max_rows`, or more lights a source than `max_columns`, an even choice is shown. Where every
+    source has one image, up to 2 `max_rows` of them are shown in a grid, which says of how many.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -70,24 +80,27 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
 
-    rows: dict[str, list[Entry]] = {}
-    for entry in dataset.entries:
-        rows.setdefault(entry.source, []).append(entry)
-    names = [list(rows)[place] for place in _even(len(rows), max_rows)]
-    columns = _even(max(len(rows[name]) for name in names), max_columns)
-    grid = [[rows[name][place] for place in columns if place < len(rows[name])] for name in names]
+    made = dataset.description
+    # Sources that were drawn several times have one name; those that make one image each still fill a grid.
+    alone = made.images == made.sources
+    grid = _flow(dataset.entries, max_rows, max_columns) if alone else _rows(dataset.entries, max_rows, max_columns)
     pictures = [[_load(dataset, entry) for entry in line] for line in grid]
     lights = len({light for entry in dataset.entries for light in entry.lights})
     table_lights = {light.illumination: light for light in dataset.description.lights}
     named = {str(number): light.label for number, light in table_lights.items()}
     shared = all([entry.lights for entry in line] == [entry.lights for entry in grid[0]] for line in grid)
+    if alone:
+        shared = len({entry.lights for line in grid for entry in line}) == 1
 
-    # All in inches; a cell keeps the aspect of the widest picture and rows are as high as theirs need.
+    # All in inches; a cell keeps the aspect of the widest picture and rows are as high as theirs need. In a
+    # grid upright pictures stand in squares, since those beside them mostly lie.
     cell, gap, margin, caption = 1.75, 0.12, 0.4, 0.26
-    heights = [max(picture.shape[0] / picture.shape[1] for picture in line) * cell for line in pictures]
+    most = 1.0 if alone else np.inf
+    heights = [max(min(picture.shape[0] / picture.shape[1], most) for picture in line) * cell for line in pictures]
     head = 1.0 + (0.42 if shared else 0.0)
     below = gap + 0.2 if shared else gap + caption + 0.2
-    width = 2 * margin + len(columns) * cell + (len(columns) - 1) * gap
+    columns = max(map(len, grid))
+    width = 2 * margin + columns * cell + (columns - 1) * gap
     width = max(width, 5.2)
     height = head + sum(heights) + len(heights) * below + 0.55
     # Any: matplotlib's type hints leave keyword arguments open.
@@ -112,24 +125,28 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
 
     table = dataset.description.table
     camera = table.camera if table.computed is None else f"{table.camera}, computed"
+    sources = len({entry.source for entry in dataset.entries})
+    things = "pictures" if sources == made.images else "images"
+    shown = f"; {sum(map(len, grid))} of {made.images} {things} shown" if alone else ""
     put(margin, 0.5, camera, 13, weight="bold")
     put(
         margin,
         0.74,
-        f"{dataset.description.images} raw images of {len(rows)} pictures, "
-        f"{lights} light{'s' if lights > 1 else ''}, seed {dataset.description.seed}",
+        f"{made.images} raw images of {sources} pictures, "
+        f"{lights} light{'s' if lights > 1 else ''}, seed {made.seed}{shown}",
         8,
         _FAINT,
     )
     top = head
-    for row, (name, line, drawn) in enumerate(zip(names, grid, pictures, strict=True)):
+    for row, (line, drawn) in enumerate(zip(grid, pictures, strict=True)):
         for column, (entry, picture) in enumerate(zip(line, drawn, strict=True)):
             left = margin + column * (cell + gap)
-            tall = picture.shape[0] / picture.shape[1] * cell
-            axes = figure.add_axes((left / width, 1 - (top + tall) / height, cell / width, tall / height))
+            tall = min(picture.shape[0] / picture.shape[1], most) * cell
+            wide = cell if tall < most * cell else tall * picture.shape[1] / picture.shape[0]
+            axes = figure.add_axes((left / width, 1 - (top + tall) / height, wide / width, tall / height))
             axes.imshow(picture, interpolation="lanczos", aspect="auto")
             axes.axis("off")
-            under_it = shared and row == 0
+            under_it = shared and row == 0 and (column == 0 or not alone)
             if under_it or not shared:
                 y = head - 0.2 if under_it else top + heights[row] + 0.15
                 for place, light in enumerate(entry.lights):
@@ -139,10 +156,29 @@ def _draw(dataset: Dataset, max_rows: int, max_columns: int) -> Figure:
                 size, ink = (8, _INK) if under_it else (7, _FAINT)
                 put(left + 0.05 + 0.13 * len(entry.lights), y + 0.04, words, size, ink)
         under = top + heights[row] + (0.0 if shared else caption)
-        put(margin, under + 0.17, _short(name), 7, _FAINT, style="italic")
+        for column, entry in enumerate(line if alone else line[:1]):
+            name = _short(entry.source, _NAME) if alone else _short(entry.source)
+            put(margin + column * (cell + gap), under + 0.17, name, 7, _FAINT, style="italic")
         top += heights[row] + below
     put(margin, height - 0.25, "Tone mapped with the Flash operator; camera RGB, no white balance", 6.5, _FAINT)
     return figure
+
+
+def _rows(entries: Sequence[Entry], max_rows: int, max_columns: int) -> list[list[Entry]]:
+    """Return an even choice of the images of sources of several lights, one row a source."""
+    rows: dict[str, list[Entry]] = {}
+    for entry in entries:
+        rows.setdefault(entry.source, []).append(entry)
+    names = [list(rows)[place] for place in _even(len(rows), max_rows)]
+    columns = _even(max(len(rows[name]) for name in names), max_columns)
+    return [[rows[name][place] for place in columns if place < len(rows[name])] for name in names]
+
+
+def _flow(entries: Sequence[Entry], max_rows: int, max_columns: int) -> list[list[Entry]]:
+    """Return an even choice of images of one light each, row by row in a grid somewhat wider than high."""
+    chosen = [entries[place] for place in _even(len(entries), _ALONE * max_rows)]
+    columns = min(max(round((_WIDE * len(chosen)) ** 0.5), 1), max_columns)
+    return [chosen[first : first + columns] for first in range(0, len(chosen), columns)]
 
 
 def _label(named: Mapping[str, str], light: str, truth: Triple) -> str:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from matplotlib import text
 
 from generator.dataset.contact_sheet import contact_sheet
 from generator.dataset.making import DatasetOptions, generate_dataset
 from generator.dataset.reader import Dataset, Entry
+from generator.lights.choices import RandomLights
 from generator.pictures.sources import random_scenes
 
 if TYPE_CHECKING:
@@ -42,3 +44,29 @@ def test_a_contact_sheet_shows_rows_of_sources(
     assert shown == ["000000.png", "000003.png", "000008.png", "000011.png", "000016.png", "000019.png"]
     assert part.shape[0] < whole.shape[0]
     assert part.shape[1] < whole.shape[1]
+
+
+def test_images_of_one_light_a_picture_fill_a_grid(
+    make_lut: Callable[..., Lut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows of one image each would be a narrow column with an empty page beside it."""
+    words: list[str] = []
+    make = text.Text.set_text
+
+    def noted(self: text.Text, s: Any) -> None:
+        words.append(str(s))
+        make(self, s)
+
+    monkeypatch.setattr(text.Text, "set_text", noted)
+    made = generate_dataset(make_lut(), tmp_path / "out", random_scenes(30, 24, 16), RandomLights(1, 4, 0))
+    whole = contact_sheet(made)
+    assert 0.6 < whole.shape[0] / whole.shape[1] < 1.1
+    assert any("24 of 30 pictures shown" in word for word in words)
+    names = [entry.source for entry in made.entries]
+    assert [word for word in words if word in names] == [
+        names[place] for place in np.linspace(0, 29, 24).round().astype(int)
+    ]
+    words.clear()
+    few = contact_sheet(made, max_rows=2, max_columns=3)
+    assert few.shape[0] < whole.shape[0]
+    assert any("4 of 30 pictures shown" in word for word in words)
