@@ -16,6 +16,7 @@ from foundation.errors import InputError
 from foundation.processors import processor_count
 from generator.command.grouping import grouped
 from generator.command.likeness_options import LikenessOptions, choose
+from generator.command.matrices_told import matrix_sentence
 from generator.command.options import (
     ImageOptions,
     LightOptions,
@@ -125,7 +126,10 @@ def _plan(
         print(line)
     varied = variation.variation(table, chosen.exposure)
     options = images.dataset_options(work.shard_images, chosen.reading, varied, chosen.crops, chosen.weighted)
-    return Plan(table, chosen.sources, chosen.choice, images.seed, rendering.of(options, table))
+    plan = Plan(table, chosen.sources, chosen.choice, images.seed, rendering.of(options, table))
+    if plan.options.matrix is not None:
+        print(matrix_sentence(plan.options.matrix, table.provenance.camera, chosen=rendering.matrix is not None))
+    return plan
 
 
 def _tint_caution(table: Lut, rendering: str | None) -> tuple[str, ...]:
