@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from foundation.angles import angles_deg
+from foundation.errors import QualityError
 from foundation.hashing import sha256_of
 from generator.lights.gamut import black_body
 from generator.lights.lighting import Lighting, Mixture, mixture_of, plain
@@ -114,7 +115,7 @@ def colorimetric_mixtures(
     InputError
         The table has no such light.
     QualityError
-        No cell of the table can be trusted under that light.
+        No cell of the table can be trusted under that light, or black is half as bright as paper.
     """
     if not isinstance(light, Mixture):
         light = black_body(lut, light) if isinstance(light, float) else plain(int(light))
@@ -191,6 +192,12 @@ def _mixtures(lut: Lut, light: Mixture, rows: tuple[float, ...], folder: Path | 
     found = load_mixtures(key, source_colours.NODES, folder)
     if found is None:
         profile = _profile(lut, first)
+        if 2 * profile.black >= profile.white:
+            raise QualityError(
+                f"under light {first} the table {lut.folder} has a black as bright as {profile.black:.2g} of white, "
+                "expected less than half of its paper: its cell is spoilt or the print has no contrast; leave the "
+                "light out, build the table again, or render by codes"
+            )
         found = mix_cells(profile, wanted_colours(profile, matrix))
         keep_mixtures(key, found, folder)
     return found

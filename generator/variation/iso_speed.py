@@ -65,12 +65,12 @@ def parse_iso(text: str, base: float | None = None, sensor_electrons: float = SE
     text
         What was written; ``1600`` alone where the speed of the table is known.
     base, sensor_electrons
-        What is known of the table, see `known_of_table`; what the text says goes before it.
+        What is known of the table, see `known_of_table`.
 
     Raises
     ------
     InputError
-        It names none.
+        It names none, or another speed of the table than is known.
 
     Examples
     --------
@@ -86,6 +86,10 @@ def parse_iso(text: str, base: float | None = None, sensor_electrons: float = SE
         raise InputError(
             f"{text!r} is no ISO speed of a table that does not say its own; write the wanted one over that with which "
             "the table was photographed, such as 1600/100"
+        )
+    if base is not None and own != base:
+        raise InputError(
+            f"{text!r} says that the table is of ISO {own:g}, and the table says {base:g}; write {match[1]}"
         )
     numbers = parse_numbers(rest, {"read": (0.0, 1000.0)}, "an ISO speed")
     return IsoSpeed(float(match[1]), own, numbers.get("read", sensor_electrons))

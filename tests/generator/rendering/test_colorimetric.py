@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from foundation.angles import angles_deg
-from foundation.errors import InputError
+from foundation.errors import InputError, QualityError
 from generator.lights.lighting import Lighting, Mixture, plain
 from generator.masks.request import parse_masks
 from generator.rendering.cell_mixtures import CellMixtures, mix_cells
@@ -185,3 +185,11 @@ def test_cells_that_clip_and_cells_with_hot_samples_are_not_used(make_table: Mak
     assert profile.white < whole.white
     shown = clipped.samples[1].astype(np.float64)[colorimetric_mixtures(clipped, 1).cells[GREYS]].mean(axis=(1, 2))
     assert angles_deg(shown, clipped.white[1]).max() < 0.7
+
+
+def test_a_black_that_is_spoilt_is_named_and_makes_no_flat_image(make_table: MakeTable) -> None:
+    def spoil(samples: npt.NDArray[np.uint16]) -> None:
+        samples[0] = (samples[511] * 0.7).astype(np.uint16)
+
+    with pytest.raises(QualityError, match=r"under light 1 the table .* has a black as bright as 0\.6\d* of white"):
+        colorimetric_mixtures(make_table(change=spoil), 1)

@@ -92,11 +92,13 @@ def test_a_computed_table_says_its_speed() -> None:
     object.__setattr__(lut.provenance, "computed", computed)
     iso = parse_iso("1600", *known_of_table(lut))
     assert (iso.ratio, iso.sensor_electrons) == (8.0, 2.8)
-    assert parse_iso("1600/100:read=3", *known_of_table(lut)).describe() == {
+    assert parse_iso("1600/200:read=3", *known_of_table(lut)).describe() == {
         "wanted": 1600.0,
-        "table": 100.0,
+        "table": 200.0,
         "sensor_electrons": 3.0,
     }
+    with pytest.raises(InputError, match="says that the table is of ISO 100, and the table says 200; write 1600"):
+        parse_iso("1600/100", *known_of_table(lut))
     with pytest.raises(InputError, match="below the ISO 200"):
         parse_iso("100", *known_of_table(lut))
 
