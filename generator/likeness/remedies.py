@@ -30,8 +30,8 @@ def remedies(drawn: DrawnPictures, options: DatasetOptions) -> list[str]:
     pale = chroma is not None and chroma.after < chroma.wanted
     if (bright or pale) and options.rendering == "codes":
         told.append(
-            "--rendering colorimetric: by codes a picture has the contrast and chroma of the print, mostly less than the "
-            "scene's"
+            "--rendering colorimetric: by codes a picture has the contrast and chroma of the print, mostly less than "
+            "the scene's"
         )
     if (bright or pale) and options.black_point.kind != "compensate":
         told.append("--black-point compensate: the print's own black lifts shadows and makes colours pale")
