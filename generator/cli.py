@@ -25,6 +25,7 @@ from generator.command.options import (
     VariationOptions,
     WorkOptions,
 )
+from generator.command.rendering_told import cells_sentences, matrix_sentence
 
 if TYPE_CHECKING:
     from calibration.table.lut import Lut
@@ -125,7 +126,10 @@ def _plan(
         print(line)
     varied = variation.variation(table, chosen.exposure)
     options = images.dataset_options(work.shard_images, chosen.reading, varied, chosen.crops, chosen.weighted)
-    return Plan(table, chosen.sources, chosen.choice, images.seed, rendering.of(options, table))
+    plan = Plan(table, chosen.sources, chosen.choice, images.seed, rendering.of(options, table))
+    if plan.options.matrix is not None:
+        print(matrix_sentence(plan.options.matrix, table.provenance.camera, chosen=rendering.matrix is not None))
+    return plan
 
 
 def _tint_caution(table: Lut, rendering: str | None) -> tuple[str, ...]:
@@ -145,6 +149,7 @@ def _make_whole(plan: Plan, out: str, workers: Workers) -> Dataset:
     from generator.command.progress import shown_progress
     from generator.dataset.making import make_dataset
 
+    _print_cells(plan, range(plan.shards))
     with shown_progress(plan.total) as callbacks:
         dataset = make_dataset(plan, out, workers, callbacks)
     _print_summary(dataset, out)
@@ -157,10 +162,18 @@ def _make_share(plan: Plan, out: str, shard: str, workers: Workers) -> None:
     from generator.dataset.production.workers import parse_share
 
     share = parse_share(shard)
-    with shown_progress(sum(plan.images_of(number) for number in range(share[0], plan.shards, share[1]))) as callbacks:
-        done, shards = make_share(plan, out, share, workers, callbacks)
+    shards = range(share[0], plan.shards, share[1])
+    _print_cells(plan, shards)
+    with shown_progress(sum(map(plan.images_of, shards))) as callbacks:
+        done, every = make_share(plan, out, share, workers, callbacks)
     finish = f"make a dataset of them with generate --finish {out}"
-    print(f"{done} of {shards} shards of {out} are done; {finish if done == shards else 'others are still to be made'}")
+    print(f"{done} of {every} shards of {out} are done; {finish if done == every else 'others are still to be made'}")
+
+
+def _print_cells(plan: Plan, shards: range) -> None:
+    """Say that cells of lights are found first."""
+    for line in cells_sentences(plan, shards):
+        print(line, flush=True)
 
 
 def _print_summary(dataset: Dataset, out: str) -> None:

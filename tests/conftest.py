@@ -85,6 +85,7 @@ SLOW = (
     "generator/likeness/test_same_lights.py",
     "generator/test_cli.py",
     "generator/test_library.py",
+    "generator/test_rendering_told.py",
     "house/test_commands.py",
     "house/test_contributing.py",
     "sim/camera/test_dng.py",

@@ -150,6 +150,7 @@ def _like(
 ) -> Chosen:
     from generator.likeness.drawing import cautions, drawn_sources
     from generator.likeness.exposing import exposure_sentence, like_exposure
+    from generator.likeness.remedies import light_caution, remedies
     from generator.likeness.sizes import like_size
     from generator.statistics.statistics_file import read_statistics
 
@@ -188,7 +189,7 @@ def _like(
         drawn = _drawn(lut, target, sources, rendered, likeness.draw, seed, workers)
         sources = drawn_sources(sources, drawn)
         record["pictures"] = drawn.describe()
-        told += drawn.sentences()
+        told += [*drawn.sentences(), *remedies(drawn, rendered), light_caution(lut, target)]
     choice = light.request().choose(lut, seed, [source.name for source in sources], pictures.crops)
     reading = {**pictures.preparation(seed).describe(), "like": record}
     return Chosen(sources, choice, reading, tuple(told), pictures.crops, "pictures" in parts, exposure)

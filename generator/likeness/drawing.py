@@ -32,6 +32,18 @@ BY_SPREAD: Final = ("grey_red", "grey_blue")
 """Numbers of images that are brought to the target's mean and standard deviation: grey-world offsets, whose spread is
 what a method cannot know, and of which data sets are compared by these two."""
 
+TITLES: Final = {
+    "luminance_1": "Luminance, 1st percentile",
+    "luminance_50": "Luminance, 50th percentile",
+    "luminance_95": "Luminance, 95th percentile",
+    "chroma_spread": "Chroma spread",
+    "grey_offset_red": "Grey-world offset, red",
+    "grey_spread_red": "Grey-world spread, red",
+    "grey_offset_blue": "Grey-world offset, blue",
+    "grey_spread_blue": "Grey-world spread, blue",
+}
+"""Figures as the tables of `evaluate describe` call them, which stands above this package."""
+
 _PERCENTS: Final = (10, 25, 50, 75, 90)
 """Percentiles that are matched: the middle, and what five images of a thousand decide is left out."""
 
@@ -75,7 +87,8 @@ class Reached:
     def sentence(self) -> str:
         """Return in one line what became of it."""
         end = "" if self.is_alike else ", not within 25 %"
-        return f"{self.name}: {self.before:.3g} of all pictures, {self.after:.3g} drawn, {self.wanted:.3g} wanted{end}"
+        figures = f"{self.before:.3g} of all pictures, {self.after:.3g} drawn, {self.wanted:.3g} wanted"
+        return f"{TITLES[self.name]}: {figures}{end}"
 
 
 @dataclass(frozen=True, eq=False)

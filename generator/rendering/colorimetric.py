@@ -14,6 +14,7 @@ the very light of the image.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
@@ -30,7 +31,7 @@ from generator.lights.gamut import black_body
 from generator.lights.lighting import Lighting, Mixture, mixture_of, plain
 from generator.rendering import cell_mixtures, print_profiles, source_colours
 from generator.rendering.cell_mixtures import CellMixtures, mix_cells, mixtures_of, near_grey
-from generator.rendering.kept_mixtures import keep_mixtures, load_mixtures
+from generator.rendering.kept_mixtures import are_kept, keep_mixtures, load_mixtures
 from generator.rendering.matrices import ColourMatrix
 from generator.rendering.print_profiles import PrintProfile, mixed_profile, profile_of
 from generator.rendering.table_matrix import matrix_for
@@ -161,6 +162,26 @@ class ColorimetricRendering:
         return colorimetric_mixtures(self.lut, self.light_of(lighting), self.matrix)
 
 
+def lights_to_find(
+    rendering: ColorimetricRendering, lightings: Iterable[Lighting], folder: Path | None = None
+) -> frozenset[int]:
+    """Return the lights of the table whose cells images need and that are not kept: each takes a second or more.
+
+    Parameters
+    ----------
+    rendering
+        The rendering.
+    lightings
+        The lights of each image; of a mixture it is the light of the table that is nearest.
+    folder
+        Where mixtures are kept; None for `kept_mixtures.cache_folder`.
+    """
+    lut, rows = rendering.lut, tuple(rendering.matrix.rows.ravel().tolist())
+    mixtures = {rendering.light_of(lighting) for lighting in lightings}
+    needed = {_kept_for(lut, light) for light in mixtures}
+    return frozenset(light for light in needed if not are_kept(_key(lut, plain(light), rows), folder))
+
+
 @lru_cache(maxsize=_MIXTURES_AT_HAND)
 def _mixtures(lut: Lut, light: Mixture, rows: tuple[float, ...], folder: Path | None) -> CellMixtures:
     matrix = ColourMatrix("", np.array(rows).reshape(3, 3), "")
@@ -184,8 +205,7 @@ def _mixtures(lut: Lut, light: Mixture, rows: tuple[float, ...], folder: Path | 
 
 def _mixtures_near_grey(lut: Lut, light: Mixture, matrix: ColourMatrix, folder: Path | None) -> CellMixtures:
     """Return the mixtures of the light of the table that is nearest to `light`, those near grey mixed for `light`."""
-    nearest = int(angles_deg(lut.white, light.white(lut)).argmin())
-    base = colorimetric_mixtures(lut, nearest, matrix, folder)
+    base = colorimetric_mixtures(lut, _kept_for(lut, light), matrix, folder)
     profile = mixed_profile(
         [_profile(lut, number) for number in light.lights],
         np.array(light.weights)[:, None] * lut.white[list(light.lights)],
@@ -197,6 +217,12 @@ def _mixtures_near_grey(lut: Lut, light: Mixture, matrix: ColourMatrix, folder: 
     cells = base.cells.copy()
     cells[anew] = again.cells
     return mixtures_of(cells, profile, wanted)
+
+
+def _kept_for(lut: Lut, light: Mixture) -> int:
+    """Return the light of a table whose cells serve a light: itself, or the one whose white is nearest to a mixture."""
+    first, *others = light.lights
+    return int(angles_deg(lut.white, light.white(lut)).argmin()) if others else first
 
 
 @lru_cache(maxsize=_PROFILES_AT_HAND)
@@ -212,9 +238,15 @@ def _key(lut: Lut, light: Mixture, rows: tuple[float, ...]) -> str:
         "matrix": [row.hex() for row in rows],
         "code": _code(),
         # Of cells that are equally good the last digits choose, and other versions may have others.
-        "libraries": {name: version(name) for name in ("numpy", "scipy")},
+        "libraries": _libraries(version),
     }
     return sha256_of(json.dumps(depends).encode())
+
+
+@lru_cache(maxsize=1)
+def _libraries(version_of: Callable[[str], str]) -> dict[str, str]:
+    """Return versions of libraries; a key is made of each light, and to read one takes milliseconds."""
+    return {name: version_of(name) for name in ("numpy", "scipy")}
 
 
 @lru_cache(maxsize=1)

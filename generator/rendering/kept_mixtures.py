@@ -94,6 +94,12 @@ def load_mixtures(key: str, nodes: int, folder: Path | None = None) -> CellMixtu
     return CellMixtures(np.ascontiguousarray(cells), _rows(colours), _rows(wanted))
 
 
+def are_kept(key: str, folder: Path | None = None) -> bool:
+    """Return whether there is a file of such mixtures, whatever its state; arguments as of `load_mixtures`."""
+    folder = folder or cache_folder()
+    return folder is not None and (folder / f"{key}{_SUFFIX}").is_file()
+
+
 def keep_mixtures(key: str, mixtures: CellMixtures, folder: Path | None = None) -> None:
     """Keep mixtures for the next time; does nothing where that cannot be.
 

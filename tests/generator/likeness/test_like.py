@@ -216,6 +216,9 @@ def test_an_encoded_and_a_small_real_set_are_told_of(table: Lut, capsys: pytest.
     printed = capsys.readouterr().out
     assert "if they are encoded for a display, describe linear ones" in printed
     assert "real has 5 images" in printed
+    assert "Luminance, 50th percentile: " in printed
+    assert "what may help: more pictures with --sources" in printed
+    assert "pictures measured under one light" in printed
 
 
 def test_pictures_are_measured_as_they_will_be_rendered(table: Lut) -> None:

@@ -9,6 +9,8 @@ import pytest
 
 from evaluation.experiments.describing import DataDescription, describe, figures
 from evaluation.experiments.describing.against import FigureCompared, compare_figures, sentence
+from evaluation.experiments.describing.quantities import QUANTITIES
+from generator.likeness.drawing import TITLES
 from tests.evaluation.experiments.describing.scenes import random_set
 
 
@@ -81,3 +83,8 @@ def test_intervals_of_spreads_cover() -> None:
         change = found["grey_spread_red"].change
         hits += change[1] <= 1.5 <= change[2]
     assert 0.86 < hits / 80 <= 1
+
+
+def test_generate_calls_figures_by_the_same_names() -> None:
+    titles = {quantity.name: quantity.title for quantity in QUANTITIES}
+    assert {name: titles[name] for name in TITLES} == TITLES
