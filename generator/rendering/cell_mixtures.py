@@ -1,6 +1,6 @@
 """Which cells of the chart together show a wanted colour: 16 of them, equally likely, for each wanted colour.
 
-For a wanted colour t the weights w of the cells near to it are to make their mean t, and their spread small:
+For a wanted colour t the weights w of the cells near to it are to make their mean t, and their spread small::
 
     minimise  |m - t|² + λ Σ w |R - t|²,   m = Σ w R,  w ≥ 0,  Σ w = 1,
 
