@@ -102,6 +102,10 @@ class BlackPoint:
         return np.full(np.shape(words), 1.0 if self.kind == "compensate" else 0.0)
 
 
+KEEP: Final = BlackPoint()
+"""The print's black is kept."""
+
+
 def parse_black_point(text: str) -> BlackPoint:
     """Return what an option asks for: ``keep``, ``compensate``, ``random``, or ``random:MAX``.
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,8 @@ from generator.kernels.dithering import CellTable, checked_cells
 from generator.kernels.palette import replace_unfit_colours
 from generator.kernels.planar import draw_batch
 from generator.lights.lighting import Lighting, Mixture
-from generator.rendering.black_points import BlackPoint, black_of, veil_of
+from generator.rendering import Rendering
+from generator.rendering.black_points import KEEP, BlackPoint, black_of, veil_of
 from generator.training.recycling import Recycled
 from generator.variation.iso_speed import IsoSpeed
 from generator.variation.sensor_noise import SensorNoise
@@ -46,11 +47,6 @@ if TYPE_CHECKING:
     from generator.training.gallery import Gallery
 
 __all__ = ["Batch", "Crops"]
-
-Rendering = Literal["codes", "colorimetric"]
-
-KEEP: Final = BlackPoint()
-"""The print's black is kept."""
 
 _HALF: Final = np.uint64(32)
 """Bits of a random word."""

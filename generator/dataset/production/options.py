@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 from foundation.errors import InputError
 from generator.dataset.production.records import Layout
 from generator.files.formats import FORMATS, Format
-from generator.rendering.black_points import BlackPoint
+from generator.rendering import Rendering
+from generator.rendering.black_points import KEEP, BlackPoint
 from generator.rendering.matrices import ColourMatrix
 from generator.variation.variation import NO_VARIATION, Variation
 
@@ -19,13 +20,10 @@ if TYPE_CHECKING:
 SHARD_IMAGES: Final = 256
 """Images of a shard unless said otherwise: all that a kill can cost, for each shard that was being made."""
 
-Rendering = Literal["codes", "colorimetric"]
 RENDERING: Final[Rendering] = "codes"
 """Rendering unless said otherwise: the paper's."""
 RENDERING_VERSION: Final = 1
 """Of colorimetric rendering: rises when its rules change, so that other pixels come of the same options."""
-KEEP: Final = BlackPoint()
-"""The print's black is kept."""
 
 
 @dataclass(frozen=True)
