@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.framing.movement import REREGISTER_PX, Shift
 from acquisition.framing.planes import CLIPPING_SHARE, frame_black, strongest_channel
 from acquisition.measures.linearity import HIGHEST, LOWEST, deviations
 from acquisition.measures.sensor_range import saturation
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.pipeline.baseline import Baseline
-from calibration.registration.movement import REREGISTER_PX, Shift
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import FormatError, InputError
 
