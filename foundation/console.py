@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager, suppress
 
+from foundation.ending import Ending
 from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
 from foundation.files import remedy_of
 
@@ -92,30 +93,36 @@ def _interrupted(keeps: bool) -> int:
 
 
 @contextmanager
-def orderly_end() -> Generator[None]:
+def orderly_end() -> Generator[Ending]:
     """End as by Ctrl-C, devices closed, where the process is asked to end: by `kill`, or by a terminal that went away.
 
-    A hang-up that is ignored already, as under `nohup`, stays ignored.
+    A signal that is ignored already, as a hang-up is under `nohup`, stays ignored.
+
+    Yields
+    ------
+    Ending
+        By which a part of the block can put off the first request, Ctrl-C included, until what it has begun is done.
     """
+    ending = Ending()
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield ending
         return
 
-    asked = False
+    from_outside = False
 
     def end(number: int, frame: object) -> None:
-        nonlocal asked
-        asked = True
-        raise KeyboardInterrupt
+        nonlocal from_outside
+        from_outside = from_outside or number != signal.SIGINT
+        ending.ask()
 
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     taken = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
     for number in taken:
         signal.signal(number, end)
     try:
-        yield
+        yield ending
     except OSError as error:
-        if not asked:
+        if not from_outside:
             raise
         # A terminal that went away does not take the last state of a bar either.
         raise KeyboardInterrupt from error
