@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.planes import Channel
-from acquisition.session.journal import FrameRecord
+from acquisition.session.records import FrameRecord
 from calibration.checks.frame_consistency import FrameConsistency
 from calibration.radiometry.flat_field import FlatField
 from calibration.radiometry.paper import Paper
