@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from acquisition.config import LabSettings
+from acquisition.judge.exposure import judge_file
 from acquisition.run.devices import Devices
-from acquisition.run.judging import judge_file
 from acquisition.run.lamp import await_health, health_fault, make_ready
 from acquisition.run.patience import Patience
 from acquisition.session.folder import Session

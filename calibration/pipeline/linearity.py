@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.framing.movement import REREGISTER_PX, Shift
 from acquisition.framing.planes import CLIPPING_SHARE, frame_black, strongest_channel
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.fitting.least_squares import least_squares
 from calibration.pipeline.baseline import Baseline
 from calibration.radiometry.sensor_range import saturation
-from calibration.registration.movement import REREGISTER_PX, Shift
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import FormatError, InputError
 
