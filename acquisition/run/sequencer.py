@@ -7,6 +7,7 @@ whatever happens, and a second call goes on where the first stopped.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
@@ -24,6 +25,7 @@ from acquisition.session.journal import ACCEPTED, VOIDED
 from acquisition.session.judgement import FrameJudge
 from drivers.camera import keep_awake
 from foundation.ending import Ending
+from foundation.errors import StorageError
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,12 @@ def take_session(
             make_ready(devices.projector, settings.sequence, patience)
         with Saver(session, used) as saver:
             Pipeline(session, devices, settings, agenda, saver, patience, observe, asked).run()
-    finally:
-        session.write_frames_csv()
+    except BaseException:
+        # It is derived, and made anew at the next opening: the fault that is there counts.
+        with suppress(StorageError):
+            session.write_frames_csv()
+        raise
+    session.write_frames_csv()
     outcome = RunOutcome(total, len(agenda), agenda.given_up)
     if outcome.complete and settings.sequence.switch_off and devices.projector is not None:
         devices.projector.switch_off()
