@@ -34,7 +34,7 @@ from acquisition.run.lamp import await_health, health_fault
 from acquisition.run.patience import Patience, Pause, is_curable
 from acquisition.run.saving import FilledFile, Saved, Saver, download
 from acquisition.session.folder import Session
-from acquisition.session.journal import ACCEPTED
+from acquisition.session.records import ACCEPTED
 from acquisition.session.judgement import Check, Judgement
 from acquisition.session.plan import SessionStep
 from drivers.presenter import ReadsBack
