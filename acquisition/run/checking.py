@@ -24,7 +24,7 @@ from acquisition.run.lamp import make_ready
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.shutter import exposure_advice, light_period_s
 from acquisition.session.plan import FrameKind
-from drivers.camera import keep_awake
+from drivers.camera import capture, keep_awake
 from drivers.presenter import BLACK, WHITE, Colour, ReportsWarnings
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import RegistrationError
@@ -120,7 +120,7 @@ def _take(devices: Devices, colour: Colour, settings: LabSettings, path: Path) -
     devices.presenter.show(colour)
     devices.clock.sleep(settings.sequence.settle_s)
     with path.open("wb") as stream:
-        devices.camera.capture(stream)
+        capture(devices.camera, stream)
     return read_raw(path)
 
 

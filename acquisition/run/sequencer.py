@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
@@ -16,7 +17,7 @@ from acquisition.run.lamp import await_health, health_fault, make_ready
 from acquisition.session.folder import Session
 from acquisition.session.journal import ACCEPTED, REFUSED
 from acquisition.session.plan import SessionStep
-from drivers.camera import keep_awake
+from drivers.camera import capture, keep_awake
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
 
 REFUSED_IN_A_ROW = 3
@@ -125,7 +126,7 @@ def _take_step(
         try:
             devices.presenter.show(step.colour)
             clock.sleep(settings.sequence.settle_s)
-            received = session.receive(stem, devices.camera.capture)
+            received = session.receive(stem, partial(capture, devices.camera))
         except DeviceError as error:
             session.journal.fail(attempt, clock.now(), str(error))
             if remaining == 0 or isinstance(error, DeviceFault | DeviceRefused):

@@ -282,11 +282,12 @@ def test_a_replay_with_another_exposure_is_told_the_recordings(lab: Path, capsys
 def test_a_series_longer_than_a_battery_lasts(lab: Path) -> None:
     from acquisition.chart.model import load_chart
     from acquisition.run.rig.opening import open_rig
+    from drivers.camera import capture
 
     settings = load_lab(lab)
     with open_rig(settings, load_chart(settings.chart)) as devices:
         devices.camera.configure(settings.camera.exposure)
-        frames = {devices.camera.capture(io.BytesIO()).name for _ in range(430)}
+        frames = {capture(devices.camera, io.BytesIO()).name for _ in range(430)}
     assert len(frames) == 430
 
 

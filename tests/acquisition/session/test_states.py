@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -111,8 +112,11 @@ class WatchedCamera:
     def shutter_speeds(self) -> tuple[float, ...]:
         return self.camera.shutter_speeds()
 
-    def capture(self, into: BinaryIO) -> CapturedFrame:
-        captured = self.camera.capture(into)
+    def expose(self) -> datetime:
+        return self.camera.expose()
+
+    def download(self, into: BinaryIO) -> CapturedFrame:
+        captured = self.camera.download(into)
         self.watch.enter(StepState.EXPOSED)
         return replace(captured, size=captured.size + 1) if self.watch.fault == "cuts the file" else captured
 
