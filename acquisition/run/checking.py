@@ -17,9 +17,9 @@ from acquisition.framing.corners import Corners
 from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
 from acquisition.framing.tags import MIN_MODULE_PX
+from acquisition.judge.exposure import measure_exposure, refusal
 from acquisition.lights.illuminations import load_illuminations
 from acquisition.run.devices import Devices
-from acquisition.run.judging import measure_exposure, refusal
 from acquisition.run.lamp import make_ready
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.shutter import exposure_advice, light_period_s

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import partial
 
 from acquisition.config import LabSettings
+from acquisition.judge.exposure import judge_file
 from acquisition.run.devices import Devices
-from acquisition.run.judging import judge_file
 from acquisition.run.lamp import await_health, health_fault, make_ready
 from acquisition.session.folder import Session
 from acquisition.session.journal import ACCEPTED, REFUSED
