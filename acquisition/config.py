@@ -6,19 +6,67 @@ Nothing here opens anything: paths are resolved against the file's folder, value
 from __future__ import annotations
 
 import difflib
+import math
+import shlex
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError
 
 from drivers.camera import ExposureSettings
 from foundation.errors import ConfigurationError
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+_SECRETS = ("sequence.notify", "lab.projector.password")
+"""Keys whose values are in no message, nor in `session.toml`: a session is copied, shown and published."""
+
+_MASK = "…"
+
+
+def notify_label(target: str) -> str:
+    """Return what may be shown of `sequence.notify`: a URL's scheme and host, or a command's first word.
+
+    The rest of it may be a secret: a webhook's path is one, and so are user names, queries and most arguments.
+
+    Examples
+    --------
+    >>> notify_label("https://user:word@ntfy.example/lab?auth=tk_1"), notify_label("curl -H 'Authorization: x' y")
+    ('https://ntfy.example/…', 'curl …')
+    """
+    if is_webhook(target):
+        parts = urlsplit(target)
+        host = parts.netloc.rpartition("@")[2]
+        return f"{parts.scheme}://{host}/{_MASK}"
+    words = shlex.split(target)
+    return " ".join([*words[:1], *([_MASK] if words[1:] else [])])
+
+
+def is_webhook(target: str) -> bool:
+    """Return whether `sequence.notify` is a URL to post to, rather than a command."""
+    return target.lower().startswith(("http://", "https://"))
+
+
+def _notify_checked(target: str) -> str:
+    """Return the target of notices as it is; refuse one that is neither a URL nor a command line."""
+    if is_webhook(target):
+        parts = urlsplit(target)
+        if not parts.hostname or parts.port == 0:
+            raise ValueError("a URL names a host, as in https://ntfy.sh/my-lab")
+    else:
+        # A quotation that does not end.
+        shlex.split(target)
+    return target
+
+
+def _endless(value: object) -> object:
+    """Return infinity for the word ``forever``, and anything else as it is."""
+    return math.inf if isinstance(value, str) and value.strip().lower() == "forever" else value
 
 
 class _Settings(BaseModel):
@@ -52,10 +100,24 @@ class SequenceSettings(_Settings):
     """Tries at a frame before it is left for the next run."""
     warm_up_s: NotNegative = 1200.0
     """Seconds that the lamp burns after it was switched on before the first frame."""
-    patience_s: NotNegative = 600.0
-    """Seconds that a run pauses for a projector that reports a fault, is off or muted, before it ends."""
+    patience_s: Annotated[float, BeforeValidator(_endless), Field(ge=0)] = 600.0
+    """Seconds that a run pauses for a device or the disk that fails, before it ends: camera, screen, projector, disk
+    alike; ``inf`` or ``"forever"``: until it is mended. Ten minutes outlast a restart of any of them, and a run that
+    ended lets the lamp go out."""
+    order: Literal["shuffled", "listed"] = "shuffled"
+    """Order of the lights: shuffled by `seed`, so that neither the lamp's drift nor a picture that did not change runs
+    along with the colour; or as they are listed. An older session keeps the order of its journal."""
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Seed of the shuffled order."""
     switch_off: bool = True
     """Whether the projector is switched off when the session is complete."""
+    lamp_if_unfinished: Literal["off", "on"] = "off"
+    """What the lamp does when a run ends by itself before the session is complete: it goes out, for nobody may be
+    there, or burns on, so that the next run needs no warm-up. After Ctrl-C it burns on."""
+    notify: Annotated[str, AfterValidator(_notify_checked), Field(repr=False)] = ""
+    """Who is told when a run pauses, goes on and ends: a URL that gets JSON by POST, or a command that gets the same on
+    its standard input; empty: nobody. Kept out of messages and `session.toml`, but for the host or the program's
+    name."""
 
 
 class LimitSettings(_Settings):
@@ -67,6 +129,33 @@ class LimitSettings(_Settings):
     """A lit frame's brightest photosites must reach this many counts above black."""
     stray_light_percent: NotNegative = 5.0
     """A dark frame's brightest photosites may reach this share of saturation, per cent."""
+
+
+class JudgeSettings(_Settings):
+    """What every frame is measured for while the session is taken, and when it is refused.
+
+    Pixels are those of the half-size picture, one for each 2×2 block of photosites. The limits are judgement where no
+    measurement is named.
+    """
+
+    chart: bool = True
+    """Whether the chart is looked for in the frames: false for a bare wall, of which only the light is judged."""
+    moved_px: NotNegative = 0.2
+    """Largest displacement of the chart since the first white frame, px: ten times the error of the measurement on a
+    dark frame (0.02 at 66 counts), and below 0.3, about the margin that the 25 samples of a cell have."""
+    blur_px: NotNegative = 0.3
+    """Largest growth of the blur σ since the first white frame, px, as the root of the difference of the squares: less
+    than a lens's own 0.5."""
+    drift_percent: NotNegative = 1.0
+    """Largest change of paper white from one white frame to the next, per cent: usual for a warm lamp; `build-lut`
+    warns at as much."""
+    dark_percent: NotNegative = 0.5
+    """Largest light in a dark frame, of white, per cent: `build-lut` warns at as much."""
+    ambient_percent: NotNegative = 0.2
+    """Largest change of that light since the first dark frame, of white, per cent: `build-lut` warns at as much."""
+    light_deg: NotNegative = 0.5
+    """Largest angle between the light seen and the one ordered, as predicted from the primaries, degrees: a
+    quarter of the 2 degrees within which a fifth of the 707 have their neighbour."""
 
 
 class SimulatedSettings(_Settings):
@@ -121,8 +210,8 @@ class ProjectorCable(_Settings):
     """Address, for PJLink and for languages over TCP."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
     """TCP port where it is not the language's own."""
-    password: str | None = None
-    """PJLink password."""
+    password: Annotated[str | None, Field(repr=False)] = None
+    """PJLink password; not in `session.toml`."""
     device: str | None = None
     """Serial port, such as /dev/ttyUSB0."""
     baud: Annotated[int, Field(ge=300)] | None = None
@@ -167,6 +256,7 @@ class LabSettings(_Settings):
     camera: CameraSettings = CameraSettings()
     sequence: SequenceSettings = SequenceSettings()
     limits: LimitSettings = LimitSettings()
+    judge: JudgeSettings = JudgeSettings()
     simulated: SimulatedSettings = SimulatedSettings()
     replay: ReplaySettings | None = None
     lab: LabRig = LabRig()
@@ -184,8 +274,12 @@ class LabSettings(_Settings):
         return named
 
     def to_toml(self) -> str:
-        """Return the settings, defaults included, as the text of `session.toml`."""
-        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
+        """Return the settings, defaults included, as the text of `session.toml`; secrets are masked."""
+        values = self.model_dump(mode="json", exclude_none=True)
+        values["sequence"]["notify"] = notify_label(self.sequence.notify)
+        # A password is needed to take frames, and whoever does that has LAB.toml.
+        values["lab"]["projector"].pop("password", None)
+        return tomli_w.dumps(values)
 
 
 def unknown_key(key: str, known: Iterable[str], where: str) -> ConfigurationError:
@@ -242,7 +336,10 @@ def parse_lab(text: str, where: str) -> LabSettings:
             raise unknown_key(key, _known_keys(first["loc"][:-1]), where) from error
         if first["type"] == "missing":
             raise ConfigurationError(f"{where}: {key} is missing; add it") from error
-        raise ConfigurationError(f"{where}: {key} = {first['input']!r}: {first['msg']}") from error
+        given = _MASK if key in _SECRETS else repr(first["input"])
+        # The cause has the value, too.
+        reason = first["msg"].removeprefix("Value error, ")
+        raise ConfigurationError(f"{where}: {key} = {given}: {reason}") from (None if key in _SECRETS else error)
     return settings.read_from(where)
 
 

@@ -18,9 +18,9 @@ import numpy as np
 
 from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings
+from acquisition.judge.exposure import judge_file
 from acquisition.lights.illuminations import Illumination
 from acquisition.run.devices import Devices
-from acquisition.run.judging import judge_file
 from acquisition.run.sequencer import take_session
 from acquisition.session.folder import Session
 from acquisition.session.plan import plan_steps

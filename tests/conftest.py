@@ -40,7 +40,7 @@ SLOW = (
     "calibration/pipeline/test_small_charts.py",
     "calibration/radiometry/test_cell_field.py",
     "calibration/radiometry/test_dark_subtraction.py",
-    "calibration/registration/test_movement.py",
+    "acquisition/framing/test_movement.py",
     "calibration/registration/test_register.py",
     "calibration/registration/test_register_without_tags.py",
     "calibration/sampling/test_windows.py",

@@ -17,8 +17,8 @@ from typing import BinaryIO
 
 from acquisition.chart.model import load_chart
 from acquisition.config import LabSettings
+from acquisition.judge.exposure import judge_file
 from acquisition.lights.illuminations import Illumination, load_illuminations
-from acquisition.run.judging import judge_file
 from acquisition.session.folder import FRAME_COLUMNS, Session
 from acquisition.session.journal import ACCEPTED, REFUSED
 from acquisition.session.plan import FrameKind, SessionStep

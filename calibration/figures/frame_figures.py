@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.framing.movement import Shift
 from acquisition.framing.planes import Channel
+from acquisition.measures.flat_field import FlatField
+from acquisition.measures.paper import Paper
 from acquisition.session.journal import FrameRecord
 from calibration.checks.frame_consistency import FrameConsistency
-from calibration.radiometry.flat_field import FlatField
-from calibration.radiometry.paper import Paper
-from calibration.registration.movement import Shift
 
 _Array = npt.NDArray[np.float64]
 

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from acquisition.framing.annotated import annotated_png
+from acquisition.framing.movement import Shift
 from acquisition.session.folder import Session
 from acquisition.session.journal import FrameRecord
 from calibration.figures.linearity_figures import LinearityFigures
@@ -49,7 +50,6 @@ from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
 from calibration.pipeline.prefetching import prefetched
 from calibration.radiometry.corrections import corrections
 from calibration.radiometry.greys import references_csv
-from calibration.registration.movement import Shift
 from calibration.table.file_names import REFERENCES, REPORT_JSON, REPORT_PAGE, SAMPLES
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.framing.movement import Shift
 from acquisition.session.folder import Session
 from acquisition.session.journal import FrameRecord
 from calibration.figures.frame_figures import FrameFigures
@@ -34,7 +35,6 @@ from calibration.pipeline.measuring import (
 from calibration.pipeline.registered_frame import RegisteredFrame
 from calibration.radiometry.dark_frames import DarkFrameFigures
 from calibration.radiometry.dark_subtraction import DarkLight, DarkLightEstimator
-from calibration.registration.movement import Shift
 
 EarlyMeasurement = MeasuredFrame | MeasuredDarkFrame | None
 """A frame as measured before its turn; None where the chart has to be registered again in it."""

@@ -17,11 +17,11 @@ import numpy.typing as npt
 
 from acquisition.chart.model import Chart
 from acquisition.framing.finding import Framing
+from acquisition.framing.movement import gauge_boxes
 from acquisition.framing.planes import CHANNELS, Channel, Plane, channel_offset_px, phases
 from calibration.pipeline.frames import DecodedFrame
 from calibration.pipeline.options import BuildOptions
 from calibration.radiometry.greys import GreyLevels
-from calibration.registration.movement import gauge_boxes
 from calibration.registration.register import register
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites, sites_at

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
 
-from acquisition.config import load_lab, parse_lab
+from acquisition.config import LabSettings, load_lab, notify_label, parse_lab
 from acquisition.run.shutter import require_whole_turns
 from foundation.errors import ConfigurationError
 
@@ -38,6 +39,12 @@ def test_settings_as_used_read_back_equal() -> None:
         (MINIMAL + "[camera]\niso = -5\n", "camera.iso = -5"),
         (MINIMAL + "[camera]\nshutter_s = nan\n", "camera.shutter_s"),
         (MINIMAL + "[camera]\niso = 'fast'\n", "camera.iso = 'fast'"),
+        (MINIMAL + "[sequence]\npatience_s = -1\n", "sequence.patience_s = -1"),
+        (MINIMAL + "[sequence]\npatience_s = nan\n", "sequence.patience_s = nan"),
+        (MINIMAL + "[sequence]\npatience_s = 'never'\n", "sequence.patience_s = 'never'"),
+        (MINIMAL + "[sequence]\norder = 'random'\n", "sequence.order = 'random'"),
+        (MINIMAL + "[sequence]\nlamp_if_unfinished = 'dim'\n", "sequence.lamp_if_unfinished = 'dim'"),
+        (MINIMAL + "[judge]\nmoved = 1\n", "unknown key 'judge.moved'; did you mean 'moved_px'?"),
         ('rig = "simulated"\n', "chart is missing"),
         (MINIMAL.replace("simulated", "lightsaber"), "rig = 'lightsaber'"),
         ("rig = ", "is not TOML"),
@@ -48,6 +55,107 @@ def test_a_mistake_is_named(text: str, expected: str) -> None:
         parse_lab(text, "LAB.toml")
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+OLDER = """rig = "simulated"
+chart = "/lab/chart.json"
+illuminations = "/lab/lights.csv"
+
+[camera]
+iso = 100
+aperture = 8.0
+shutter_s = 0.5
+
+[sequence]
+settle_s = 0.5
+reference_every = 25
+attempts = 3
+warm_up_s = 1200.0
+patience_s = 600.0
+switch_off = true
+
+[limits]
+clipped_percent = 0.1
+too_dark_dn = 100.0
+stray_light_percent = 5.0
+
+[simulated]
+body = "EOS 550D"
+seed = 1
+
+[simulated.room]
+
+[lab.camera]
+connection = "usb"
+port = 15740
+
+[lab.projector]
+control = "pjlink"
+password = "JBMIAProjectorLink"
+refresh_hz = 60.0
+colour_wheel_hz = 60.0
+
+[lab.light]
+shown_by = "display"
+"""
+
+
+def test_the_settings_of_an_older_session_are_read() -> None:
+    settings = parse_lab(OLDER, "session.toml")
+    assert settings.sequence.patience_s == 600
+    assert settings.judge.chart
+
+
+@pytest.mark.parametrize("text", ["inf", '"forever"', '"Forever"'])
+def test_patience_may_have_no_end(text: str) -> None:
+    settings = parse_lab(MINIMAL + f"[sequence]\npatience_s = {text}\n", "LAB.toml")
+    assert settings.sequence.patience_s == math.inf
+    assert parse_lab(settings.to_toml(), "session.toml").sequence.patience_s == math.inf
+
+
+@pytest.mark.parametrize(
+    ("target", "label"),
+    [
+        ("", ""),
+        ("https://ntfy.example:8443/s3cret?auth=s3cret#s3cret", "https://ntfy.example:8443/…"),
+        ("HTTPS://s3cret:s3cret@ntfy.example", "https://ntfy.example/…"),
+        ("http://[::1]:80/s3cret", "http://[::1]:80/…"),
+        ("curl -H 'Authorization: s3cret' https://x", "curl …"),
+        ("/opt/lab/notify", "/opt/lab/notify"),
+        ("'/opt/my lab/notify' s3cret", "/opt/my lab/notify …"),
+    ],
+)
+def test_no_secret_gets_into_the_session(target: str, label: str) -> None:
+    settings = LabSettings.model_validate(
+        {
+            "rig": "lab",
+            "chart": "c",
+            "illuminations": "i",
+            "sequence": {"notify": target},
+            "lab": {"projector": {"control": "pjlink", "host": "h", "password": "s3cret"}},
+        }
+    )
+    assert notify_label(target) == label
+    assert "s3cret" not in settings.to_toml()
+    assert "s3cret" not in repr(settings)
+    assert parse_lab(settings.to_toml(), "session.toml").sequence.notify == label
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ('notify = "curl \'s3cret"', "sequence.notify = …: No closing quotation"),
+        ('notify = "https:///s3cret"', "a URL names a host"),
+        ('notify = "https://s3cret:99999/"', "sequence.notify = …: Port out of range"),
+        ('notify = ["s3cret"]', "sequence.notify = …: Input should be a valid string"),
+    ],
+)
+def test_a_mistake_in_a_secret_is_named_without_it(line: str, expected: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        parse_lab(MINIMAL + f"[sequence]\n{line}\n", "LAB.toml")
+    assert expected in str(caught.value)
+    assert "s3cret" not in str(caught.value)
+    assert caught.value.__cause__ is None
 
 
 def test_replay_needs_a_recording(tmp_path: Path) -> None:

@@ -17,10 +17,10 @@ from acquisition.chart.layout import A_SERIES_MM, design_chart
 from acquisition.chart.model import Chart
 from acquisition.chart.printing import drawing
 from acquisition.framing.finding import find_chart
+from acquisition.framing.movement import shift_between
 from acquisition.framing.planes import CHANNELS, Plane, channel_offset_px, phases, plane_of, strongest_plane
 from acquisition.framing.sharpness import blur_px
 from acquisition.framing.tags import find_tags
-from calibration.registration.movement import shift_between
 from drivers.camera import ExposureSettings
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw

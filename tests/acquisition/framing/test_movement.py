@@ -13,8 +13,8 @@ from scipy import ndimage
 
 from acquisition.chart.layout import paper_chart
 from acquisition.framing.finding import Framing, find_chart
+from acquisition.framing.movement import gauge_boxes, shift_between
 from acquisition.framing.planes import Plane, plane_of, strongest_plane
-from calibration.registration.movement import gauge_boxes, shift_between
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic
 from sim.world.room import Room

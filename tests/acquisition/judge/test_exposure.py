@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from acquisition.config import LimitSettings
-from acquisition.run.judging import Exposure, disagreement, measure_exposure, refusal
+from acquisition.judge.exposure import Exposure, disagreement, measure_exposure, refusal
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import Mosaic, read_raw
 from sim.camera.dng import write_dng
