@@ -15,7 +15,7 @@ from acquisition.run.devices import Devices
 from acquisition.run.lamp import await_health, health_fault, make_ready
 from acquisition.run.patience import Patience
 from acquisition.session.folder import Session
-from acquisition.session.journal import ACCEPTED, REFUSED
+from acquisition.session.judgement import Judgement
 from acquisition.session.plan import SessionStep
 from drivers.camera import keep_awake
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
@@ -61,8 +61,10 @@ def take_session(
     StorageError
         The disk is full; likewise.
     """
-    with session.held():
+    try:
         return _take(session, devices, settings, observe, announce)
+    finally:
+        session.write_frames_csv()
 
 
 def _take(
@@ -138,14 +140,10 @@ def _take_step(
         reason = judge_file(received.path, step.kind, settings) or (None if fault is None else str(fault))
         session.commit(
             attempt,
-            file=f"frames/{received.path.name}",
-            size=received.size,
-            sha256=received.sha256,
-            taken_at=received.captured.released_at,
+            received,
+            Judgement.of_reason("exposure", reason),
             exposure_s=settings.camera.shutter_s,
             ended_at=clock.now(),
-            verdict=ACCEPTED if reason is None else REFUSED,
-            reason=reason or "",
         )
         if reason is None:
             return None
