@@ -16,7 +16,10 @@ from acquisition.session.plan import plan_steps
 from foundation.ending import Ending
 from foundation.errors import ConfigurationError
 
-FIXED = ("rig", "camera", "simulated", "sequence.reference_every")
+FIXED = (
+    "rig", "camera", "simulated.body", "simulated.camera", "simulated.seed", "simulated.room",
+    "sequence.reference_every",
+)  # fmt: skip
 """Settings that must stay for a whole session: they decide what its frames show."""
 
 

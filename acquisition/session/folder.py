@@ -193,7 +193,7 @@ class Session:
         stem
             Name without suffix; the suffix is that of the camera's own file name.
         capture
-            Writes the whole raw file into the stream it is given; `drivers.camera.capture`.
+            Writes the whole raw file into the stream it is given; `drivers.camera.Camera.download`.
 
         Raises
         ------
