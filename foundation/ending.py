@@ -1,8 +1,8 @@
 """When a process that was asked to end may do so: at once, or after what it has begun.
 
 A request comes as a signal, in the midst of anything. A block of work that must not be cut says so with `finishing`; a
-request that comes meanwhile is noted, answered with a sentence, and seen by the block where it can end. A second request
-ends it at once.
+request that comes meanwhile is noted, answered with a sentence, and seen by the block where it can end. A second
+request ends it at once.
 """
 
 from __future__ import annotations

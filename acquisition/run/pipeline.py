@@ -2,14 +2,14 @@
 
 Order of a frame n, on one thread for the devices and one for the disk (`acquisition.run.saving`)::
 
-    devices   settle n | begin n | expose n | screen n? | show n+1 | projector? | download n | collect n-1 | settle n+1 …
-    saving             |        judge n-1                                       | hash, flush, rename, judge n …
+    devices   settle n | begin n | expose n | screen? | show n+1 | projector? | download n | collect n-1 | settle …
+    saving             |        judge n-1                                     | hash, flush, rename, judge n …
 
 Rules that hold inside:
 
 - Settling counts from when the light was shown, so that it passes during the download and while verdicts are awaited.
-- The verdict of n is collected after the download of n+1, never earlier, and so before n+2 is exposed. The rule does not
-  depend on how fast anything is: a session in simulated time is the same each time.
+- The verdict of n is collected after the download of n+1, never earlier, and so before n+2 is exposed. The rule does
+  not depend on how fast anything is: a session in simulated time is the same each time.
 - A frame counts when its row is committed; that happens on the devices' thread, in the order of taking.
 - An attempt's row gets `started_at` when its light was shown and `ended_at` when the exposure was over and the light
   could change: what they enclose are parts of the run's time that do not overlap, though the work on the frames does.
@@ -34,9 +34,9 @@ from acquisition.run.lamp import await_health, health_fault
 from acquisition.run.patience import Patience, Pause, is_curable
 from acquisition.run.saving import FilledFile, Saved, Saver, download
 from acquisition.session.folder import Session
-from acquisition.session.records import ACCEPTED
 from acquisition.session.judgement import Check, Judgement
 from acquisition.session.plan import SessionStep
+from acquisition.session.records import ACCEPTED
 from drivers.presenter import ReadsBack
 from foundation.ending import Ending
 from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted

@@ -8,8 +8,8 @@ thread collects the result.
 from __future__ import annotations
 
 import time
-from contextlib import suppress
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Self
 

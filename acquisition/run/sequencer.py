@@ -21,8 +21,8 @@ from acquisition.run.pipeline import Pipeline, Taken
 from acquisition.run.saving import Saver
 from acquisition.session.folder import Session
 from acquisition.session.heartbeat import RunState
-from acquisition.session.records import ACCEPTED, VOIDED
 from acquisition.session.judgement import FrameJudge
+from acquisition.session.records import ACCEPTED, VOIDED
 from drivers.camera import keep_awake
 from foundation.ending import Ending
 from foundation.errors import StorageError

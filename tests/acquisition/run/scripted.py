@@ -55,8 +55,8 @@ TURNED = raw(6000, ExposureSettings(100, 8.0, 0.4))
 class Screen:
     """A presenter that remembers what it showed, and fails where it is told to.
 
-    `covered` are the numbers of the exposures, from 0, after which something lies over the picture; `fails` those of the
-    calls of `show` that raise.
+    `covered` are the numbers of the exposures, from 0, after which something lies over the picture; `fails` those of
+    the calls of `show` that raise.
     """
 
     shown: list[Colour] = field(default_factory=list[Colour])
@@ -84,8 +84,8 @@ class Screen:
 class ScriptedCamera:
     """Photographs black as dark and every other colour as well exposed, unless the script says otherwise.
 
-    The script maps the number of an exposure, from 0, to the bytes it gives or the error that it raises; `downloads` maps
-    the number of a download to the error that it raises.
+    The script maps the number of an exposure, from 0, to the bytes it gives or the error that it raises; `downloads`
+    maps the number of a download to the error that it raises.
     """
 
     def __init__(self, screen: Screen, clock: SimulatedClock, script: dict[int, bytes | Exception]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Callable, Iterable
 from datetime import timedelta
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ class TestTime:
         assert DOWNLOAD_S < SETTLE_S
         lab = Lab(folder)
         run(lab)
-        periods = [later - earlier for earlier, later in zip(lab.camera.released, lab.camera.released[1:], strict=False)]
+        periods = [later - earlier for earlier, later in pairwise(lab.camera.released)]
         assert periods == [timedelta(seconds=EXPOSE_S + SETTLE_S)] * 5
 
     def test_no_light_is_exposed_before_it_has_settled(self, folder: Path) -> None:
@@ -100,9 +101,7 @@ class TestTime:
         lab = Lab(folder)
         run(lab)
         attempts = lab.session.journal.attempts()
-        assert all(
-            earlier.ended_at == later.started_at for earlier, later in zip(attempts, attempts[1:], strict=False)
-        )
+        assert all(earlier.ended_at == later.started_at for earlier, later in pairwise(attempts))
 
     def test_every_step_of_an_attempt_has_its_time_in_the_journal(self, folder: Path) -> None:
         lab = Lab(folder)
@@ -157,11 +156,11 @@ class TestRefusals:
     def test_what_was_measured_of_earlier_frames_is_recalled(self, folder: Path) -> None:
         lab = Lab(folder)
         run(lab, ScriptedJudge({3: refused("another light"), 5: refused("again"), 7: refused("again")}))
-        before = lab.session.journal.attempts()
+        earlier = lab.session.journal.attempts()
         judge = ScriptedJudge()
         assert run(lab, judge).complete
         assert [(number, accepted) for number, _, accepted in judge.recalled] == [
-            (attempt.step, attempt.verdict == "accepted") for attempt in lab.session.journal.attempts()[:-3]
+            (attempt.step, attempt.verdict == "accepted") for attempt in earlier
         ]
 
     def test_a_covered_screen_refuses_the_frame_and_the_judge_does_not_learn_from_it(self, folder: Path) -> None:
@@ -455,7 +454,11 @@ def test_the_number_left_counts_what_was_voided(folder: Path) -> None:
     lab = Lab(folder, lights=FOUR, reference_every=2)
     left: list[int] = []
     judge = ScriptedJudge({4: refused("the picture is stuck", voids=True)})
-    assert run(lab, judge, observe=lambda taken: left.append(taken.left)).complete
+
+    def count(taken: Taken) -> None:
+        left.append(taken.left)
+
+    assert run(lab, judge, observe=count).complete
     assert left[:5] == [9, 8, 7, 6, 8]
     assert left[-1] == 0
 

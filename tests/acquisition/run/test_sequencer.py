@@ -21,7 +21,6 @@ from sim.projectors.pjlink import PjLinkPeer, memory_link
 from sim.projectors.projector import SimulatedProjector
 from tests.acquisition.run.scripted import EXPOSE_S, SETTINGS, Hurried, Lab, ScriptedCamera
 
-
 ONE_AGAIN = ["accepted", "accepted", "refused", "accepted", "accepted", "accepted", "accepted"]
 """The light that is on the screen when something happens is taken again: its frame cannot be trusted."""
 
@@ -92,9 +91,7 @@ class Disturbed:
 
         projector = PjLinkProjector(self.connect, clock=self.clock)
         devices = Devices(self.lab.camera, self.lab.screen, projector, self.clock)
-        assert take_session(
-            self.lab.session, devices, SETTINGS, observe=disturbing, announce=self.said.append
-        ).complete
+        assert take_session(self.lab.session, devices, SETTINGS, observe=disturbing, announce=self.said.append).complete
 
     @property
     def words(self) -> list[str]:

@@ -13,8 +13,8 @@ import pytest
 
 from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings
-from acquisition.lights.illuminations import Illumination
 from acquisition.judge.exposure import ExposureJudge
+from acquisition.lights.illuminations import Illumination
 from acquisition.run.agenda import Agenda
 from acquisition.run.devices import Devices
 from acquisition.run.rig.opening import open_rig
@@ -239,7 +239,9 @@ def journalled(session: Session) -> set[tuple[StepState, StepState]]:
         seen.add((state.get(attempt.step, StepState.PLANNED), StepState.BEGUN))
         # Its row said accepted before it said voided.
         voided = end is StepState.VOIDED
-        seen |= {(StepState.BEGUN, StepState.ACCEPTED), (StepState.ACCEPTED, end)} if voided else {(StepState.BEGUN, end)}
+        seen |= (
+            {(StepState.BEGUN, StepState.ACCEPTED), (StepState.ACCEPTED, end)} if voided else {(StepState.BEGUN, end)}
+        )
         state[attempt.step] = end
     return seen
 
