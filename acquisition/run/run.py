@@ -15,7 +15,10 @@ from acquisition.session.folder import Session, session_exists
 from acquisition.session.plan import plan_steps
 from foundation.errors import ConfigurationError
 
-FIXED = ("rig", "camera", "simulated", "sequence.reference_every")
+FIXED = (
+    "rig", "camera", "simulated.body", "simulated.camera", "simulated.seed", "simulated.room",
+    "sequence.reference_every",
+)  # fmt: skip
 """Settings that must stay for a whole session: they decide what its frames show."""
 
 
@@ -66,7 +69,7 @@ def open_session(settings: LabSettings, folder: Path) -> Session:
         As `run_session`.
     """
     if session_exists(folder):
-        session = Session.open(folder)
+        session = Session.open_for_run(folder)
         try:
             _require_same(session, settings)
         except BaseException:

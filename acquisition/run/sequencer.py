@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from acquisition.config import LabSettings
 from acquisition.judge.exposure import judge_file
@@ -15,9 +16,9 @@ from acquisition.run.devices import Devices
 from acquisition.run.lamp import await_health, health_fault, make_ready
 from acquisition.run.patience import Patience
 from acquisition.session.folder import Session
-from acquisition.session.journal import ACCEPTED, REFUSED
+from acquisition.session.judgement import Judgement
 from acquisition.session.plan import SessionStep
-from drivers.camera import keep_awake
+from drivers.camera import capture, keep_awake
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
 
 REFUSED_IN_A_ROW = 3
@@ -61,8 +62,10 @@ def take_session(
     StorageError
         The disk is full; likewise.
     """
-    with session.held():
+    try:
         return _take(session, devices, settings, observe, announce)
+    finally:
+        session.write_frames_csv()
 
 
 def _take(
@@ -127,7 +130,7 @@ def _take_step(
         try:
             devices.presenter.show(step.colour)
             clock.sleep(settings.sequence.settle_s)
-            received = session.receive(stem, devices.camera.capture)
+            received = session.receive(stem, partial(capture, devices.camera))
         except DeviceError as error:
             session.journal.fail(attempt, clock.now(), str(error))
             if remaining == 0 or isinstance(error, DeviceFault | DeviceRefused):
@@ -138,14 +141,10 @@ def _take_step(
         reason = judge_file(received.path, step.kind, settings) or (None if fault is None else str(fault))
         session.commit(
             attempt,
-            file=f"frames/{received.path.name}",
-            size=received.size,
-            sha256=received.sha256,
-            taken_at=received.captured.released_at,
+            received,
+            Judgement.of_reason("exposure", reason),
             exposure_s=settings.camera.shutter_s,
             ended_at=clock.now(),
-            verdict=ACCEPTED if reason is None else REFUSED,
-            reason=reason or "",
         )
         if reason is None:
             return None

@@ -12,7 +12,7 @@ from acquisition.framing.movement import Shift
 from acquisition.framing.planes import Channel
 from acquisition.measures.flat_field import FlatField
 from acquisition.measures.paper import Paper
-from acquisition.session.journal import FrameRecord
+from acquisition.session.records import FrameRecord
 from calibration.checks.frame_consistency import FrameConsistency
 
 _Array = npt.NDArray[np.float64]

@@ -7,7 +7,8 @@ Rules that hold inside:
 - A release is never repeated once it may have happened: after a fault the frame is looked for in the camera's memory,
   and what is not found there is an error. So no frame is ever taken for another one's.
 - What waits in the memory before a release belongs to nobody any more, and is thrown away.
-- When a capture ends, well or badly, the body's memory is empty, or the next call empties it.
+- The exposed frame stays in the memory until it has been downloaded whole, or the next is exposed: a cable that fails
+  and a file that cannot be written cost a download, not a frame. Once downloaded, the memory is emptied.
 """
 
 from __future__ import annotations
@@ -63,13 +64,18 @@ _Result = TypeVar("_Result")
 
 @dataclass
 class _Shot:
-    """A release that has happened, or may have; objects that are `absent` cannot be its frame."""
+    """A release that has happened, or may have.
+
+    `announced` is its frame once the body has named it, `fetched` what a download has begun with; objects that are
+    `absent` cannot be its frame.
+    """
 
     body: EosBody
     released_at: datetime
     not_before: float
     until: float
     shutter_s: float
+    announced: WaitingObject | None = None
     fetched: WaitingObject | None = None
     absent: set[int] = field(default_factory=set[int])
 
@@ -92,6 +98,7 @@ class CanonEos:
         self._body: EosBody | None = None
         self._identity: CameraIdentity | None = None
         self._settings: ExposureSettings | None = None
+        self._shot: _Shot | None = None
         self._closed = False
 
     def identity(self) -> CameraIdentity:
@@ -99,7 +106,7 @@ class CanonEos:
         return self._carry_out(EosBody.identity)
 
     def configure(self, settings: ExposureSettings) -> None:
-        """Set and verify the exposure, raw format and destination.
+        """Set and verify the exposure, raw format and destination; a frame that was not downloaded is dropped.
 
         Raises
         ------
@@ -113,7 +120,7 @@ class CanonEos:
             body.make_ready()
             _apply(body, settings)
 
-        self._settings = None
+        self._settings = self._shot = None
         self._carry_out(configured)
         self._settings = settings
 
@@ -132,26 +139,48 @@ class CanonEos:
 
         return self._carry_out(listed)
 
-    def capture(self, into: BinaryIO) -> CapturedFrame:
-        """Release the shutter without autofocus and write the raw file, whole and unchanged, to `into`.
+    def expose(self) -> datetime:
+        """Release the shutter without autofocus; return when it was released, UTC, once the body announces the frame.
+
+        A frame that was exposed before and has not been downloaded is dropped.
 
         Raises
         ------
         DeviceRefused
             The body was never configured, or declines to take a frame.
         DeviceError
-            The frame did not arrive; what `into` holds is worthless and may be retaken.
+            No frame was announced; it may be exposed again.
         """
         settings = self._settings
         if settings is None:
-            raise DeviceRefused("the camera has no exposure settings; configure it before the first capture")
-        start = into.tell()
+            raise DeviceRefused("the camera has no exposure settings; configure it before the first exposure")
+        self._shot = None
         shot = self._release(settings)
         try:
-            frame = self._carry_out(lambda body: self._receive(body, shot, into, start))
+            self._carry_out(lambda body: self._await_frame(body, shot))
         except Exception:
             self._empty()
             raise
+        self._shot = shot
+        return shot.released_at
+
+    def download(self, into: BinaryIO) -> CapturedFrame:
+        """Write the raw file of the frame exposed last, whole and unchanged, to `into`.
+
+        A download that failed, for whatever reason, may be tried again with a new stream as long as the body holds the
+        frame in its memory: until the next exposure, or until it is switched off.
+
+        Raises
+        ------
+        DeviceError
+            The frame did not arrive, and what `into` holds is worthless; or there is none, and the message says so.
+        """
+        shot = self._shot
+        if shot is None:
+            raise DeviceError("no exposed frame waits in the camera to be downloaded; expose it again")
+        start = into.tell()
+        frame = self._carry_out(lambda body: self._receive(body, shot, into, start))
+        self._shot = None
         self._empty()
         return CapturedFrame(_file_name(frame), frame.size, shot.released_at)
 
@@ -162,6 +191,7 @@ class CanonEos:
     def close(self) -> None:
         """Give the camera back to its user; a second call does nothing."""
         self._closed = True
+        self._shot = None
         body = self._body
         if body is not None:
             try:
@@ -208,19 +238,30 @@ class CanonEos:
 
         return self._carry_out(released)
 
-    def _receive(self, body: EosBody, shot: _Shot, into: BinaryIO, start: int) -> WaitingObject:
-        """Return the frame of a release when it is complete in `into`, from `start` on."""
+    def _await_frame(self, body: EosBody, shot: _Shot) -> WaitingObject:
+        """Return the frame of a release when the body has announced it; the same one whenever it is asked again."""
         renewed = body is not shot.body
         until = self._clock.monotonic() + shot.shutter_s + REDISCOVERY_S if renewed else shot.until
+        known = shot.announced
+
+        def wanted(waiting: WaitingObject) -> bool:
+            if known is not None and (waiting.name, waiting.size) != (known.name, known.size):
+                return False  # taken since, by a finger on the camera
+            return waiting.is_raw and waiting.handle not in shot.absent
+
+        try:
+            shot.announced = body.await_object(shot.not_before, until, wanted)
+        except LinkTimeout as error:
+            if not renewed:
+                raise  # its announcement may be lost: a new connection hears it again
+            self._shot = None
+            raise DeviceError(f"{error}, and holds none in its memory; take it again") from error
+        return shot.announced
+
+    def _receive(self, body: EosBody, shot: _Shot, into: BinaryIO, start: int) -> WaitingObject:
+        """Return the frame of a release when it is complete in `into`, from `start` on."""
         while True:
-            try:
-                frame = body.await_object(
-                    shot.not_before, until, lambda waiting: waiting.is_raw and waiting.handle not in shot.absent
-                )
-            except LinkTimeout as error:
-                if not renewed:
-                    raise  # its announcement may be lost: a new connection hears it again
-                raise DeviceError(f"{error}, and holds none in its memory; take it again") from error
+            frame = self._await_frame(body, shot)
             # What has come of the same object before a fault is good: pieces are written whole.
             offset = into.tell() - start if frame == shot.fetched else 0
             into.seek(start + offset)
@@ -232,6 +273,7 @@ class CanonEos:
                 if error.code != ResponseCode.INVALID_OBJECT_HANDLE:
                     raise
                 shot.absent.add(frame.handle)
+                shot.announced = None
                 body.free(frame)
                 continue
             return frame

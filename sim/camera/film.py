@@ -7,15 +7,19 @@ or the frames of a recorded session (`sim.camera.replay`). Nothing here draws a 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from typing import BinaryIO, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from foundation.errors import DeviceRefused
 from sim.camera.dng import write_dng
 from sim.clock import OPENING
+from sim.world.disturbances import CALM, Disturbances, Moment
 from sim.world.world import World
 
 
@@ -48,6 +52,10 @@ class WorldFilm:
     exposed
         How many pictures of each colour have been taken before: with it a lab that is taken up again goes on with
         the very noise it would have had.
+    disturbances
+        What goes wrong, by the number of exposures and the time since the lab opened.
+    before
+        Second since the lab opened, and colour, of each picture that has been taken before.
     """
 
     suffix = ".dng"
@@ -59,12 +67,17 @@ class WorldFilm:
         light: Callable[[], float],
         serial: str,
         exposed: Mapping[Colour, int],
+        disturbances: Disturbances = CALM,
+        before: Sequence[tuple[float, Colour]] = (),
     ) -> None:
         self._world = world
         self._look = look
         self._light = light
         self._serial = serial
         self._exposed = Counter(dict(exposed))
+        self._disturbances = disturbances
+        self._before = list(before)
+        self._last: tuple[datetime, NDArray[np.uint16]] | None = None
 
     def accept(self, settings: ExposureSettings) -> None:
         """Refuse what no such body has."""
@@ -79,11 +92,23 @@ class WorldFilm:
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
         """Photograph the world as it is lit now."""
         colour = self._look()
-        hours = (released_at - OPENING).total_seconds() / 3600
-        lamp = self._light() * (1 - self._world.room.lamp_drift_per_hour * hours)
+        seconds = (released_at - OPENING).total_seconds()
+        moment = Moment(len(self._before), seconds, colour, tuple(self._before))
+        lamp = self._light() * (1 - self._world.room.lamp_drift_per_hour * seconds / 3600)
+        # The noise is that of the frame that was ordered, whatever there is to see.
         key = (colour.red, colour.green, colour.blue, self._exposed[colour])
-        counts = self._world.expose(colour, settings, key=key, lamp=lamp)
         self._exposed[colour] += 1
+        self._before.append((seconds, colour))
+        stale = self._disturbances.stale(moment)
+        if stale is None or self._last is None:
+            shown, situation = self._disturbances.shown(moment), self._disturbances.situation(moment)
+            counts = self._world.expose(shown, settings, key=key, lamp=lamp, situation=situation)
+            taken_at, counts = released_at, self._disturbances.counted(counts, moment)
+        else:
+            taken_at, counts = self._last
+            taken_at = released_at if stale.new_header else taken_at
+        if self._disturbances.repeats_files:
+            self._last = taken_at, counts
         start = into.tell()
-        write_dng(into, counts, self._world.body, settings=settings, taken_at=released_at, serial=self._serial)
+        write_dng(into, counts, self._world.body, settings=settings, taken_at=taken_at, serial=self._serial)
         return into.seek(0, 2) - start

@@ -35,6 +35,7 @@ from sim.projectors.projector import SimulatedProjector
 from sim.projectors.screen import Screen, SimulatedPresenter
 from sim.spectral.sensitivities import known_sensitivities
 from sim.world.body_settings import find_body
+from sim.world.disturbances import read_disturbances
 from sim.world.drawing import Print
 from sim.world.room import Room
 from sim.world.sensors import BODIES, Body
@@ -72,7 +73,10 @@ def open_simulated(settings: LabSettings, chart: Chart, session: Session | None,
     sensor = simulated_body(settings)
     if settings.rig == "simulated":
         world = World(sheet(chart), sensor, simulated_room(settings))
-        film: Film = WorldFilm(world, lambda: screen.colour, simulated.light, SERIAL, exposed)
+        events = read_disturbances(settings.simulated.events, settings.file)
+        film: Film = WorldFilm(
+            world, lambda: screen.colour, simulated.light, SERIAL, exposed, events, _taken_before(session)
+        )
     else:
         assert settings.replay is not None
         film = ReplayFilm(_recording(settings.replay.session), lambda: screen.colour, exposed)
@@ -140,6 +144,18 @@ def _exposed(session: Session | None) -> Counter[Colour]:
     return Counter(colours[attempt.step] for attempt in session.journal.attempts() if attempt.has_frame)
 
 
+def _taken_before(session: Session | None) -> list[tuple[float, Colour]]:
+    """Return the second since the opening, and the colour, of every picture that was taken before."""
+    if session is None:
+        return []
+    colours = {step.number: step.colour for step in session.steps}
+    return [
+        ((attempt.started_at - OPENING).total_seconds(), colours[attempt.step])
+        for attempt in session.journal.attempts()
+        if attempt.has_frame
+    ]
+
+
 def _last_moment(session: Session) -> datetime:
     ends = [
         attempt.ended_at for attempt in session.journal.attempts() if attempt.has_frame and attempt.ended_at is not None
@@ -149,10 +165,10 @@ def _last_moment(session: Session) -> datetime:
 
 def _recording(folder: Path) -> list[RecordedFrame]:
     with Session.open(folder) as recording:
-        colours = {(step.kind, step.illumination): step.colour for step in recording.steps}
+        colours = {step.number: step.colour for step in recording.steps}
+        shown = {attempt.file: colours[attempt.step] for attempt in recording.journal.attempts()}
         frames = [
-            RecordedFrame(colours[frame.kind, frame.illumination], folder / frame.file, frame.exposure_s)
-            for frame in recording.frames()
+            RecordedFrame(shown[frame.file], folder / frame.file, frame.exposure_s) for frame in recording.frames()
         ]
     if not frames:
         raise FormatError(f"{folder} holds no frames; name a session in which some were taken")

@@ -79,6 +79,7 @@ class ScriptedCamera:
         self.screen, self.clock, self.script = screen, clock, script
         self.captures = 0
         self.claims: int | None = None
+        self.scripted: bytes | Exception = WELL
 
     def identity(self) -> CameraIdentity:
         return CameraIdentity("Canon", "Test", "1")
@@ -89,15 +90,19 @@ class ScriptedCamera:
     def shutter_speeds(self) -> tuple[float, ...]:
         return ()
 
-    def capture(self, into: BinaryIO) -> CapturedFrame:
+    def expose(self) -> datetime:
         usual = NIGHT if self.screen.shown[-1] == BLACK else WELL
-        scripted = self.script.get(self.captures, usual)
+        self.scripted = self.script.get(self.captures, usual)
         self.captures += 1
+        self.clock.sleep(1.5)
+        return self.clock.now()
+
+    def download(self, into: BinaryIO) -> CapturedFrame:
+        scripted = self.scripted
         if isinstance(scripted, Exception):
             into.write(b"half a frame")
             raise scripted
         into.write(scripted)
-        self.clock.sleep(1.5)
         size = len(scripted) if self.claims is None else self.claims
         self.claims = None
         return CapturedFrame(f"IMG_{self.captures:04d}.DNG", size, self.clock.now())

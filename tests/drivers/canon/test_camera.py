@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.camera import CameraIdentity, ExposureSettings
+from drivers.camera import CameraIdentity, ExposureSettings, capture
 from drivers.canon.camera import CanonEos
 from drivers.canon.records import (
     Notice,
@@ -517,7 +517,7 @@ def test_a_transfer_goes_on_where_it_broke_off() -> None:
 def test_what_stood_behind_the_place_in_the_file_is_gone(lab: Lab) -> None:
     lab.camera.configure(SETTINGS)
     into = io.BytesIO(b"former" * 1000)
-    lab.camera.capture(into)
+    capture(lab.camera, into)
     assert into.getvalue() == lab.film.frames[-1]
 
 
@@ -558,23 +558,32 @@ SIZES: dict[str, Callable[[int], int]] = {
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_a_size_that_is_not_true_is_told_and_leaves_nothing_behind(lab: Lab, size: str) -> None:
+def test_a_size_that_is_not_true_is_told(lab: Lab, size: str) -> None:
     lab.device = Announcing(lab.eos, announced(SIZES[size]))
     lab.camera.configure(SETTINGS)
-    with pytest.raises(DeviceError, match="bytes"):
-        lab.take(attempts=1)
-    assert lab.waiting() == 0
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="bytes"):
+            lab.take(attempts=1)
+        assert lab.waiting() == 1, "of every exposure it holds the last"
     assert lab.openings == 1
+    lab.camera.close()
+    assert lab.waiting() == 0
 
 
-def test_a_full_disk_leaves_nothing_in_the_camera(lab: Lab) -> None:
+def test_a_full_disk_costs_no_frame(lab: Lab) -> None:
     class Full(io.BytesIO):
         def write(self, data: Any) -> int:
             raise StorageError("the disk is full")
 
     lab.camera.configure(SETTINGS)
+    lab.camera.expose()
     with pytest.raises(StorageError):
-        lab.camera.capture(Full())
+        lab.camera.download(Full())
+    assert lab.waiting() == 1
+    into = io.BytesIO()
+    lab.camera.download(into)
+    assert into.getvalue() == lab.film.frames[-1]
+    assert len(lab.film.frames) == 1
     assert lab.waiting() == 0
     lab.take()
 
