@@ -127,12 +127,17 @@ def make_folder(folder: Path, of: Path | None = None) -> None:
         The disk is full, read-only or gone.
     """
     path = folder if of is None else of
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
-    except OSError as error:
-        raise storage_error(path, error) from error
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            # Another program may have taken it away between two calls.
+            if os.path.lexists(folder) and not folder.is_dir():
+                raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
+        except OSError as error:
+            raise storage_error(path, error) from error
+        else:
+            return
 
 
 def sync_folder(folder: Path) -> None:
