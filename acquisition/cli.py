@@ -199,6 +199,14 @@ def check(
 def run(
     lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
     session: Annotated[Path, typer.Argument(help="Session folder: new, or one that was interrupted.")],
+    retake: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIGHTS",
+            help="Take lights again, as in 12,40-44; bad: the frames that build-lut refused, by the newest report "
+            "beside SESSION. What was taken of them before is kept and not used.",
+        ),
+    ] = None,
 ) -> None:
     """Take the session, or take up one that was interrupted.
 
@@ -212,7 +220,7 @@ def run(
 
     settings = load_lab(lab)
     with orderly_end(), progress("frames") as advance:
-        outcome = run_session(settings, session, advance, lambda sentence: print(sentence, file=sys.stderr))
+        outcome = run_session(settings, session, advance, lambda sentence: print(sentence, file=sys.stderr), retake)
     if not outcome.complete:
         raise QualityError(
             f"{outcome.left} of {outcome.total} frames are without an accepted frame; " + "; ".join(outcome.refused)
