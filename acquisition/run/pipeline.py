@@ -38,7 +38,7 @@ from acquisition.session.judgement import Check, Judgement
 from acquisition.session.plan import SessionStep
 from acquisition.session.records import ACCEPTED
 from drivers.presenter import ReadsBack
-from foundation.ending import Ending
+from foundation.console import Ending
 from foundation.errors import CropError, DeviceError, QualityError, StorageError, counted
 
 AHEAD = 1

@@ -13,7 +13,7 @@ from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.session.folder import Session, session_exists
 from acquisition.session.plan import plan_steps
-from foundation.ending import Ending
+from foundation.console import Ending
 from foundation.errors import ConfigurationError
 
 FIXED = (

@@ -24,7 +24,7 @@ from acquisition.session.heartbeat import RunState
 from acquisition.session.judgement import FrameJudge
 from acquisition.session.records import ACCEPTED, VOIDED
 from drivers.camera import keep_awake
-from foundation.ending import Ending
+from foundation.console import Ending
 from foundation.errors import StorageError
 
 

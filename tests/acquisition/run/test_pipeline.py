@@ -20,7 +20,7 @@ from acquisition.session.judgement import Check, Judgement
 from acquisition.session.plan import SessionStep
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
-from foundation.ending import Ending
+from foundation.console import Ending
 from foundation.errors import DeviceError, DeviceFault, LinkTimeout, QualityError, StorageError
 from tests.acquisition.run.scripted import DOWNLOAD_S, EXPOSE_S, GLARE, LIGHTS, NIGHT, SETTINGS, TURNED, WELL, Lab
 
