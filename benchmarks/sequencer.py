@@ -1,16 +1,33 @@
-"""What the sequencer costs beside the devices: frames of full size through it, against saving the same bytes safely.
+"""How near a session comes to the time that exposure, settling and download need in any case, and what saving costs.
 
-`python -m benchmarks.sequencer` prints one JSON object a line for each figure.
+`python -m benchmarks.sequencer` prints one JSON object a line for each figure:
+
+- in simulated time, 767 frames (707 lights and their references) of the layout of an EOS 550D's CR2, with the latencies
+  of a camera, a screen and a projector; each file is written, flushed, hashed and decoded;
+- in real time on the machine at hand, frames of 25 MB at 30 MB/s, exposure 0.5 s, settling 0.2 s, decoded and judged;
+- a frame saved, hashed and judged against the same bytes written, flushed and hashed by a few lines.
+
+``python -m benchmarks.sequencer quick`` takes a tenth of the frames in simulated time.
+
+The unavoidable time of a frame is release, exposure and readout, and then the longer of settling and download: a body does
+not expose while it sends, and the light may change when it has announced the frame. What is flattered: files are
+prepared (four, handed out by what the screen shows), cable and body do their work without a processor of this machine,
+the latencies are constants, and no frame is refused. In simulated time work of this machine takes none; the figures in
+real time have it.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
+import statistics
+import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO
@@ -18,48 +35,146 @@ from typing import BinaryIO
 import numpy as np
 
 from acquisition.chart.layout import design_chart
-from acquisition.config import LabSettings
-from acquisition.judge.exposure import judge_file
-from acquisition.lights.illuminations import Illumination
+from acquisition.config import LabSettings, SequenceSettings
+from acquisition.judge.exposure import ExposureJudge
+from acquisition.lights.illuminations import Illumination, plan_illuminations
 from acquisition.run.devices import Devices
+from acquisition.run.pipeline import Taken
 from acquisition.run.sequencer import take_session
 from acquisition.session.folder import Session
+from acquisition.session.journal import Journal
 from acquisition.session.plan import plan_steps
+from benchmarks.cr2 import encode_cr2
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
 from drivers.presenter import BLACK, Colour
-from sim.camera.dng import write_dng
-from sim.clock import SimulatedClock
+from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
+from foundation.clock import Clock, SystemClock
+from sim.clock import OPENING, SimulatedClock
 from sim.world.sensors import BODIES
 
-LIGHTS = 12
 BODY = BODIES["EOS 550D"]
-SETTINGS = LabSettings(rig="simulated", chart=Path("chart.json"), illuminations=Path("illuminations.csv"))
+EXPOSURE = ExposureSettings(100, 8.0, 0.5)
+LIGHTS = plan_illuminations(35, list(range(2000, 10001, 200)))
+REAL_LIGHTS = 36
+"""Lights of the session in real time: some tens of frames, a minute."""
+SAVED = 12
+"""Files of the comparison with plain saving."""
 
 
-class Screen:
-    """Remembers the colour."""
+@dataclass(frozen=True)
+class Latencies:
+    """What devices take, seconds.
 
-    colour = BLACK
+    Attributes
+    ----------
+    release_s
+        From the command to the open shutter: mirror and two messages (60D: 2 … 40 ms a message; mirror chosen).
+    readout_s
+        From the closed shutter to the announcement: an EOS 550D's in `sim.camera.eos_bodies`.
+    bytes_per_s
+        Of the cable: USB 2.0 carries 25 to 40 million.
+    show_s
+        From the call to a colour that is known to be on the screen: a picture or two at 60 Hz.
+    verify_s
+        Reading the screen back.
+    question_s
+        A projector's answer over the network; it is asked five things a frame.
+    """
+
+    release_s: float = 0.08
+    readout_s: float = 0.783
+    bytes_per_s: float = 27.5e6
+    show_s: float = 1.5 / 60
+    verify_s: float = 0.008
+    question_s: float = 0.004
+
+
+class PacedScreen:
+    """Remembers the colour, and takes its time."""
+
+    def __init__(self, clock: Clock, latencies: Latencies) -> None:
+        self.clock, self.latencies = clock, latencies
+        self.colour = BLACK
 
     def show(self, colour: Colour) -> None:
-        """Show at once."""
+        """Show a colour."""
+        self.clock.sleep(self.latencies.show_s)
         self.colour = colour
+
+    def verify(self, colour: Colour) -> None:
+        """Read the screen back."""
+        self.clock.sleep(self.latencies.verify_s)
+        assert colour == self.colour
 
     def close(self) -> None:
         """Do nothing."""
 
 
-class PreparedCamera:
-    """Hands out one of two prepared files, so that the camera costs nothing but the write."""
+class PacedProjector:
+    """A healthy projector that takes its time to say so."""
 
-    def __init__(self, screen: Screen, clock: SimulatedClock) -> None:
-        self.screen, self.clock = screen, clock
-        self.lit, self.dark = _raw(5000), _raw(0)
-        self.content = self.dark
+    def __init__(self, clock: Clock, latencies: Latencies) -> None:
+        self.clock, self.latencies = clock, latencies
+
+    def _ask(self) -> None:
+        self.clock.sleep(self.latencies.question_s)
+
+    def identity(self) -> ProjectorIdentity:
+        """Return a name."""
+        return ProjectorIdentity("CroP", "paced", "")
+
+    def power(self) -> Power:
+        """Say that the lamp burns."""
+        self._ask()
+        return Power.ON
+
+    def switch_on(self) -> None:
+        """Do nothing."""
+
+    def switch_off(self) -> None:
+        """Do nothing."""
+
+    def muted(self) -> bool:
+        """Say that it is not."""
+        self._ask()
+        return False
+
+    def set_muted(self, muted: bool) -> None:
+        """Do nothing."""
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Say that there are none."""
+        self._ask()
+        return ()
+
+    def picture_fault(self) -> str | None:
+        """Say that the picture follows: signal and freeze are two questions."""
+        self._ask()
+        self._ask()
+        return None
+
+    def lamps(self) -> tuple[Lamp, ...]:
+        """Return none."""
+        return ()
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class PacedCamera:
+    """Hands out prepared files in the time that a camera takes."""
+
+    def __init__(self, screen: PacedScreen, clock: Clock, latencies: Latencies, files: dict[str, bytes]) -> None:
+        self.screen, self.clock, self.latencies, self.files = screen, clock, latencies, files
+        self.exposing_s = 0.0
+        self.downloading_s: list[float] = []
+        self.frames = 0
+        self._frame = b""
+        self._released = OPENING
 
     def identity(self) -> CameraIdentity:
         """Return a name."""
-        return CameraIdentity("CroP", "prepared", "0")
+        return CameraIdentity(BODY.maker, BODY.model, "1")
 
     def configure(self, settings: ExposureSettings) -> None:
         """Do nothing."""
@@ -69,26 +184,156 @@ class PreparedCamera:
         return ()
 
     def expose(self) -> datetime:
-        """See what the screen shows."""
-        self.content = self.dark if self.screen.colour == BLACK else self.lit
-        return self.clock.now()
+        """Release, expose, read out."""
+        self._frame = self.files["dark" if self.screen.colour == BLACK else f"lit {self.frames % 3}"]
+        self.frames += 1
+        self._released = self.clock.now()
+        exposing_s = self.latencies.release_s + EXPOSURE.shutter_s + self.latencies.readout_s
+        self.exposing_s += exposing_s
+        self.clock.sleep(exposing_s)
+        return self._released
 
     def download(self, into: BinaryIO) -> CapturedFrame:
-        """Write a file."""
-        content = self.content
-        return CapturedFrame("IMG_0001.DNG", into.write(content), self.clock.now())
+        """Send the file in pieces of a mebibyte, as fast as the cable."""
+        begun = self.clock.monotonic()
+        self.downloading_s.append(len(self._frame) / self.latencies.bytes_per_s)
+        for at in range(0, len(self._frame), 1 << 20):
+            into.write(self._frame[at : at + (1 << 20)])
+            due = begun + min(at + (1 << 20), len(self._frame)) / self.latencies.bytes_per_s
+            self.clock.sleep(max(due - self.clock.monotonic(), 0))
+        return CapturedFrame(f"IMG_{self.frames:04d}.CR2", len(self._frame), self._released)
 
     def close(self) -> None:
         """Do nothing."""
 
 
-def _raw(level: int) -> bytes:
-    counts = np.full(BODY.sensor, BODY.black + level, dtype=np.uint16)
+def prepared_files() -> dict[str, bytes]:
+    """Return a dark file and three lit ones, with the noise of the body."""
+    rng = np.random.default_rng(20190601)
+    rows, columns = np.mgrid[0 : BODY.sensor[0], 0 : BODY.sensor[1]]
+    scene = 0.6 + 0.4 * np.sin(columns / 90) * np.cos(rows / 70)
+    return {
+        name: _file(level * scene, rng) for name, level in (("dark", 0), ("lit 0", 7000), ("lit 1", 6000), ("lit 2", 5000))
+    }
+
+
+def _file(signal: np.ndarray[tuple[int, int], np.dtype[np.float64]], rng: np.random.Generator) -> bytes:
+    noise = rng.standard_normal(BODY.sensor, dtype=np.float32)
+    counts = BODY.black + signal + noise * np.sqrt(signal / BODY.electrons_per_dn + BODY.read_noise_dn**2)
     for area in BODY.masked:
-        counts[area.top : area.top + area.height, area.left : area.left + area.width] = BODY.black
-    stream = io.BytesIO()
-    write_dng(stream, counts, BODY, settings=ExposureSettings(100, 8, 0.5), taken_at=SimulatedClock().now())
-    return stream.getvalue()
+        part = (slice(area.top, area.top + area.height), slice(area.left, area.left + area.width))
+        counts[part] = BODY.black + BODY.read_noise_dn * noise[part]
+    whole = counts.round().clip(0, BODY.saturation).astype(np.uint16)
+    return encode_cr2(whole, BODY, settings=EXPOSURE, taken_at=OPENING, serial="1")
+
+
+def _settings(settle_s: float) -> LabSettings:
+    return LabSettings(
+        rig="simulated",
+        chart=Path("chart.json"),
+        illuminations=Path("lights.csv"),
+        sequence=SequenceSettings(settle_s=settle_s),
+    )
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A session: frames, its time by its clock and by this machine's, the unavoidable time, and where time went."""
+
+    frames: int
+    taken_s: float
+    machine_s: float
+    unavoidable_s: float
+    timings: dict[str, float]
+
+    @property
+    def efficiency(self) -> float:
+        """Unavoidable time over the time taken."""
+        return self.unavoidable_s / self.taken_s
+
+
+def measure(clock: Clock, latencies: Latencies, settle_s: float, lights: int, files: dict[str, bytes]) -> Measured:
+    """Take a session of `lights` lights; files are removed when they are judged, so that the disk need not hold all."""
+    screen = PacedScreen(clock, latencies)
+    camera = PacedCamera(screen, clock, latencies, files)
+    chosen = [Illumination(n, "uniform", None, LIGHTS[n].colour) for n in range(lights)]
+    settings = _settings(settle_s)
+    steps = plan_steps(chosen, settings.sequence.reference_every)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch) / "session"
+        with Session.create(folder, settings.to_toml(), design_chart(bits=1), chosen, steps) as session:
+
+            def tidy(taken: Taken) -> None:
+                assert taken.judgement.accepted, taken.judgement.reason
+                for path in session.frames_folder.glob(f"{taken.step.stem}.*"):
+                    path.unlink()
+
+            begun, machine = clock.monotonic(), time.perf_counter()
+            devices = Devices(camera, screen, PacedProjector(clock, latencies), clock)
+            assert take_session(session, devices, settings, ExposureJudge(settings), tidy).complete
+            taken_s, machine_s = clock.monotonic() - begun, time.perf_counter() - machine
+            parts = list(session.journal.timings().values())
+    medians = {name: statistics.median(part[name] for part in parts) for name in parts[0]}
+    # The first light settles with nothing to hide it; behind the last frame there is no light to settle.
+    waits = [max(settle_s, downloading_s) for downloading_s in camera.downloading_s]
+    return Measured(len(steps), taken_s, machine_s, camera.exposing_s + sum(waits), medians)
+
+
+def report(name: str, value: float, unit: str, against: str = "") -> None:
+    """Print one figure."""
+    print(json.dumps({"name": name, "value": float(f"{value:.4g}"), "unit": unit, "against": against}), flush=True)
+
+
+def report_session(name: str, measured: Measured) -> None:
+    """Print what a session took, and where its time went."""
+    frames = measured.frames
+    report(f"{name}: frames", frames, "frames")
+    report(f"{name}: seconds a frame", measured.taken_s / frames, "s")
+    report(f"{name}: unavoidable", measured.unavoidable_s / frames, "s", "exposure and the longer of settling, download")
+    report(f"{name}: efficiency", measured.efficiency, "ratio", "unavoidable time over time taken")
+    for part, seconds in measured.timings.items():
+        report(f"{name}: median of {part}", seconds, "s")
+
+
+@contextmanager
+def counted_writes() -> Iterator[list[float]]:
+    """Collect the seconds of each write to the journal."""
+    spent: list[float] = []
+    real = {name: getattr(Journal, name) for name in ("begin", "commit", "beat", "note")}
+
+    def timed(name: str):  # noqa: ANN202  # pyright: ignore
+        def call(*given: object, **named: object) -> object:
+            begun = time.perf_counter()
+            try:
+                return real[name](*given, **named)
+            finally:
+                spent.append(time.perf_counter() - begun)
+
+        return call
+
+    for name in real:
+        setattr(Journal, name, timed(name))
+    try:
+        yield spent
+    finally:
+        for name, method in real.items():
+            setattr(Journal, name, method)
+
+
+def compare_saving(files: dict[str, bytes]) -> None:
+    """Compare what becomes of a frame on this machine with plain saving of the same bytes."""
+    instant = Latencies(0, 0, 1e15, 0, 0, 0)
+    measured = measure(SimulatedClock(), instant, 0.0, SAVED - 4, files)
+    with tempfile.TemporaryDirectory() as scratch:
+        begun = time.perf_counter()
+        for number in range(measured.frames):
+            _save(Path(scratch) / f"{number}.cr2", files["lit 0"])
+        saved_s = time.perf_counter() - begun
+    name = "sequencer: a frame of 18 Mpx saved, hashed, decoded, judged"
+    report(name, measured.machine_s / measured.frames, "s")
+    report(f"{name}, over saving alone", measured.machine_s / saved_s, "ratio", "write, fsync, SHA-256")
+    judged_s = measured.timings["judge"] * measured.frames
+    report(f"{name}, over saving and judging", measured.machine_s / (saved_s + judged_s), "ratio", "and judging")
 
 
 def _save(path: Path, content: bytes) -> None:
@@ -99,36 +344,23 @@ def _save(path: Path, content: bytes) -> None:
     hashlib.sha256(content).hexdigest()
 
 
-def main() -> int:
-    """Measure a session of prepared frames."""
-    clock, screen = SimulatedClock(), Screen()
-    camera = PreparedCamera(screen, clock)
-    lights = tuple(Illumination(number, "uniform", None, Colour(255, number, 9)) for number in range(LIGHTS))
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        steps = plan_steps(lights, 25)
-        with Session.create(folder / "session", SETTINGS.to_toml(), design_chart(bits=1), lights, steps) as session:
-            begun = time.perf_counter()
-            outcome = take_session(session, Devices(camera, screen, None, clock), SETTINGS)
-            taken = time.perf_counter() - begun
-            assert outcome.complete
-            file = folder / "session" / session.frames()[0].file
-            begun = time.perf_counter()
-            for _ in steps:
-                judge_file(file, "white", SETTINGS)
-            judged = time.perf_counter() - begun
-        begun = time.perf_counter()
-        for number in range(len(steps)):
-            _save(folder / f"{number}.dng", camera.lit)
-        saved = time.perf_counter() - begun
-    for name, value, unit, against in (
-        ("sequencer: seconds a frame of 18 Mpx, saved, hashed, decoded, judged", taken / len(steps), "s", ""),
-        ("sequencer: time over saving and hashing the same bytes", taken / saved, "ratio", "write, fsync, SHA-256"),
-        ("sequencer: time over that and decoding", taken / (saved + judged), "ratio", "the same and judge_file"),
-    ):
-        print(json.dumps({"name": name, "value": float(f"{value:.3g}"), "unit": unit, "against": against}), flush=True)
+def main(argv: list[str]) -> int:
+    """Measure sessions of prepared frames."""
+    files = prepared_files()
+    report("size of a frame", len(files["lit 0"]) / 1e6, "MB")
+    report("load of the machine when begun", os.getloadavg()[0], "processes", f"{os.cpu_count()} processors")
+    compare_saving(files)
+    real = Latencies(0, 0, 30e6, 0, 0, 0)
+    with counted_writes() as spent:
+        measured = measure(SystemClock(), real, 0.2, REAL_LIGHTS, files)
+    report_session("real time", measured)
+    report("real time: journal's writes a frame", sum(spent) / measured.frames, "s")
+    lights = len(LIGHTS) // 10 if "quick" in argv else len(LIGHTS)
+    report_session("simulated time", measure(SimulatedClock(), Latencies(), 0.5, lights, files))
+    slow = measure(SimulatedClock(), Latencies(question_s=0.02), 0.5, len(LIGHTS) // 10, files)
+    report_session("simulated time, a projector that takes 20 ms an answer", slow)
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main(sys.argv[1:]))

@@ -8,13 +8,13 @@ Rules that hold inside:
 - Open steps are taken in the plan's order, so that a refused one comes before those behind it.
 - A reference that voids other frames is taken again before them: it shows whether the cause is still there.
 - Lights are followed by a white and a dark frame. Where the last lights of a run have none behind them, because they
-  were taken again, the last pair of the plan is taken once more.
+  were taken again, another pair is put behind the plan.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 
 from acquisition.session.plan import FrameKind, SessionStep
 
@@ -41,6 +41,8 @@ class Agenda:
         Numbers of the steps that are taken before all others, in their order, done or not.
     unclosed
         Kinds of references that must still follow lights that were taken in earlier runs; see `unclosed_kinds`.
+    append
+        Given a reference's kind, puts one behind the plan and returns it; None: nothing is put there.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class Agenda:
         attempts: int,
         first: Iterable[int] = (),
         unclosed: Collection[str] = (),
+        append: Callable[[FrameKind], SessionStep] | None = None,
     ) -> None:
         self._steps = {step.number: step for step in steps}
         self._first = list(first)
@@ -60,8 +63,9 @@ class Agenda:
         self._given_up: dict[int, str] = {}
         self._in_a_row = 0
         self._unclosed: set[str] = set(unclosed)
-        last = {step.kind: step.number for step in steps if step.kind in REFERENCES}
-        self._closing = [last[kind] for kind in REFERENCES if kind in last]
+        self._append = append
+        planned = {step.kind for step in steps}
+        self._closing = [kind for kind in REFERENCES if kind in planned]
 
     def __len__(self) -> int:
         """Return how many steps are without an accepted frame, given up or under way included."""
@@ -82,7 +86,7 @@ class Agenda:
         ready = self._open - self._under_way - self._given_up.keys()
         number = next((number for number in self._first if number in ready), min(ready, default=None))
         if number is None and not self._under_way:
-            number = self._reopened()
+            number = self._closed()
         return None if number is None else self._steps[number]
 
     def begin(self, step: SessionStep) -> None:
@@ -148,15 +152,15 @@ class Agenda:
         if number in self._first:
             self._first.remove(number)
 
-    def _reopened(self) -> int | None:
-        """Return the reference that is taken once more to close the lights; None where none is needed or left."""
-        for number in self._closing:
-            if self._steps[number].kind in self._unclosed and number not in self._given_up:
-                # Its tries are new: what is asked for is another frame, not another try at one.
-                self._unclosed.discard(self._steps[number].kind)
-                self._tries[number] = 0
-                self._open.add(number)
-                return number
+    def _closed(self) -> int | None:
+        """Put a reference behind the plan that closes the last lights; None where none is needed."""
+        for kind in self._closing:
+            if self._append is not None and kind in self._unclosed:
+                self._unclosed.discard(kind)
+                step = self._append(kind)
+                self._steps[step.number] = step
+                self._open.add(step.number)
+                return step.number
         return None
 
 

@@ -6,7 +6,7 @@ whatever happens, and a second call goes on where the first stopped.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -23,7 +23,9 @@ from acquisition.session.folder import Session
 from acquisition.session.heartbeat import RunState
 from acquisition.session.judgement import FrameJudge
 from acquisition.session.records import ACCEPTED, VOIDED
+from acquisition.session.plan import FrameKind, SessionStep
 from drivers.camera import keep_awake
+from drivers.presenter import BLACK, WHITE
 from foundation.console import Ending
 from foundation.errors import StorageError
 
@@ -59,6 +61,7 @@ def take_session(
     announce: Callable[[str], object] = lambda sentence: None,
     state: Callable[[str], object] = lambda sentence: None,
     ending: Ending | None = None,
+    first: Sequence[int] = (),
 ) -> RunOutcome:
     """Take every step of the session's plan that has no accepted frame yet.
 
@@ -76,6 +79,8 @@ def take_session(
         Called every few seconds of a wait with what is waited for and how long; the newest holds.
     ending
         By which the run learns that it is to end after the running frame; None for a run that nobody asks.
+    first
+        Numbers of steps that are taken before all others (`acquisition.run.resuming.tie`).
 
     Raises
     ------
@@ -103,12 +108,19 @@ def take_session(
     asked = ending or Ending()
     for stray in session.set_aside_strays():
         report("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
-    total = len(session.steps)
     taken = [attempt.kind for attempt in journal.attempts() if attempt.verdict == ACCEPTED]
-    agenda = Agenda(session.steps, session.done_steps(), settings.sequence.attempts, unclosed=unclosed_kinds(taken))
+
+    def append(kind: FrameKind) -> SessionStep:
+        step = SessionStep(session.steps[-1].number + 1, kind, None, WHITE if kind == "white" else BLACK)
+        session.add_steps([step])
+        return step
+
+    agenda = Agenda(
+        session.steps, session.done_steps(), settings.sequence.attempts, first, unclosed_kinds(taken), append
+    )
     if not len(agenda):
-        return RunOutcome(total, 0, ())
-    journal.note(clock.now(), "start", f"{len(agenda)} of {total} frames to take")
+        return RunOutcome(len(session.steps), 0, ())
+    journal.note(clock.now(), "start", f"{len(agenda)} of {len(session.steps)} frames to take")
     devices.camera.configure(settings.camera.exposure)
     used = judge or ExposureJudge(settings)
     for step, _, measurement, accepted in journal.measurements():
@@ -124,7 +136,7 @@ def take_session(
             session.write_frames_csv()
         raise
     session.write_frames_csv()
-    outcome = RunOutcome(total, len(agenda), agenda.given_up)
+    outcome = RunOutcome(len(session.steps), len(agenda), agenda.given_up)
     if outcome.complete and settings.sequence.switch_off and devices.projector is not None:
         devices.projector.switch_off()
     journal.note(clock.now(), "complete" if outcome.complete else "incomplete", f"{outcome.left} frames left")

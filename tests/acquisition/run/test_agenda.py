@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from typing import Any
+
 import pytest
 
 from acquisition.lights.illuminations import Illumination
 from acquisition.run.agenda import GIVEN_UP_IN_A_ROW, Agenda, unclosed_kinds
-from acquisition.session.plan import SessionStep, plan_steps
-from drivers.presenter import Colour
+from acquisition.session.plan import FrameKind, SessionStep, plan_steps
+from drivers.presenter import BLACK, WHITE, Colour
 
 STEPS = plan_steps([Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(4)], 2)
 """white 0, dark 1, light 2, 3, white 4, dark 5, light 6, 7, white 8, dark 9."""
+
+
+def agenda_of(done: Collection[int], attempts: int = 3, **more: Any) -> Agenda:
+    """Return an agenda of `STEPS` that puts closing references behind them, from 10 on."""
+    behind: list[SessionStep] = []
+
+    def append(kind: FrameKind) -> SessionStep:
+        behind.append(SessionStep(len(STEPS) + len(behind), kind, None, WHITE if kind == "white" else BLACK))
+        return behind[-1]
+
+    return Agenda(STEPS, done, attempts, append=append, **more)
 
 
 def take(agenda: Agenda, refused: dict[int, int] | None = None) -> list[int]:
@@ -65,16 +79,16 @@ def test_a_fault_of_a_device_is_no_try() -> None:
 
 
 def test_lights_that_were_taken_again_last_are_closed_by_another_pair() -> None:
-    agenda = Agenda(STEPS, {step.number for step in STEPS} - {6}, 3)
-    assert take(agenda) == [6, 8, 9]
+    agenda = agenda_of({step.number for step in STEPS} - {6})
+    assert take(agenda) == [6, 10, 11]
     assert len(agenda) == 0
 
 
 def test_lights_of_an_earlier_run_are_closed_too() -> None:
     assert unclosed_kinds(["white", "dark", "light", "white", "dark"]) == frozenset()
     unclosed = unclosed_kinds(["white", "dark", "white", "dark", "light"])
-    agenda = Agenda(STEPS, {step.number for step in STEPS} - {1}, 3, unclosed=unclosed)
-    assert take(agenda) == [1, 8], "the dark frame that is open closes them as well"
+    agenda = agenda_of({step.number for step in STEPS} - {1}, unclosed=unclosed)
+    assert take(agenda) == [1, 10], "the dark frame that is open closes them as well"
 
 
 def test_a_reference_that_voids_is_probed_before_what_it_voids() -> None:
@@ -87,10 +101,10 @@ def test_a_reference_that_voids_is_probed_before_what_it_voids() -> None:
 
 
 def test_the_last_lights_that_are_voided_are_closed_again() -> None:
-    agenda = Agenda(STEPS, set(range(8)), 3)
+    agenda = agenda_of(set(range(8)))
     agenda.refuse(begun(agenda), "the picture is stuck", before_others=True)
     agenda.void([6, 7], "voided")
-    assert take(agenda) == [8, 6, 7, 9, 8], "a white frame lies behind the lights that were taken again"
+    assert take(agenda) == [8, 6, 7, 9, 10], "a white frame lies behind the lights that were taken again"
 
 
 def test_frames_are_not_voided_for_ever() -> None:

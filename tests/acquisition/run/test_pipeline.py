@@ -141,7 +141,7 @@ class TestRefusals:
     def test_a_light_that_is_taken_again_behind_the_last_white_is_closed_by_another(self, folder: Path) -> None:
         lab = Lab(folder)
         assert run(lab, ScriptedJudge({3: refused("another light")})).complete
-        assert [step for step, _ in lab.taken()] == ["w0", "d1", "l2", "l3", "w4", "l3", "d5", "w4"]
+        assert [step for step, _ in lab.taken()] == ["w0", "d1", "l2", "l3", "w4", "l3", "d5", "w6"]
 
     def test_a_step_without_a_try_left_is_left_for_the_next_run(self, folder: Path) -> None:
         lab = Lab(folder)
