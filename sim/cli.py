@@ -15,6 +15,9 @@ from foundation import console
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from sim.camera.film import Film
     from sim.projectors.projector import SimulatedProjector
     from sim.world.drawing import Print
@@ -163,9 +166,9 @@ def camera(
     real time: a window in front lights its place, for its share of the exposure. With --watch-projector the projector's
     power, mute, freeze and input count, too. So `acquire` can be rehearsed as in a lab (docs/how-to/rehearsal.md).
 
-    Writes no file. Prints the address it listens on, then serves until interrupted (Ctrl-C), which is its proper end:
-    exit code 0. Exit code 2 when there is no such model, chart, room or screen, or not exactly one cable, 3 when the
-    port is taken or the screen cannot be reached.
+    Writes no file. Prints the address it listens on, and what each exposure of a watched screen saw; serves until
+    interrupted (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there is no such model, chart, room or
+    screen, or not exactly one cable, 3 when the port is taken or the screen cannot be reached.
 
     With --port, any software that speaks PTP/IP can use it, for instance (both connections go to one port):
 
@@ -250,7 +253,14 @@ def _film(
     with Beam(pictures, asked, world.room.light_of, clock) as beam:
         # The first frame would else come seconds late.
         world.signal(WHITE, REFERENCE_EXPOSURE)
-        yield WatchedFilm(world, lambda seconds: beam.gather(seconds).parts, serial, happens, clock.now())
+
+        def gather(number: int, seconds: float) -> tuple[NDArray[np.float32], float]:
+            print(f"exposure {number} begins, {seconds:g} s", flush=True)
+            thrown = beam.gather(seconds, lambda: print(f"exposure {number} half over", flush=True))
+            print(f"exposure {number} ends: {thrown}", flush=True)
+            return thrown.picture, thrown.lamp
+
+        yield WatchedFilm(world, gather, serial, happens, clock.now())
 
 
 def _print(context: typer.Context, chart: Path) -> Print:

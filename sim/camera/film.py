@@ -51,8 +51,9 @@ class WatchedFilm:
     Parameters
     ----------
     gather
-        Waits for so many seconds and returns the light that fell on the chart meanwhile: the projected picture
-        (h, w, 3) float32, 0 … 1 of each primary's full light, and the share of the lamp's light.
+        Called with the number of the exposure, from 0, and its seconds; waits for them and returns the light that fell
+        on the chart meanwhile: the projected picture (h, w, 3) float32, 0 … 1 of each primary's full light, and the
+        share of the lamp's light.
     disturbances
         What goes wrong besides, by the number of exposures and the time since `opened`.
     opened
@@ -64,7 +65,7 @@ class WatchedFilm:
     def __init__(
         self,
         world: World,
-        gather: Callable[[float], tuple[NDArray[np.float32], float]],
+        gather: Callable[[int, float], tuple[NDArray[np.float32], float]],
         serial: str,
         disturbances: Disturbances,
         opened: datetime,
@@ -82,9 +83,9 @@ class WatchedFilm:
 
     def expose(self, settings: ExposureSettings, released_at: datetime, into: BinaryIO) -> int:
         """Photograph the world as it is lit from now on, for the exposure's time."""
-        picture, lamp = self._gather(settings.shutter_s)
         seconds = (released_at - self._opened).total_seconds()
         moment = Moment(next(self._frames), seconds)
+        picture, lamp = self._gather(moment.frame, settings.shutter_s)
         situation = replace(self._disturbances.situation(moment), picture=picture)
         lamp *= 1 - self._world.room.lamp_drift_per_hour * seconds / 3600
         key = (_WATCHED, moment.frame)

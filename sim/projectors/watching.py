@@ -45,6 +45,12 @@ FINEST_PX: Final = 480
 WARMING_SHARE: Final = 0.5
 """Light of a lamp that warms up, over its full light: its control port does not tell how far it has come (chosen)."""
 
+_INSTANT_S: Final = 1e-4
+"""Time that clocks, which count in whole microseconds, need not tell from none."""
+
+_ALIKE: Final = 1e-3
+"""Difference of light below which a picture is called plain: a quarter of a code at the bright end."""
+
 _PLACE = re.compile(r"(?P<display>[^,]*:\d+(?:\.\d+)?)?(?:,|^)?(?P<region>\d+x\d+\+\d+\+\d+)?")
 
 
@@ -194,10 +200,11 @@ class ThrownLight:
     picture: NDArray[np.float32]
     lamp: float
 
-    @property
-    def parts(self) -> tuple[NDArray[np.float32], float]:
-        """The picture (h, w, 3) float32 and the lamp's share."""
-        return self.picture, self.lamp
+    def __str__(self) -> str:
+        least, most = self.picture.min(axis=(0, 1)), self.picture.max(axis=(0, 1))
+        mean = " ".join(f"{share:.3f}" for share in self.picture.mean(axis=(0, 1)))
+        shape = "plain" if float((most - least).max()) < _ALIKE else "not plain"
+        return f"{shape} picture, mean light {mean}, lamp {self.lamp:.2f}"
 
 
 class Beam:
@@ -249,19 +256,29 @@ class Beam:
             self._projector.close()
         self._pictures.close()
 
-    def gather(self, seconds: float) -> ThrownLight:
-        """Return what reaches the chart from now on, for so many seconds; returns when they are over."""
+    def gather(self, seconds: float, halfway: Callable[[], None] = lambda: None) -> ThrownLight:
+        """Return what reaches the chart from now on, for so many seconds; returns when they are over.
+
+        Parameters
+        ----------
+        seconds
+            More than 0.
+        halfway
+            Called once, when half of them are over.
+        """
         at = self._clock.monotonic()
-        ends = at + seconds
+        ends, half = at + seconds, at + seconds / 2
         total: NDArray[np.float64] = np.zeros((1, 1, 3))
         lit = 0.0
-        while at < ends:
+        while ends - at > _INSTANT_S:
             share, picture = self._thrown()
             self._clock.sleep(min(SAMPLE_S, max(ends - self._clock.monotonic(), 0.0)))
             # A look stands for the time until the next one.
             until = min(self._clock.monotonic(), ends)
             lit += share * (until - at)
             total = _added(total, picture.astype(np.float64) * (share * (until - at)))
+            if at < half <= until:
+                halfway()
             at = until
         # What is dark has no picture.
         mean = total / lit if lit else total
