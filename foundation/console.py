@@ -14,12 +14,14 @@ from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager, suppress
 
 from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
-from foundation.files import remedy_of
+from foundation.files import disk_remedy_of, remedy_of
 
 EXIT_CODES = (
     "Exit codes: 0 done; 2 something given cannot be used; 3 a device failed; 4 the data are not good enough; "
     "5 the disk is full or read-only; 130 interrupted."
 )
+
+_WRITING_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 def say_error(message: str) -> None:
@@ -63,11 +65,16 @@ def _outcome(command: Callable[[], object], keeps: bool) -> int:
         _abandon_stdout()
         return 0
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EROFS, errno.EDQUOT):
-            say_error(f"cannot write {error.filename or 'to the disk'}: {error.strerror}; free space and run again")
+        named = isinstance(error.filename, str | bytes)
+        remedy = disk_remedy_of(error)
+        # A file that is not there, and a socket that is not connected, are no fault of a disk.
+        if remedy is not None and error.errno not in (errno.ENOENT, errno.ENOTCONN):
+            about = os.fsdecode(error.filename) if named else "the disk"
+            doing = "write" if error.errno in _WRITING_FAULTS else "use"
+            say_error(f"cannot {doing} {about}: {error.strerror}; {remedy}")
             return StorageError.exit_code
         remedy = remedy_of(error)
-        if remedy is None or not isinstance(error.filename, str | bytes):
+        if remedy is None or not named:
             raise
         say_error(f"cannot use {os.fsdecode(error.filename)}: {error.strerror}; {remedy}")
         return InputError.exit_code

@@ -27,6 +27,7 @@ def run_session(
     folder: Path,
     observe: Callable[[int, int], None],
     announce: Callable[[str], None] = lambda sentence: None,
+    retake: str | None = None,
 ) -> RunOutcome:
     """Take the session `folder`, new or interrupted, with the rig that the settings name.
 
@@ -36,6 +37,8 @@ def run_session(
         Called with frames done and in all, once at the start and after each frame.
     announce
         Called with a sentence when the run waits, tries again, pauses and goes on.
+    retake
+        What to take again (`Session.retake`); nothing if None.
 
     Raises
     ------
@@ -45,6 +48,8 @@ def run_session(
         See `acquisition.run.sequencer.take_session`; the session can be taken up again.
     """
     with open_session(settings, folder) as session:
+        if retake is not None:
+            session.retake(retake)
         total = len(session.steps)
         done = len(session.done_steps())
         observe(done, total)

@@ -66,15 +66,43 @@ def test_interruption_is_130(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == "error: interrupted; nothing of it was kept\n"
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])
-def test_a_disk_fault_that_nobody_translated_is_5(number: int, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("number", "beginning"),
+    [
+        (errno.ENOSPC, "cannot write /disk/samples.npy: No space left on device; free space or"),
+        (errno.EROFS, "cannot write /disk/samples.npy: Read-only file system; the disk can only be read"),
+        (errno.EDQUOT, "cannot write /disk/samples.npy: Disk quota exceeded; what this user may use"),
+        (errno.EIO, "cannot use /disk/samples.npy: Input/output error; the disk fails: see what dmesg says"),
+        (errno.ENODEV, "cannot use /disk/samples.npy: No such device; the disk is gone: connect and mount it"),
+        (errno.ESTALE, "cannot use /disk/samples.npy: Stale file handle; the folder was taken away or mounted anew"),
+    ],
+)
+def test_a_disk_fault_that_nobody_translated_is_5(
+    number: int, beginning: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     def fail() -> None:
-        raise OSError(number, "No space left on device", "/disk/samples.npy")
+        raise OSError(number, os.strerror(number), "/disk/samples.npy")
 
     assert run(fail) == 5
-    assert capsys.readouterr().err == (
-        "error: cannot write /disk/samples.npy: No space left on device; free space and run again\n"
-    )
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: {beginning}")
+    assert said.endswith("then run the same command again\n")
+
+
+def test_a_disk_fault_of_an_open_file_is_5(capsys: pytest.CaptureFixture[str]) -> None:
+    def fail() -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    assert run(fail) == 5
+    assert "cannot use the disk: Input/output error; the disk fails" in capsys.readouterr().err
+
+
+def test_a_missing_file_that_nobody_translated_is_no_disk_fault() -> None:
+    def fail() -> None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), "/nowhere")
+
+    with pytest.raises(FileNotFoundError):
+        run(fail)
 
 
 @pytest.mark.parametrize("name", ["/theirs/dataset.json", b"/theirs/dataset.json"])

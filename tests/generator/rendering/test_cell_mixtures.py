@@ -8,12 +8,12 @@ import pytest
 
 from foundation.angles import angles_deg
 from generator.rendering.cell_mixtures import (
+    _AXES,  # pyright: ignore[reportPrivateUsage]  # what differences cost is no part of the result
     BRIGHTNESS_COST,
     GREY_MET_DEG,
     MET_WITHIN,
     SLOTS,
     WIDE_SPREAD_COST,
-    _AXES,  # pyright: ignore[reportPrivateUsage]  # what differences cost is no part of the result
     mix_cells,
 )
 from generator.rendering.print_profiles import PrintProfile
