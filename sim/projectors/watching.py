@@ -140,12 +140,12 @@ class Asked(Protocol):
         """Return the power state now."""
         ...
 
-    def muted(self) -> bool:
-        """Return whether the picture is blanked."""
+    def muted(self) -> bool | None:
+        """Return whether the picture is blanked; None where it cannot tell."""
         ...
 
-    def frozen(self) -> bool:
-        """Return whether the picture is frozen; refused where it cannot tell."""
+    def frozen(self) -> bool | None:
+        """Return whether the picture is frozen; refused, or None, where it cannot tell."""
         ...
 
     def input(self) -> Input:
@@ -181,7 +181,7 @@ def ask(projector: Asked) -> LampState:
     with contextlib.suppress(DeviceError):
         source = projector.input().code
     with contextlib.suppress(DeviceError):
-        frozen = projector.frozen()
+        frozen = bool(projector.frozen())
     return LampState(1.0, frozen, source)
 
 
