@@ -13,12 +13,12 @@ from datetime import UTC, datetime, timedelta
 
 from acquisition.config import LabSettings
 from acquisition.judge.exposure import ExposureJudge
-from acquisition.run.agenda import Agenda, unclosed_kinds
+from acquisition.run.taking.agenda import Agenda, unclosed_kinds
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import make_ready
 from acquisition.run.patience import Patience
-from acquisition.run.pipeline import Pipeline, Taken
-from acquisition.run.saving import Saver
+from acquisition.run.taking.pipeline import Pipeline, Taken
+from acquisition.run.taking.saving import Saver
 from acquisition.session.folder import Session
 from acquisition.session.heartbeat import RunState
 from acquisition.session.judgement import FrameJudge

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from acquisition.lights.illuminations import Illumination
-from acquisition.run.agenda import GIVEN_UP_IN_A_ROW, Agenda, unclosed_kinds
+from acquisition.run.taking.agenda import GIVEN_UP_IN_A_ROW, Agenda, unclosed_kinds
 from acquisition.session.plan import FrameKind, SessionStep, plan_steps
 from drivers.presenter import BLACK, WHITE, Colour
 

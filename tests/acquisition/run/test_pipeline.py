@@ -13,7 +13,7 @@ import pytest
 
 from acquisition.lights.illuminations import Illumination
 from acquisition.run.patience import PAUSE_S
-from acquisition.run.pipeline import Taken
+from acquisition.run.taking.pipeline import Taken
 from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.session.folder import Session
 from acquisition.session.judgement import Check, Judgement

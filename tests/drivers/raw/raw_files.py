@@ -16,16 +16,27 @@ Tags = dict[int, tuple[int, int, bytes]]
 """TIFF tags: code to type, number of values, and the values' bytes."""
 
 
-def write_cr2(path: Path, counts: NDArray[np.uint16], model: str, iso: int = 100) -> None:
-    """Write a CR2 of one slice; `counts` is (H, W) uint16 of the whole sensor, W even, below 2**14."""
+def write_cr2(
+    path: Path,
+    counts: NDArray[np.uint16],
+    model: str,
+    iso: int = 100,
+    slices: tuple[int, int, int] | None = None,
+) -> None:
+    """Write a CR2; `counts` is (H, W) uint16 of the whole sensor, W even, below 2**14.
+
+    `slices` are their number without the last, their width, and that of the last; None: one slice.
+    """
     width = counts.shape[1]
-    strip = lossless_jpeg(counts)
+    number, each, last = slices or (0, 0, width)
+    cuts = [counts[:, n * each : (n + 1) * each] for n in range(number)] + [counts[:, number * each :]]
+    strip = lossless_jpeg(np.concatenate([cut.ravel() for cut in cuts]).reshape(counts.shape))
     exif: Tags = {33434: ratios((1, 2)), 33437: ratios((8, 1)), 34855: shorts(iso)}
     directories: list[Tags] = [
         {271: text("Canon"), 272: text(model), 274: shorts(1), 34665: longs(0)},
         {},
         {},
-        {259: shorts(6), 273: longs(0), 279: longs(len(strip)), 50752: shorts(0, 0, width)},
+        {259: shorts(6), 273: longs(0), 279: longs(len(strip)), 50752: shorts(number, each, last)},
     ]
     # Header: TIFF, then "CR", version 2.0, and where the raw directory is.
     starts: list[int] = []

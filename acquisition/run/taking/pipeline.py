@@ -1,6 +1,6 @@
 """Frames one behind another: while one is downloaded the next light settles, while one is exposed the last is judged.
 
-Order of a frame n, on one thread for the devices and one for the disk (`acquisition.run.saving`)::
+Order of a frame n, on one thread for the devices and one for the disk (`acquisition.run.taking.saving`)::
 
     devices   settle n | begin n | expose n | screen? | show n+1 | projector? | download n | collect n-1 | settle …
     saving             |        judge n-1                                     | hash, flush, rename, judge n …
@@ -28,11 +28,11 @@ from datetime import datetime
 from typing import TypeVar
 
 from acquisition.config import LabSettings
-from acquisition.run.agenda import REFERENCES, Agenda, step_name
+from acquisition.run.taking.agenda import REFERENCES, Agenda, step_name
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import await_health, health_fault
 from acquisition.run.patience import Patience, Pause, is_curable
-from acquisition.run.saving import FilledFile, Saved, Saver, download
+from acquisition.run.taking.saving import FilledFile, Saved, Saver, download
 from acquisition.session.folder import Session
 from acquisition.session.judgement import Check, Judgement
 from acquisition.session.plan import SessionStep

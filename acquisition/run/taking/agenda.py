@@ -1,6 +1,6 @@
 """Which frame is taken next: the plan's open steps, what must be taken again, and what closes a run.
 
-A value that changes: no device, no clock, no file. The pipeline (`acquisition.run.pipeline`) asks it for the next step
+A value that changes: no device, no clock, no file. The pipeline (`acquisition.run.taking.pipeline`) asks it for the next step
 and tells it how each ended.
 
 Rules that hold inside:

@@ -1,0 +1,45 @@
+"""What a run says of the last frame and of the time left."""
+
+from __future__ import annotations
+
+import pytest
+
+from acquisition.run.taking.pipeline import Taken
+from acquisition.run.terminal import Terminal, TimeLeft, verdict_line
+from acquisition.session.judgement import Check, Judgement
+from acquisition.session.plan import SessionStep
+from drivers.presenter import Colour
+
+STEP = SessionStep(7, "light", 5, Colour(1, 2, 3))
+
+
+def test_the_verdict_has_its_numbers() -> None:
+    checks = (Check("file"), Check("movement", 0.031, None, 0.2, "px"), Check("light", 0.2134, None, 0.5, "°"))
+    assert verdict_line(Taken(STEP, Judgement(checks), 3)) == "light 5 accepted, light 0.213°, movement 0.031 px"
+    dark = Judgement((Check("exposure", 0.4, None, None, "%", "too dark"),))
+    assert verdict_line(Taken(STEP, dark, 3)) == "light 5 refused, exposure 0.4 %"
+
+
+def test_the_time_left_is_that_of_the_last_frames_without_pauses() -> None:
+    now = [0.0]
+    left = TimeLeft(lambda: now[0])
+    assert left.left_s(10) is None
+    for seconds in (0, 2, 2, 3):
+        now[0] += seconds
+        left.taken()
+    assert left.left_s(10) == 20
+    left.paused()
+    now[0] += 600
+    left.taken()
+    now[0] += 2
+    left.taken()
+    assert left.left_s(10) == 20
+
+
+def test_lines_stay_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    with Terminal() as terminal:
+        terminal.progress(0, 2)
+        terminal.taken(Taken(STEP, Judgement((Check("file"),)), 1))
+        terminal.announce("refused: light 5: too dark")
+        terminal.state("the lamp warms up, 3 min 00 s left")
+    assert "refused: light 5: too dark\n" in capsys.readouterr().err

@@ -1,0 +1,17 @@
+"""A hundred sessions of twenty lights with several mishaps each, of every kind: most complete at once, all in the end."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+from tests.acquisition.run.mishaps import MISHAPS, TroubledLab, take_all
+
+SEEDS = range(10, 110)
+
+
+def test_a_hundred_sessions_with_mishaps(tmp_path: Path) -> None:
+    happened = Counter(name for seed in SEEDS for name in TroubledLab(seed).mishaps)
+    assert set(happened) == {mishap.__name__ for mishap in MISHAPS}, "every kind of mishap came up"
+    complete = sum(take_all(tmp_path / f"{seed}", seed) for seed in SEEDS)
+    assert complete > 75, "most of what happens once is lived with"
