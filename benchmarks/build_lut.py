@@ -31,12 +31,14 @@ from acquisition.chart.printing import drawing
 from acquisition.framing.planes import frame_black
 from acquisition.lights.illuminations import plan_illuminations
 from acquisition.session.folder import Session
-from acquisition.session.journal import ACCEPTED
+from acquisition.session.incoming import ReceivedFile
+from acquisition.session.judgement import Judgement
 from acquisition.session.plan import plan_steps
 from calibration.pipeline.build import build
 from calibration.pipeline.prefetching import thread_count
 from calibration.registration.register import register
 from calibration.sampling.samples import gather_values, sites_at
+from drivers.camera import CapturedFrame
 from drivers.raw.rawfile import read_raw
 from sim.camera.dng import write_dng
 from sim.world.drawing import Print
@@ -86,16 +88,10 @@ def take(folder: Path, body: str = "EOS 550D", cr2: bool = False, lights: int = 
         at += timedelta(seconds=4)
         attempt = session.journal.begin(step, file, at)
         (folder / file).write_bytes(data)
-        session.commit(
-            attempt,
-            file=file,
-            size=len(data),
-            sha256=hashlib.sha256(data).hexdigest(),
-            taken_at=at,
-            exposure_s=REFERENCE_EXPOSURE.shutter_s,
-            ended_at=at,
-            verdict=ACCEPTED,
+        received = ReceivedFile(
+            folder / file, len(data), hashlib.sha256(data).hexdigest(), CapturedFrame(Path(file).name, len(data), at)
         )
+        session.commit(attempt, received, Judgement(()), exposure_s=REFERENCE_EXPOSURE.shutter_s, ended_at=at)
     return session, world
 
 

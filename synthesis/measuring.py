@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
+from acquisition.measures.sensor_range import saturation
 from calibration.pipeline.baseline import usable_means
 from calibration.pipeline.registered_frame import ChartPoints
-from calibration.radiometry.paper import MAX_ORDER, MAX_ORDER_AROUND, MIN_REFERENCES, Paper, PaperReader
 from calibration.radiometry.primaries import Primaries
-from calibration.radiometry.sensor_range import saturation
 from calibration.sampling.patch_statistics import patch_means
 from calibration.sampling.samples import Sites, gather, gather_values
 from foundation.errors import QualityError

@@ -21,6 +21,7 @@ from acquisition.judge.exposure import measure_exposure, refusal
 from acquisition.lights.illuminations import load_illuminations
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import make_ready
+from acquisition.run.patience import Patience
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.shutter import exposure_advice, light_period_s
 from acquisition.session.plan import FrameKind
@@ -102,13 +103,13 @@ def _make_devices_ready(devices: Devices, settings: LabSettings, announce: Calla
         lines += [f"picture     {warning}" for warning in devices.presenter.warnings()]
     devices.camera.configure(settings.camera.exposure)
     if devices.projector is not None:
-        make_ready(
-            devices.projector,
+        patience = Patience(
             devices.clock,
-            settings.sequence,
-            lambda: keep_awake(devices.camera),
+            0,
             lambda what, sentence: announce(f"{what}: {sentence}"),
+            lambda: keep_awake(devices.camera),
         )
+        make_ready(devices.projector, settings.sequence, patience)
         identity = devices.projector.identity()
         hours = ", ".join(f"{lamp.hours} h" for lamp in devices.projector.lamps()) or "no lamp"
         lines.append(f"projector   {identity.maker} {identity.model} {identity.name}, {hours}")

@@ -20,8 +20,9 @@ from acquisition.config import LabSettings
 from acquisition.judge.exposure import judge_file
 from acquisition.lights.illuminations import Illumination, load_illuminations
 from acquisition.session.folder import FRAME_COLUMNS, Session
-from acquisition.session.journal import ACCEPTED, REFUSED
+from acquisition.session.judgement import Judgement
 from acquisition.session.plan import FrameKind, SessionStep
+from acquisition.session.records import ACCEPTED, REFUSED
 from drivers.camera import CapturedFrame
 from drivers.presenter import BLACK, WHITE
 from foundation.errors import FormatError
@@ -61,7 +62,8 @@ class Imported:
 def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, ...]]:
     """Read a list of frames, columns as `frames.csv`, files relative to the list; and the lights beside it.
 
-    Only `kind`, `illumination` and `file` must be filled.
+    Only `kind`, `illumination` and `file` must be filled. Rows of the kind ``response`` are passed over: they serve
+    while a session is taken, and the list does not say which codes they show.
 
     Raises
     ------
@@ -77,7 +79,11 @@ def read_frame_list(path: Path) -> tuple[list[ListedFrame], tuple[Illumination, 
     if not rows or any(column not in rows[0] for column in FRAME_COLUMNS[:3]):
         raise FormatError(f"{path}: expected frames under the columns {','.join(FRAME_COLUMNS)}")
     lights = load_illuminations(path.parent / "illuminations.csv")
-    frames = [_listed(row, f"{path}, line {number}", path.parent, len(lights)) for number, row in enumerate(rows, 2)]
+    frames = [
+        _listed(row, f"{path}, line {number}", path.parent, len(lights))
+        for number, row in enumerate(rows, 2)
+        if (row["kind"] or "").strip() != "response"
+    ]
     return frames, lights
 
 
@@ -86,7 +92,7 @@ def _listed(row: Mapping[str, str | None], where: str, folder: Path, lights: int
         return (row.get(column) or "").strip()
 
     kind = cell("kind")
-    if kind != "light" and kind != "white" and kind != "dark":
+    if kind not in ("light", "white", "dark"):
         raise FormatError(f"{where}: kind is {kind!r}, expected light, white or dark")
     file = folder / cell("file")
     if not cell("file") or not file.is_file():
@@ -155,6 +161,7 @@ def import_session(
                     refused.append(f"{frame.path.name}: {reason}")
                 observe(step.number + 1, len(frames))
             session.journal.note(datetime.now(UTC), "import", f"{len(frames)} frames from {frame_list.name}")
+            session.write_frames_csv()
         except BaseException:
             session.close()
             shutil.rmtree(folder)
@@ -199,14 +206,10 @@ def _take_over(
         reason = judge_file(received.path, frame.kind, settings)
     session.commit(
         attempt,
-        file=f"frames/{received.path.name}",
-        size=received.size,
-        sha256=received.sha256,
-        taken_at=frame.taken_at,
+        received,
+        Judgement.of_reason("exposure" if not frame.verdict else "list", reason),
         exposure_s=frame.exposure_s,
         ended_at=frame.taken_at,
-        verdict=ACCEPTED if reason is None else REFUSED,
-        reason=reason or "",
     )
     return reason, received.sha256
 

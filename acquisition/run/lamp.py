@@ -2,76 +2,56 @@
 
 Rules that hold inside:
 
-- A lamp that was lit when it was first asked for is taken as warm; one that was lit meanwhile gets its warm-up.
-- A projector that reports a fault, shows no picture or does not answer is unhealthy: the run pauses.
+- A lamp that was lit when it was first asked for is taken as warm; one that was lit meanwhile gets its warm-up, and
+  gets it anew where it goes out during that.
+- A projector that reports a fault, shows no picture or does not answer is unhealthy: the run pauses, with the cause
+  that holds now (`acquisition.run.patience`).
 - A projector that was out of reach for as long as a lamp takes to light may have lost its power meanwhile.
+- It is lit by the program once, before the first frame: whoever switched it off later may have had a reason.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from contextlib import suppress
+from typing import Final
 
 from acquisition.config import SequenceSettings
+from acquisition.run.patience import PAUSE_S, Patience, Pause
+from acquisition.session.progress import duration_text
 from drivers.projector import Power, Projector, ReportsPictureFault, Severity
-from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused, LinkError
 
-POWER_LIMIT_S = 300.0
+POWER_LIMIT_S: Final = 300.0
 """How long a lamp may take to light; makers state up to 130 s with repeated ignition."""
-IDLE_S = 8.0
-"""Between two messages to a camera in a long wait; libgphoto2 keeps bodies awake every 10 s."""
-PAUSE_S = 5.0
-"""Between two questions to an unhealthy projector; an operator who mends it does not notice so short a wait."""
-RELIGHT_S = 15.0
+RELIGHT_S: Final = 15.0
 """No lamp is lit again, and its projector back on the network, in less."""
 
+_NAME: Final = "the projector"
 
-def make_ready(
-    projector: Projector,
-    clock: Clock,
-    sequence: SequenceSettings,
-    idle: Callable[[], None] = lambda: None,
-    report: Callable[[str, str], None] = lambda what, sentence: None,
-) -> None:
-    """Switch the lamp on if need be, wait until it burns steadily, and require good health.
+
+def make_ready(projector: Projector, sequence: SequenceSettings, patience: Patience) -> None:
+    """Switch the lamp on if need be, wait until it burns steadily, and until its health is good.
 
     Parameters
     ----------
-    idle
-        Called every few seconds of the wait, for the other devices.
-    report
-        Called with a word and a sentence when a long wait begins.
+    sequence
+        How long the lamp warms up.
+    patience
+        Waits, with a beat every few seconds; where it has no time, the first fault is raised.
 
     Raises
     ------
     DeviceFault
-        It reports an error, or the lamp does not light within `POWER_LIMIT_S`.
-    DeviceRefused, LinkError, ProtocolError
-        It does not carry out a command, or cannot be reached.
+        The lamp does not light within `POWER_LIMIT_S`; or patience ended with an error that it reports.
+    DeviceError
+        It does not carry out a command, or could not be reached for as long as patience lasts.
     """
-    begun = clock.monotonic()
-    found_lit, switched = True, False
-    while (power := _power(projector, patiently=switched)) is not Power.ON:
-        found_lit = False
-        if power is Power.STANDBY and not switched:
-            projector.switch_on()
-            switched = True
-        if clock.monotonic() - begun > POWER_LIMIT_S:
-            state = "does not answer" if power is None else f"is still in {power.value}"
-            raise DeviceFault(
-                f"the projector {state} {POWER_LIMIT_S:g} s after it was switched on; look at its lamp and its display"
-            )
-        clock.sleep(1.0)
-    try:
-        muted = projector.muted()
-    except DeviceRefused:
-        # Some do not know it before mute was first set.
-        muted = True
-    if muted:
-        projector.set_muted(False)
-    require_healthy(projector)
-    if not found_lit:
-        _warm_up(clock, sequence, idle, report)
+    found_lit = _light(projector, patience)
+    if patience.attempt(lambda: _muted(projector), _NAME):
+        patience.attempt(lambda: projector.set_muted(False), _NAME)
+    went_out = _outlast(projector, patience)
+    if not found_lit or went_out:
+        _warm_up(projector, sequence, patience)
 
 
 def require_healthy(projector: Projector) -> None:
@@ -89,7 +69,8 @@ def require_healthy(projector: Projector) -> None:
         )
     power = projector.power()
     if power is not Power.ON:
-        raise DeviceFault(f"the projector is in {power.value} during the session; switch it on")
+        remedy = "it is waited for" if power is Power.WARMING else "switch it on"
+        raise DeviceFault(f"the projector is in {power.value} during the session; {remedy}")
     if projector.muted():
         raise DeviceFault("the projector's picture is muted; release mute on its remote control")
     if isinstance(projector, ReportsPictureFault) and (fault := projector.picture_fault()):
@@ -106,76 +87,110 @@ def health_fault(projector: Projector | None) -> DeviceError | None:
     return None
 
 
-def await_health(
-    projector: Projector,
-    clock: Clock,
-    sequence: SequenceSettings,
-    idle: Callable[[], None],
-    report: Callable[[str, str], None],
-) -> None:
+def await_health(projector: Projector, sequence: SequenceSettings, patience: Patience) -> None:
     """Pause while the projector is unhealthy; return when it is healthy, and warm, again.
 
-    Parameters
-    ----------
-    idle
-        Called every few seconds of the wait, for the other devices.
-    report
-        Called with a word and a sentence when the pause begins, when the lamp warms up again, and when it is over.
+    Parameters are those of `make_ready`.
 
     Raises
     ------
     DeviceError
-        The fault that lasts after `sequence.patience_s`.
+        Patience has ended.
     """
-    fault = health_fault(projector)
-    if fault is None:
-        return
-    report("paused", f"{fault} (the run waits for up to {sequence.patience_s:g} s, and goes on by itself)")
-    begun = answered = clock.monotonic()
+    pause = patience.pause(_NAME)
+    if _outlast(projector, patience, pause):
+        _warm_up(projector, sequence, patience)
+    pause.over()
+
+
+def _outlast(projector: Projector, patience: Patience, pause: Pause | None = None) -> bool:
+    """Wait until the projector is healthy; return whether its lamp went out meanwhile, or may have.
+
+    A `pause` that is given is not told to be over.
+    """
+    own = pause or patience.pause(_NAME)
+    answered = patience.clock.monotonic()
     went_out = False
-    while fault is not None:
+    while (fault := health_fault(projector)) is not None:
         if not isinstance(fault, LinkError):
-            answered = clock.monotonic()
+            answered = patience.clock.monotonic()
             went_out = went_out or not _is_lit(projector)
-        if clock.monotonic() - begun >= sequence.patience_s:
-            raise type(fault)(
-                f"{fault}; the run waited {sequence.patience_s:g} s for that and ended: then run the same command again"
-            ) from fault
-        clock.sleep(min(PAUSE_S, sequence.patience_s))
-        idle()
-        fault = health_fault(projector)
-        went_out = went_out or clock.monotonic() - answered >= RELIGHT_S
-    paused_s = clock.monotonic() - begun
-    if went_out:
-        _warm_up(clock, sequence, idle, report)
-    report("resumed", f"the projector is ready again after a pause of {paused_s:.0f} s")
+        own.wait(fault)
+    went_out = went_out or patience.clock.monotonic() - answered >= RELIGHT_S
+    if pause is None:
+        own.over()
+    return went_out
 
 
-def _power(projector: Projector, patiently: bool) -> Power | None:
-    """Return the power state; None where a projector that is `patiently` asked does not answer now."""
+def _light(projector: Projector, patience: Patience) -> bool:
+    """Wait until the lamp is lit, after switching it on if need be; return whether it was lit when first asked for."""
+    power: Power | None = patience.attempt(projector.power, _NAME)
+    if power is Power.ON:
+        return True
+    clock = patience.clock
+    begun, switched = clock.monotonic(), False
+    while power is not Power.ON:
+        if power is Power.STANDBY and not switched:
+            patience.attempt(projector.switch_on, _NAME)
+            begun, switched = clock.monotonic(), True
+        if clock.monotonic() - begun > POWER_LIMIT_S:
+            state = "does not answer" if power is None else f"is still in {power.value}"
+            done = "it was switched on" if switched else "it was first asked"
+            raise DeviceFault(
+                f"the projector {state} {POWER_LIMIT_S:g} s after {done}; look at its lamp and its display"
+            )
+        state = "does not answer yet" if power is None else f"is in {power.value}"
+        patience.wait(1.0, "waiting", lambda left, state=state: f"the lamp is being lit; the projector {state}")
+        power = _power(projector)
+    return False
+
+
+def _power(projector: Projector) -> Power | None:
+    """Return the power state; None where it does not answer, as some do not while the lamp is being lit."""
     try:
         return projector.power()
     except (LinkError, DeviceRefused):
-        # Some do not answer while the lamp is being lit.
-        if not patiently:
-            raise
-    return None
+        return None
+
+
+def _muted(projector: Projector) -> bool:
+    try:
+        return projector.muted()
+    except DeviceRefused:
+        # Some do not know it before mute was first set.
+        return True
 
 
 def _is_lit(projector: Projector) -> bool:
     try:
-        return projector.power() is Power.ON
+        if projector.power() is not Power.ON:
+            return False
     except DeviceError:
         return False
+    with suppress(DeviceError):
+        lamps = projector.lamps()
+        return not lamps or any(lamp.lit for lamp in lamps)
+    return True
 
 
-def _warm_up(
-    clock: Clock, sequence: SequenceSettings, idle: Callable[[], None], report: Callable[[str, str], None]
-) -> None:
-    if not sequence.warm_up_s:
-        return
-    report("warming up", f"the lamp was just lit; waiting {sequence.warm_up_s:g} s until its colour is steady")
-    until = clock.monotonic() + sequence.warm_up_s
-    while (left := until - clock.monotonic()) > 0:
-        clock.sleep(min(left, IDLE_S))
-        idle()
+def _warm_up(projector: Projector, sequence: SequenceSettings, patience: Patience) -> None:
+    """Wait until the lamp has burned for its time without a break."""
+    while sequence.warm_up_s and not _burned(projector, sequence.warm_up_s, patience):
+        pass
+
+
+def _burned(projector: Projector, warm_up_s: float, patience: Patience) -> bool:
+    """Wait for a lamp that was just lit, its health being looked at; return False where it went out meanwhile."""
+    until = patience.clock.monotonic() + warm_up_s
+    patience.report(
+        "warming up", f"the lamp was just lit; waiting {duration_text(warm_up_s)} until its colour is steady"
+    )
+
+    def countdown(rest: float) -> str:
+        return f"the lamp warms up, {duration_text(max(until - patience.clock.monotonic(), 0))} left"
+
+    while (left := until - patience.clock.monotonic()) > 0:
+        patience.wait(min(left, PAUSE_S), "waiting", countdown)
+        if health_fault(projector) is not None and _outlast(projector, patience):
+            return False
+    return True

@@ -66,7 +66,7 @@ def open_session(settings: LabSettings, folder: Path) -> Session:
         As `run_session`.
     """
     if session_exists(folder):
-        session = Session.open(folder)
+        session = Session.open_for_run(folder)
         try:
             _require_same(session, settings)
         except BaseException:

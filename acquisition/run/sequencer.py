@@ -13,8 +13,9 @@ from acquisition.config import LabSettings
 from acquisition.judge.exposure import judge_file
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import await_health, health_fault, make_ready
+from acquisition.run.patience import Patience
 from acquisition.session.folder import Session
-from acquisition.session.journal import ACCEPTED, REFUSED
+from acquisition.session.judgement import Judgement
 from acquisition.session.plan import SessionStep
 from drivers.camera import keep_awake
 from foundation.errors import DeviceError, DeviceFault, DeviceRefused
@@ -60,8 +61,10 @@ def take_session(
     StorageError
         The disk is full; likewise.
     """
-    with session.held():
+    try:
         return _take(session, devices, settings, observe, announce)
+    finally:
+        session.write_frames_csv()
 
 
 def _take(
@@ -86,13 +89,14 @@ def _take(
         session.journal.note(clock.now(), what, sentence)
         announce(f"{what}: {sentence}")
 
+    patience = Patience(clock, settings.sequence.patience_s, report, lambda: keep_awake(devices.camera))
     if devices.projector is not None:
-        make_ready(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), report)
+        make_ready(devices.projector, settings.sequence, patience)
     refused: list[str] = []
     taken = 0
     in_a_row = 0
     for step in open_steps:
-        reason = _take_step(session, step, devices, settings, report)
+        reason = _take_step(session, step, devices, settings, patience)
         observe(step, reason is None)
         if reason is None:
             taken += 1
@@ -111,14 +115,14 @@ def _take(
 
 
 def _take_step(
-    session: Session, step: SessionStep, devices: Devices, settings: LabSettings, report: Callable[[str, str], None]
+    session: Session, step: SessionStep, devices: Devices, settings: LabSettings, patience: Patience
 ) -> str | None:
     """Try a step until its frame is accepted; return None then, else the last refusal."""
     clock = devices.clock
     reason: str | None = None
     for remaining in reversed(range(settings.sequence.attempts)):
         if devices.projector is not None:
-            await_health(devices.projector, clock, settings.sequence, lambda: keep_awake(devices.camera), report)
+            await_health(devices.projector, settings.sequence, patience)
         kept = session.journal.kept_files(step)
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
         attempt = session.journal.begin(step, f"frames/{stem}", clock.now())
@@ -130,20 +134,16 @@ def _take_step(
             session.journal.fail(attempt, clock.now(), str(error))
             if remaining == 0 or isinstance(error, DeviceFault | DeviceRefused):
                 raise
-            report("retry", f"{_name(step)}: {error}")
+            patience.report("retry", f"{_name(step)}: {error}")
             continue
         fault = health_fault(devices.projector)
         reason = judge_file(received.path, step.kind, settings) or (None if fault is None else str(fault))
         session.commit(
             attempt,
-            file=f"frames/{received.path.name}",
-            size=received.size,
-            sha256=received.sha256,
-            taken_at=received.captured.released_at,
+            received,
+            Judgement.of_reason("exposure", reason),
             exposure_s=settings.camera.shutter_s,
             ended_at=clock.now(),
-            verdict=ACCEPTED if reason is None else REFUSED,
-            reason=reason or "",
         )
         if reason is None:
             return None

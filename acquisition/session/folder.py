@@ -13,44 +13,46 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO
 
 from acquisition.chart.model import Chart, load_chart
 from acquisition.lights.illuminations import Illumination, load_illuminations, save_illuminations
-from acquisition.session.journal import JOURNAL_FILE, FrameRecord, Journal, time_text
+from acquisition.session.incoming import IncomingFile, ReceivedFile
+from acquisition.session.journal import JOURNAL_FILE, Journal, time_text
+from acquisition.session.judgement import Judgement
 from acquisition.session.plan import SessionStep
+from acquisition.session.records import FrameRecord
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
-from foundation.errors import DeviceError, FormatError
-from foundation.files import is_partial, require_free, whole_file, whole_folder, write_whole
-from foundation.hashing import stream_sha256
+from foundation.errors import FormatError, StorageError
+from foundation.files import is_partial, require_free, whole_folder, write_whole
 from foundation.held_folders import held_folder
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
 """Columns of `frames.csv` (docs/formats.md)."""
 
 
-@dataclass(frozen=True)
-class ReceivedFile:
-    """A raw file that is complete on the disk, not yet counted."""
-
-    path: Path
-    size: int
-    sha256: str
-    captured: CapturedFrame
-
-
 class Session:
-    """An open session folder; close it, or use it in a `with` block."""
+    """An open session folder; close it, or use it in a `with` block.
 
-    def __init__(self, folder: Path, journal: Journal) -> None:
+    Parameters
+    ----------
+    folder
+        The session.
+    journal
+        Its journal, open; the session closes it.
+    hold
+        What holds the folder against other runs, released at the end; None for a reader.
+    """
+
+    def __init__(self, folder: Path, journal: Journal, hold: ExitStack | None = None) -> None:
         self.folder = folder
         self.journal = journal
+        self._hold = hold
         self.chart: Chart = load_chart(folder / "chart.json")
         self.illuminations: tuple[Illumination, ...] = load_illuminations(folder / "illuminations.csv")
         self.steps: tuple[SessionStep, ...] = journal.steps()
@@ -106,30 +108,47 @@ class Session:
             chart.save(new / "chart.json")
             save_illuminations(illuminations, new / "illuminations.csv")
             Journal.create(new / JOURNAL_FILE, steps)
-        session = cls.open(folder)
-        session.write_frames_csv()
-        return session
+        return cls.open_for_run(folder)
 
     @classmethod
     def open(cls, folder: Path) -> Session:
-        """Open a session folder.
+        """Open a session folder to read it, also while it is being taken; nothing in it is created or changed.
 
         Raises
         ------
         FormatError
             The folder is no session, one of a version not known here, or its lights are not those of its plan.
         """
-        path = folder / JOURNAL_FILE
-        if not path.is_file():
-            raise FormatError(
-                f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import"
-            )
-        journal = Journal.open(path)
+        journal = Journal.open(_journal_path(folder))
         try:
             return cls(folder, journal)
         except BaseException:
             journal.close()
             raise
+
+    @classmethod
+    def open_for_run(cls, folder: Path) -> Session:
+        """Open a session folder to take frames into it; it is held until it is closed, and `frames.csv` is made anew.
+
+        Raises
+        ------
+        FormatError
+            As `open`.
+        InputError
+            Another program takes the session.
+        StorageError
+            The folder cannot be written.
+        """
+        path = _journal_path(folder)
+        busy = f"{folder} is being taken by another program; wait for it, or look with acquire status"
+        with ExitStack() as opened:
+            opened.enter_context(held_folder(folder, busy))
+            journal = Journal.open_for_run(path)
+            opened.callback(journal.close)
+            session = cls(folder, journal, opened)
+            session.write_frames_csv()
+            session._hold = opened.pop_all()
+        return session
 
     def __enter__(self) -> Session:
         return self
@@ -138,21 +157,16 @@ class Session:
         self.close()
 
     def close(self) -> None:
-        """Release the journal; a second call does nothing."""
-        self.journal.close()
+        """Release journal and folder; a second call does nothing."""
+        if self._hold is None:
+            self.journal.close()
+        else:
+            self._hold.close()
 
-    @contextmanager
-    def held(self) -> Generator[None]:
-        """Hold the session for writing, so that two programs never take it at once.
-
-        Raises
-        ------
-        InputError
-            Another program holds it.
-        """
-        busy = f"{self.folder} is being taken by another program; wait for it, or look with acquire status"
-        with held_folder(self.folder, busy):
-            yield
+    @property
+    def is_held(self) -> bool:
+        """Whether it was opened for a run."""
+        return self._hold is not None
 
     def settings_text(self) -> str:
         """Return the text of `session.toml`.
@@ -179,7 +193,7 @@ class Session:
         stem
             Name without suffix; the suffix is that of the camera's own file name.
         capture
-            Writes the whole raw file into the stream it is given; `drivers.camera.Camera.capture`.
+            Writes the whole raw file into the stream it is given; `drivers.camera.capture`.
 
         Raises
         ------
@@ -188,49 +202,80 @@ class Session:
         StorageError
             The disk is full, read-only or gone. Nothing is left behind.
         """
-        path = self.frames_folder / stem
-        with whole_file(path, lambda: path) as stream:
-            captured = capture(stream)
-            size = stream.seek(0, 2)
-            if size != captured.size or size == 0:
-                raise DeviceError(
-                    f"{captured.name}: the camera says {captured.size} bytes, {size} arrived; the frame is taken again"
-                )
-            stream.seek(0)
-            sha256 = stream_sha256(stream)
-            path = path.with_name(stem + Path(captured.name).suffix.lower())
-        return ReceivedFile(path, size, sha256, captured)
+        with self.incoming(stem) as incoming:
+            return incoming.complete(capture(incoming.stream))
+
+    def incoming(self, stem: str) -> IncomingFile:
+        """Return a raw file to be filled, for which `receive` is too simple; see `IncomingFile`.
+
+        Parameters
+        ----------
+        stem
+            Name without suffix.
+
+        Raises
+        ------
+        StorageError
+            The disk is full, read-only or gone.
+        """
+        return IncomingFile(self.frames_folder / stem)
 
     def commit(
         self,
         attempt: int,
+        received: ReceivedFile,
+        judgement: Judgement,
+        timings: Mapping[str, float] | None = None,
         *,
-        file: str,
-        size: int,
-        sha256: str,
-        taken_at: datetime,
         exposure_s: float,
         ended_at: datetime,
-        verdict: str,
-        reason: str = "",
     ) -> None:
-        """Note that an attempt's raw file is complete and how it was judged; only now does the frame count."""
+        """Note that an attempt's raw file is complete and how it was judged; only now does the frame count.
+
+        Parameters
+        ----------
+        attempt
+            As `Journal.begin` returned it.
+        received
+            The raw file.
+        judgement
+            What was found; a preview is kept in `previews/`, as long as the disk takes it.
+        timings
+            Seconds that each part of the attempt took, by name.
+        exposure_s
+            The exposure asked for, seconds.
+        ended_at
+            When the attempt was over.
+        """
         self.journal.commit(
             attempt,
-            file=file,
-            size=size,
-            sha256=sha256,
-            taken_at=taken_at,
+            file=received.path.relative_to(self.folder).as_posix(),
+            size=received.size,
+            sha256=received.sha256,
+            taken_at=received.captured.released_at,
             exposure_s=exposure_s,
             ended_at=ended_at,
-            verdict=verdict,
-            reason=reason,
+            judgement=judgement,
+            timings=timings,
         )
-        self.write_frames_csv()
+        if judgement.preview:
+            with suppress(StorageError):
+                write_whole(self.preview_path(received.path.stem), judgement.preview)
+
+    def preview_path(self, stem: str) -> Path:
+        """Return where the preview of a frame is, if there is one; `stem` is that of its raw file."""
+        return self.folder / "previews" / f"{stem}.jpg"
+
+    def add_steps(self, steps: Sequence[SessionStep]) -> None:
+        """Put steps at the end of the plan; their numbers must be free."""
+        self.journal.add_steps(steps)
+        self.steps = self.journal.steps()
 
     def done_steps(self) -> set[int]:
         """Return the numbers of the steps whose frame was taken, accepted, and is still there in full size."""
-        return {step for step, file, size in self.journal.accepted_files() if _has_size(self.folder / file, size)}
+        return {
+            frame.step for frame in self.journal.accepted_files() if _has_size(self.folder / frame.file, frame.size)
+        }
 
     def frames(self) -> list[FrameRecord]:
         """Return every frame that was taken and judged, in the order of the plan, refused ones included."""
@@ -301,6 +346,15 @@ def session_exists(folder: Path) -> bool:
         return True
     require_free(folder, "the session")
     return False
+
+
+def _journal_path(folder: Path) -> Path:
+    path = folder / JOURNAL_FILE
+    if not path.is_file():
+        raise FormatError(
+            f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import"
+        )
+    return path
 
 
 def _codes(colour: Colour) -> str:

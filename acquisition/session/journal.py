@@ -4,121 +4,63 @@ Rules that hold inside:
 
 - The journal is written before and after each frame; every write is a transaction of its own and on the disk when the
   call returns, since a committed row is what makes a frame count.
-- Rows are never deleted. Times are ISO 8601 text with microseconds and zone, files are named relative to the session's
-  folder.
+- Rows are never deleted; a frame that was accepted can be voided. Times are ISO 8601 text with microseconds and zone,
+  files are named relative to the session's folder.
+- A reader changes nothing, and never stops a run.
 
-Knows one file; `acquisition.session.folder` knows which raw files are really there.
+Knows one file (`acquisition.session.journal_file`: how it is opened); `acquisition.session.folder` knows which raw
+files are really there.
 """
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
-from dataclasses import astuple, dataclass
-from datetime import datetime
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import astuple
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any, TypeVar
 
-from acquisition.session.plan import FrameKind, SessionStep
+from acquisition.session.heartbeat import Heartbeat, Process, RunState
+from acquisition.session.journal_file import (
+    JOURNAL_VERSION,
+    close_after_run,
+    create_file,
+    is_busy,
+    open_for_run,
+    open_to_read,
+    reading_error,
+    writing_error,
+)
+from acquisition.session.judgement import Check, Judgement
+from acquisition.session.plan import KINDS, FrameKind, SessionStep
+from acquisition.session.records import (
+    ACCEPTED,
+    FAILED,
+    REFUSED,
+    VOIDED,
+    AcceptedFile,
+    Attempt,
+    FrameRecord,
+    SessionEvent,
+)
 from drivers.presenter import Colour
-from foundation.errors import FormatError, StorageError
+from foundation.errors import FormatError, counted
 
-ACCEPTED = "accepted"
-"""Verdict of a frame that may be used."""
-
-REFUSED = "refused"
-"""Verdict of a frame that is there and cannot be used."""
-
-FAILED = "failed"
-"""Verdict of an attempt that gave no frame."""
-
-JOURNAL_VERSION = 1
-"""`PRAGMA user_version` of the journals that this software writes and reads (docs/formats.md)."""
+_T = TypeVar("_T")
 
 JOURNAL_FILE = "journal.sqlite"
 """Name of the journal in a session's folder."""
 
-BUSY_LIMIT_S = 10
-"""How long a write waits for another program's; a write takes milliseconds, and a disk may stall for seconds."""
-
-_SCHEMA = """
-CREATE TABLE attempts (
-    id INTEGER PRIMARY KEY,
-    step INTEGER NOT NULL,
-    kind TEXT NOT NULL,
-    illumination INTEGER,
-    file TEXT NOT NULL,
-    started_at TEXT NOT NULL,
-    ended_at TEXT,
-    taken_at TEXT,
-    exposure_s REAL,
-    size INTEGER,
-    sha256 TEXT,
-    verdict TEXT,
-    reason TEXT NOT NULL DEFAULT ''
-);
-CREATE TABLE plan (
-    step INTEGER PRIMARY KEY, kind TEXT NOT NULL, illumination INTEGER,
-    red INTEGER NOT NULL, green INTEGER NOT NULL, blue INTEGER NOT NULL
-);
-CREATE TABLE events (id INTEGER PRIMARY KEY, at TEXT NOT NULL, what TEXT NOT NULL, detail TEXT NOT NULL);
-"""
-
-_TABLES = {"attempts", "plan", "events"}
-
-
-@dataclass(frozen=True)
-class FrameRecord:
-    """A frame that counts as taken and judged; the row of `frames.csv`.
-
-    `file` is relative to the session's folder; `illumination` is None for white and dark frames; `verdict` is
-    ``accepted`` or ``refused: reason``.
-    """
-
-    kind: FrameKind
-    illumination: int | None
-    file: str
-    sha256: str
-    taken_at: datetime
-    exposure_s: float
-    verdict: str
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the frame may be used."""
-        return self.verdict == ACCEPTED
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """One try at a step as the journal has it.
-
-    `verdict` is None while it is under way, or if it was cut off; `has_frame` is whether a raw file came of it.
-    """
-
-    id: int
-    step: int
-    kind: FrameKind
-    illumination: int | None
-    file: str
-    started_at: datetime
-    ended_at: datetime | None
-    verdict: str | None
-    reason: str
-    has_frame: bool
-
-
-@dataclass(frozen=True)
-class SessionEvent:
-    """What happened at some time that is no frame: start, stop, warm-up, a device's fault."""
-
-    at: datetime
-    what: str
-    detail: str
+PATIENCE_S = 600.0
+"""How long a write waits for another program's unless `Journal.be_patient` says otherwise: as long as a run waits for a
+device by default (`sequence.patience_s`)."""
 
 
 class Journal:
-    """An open journal; close it after use.
+    """An open journal; close it after use. Used from one thread.
 
     Parameters
     ----------
@@ -126,11 +68,19 @@ class Journal:
         The file, for messages.
     connection
         To the same file; the journal closes it.
+    version
+        Of the file.
+    writes
+        Whether it was opened for a run.
     """
 
-    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+    def __init__(self, path: Path, connection: sqlite3.Connection, version: int, writes: bool) -> None:
         self._path = path
         self._connection = connection
+        self._version = version
+        self._writes = writes
+        self._patience_s = PATIENCE_S
+        self._announce: Callable[[str], None] = lambda sentence: None
 
     @staticmethod
     def create(path: Path, steps: Sequence[SessionStep]) -> None:
@@ -141,55 +91,71 @@ class Journal:
         StorageError
             The disk is full, read-only or gone.
         """
-        connection = _connect(path)
-        connection.executescript(_SCHEMA)
-        with connection:
-            connection.executemany(
-                "INSERT INTO plan VALUES (?, ?, ?, ?, ?, ?)",
-                [(step.number, step.kind, step.illumination, *astuple(step.colour)) for step in steps],
-            )
-        connection.execute(f"PRAGMA user_version = {JOURNAL_VERSION}")
-        connection.close()
+        with closing(Journal(path, create_file(path), JOURNAL_VERSION, writes=True)) as journal:
+            journal.add_steps(steps)
 
     @classmethod
     def open(cls, path: Path) -> Journal:
-        """Open a journal.
+        """Open a journal to read it, also while a run writes it; nothing is created or changed.
 
         Raises
         ------
         FormatError
             It cannot be read, is damaged, or of a version not known here.
         """
-        try:
-            # SQLite calls a file that it may not read, too, one that it cannot open.
-            path.open("rb").close()
-            connection = _connect(path)
-            version = connection.execute("PRAGMA user_version").fetchone()[0]
-            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        except OSError as error:
-            raise FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk") from error
-        except sqlite3.OperationalError as error:
-            raise FormatError(f"cannot read {path}: {error}; see that no other program holds it") from error
-        except sqlite3.DatabaseError as error:
-            raise FormatError(f"{path} is damaged: {error}; restore it from a copy") from error
-        if version != JOURNAL_VERSION:
-            connection.close()
-            raise FormatError(f"{path} is of version {version}, this software reads {JOURNAL_VERSION}")
-        if lacking := _TABLES - tables:
-            connection.close()
-            raise FormatError(
-                f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; restore it from a copy"
-            )
-        return cls(path, connection)
+        return cls(path, *open_to_read(path), writes=False)
+
+    @classmethod
+    def open_for_run(cls, path: Path) -> Journal:
+        """Open a journal to write it; one of an older version gets what it lacks.
+
+        Raises
+        ------
+        FormatError
+            As `open`.
+        StorageError
+            It can be read, but not written.
+        """
+        return cls(path, open_for_run(path), JOURNAL_VERSION, writes=True)
 
     def close(self) -> None:
         """Release the file; a second call does nothing."""
-        self._connection.close()
+        if self._writes:
+            close_after_run(self._connection)
+        else:
+            self._connection.close()
+
+    def be_patient(self, patience_s: float, announce: Callable[[str], None]) -> None:
+        """Say how long a write waits for another program's, by the machine's own time, and who is told of it.
+
+        Parameters
+        ----------
+        patience_s
+            Seconds; infinite for ever.
+        announce
+            Called with a sentence once for each write that waits.
+        """
+        self._patience_s = patience_s
+        self._announce = announce
 
     def steps(self) -> tuple[SessionStep, ...]:
-        """Return the plan, in taking order."""
-        rows = self._connection.execute("SELECT step, kind, illumination, red, green, blue FROM plan ORDER BY step")
-        return tuple(SessionStep(row[0], row[1], row[2], Colour(*row[3:])) for row in rows)
+        """Return the plan, in taking order.
+
+        Raises
+        ------
+        FormatError
+            A step is of a kind that this software does not know.
+        """
+        rows = self._rows("SELECT step, kind, illumination, red, green, blue FROM plan ORDER BY step")
+        return tuple(SessionStep(row[0], self._kind(row[1]), row[2], Colour(*row[3:])) for row in rows)
+
+    def add_steps(self, steps: Sequence[SessionStep]) -> None:
+        """Put steps at the end of the plan; their numbers must be free."""
+        with self._writing():
+            self._connection.executemany(
+                "INSERT INTO plan VALUES (?, ?, ?, ?, ?, ?)",
+                [(step.number, step.kind, step.illumination, *astuple(step.colour)) for step in steps],
+            )
 
     def begin(self, step: SessionStep, file: str, at: datetime) -> int:
         """Note that an attempt at `step` begins, to be saved as `file`; return the attempt's id."""
@@ -211,15 +177,49 @@ class Journal:
         taken_at: datetime,
         exposure_s: float,
         ended_at: datetime,
-        verdict: str,
-        reason: str = "",
+        judgement: Judgement,
+        timings: Mapping[str, float] | None = None,
     ) -> None:
-        """Note that an attempt's raw file is complete and how it was judged; only now does the frame count."""
+        """Note that an attempt's raw file is complete and how it was judged; only now does the frame count.
+
+        Parameters
+        ----------
+        attempt
+            As `begin` returned it.
+        file, size, sha256
+            The raw file, relative to the session's folder, its bytes and their hash.
+        taken_at
+            When the shutter was released.
+        exposure_s
+            The exposure asked for, seconds.
+        ended_at
+            When the attempt was over.
+        judgement
+            What was found; kept whole but for its preview.
+        timings
+            Seconds that each part of the attempt took, by name.
+        """
+        verdict = ACCEPTED if judgement.accepted else REFUSED
+        row = (file, size, sha256, time_text(taken_at), exposure_s, time_text(ended_at), verdict, judgement.reason)
+        checks = [
+            (attempt, position, check.name, check.value, check.low, check.high, check.unit, check.reason)
+            for position, check in enumerate(judgement.checks)
+        ]
+        seen = judgement.seen or (None, None, None)
         with self._writing():
             self._connection.execute(
                 "UPDATE attempts SET file=?, size=?, sha256=?, taken_at=?, exposure_s=?, ended_at=?, verdict=?,"
                 " reason=? WHERE id=?",
-                (file, size, sha256, time_text(taken_at), exposure_s, time_text(ended_at), verdict, reason, attempt),
+                (*row, attempt),
+            )
+            self._connection.executemany("INSERT INTO checks VALUES (?, ?, ?, ?, ?, ?, ?, ?)", checks)
+            self._connection.execute(
+                "INSERT INTO measurements VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (attempt, *seen, judgement.measurement, judgement.voids, judgement.lasting),
+            )
+            self._connection.executemany(
+                "INSERT INTO timings VALUES (?, ?, ?)",
+                [(attempt, name, seconds) for name, seconds in (timings or {}).items()],
             )
 
     def fail(self, attempt: int, at: datetime, reason: str) -> None:
@@ -230,6 +230,29 @@ class Journal:
                 (time_text(at), FAILED, reason, attempt),
             )
 
+    def void(self, attempts: Iterable[int], at: datetime, reason: str) -> None:
+        """Note that frames that were accepted must not be used after all; their rows and files stay.
+
+        Parameters
+        ----------
+        attempts
+            Ids; those that are not accepted stay as they are.
+        at
+            When this was found.
+        reason
+            Why, one sentence.
+        """
+        with self._writing():
+            changed = self._connection.executemany(
+                "UPDATE attempts SET verdict=?, reason=? WHERE id=? AND verdict=?",
+                [(VOIDED, reason, attempt, ACCEPTED) for attempt in attempts],
+            ).rowcount
+            if changed > 0:
+                self._connection.execute(
+                    "INSERT INTO events (at, what, detail) VALUES (?, ?, ?)",
+                    (time_text(at), VOIDED, f"{counted(changed, 'frame')}: {reason}"),
+                )
+
     def note(self, at: datetime, what: str, detail: str = "") -> None:
         """Note an event."""
         with self._writing():
@@ -237,9 +260,45 @@ class Journal:
                 "INSERT INTO events (at, what, detail) VALUES (?, ?, ?)", (time_text(at), what, detail)
             )
 
+    def beat(self, state: RunState, sentence: str, until: datetime) -> None:
+        """Give a sign of life, in place of the one before.
+
+        Parameters
+        ----------
+        state
+            What the run does.
+        sentence
+            The same in words, for people.
+        until
+            When the next sign is given at the latest, by the machine's wall clock (not by a simulated lab's time).
+        """
+        own, at = Process.own(), datetime.now(UTC)
+        with self._writing():
+            self._connection.execute(
+                "INSERT OR REPLACE INTO heartbeat VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (time_text(at), own.pid, own.started, own.host, own.boot, state, sentence, time_text(until)),
+            )
+
+    def record(self, key: str, text: str) -> None:
+        """Note what a session is taken with, such as a device's identity, in place of what stood under `key`."""
+        with self._writing():
+            self._connection.execute("INSERT OR REPLACE INTO records VALUES (?, ?)", (key, text))
+
+    def records(self) -> dict[str, str]:
+        """Return what the session was taken with, by key."""
+        return dict(self._newer_rows("SELECT key, text FROM records ORDER BY key"))
+
+    def heartbeat(self) -> Heartbeat | None:
+        """Return the newest sign of life; None if none was ever given."""
+        rows = self._newer_rows("SELECT at, pid, started, host, boot, state, sentence, until FROM heartbeat")
+        if not rows:
+            return None
+        at, *process, state, sentence, until = rows[0]
+        return Heartbeat(datetime.fromisoformat(at), Process(*process), state, sentence, datetime.fromisoformat(until))
+
     def attempts(self) -> list[Attempt]:
         """Return every attempt, oldest first."""
-        rows = self._connection.execute(
+        rows = self._rows(
             "SELECT id, step, kind, illumination, file, started_at, ended_at, verdict, reason, sha256 IS NOT NULL"
             " FROM attempts ORDER BY id"
         )
@@ -247,7 +306,7 @@ class Journal:
             Attempt(
                 row[0],
                 row[1],
-                row[2],
+                self._kind(row[2]),
                 row[3],
                 row[4],
                 datetime.fromisoformat(row[5]),
@@ -261,48 +320,123 @@ class Journal:
 
     def events(self) -> list[SessionEvent]:
         """Return every event, oldest first."""
-        rows = self._connection.execute("SELECT at, what, detail FROM events ORDER BY id")
+        rows = self._rows("SELECT at, what, detail FROM events ORDER BY id")
         return [SessionEvent(datetime.fromisoformat(row[0]), row[1], row[2]) for row in rows]
 
-    def accepted_files(self) -> list[tuple[int, str, int]]:
-        """Return the step, the file and the bytes of every frame that was accepted, oldest first."""
-        query = "SELECT step, file, size FROM attempts WHERE verdict=? ORDER BY id"
-        return [(step, file, size) for step, file, size in self._connection.execute(query, (ACCEPTED,))]
+    def checks(self, attempt: int) -> tuple[Check, ...]:
+        """Return what was looked at in an attempt's frame."""
+        return self.all_checks().get(attempt, ())
+
+    def all_checks(self) -> dict[int, tuple[Check, ...]]:
+        """Return what was looked at in each frame, by attempt, oldest first."""
+        found: dict[int, list[Check]] = {}
+        for attempt, *check in self._newer_rows(
+            "SELECT attempt, name, value, low, high, unit, reason FROM checks ORDER BY attempt, position"
+        ):
+            found.setdefault(attempt, []).append(Check(*check))
+        return {attempt: tuple(checks) for attempt, checks in found.items()}
+
+    def seen(self) -> dict[int, tuple[float, float, float]]:
+        """Return the camera RGB of the paper above black that was seen, counts, by attempt, oldest first."""
+        rows = self._newer_rows(
+            "SELECT attempt, red, green, blue FROM measurements WHERE red IS NOT NULL ORDER BY attempt"
+        )
+        return {attempt: (red, green, blue) for attempt, red, green, blue in rows}
+
+    def measurements(self) -> Iterator[tuple[SessionStep, int, bytes, bool]]:
+        """Return what the judge keeps of each frame, in taking order: step, attempt, bytes, and whether it counts."""
+        plan = {step.number: step for step in self.steps()}
+        for attempt, step, data, verdict in self._newer_rows(
+            "SELECT id, step, data, verdict FROM attempts JOIN measurements ON attempt = id ORDER BY id"
+        ):
+            if step in plan and data:
+                yield plan[step], attempt, data, verdict == ACCEPTED
+
+    def timings(self) -> dict[int, dict[str, float]]:
+        """Return the seconds that each part of an attempt took, by attempt, oldest first."""
+        found: dict[int, dict[str, float]] = {}
+        for attempt, name, seconds in self._newer_rows("SELECT attempt, name, seconds FROM timings ORDER BY attempt"):
+            found.setdefault(attempt, {})[name] = seconds
+        return found
+
+    def accepted_files(self) -> list[AcceptedFile]:
+        """Return every frame that was accepted, oldest first."""
+        rows = self._rows("SELECT id, step, file, size, sha256 FROM attempts WHERE verdict=? ORDER BY id", (ACCEPTED,))
+        return [AcceptedFile(*row) for row in rows]
 
     def kept_files(self, step: SessionStep) -> int:
         """Return how many raw files, accepted or refused, `step` has already."""
         query = "SELECT COUNT(*) FROM attempts WHERE step=? AND sha256 IS NOT NULL"
-        return int(self._connection.execute(query, (step.number,)).fetchone()[0])
+        return int(self._rows(query, (step.number,))[0][0])
 
     def frames(self) -> list[FrameRecord]:
-        """Return every frame that was taken and judged, in the order of the plan, refused ones included."""
-        rows = self._connection.execute(
-            "SELECT kind, illumination, file, sha256, taken_at, exposure_s, verdict, reason FROM attempts"
+        """Return every frame that was taken and judged, in the order of the plan, refused ones included.
+
+        Of a step with several accepted frames, as older software could leave them, the newest counts.
+        """
+        rows = self._rows(
+            "SELECT step, kind, illumination, file, sha256, taken_at, exposure_s, verdict, reason FROM attempts"
             " WHERE sha256 IS NOT NULL ORDER BY step, id"
         )
+        newest = {row[0]: row[3] for row in rows if row[7] == ACCEPTED}
         return [
             FrameRecord(
-                row[0],
-                row[1],
+                self._kind(row[1]),
                 row[2],
                 row[3],
-                datetime.fromisoformat(row[4]),
-                row[5],
-                row[6] if not row[7] else f"{row[6]}: {row[7]}",
+                row[4],
+                datetime.fromisoformat(row[5]),
+                row[6],
+                _verdict_text(row[7], row[8], newest.get(row[0], row[3]) == row[3]),
             )
             for row in rows
         ]
 
+    def _kind(self, kind: str) -> FrameKind:
+        if kind not in KINDS:
+            raise FormatError(
+                f"{self._path} holds a frame of the kind {kind!r}, this software knows {', '.join(KINDS)}; use the "
+                "software that took the session"
+            )
+        return kind
+
+    def _newer_rows(self, query: str) -> list[Any]:
+        """Return rows of a table that journals of version 1 do not have."""
+        return [] if self._version < JOURNAL_VERSION else self._rows(query)
+
+    def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
+        """Return all rows at once, so that nothing is held once they are read."""
+        try:
+            return self._insist(lambda: self._connection.execute(query, values).fetchall())
+        except sqlite3.DatabaseError as error:
+            raise reading_error(self._path, error) from error
+
     @contextmanager
     def _writing(self) -> Generator[None]:
+        """Make what is written inside one transaction, which is on the disk when the block ends."""
         try:
-            with self._connection:
-                yield
-        except sqlite3.OperationalError as error:
-            raise StorageError(
-                f"cannot write {self._path}: {error}; free space, or end the other program that "
-                "holds the session, then run the same command again"
-            ) from error
+            self._insist(lambda: self._connection.execute("BEGIN IMMEDIATE"))
+            yield
+            self._insist(lambda: self._connection.execute("COMMIT"))
+        except sqlite3.DatabaseError as error:
+            raise writing_error(self._path, error) from error
+        finally:
+            with suppress(sqlite3.Error):
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+
+    def _insist(self, attempt: Callable[[], _T]) -> _T:
+        """Return what `attempt` returns, after trying again while another program holds the journal."""
+        begun, told = time.monotonic(), False
+        while True:
+            try:
+                return attempt()
+            except sqlite3.OperationalError as error:
+                if not is_busy(error) or not self._writes or time.monotonic() - begun >= self._patience_s:
+                    raise
+                if not told:
+                    self._announce(f"another program writes {self._path}; the run goes on when it has finished")
+                    told = True
 
 
 def time_text(at: datetime) -> str:
@@ -310,12 +444,8 @@ def time_text(at: datetime) -> str:
     return at.isoformat(timespec="microseconds")
 
 
-def _connect(path: Path) -> sqlite3.Connection:
-    connection = sqlite3.connect(path, timeout=BUSY_LIMIT_S)
-    try:
-        # A committed row must survive a power cut: it is what makes a frame count.
-        connection.execute("PRAGMA synchronous = FULL")
-    except sqlite3.DatabaseError:
-        connection.close()
-        raise
-    return connection
+def _verdict_text(verdict: str, reason: str, newest: bool) -> str:
+    """Return a verdict as readers of frames know it: accepted, or refused with the reason."""
+    if verdict == ACCEPTED:
+        return ACCEPTED if newest else f"{REFUSED}: taken again since"
+    return f"{REFUSED}: {reason}" if reason else REFUSED

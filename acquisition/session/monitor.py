@@ -12,8 +12,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 from acquisition.session.folder import Session
-from acquisition.session.journal import SessionEvent
 from acquisition.session.progress import Progress, duration_text, session_progress
+from acquisition.session.records import SessionEvent
 from foundation.errors import CropError, InputError
 
 _PAGE = """<!doctype html>

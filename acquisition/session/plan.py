@@ -4,13 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from acquisition.lights.illuminations import Illumination
 from drivers.presenter import BLACK, WHITE, Colour
 
-FrameKind = Literal["light", "white", "dark"]
-"""What a frame shows: one of the planned lights, full white, or the picture's black."""
+FrameKind = Literal["light", "white", "dark", "response"]
+"""What a frame shows: one of the planned lights, full white, the picture's black, or a colour by which the projector is
+known. Frames of the last kind are looked at while a session is taken, and never part of a table."""
+
+KINDS: tuple[FrameKind, ...] = get_args(FrameKind)
+"""Every kind, as journals name them."""
+
+TOP = 250
+"""Highest code of a response frame; 255 is left to white and to the lights, so that none is taken for one of them."""
+
+PRIMARIES = (Colour(TOP, 0, 0), Colour(0, TOP, 0), Colour(0, 0, TOP))
+"""The projector's red, green and blue, each alone."""
+
+RESPONSE = (*PRIMARIES, *(Colour(code, code, code) for code in (16, 32, 48, 64, 88, 112, 136, 160, 184, 208, 232, TOP)))
+"""What a session shows first so that the light of any codes can be foretold: the primaries, and greys that give the
+curve from codes to light. The steps are chosen: even in code, and closer where the curve is steep in proportion."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +38,7 @@ class SessionStep:
     kind
         What it shows.
     illumination
-        Index of its light in `illuminations.csv`; None for white and dark frames.
+        Index of its light in `illuminations.csv`; None for frames of other kinds.
     colour
         Codes that the projector shows, 0 … 255.
     """
@@ -41,7 +55,13 @@ class SessionStep:
         return f"{self.number:04d}_{self.kind}{tail}"
 
 
-def plan_steps(illuminations: Sequence[Illumination], reference_every: int) -> tuple[SessionStep, ...]:
+def plan_steps(
+    illuminations: Sequence[Illumination],
+    reference_every: int,
+    *,
+    seed: int | None = None,
+    response: Sequence[Colour] = (),
+) -> tuple[SessionStep, ...]:
     """Return the whole session as data: a white and a dark frame first, every `reference_every` lights, and last.
 
     Parameters
@@ -50,17 +70,43 @@ def plan_steps(illuminations: Sequence[Illumination], reference_every: int) -> t
         Lights in the order in which they are to be shown.
     reference_every
         Lights between two pairs of white and dark frames, ≥ 1.
+    seed
+        Shuffles the lights, so that neither time nor a frame that is repeated runs along with colour; the same seed
+        gives the same order (numpy's PCG64). None keeps their order.
+    response
+        Colours to show after the first pair, before the lights (`RESPONSE`).
     """
     steps: list[SessionStep] = []
 
     def add(kind: FrameKind, illumination: int | None, colour: Colour) -> None:
         steps.append(SessionStep(len(steps), kind, illumination, colour))
 
-    for position, light in enumerate(illuminations):
+    for position, light in enumerate(illuminations if seed is None else _shuffled(illuminations, seed)):
         if position % reference_every == 0:
             add("white", None, WHITE)
             add("dark", None, BLACK)
+        if position == 0:
+            for colour in response:
+                add("response", None, colour)
         add("light", light.index, light.colour)
     add("white", None, WHITE)
     add("dark", None, BLACK)
     return tuple(steps)
+
+
+def tie_steps(first_number: int) -> tuple[SessionStep, ...]:
+    """Return what a run that is taken up again shows first, to tie it to what was taken before: a grey, the primaries.
+
+    Parameters
+    ----------
+    first_number
+        Number of the first step; the plan's last plus one.
+    """
+    colours = (Colour(TOP, TOP, TOP), *PRIMARIES)
+    return tuple(SessionStep(number, "response", None, colour) for number, colour in enumerate(colours, first_number))
+
+
+def _shuffled(illuminations: Sequence[Illumination], seed: int) -> list[Illumination]:
+    from numpy.random import PCG64, Generator
+
+    return [illuminations[position] for position in Generator(PCG64(seed)).permutation(len(illuminations))]

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 
 from acquisition.session.folder import Session
-from acquisition.session.journal import ACCEPTED, FAILED, REFUSED
+from acquisition.session.records import ACCEPTED, FAILED, REFUSED
 
 
 @dataclass(frozen=True)

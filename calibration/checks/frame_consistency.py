@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.fitting.least_squares import least_squares, product
-from calibration.fitting.polynomials import code_polynomial, code_powers
+from acquisition.measures.least_squares import least_squares, product
+from acquisition.measures.polynomials import code_polynomial, code_powers
 from foundation.robust import huber_weights, sigma_of
 
 DEGREE = 4

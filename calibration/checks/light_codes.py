@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.lights.illuminations import Illumination
-from calibration.fitting.least_squares import product
+from acquisition.measures.least_squares import product
 from foundation.angles import angles_deg
 from foundation.robust import huber_weights, sigma_of
 

@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from acquisition.framing.movement import Shift
 from acquisition.framing.planes import Channel
-from acquisition.session.journal import FrameRecord
+from acquisition.measures.flat_field import FlatField
+from acquisition.measures.paper import Paper
+from acquisition.session.records import FrameRecord
 from calibration.checks.frame_consistency import FrameConsistency
-from calibration.radiometry.flat_field import FlatField
-from calibration.radiometry.paper import Paper
 
 _Array = npt.NDArray[np.float64]
 

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from calibration.checks.stains import Stains
+from acquisition.measures.sensor_range import black_drift
+from acquisition.measures.stains import Stains
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.radiometry.dark_frames import DarkSummary
 from calibration.radiometry.greys import tint_deg
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
-from calibration.radiometry.sensor_range import black_drift
 from calibration.registration.registration import Registration
 from calibration.table.provenance import Unfit
 

@@ -24,7 +24,7 @@ import numpy as np
 from acquisition.framing.annotated import annotated_png
 from acquisition.framing.movement import Shift
 from acquisition.session.folder import Session
-from acquisition.session.journal import FrameRecord
+from acquisition.session.records import FrameRecord
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.figures.table_figures import TableFigures
 from calibration.pipeline.baseline import baseline_of

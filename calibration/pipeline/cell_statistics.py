@@ -21,11 +21,11 @@ from scipy.spatial import cKDTree
 
 from acquisition.chart.model import Chart
 from acquisition.framing.planes import CLIPPING_SHARE
-from calibration.checks.stains import Stains, find_stains
+from acquisition.measures.flat_field import FlatField
+from acquisition.measures.stains import Stains, find_stains
 from calibration.pipeline.measuring import MeasuredDarkFrame, MeasuredFrame
 from calibration.pipeline.registered_frame import RegisteredFrame
 from calibration.radiometry.dark_frames import DarkFrameFigures, DarkSummary, HotPixels, dark_summary, median_noise
-from calibration.radiometry.flat_field import FlatField
 from calibration.sampling.patch_statistics import has_dead_photosite, unevenness
 from calibration.table.provenance import Unfit
 

@@ -18,10 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.planes import Channel, frame_black, strongest_channel
+from acquisition.measures.sensor_range import saturation
 from acquisition.session.folder import Session
-from acquisition.session.journal import FrameRecord
+from acquisition.session.records import FrameRecord
 from calibration.radiometry.primaries import pure_lights
-from calibration.radiometry.sensor_range import saturation
 from calibration.table.lut import Lut
 from calibration.table.source_frames import SourceFrame, frames_sha256
 from drivers.raw.rawfile import Mosaic, decode_raw

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from acquisition.framing.movement import Shift
 from acquisition.session.folder import Session
-from acquisition.session.journal import FrameRecord
+from acquisition.session.records import FrameRecord
 from calibration.figures.frame_figures import FrameFigures
 from calibration.pipeline.baseline import Baseline
 from calibration.pipeline.cell_statistics import CellStatistics

@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-from acquisition.session.journal import FrameRecord
+from acquisition.session.records import FrameRecord
 from foundation.processors import processor_count
 
 MOST_THREADS = 8

@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from calibration.fitting.least_squares import least_squares
-from calibration.fitting.polynomials import code_polynomial, code_powers, page_polynomial
-from calibration.radiometry.flat_field import FlatField
+from acquisition.measures.flat_field import FlatField
+from acquisition.measures.least_squares import least_squares
+from acquisition.measures.polynomials import code_polynomial, code_powers, page_polynomial
 from foundation.robust import huber_weights, sigma_of
 
 CODE_DEGREE = 8

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.planes import CLIPPING_SHARE
-from calibration.radiometry.flat_field import FlatField
+from acquisition.measures.flat_field import FlatField
 
 _Array = npt.NDArray[np.float64]
 

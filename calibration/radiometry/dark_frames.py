@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.session.journal import FrameRecord
+from acquisition.session.records import FrameRecord
 from foundation.robust import MAD_TO_SIGMA, MEDIAN_ERROR
 
 HOT_COUNTS = 32.0

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calibration.radiometry.paper import Paper
+from acquisition.measures.paper import Paper
 from foundation.robust import MAD_TO_SIGMA
 
 _LEAST_WHITE = 50.0

@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.lights.illuminations import Illumination
-from calibration.fitting.least_squares import product
-from calibration.radiometry.flat_field import FlatField
-from calibration.radiometry.paper import Paper
+from acquisition.measures.flat_field import FlatField
+from acquisition.measures.least_squares import product
+from acquisition.measures.paper import Paper
 
 LEAST_PAPER = 300.0
 """Counts above black that paper must show under a primary for its field to be known well enough (judgement)."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.fitting.least_squares import least_squares
-from calibration.fitting.polynomials import code_powers
+from acquisition.measures.least_squares import least_squares
+from acquisition.measures.polynomials import code_powers
 from foundation.robust import huber_weights, sigma_of
 
 _Array = npt.NDArray[np.float64]

@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from acquisition.chart.model import Chart
 from acquisition.framing.movement import STILL_PX
+from acquisition.measures.flat_field import FlatField
+from acquisition.measures.stains import Stains
 from calibration.checks.frame_consistency import has_enough_cells
-from calibration.checks.stains import Stains
 from calibration.figures.table_figures import TableFigures
-from calibration.radiometry.flat_field import FlatField
 from calibration.registration.registration import Registration
 from calibration.sampling.patch_statistics import rim_difference, sample_noise
 from calibration.sampling.samples import sites_at

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from acquisition.chart.model import Chart
+from acquisition.measures.flat_field import FlatField
+from acquisition.measures.stains import Stains
 from acquisition.session.folder import Session
-from calibration.checks.stains import Stains
 from calibration.figures.table_figures import TableFigures
-from calibration.radiometry.flat_field import FlatField
 from calibration.report.half_size import half_size
 from calibration.report.page import Picture, page
 from calibration.report.plots import (

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.visibility import MIN_CELL_PX
+from acquisition.measures.sensor_range import MAX_BLACK_DRIFT
 from calibration.figures.table_figures import TableFigures
-from calibration.radiometry.sensor_range import MAX_BLACK_DRIFT
 from calibration.sampling.windows import SAFE_BLEED, bleed, largest_window
 
 

@@ -16,7 +16,7 @@ from typing import Literal
 from acquisition.framing.finding import MIN_TAG_SHARE
 from acquisition.framing.planes import CLIPPING_SHARE, MIN_SIGNAL
 from acquisition.framing.visibility import MIN_CELL_PX
-from calibration.radiometry.sensor_range import MAX_BLACK_DRIFT
+from acquisition.measures.sensor_range import MAX_BLACK_DRIFT
 from calibration.registration.register import (
     MAX_BLOCK_RESIDUAL_PX,
     MAX_TAG_RESIDUAL_PX,

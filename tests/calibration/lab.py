@@ -18,9 +18,11 @@ from acquisition.chart.model import Chart
 from acquisition.chart.printing import drawing
 from acquisition.lights.illuminations import Illumination, plan_illuminations
 from acquisition.session.folder import Session
-from acquisition.session.journal import ACCEPTED
+from acquisition.session.incoming import ReceivedFile
+from acquisition.session.judgement import Judgement
 from acquisition.session.plan import SessionStep, plan_steps
-from drivers.camera import ExposureSettings
+from acquisition.session.records import ACCEPTED
+from drivers.camera import CapturedFrame, ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from sim.camera.dng import write_dng
@@ -105,24 +107,20 @@ def take(
     verdict: Callable[[SessionStep], str] | None = None,
 ) -> Session:
     """Return an open session with an accepted frame for every step of the plan."""
-    session = Session.create(folder, "rig = 'simulated'\n", lab.chart, lights)
-    for step in plan_steps(lights, every):
-        data = lab.dng(step.colour, step.number) if frame is None else frame(step)
-        file = f"frames/{step.stem}.dng"
-        at = TAKEN_AT + timedelta(seconds=4 * step.number)
-        attempt = session.journal.begin(step, file, at)
-        (folder / file).write_bytes(data)
-        session.commit(
-            attempt,
-            file=file,
-            size=len(data),
-            sha256=hashlib.sha256(data).hexdigest(),
-            taken_at=at,
-            exposure_s=SETTINGS.shutter_s,
-            ended_at=at,
-            verdict=ACCEPTED if verdict is None else verdict(step),
-        )
-    return session
+    with Session.create(folder, "rig = 'simulated'\n", lab.chart, lights) as session:
+        for step in plan_steps(lights, every):
+            data = lab.dng(step.colour, step.number) if frame is None else frame(step)
+            at = TAKEN_AT + timedelta(seconds=4 * step.number)
+            path = session.frames_folder / f"{step.stem}.dng"
+            attempt = session.journal.begin(step, f"frames/{path.name}", at)
+            path.write_bytes(data)
+            captured = CapturedFrame(path.name, len(data), at)
+            received = ReceivedFile(path, len(data), hashlib.sha256(data).hexdigest(), captured)
+            refused = verdict is not None and verdict(step) != ACCEPTED
+            judgement = Judgement.of_reason("exposure", "as the test asks" if refused else None)
+            session.commit(attempt, received, judgement, exposure_s=SETTINGS.shutter_s, ended_at=at)
+        session.write_frames_csv()
+    return Session.open(folder)
 
 
 def renumbered(lights: Sequence[Illumination]) -> tuple[Illumination, ...]:

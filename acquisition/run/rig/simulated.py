@@ -149,10 +149,10 @@ def _last_moment(session: Session) -> datetime:
 
 def _recording(folder: Path) -> list[RecordedFrame]:
     with Session.open(folder) as recording:
-        colours = {(step.kind, step.illumination): step.colour for step in recording.steps}
+        colours = {step.number: step.colour for step in recording.steps}
+        shown = {attempt.file: colours[attempt.step] for attempt in recording.journal.attempts()}
         frames = [
-            RecordedFrame(colours[frame.kind, frame.illumination], folder / frame.file, frame.exposure_s)
-            for frame in recording.frames()
+            RecordedFrame(shown[frame.file], folder / frame.file, frame.exposure_s) for frame in recording.frames()
         ]
     if not frames:
         raise FormatError(f"{folder} holds no frames; name a session in which some were taken")

@@ -11,6 +11,7 @@ import pytest
 from acquisition.chart.layout import design_chart
 from acquisition.lights.illuminations import Illumination, save_illuminations
 from acquisition.session.folder import Session
+from acquisition.session.judgement import Judgement
 from acquisition.session.plan import plan_steps
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
@@ -35,26 +36,18 @@ def test_the_plan_survives_the_disk(session: Session) -> None:
         assert again.chart.sha256 == session.chart.sha256
 
 
-def take(session: Session, number: int, content: bytes, verdict: str = "accepted", reason: str = "") -> None:
+def take(session: Session, number: int, content: bytes, reason: str = "") -> None:
     step = session.steps[number]
     attempt = session.journal.begin(step, f"frames/{step.stem}", NOW)
     received = session.receive(step.stem, lambda into: CapturedFrame("IMG_1.CR2", into.write(content), NOW))
-    session.commit(
-        attempt,
-        file=f"frames/{received.path.name}",
-        size=received.size,
-        sha256=received.sha256,
-        taken_at=NOW,
-        exposure_s=0.5,
-        ended_at=NOW,
-        verdict=verdict,
-        reason=reason,
-    )
+    judgement = Judgement.of_reason("exposure", reason or None)
+    session.commit(attempt, received, judgement, exposure_s=0.5, ended_at=NOW)
 
 
 def test_frames_csv_is_as_the_format_says(session: Session) -> None:
     take(session, 0, b"white")
-    take(session, 2, b"light", "refused", "too dark")
+    take(session, 2, b"light", "too dark")
+    session.write_frames_csv()
     lines = (session.folder / "frames.csv").read_text().splitlines()
     assert lines[0] == "kind,illumination,file,sha256,taken_at,exposure_s,verdict"
     assert lines[1:] == [
@@ -65,7 +58,7 @@ def test_frames_csv_is_as_the_format_says(session: Session) -> None:
 
 def test_what_counts_is_on_disk_and_in_the_journal(session: Session) -> None:
     take(session, 0, b"frame")
-    take(session, 1, b"frame", "refused", "dark")
+    take(session, 1, b"frame", "dark")
     assert session.done_steps() == {0}
     (session.frames_folder / "0000_white.cr2").write_bytes(b"fra")
     assert session.done_steps() == set(), "a file that lost bytes is no frame"

@@ -10,8 +10,11 @@ from pathlib import Path
 import pytest
 
 from acquisition.lights.illuminations import Illumination
-from acquisition.session.journal import ACCEPTED, FAILED, REFUSED, Journal, SessionEvent
+from acquisition.session import journal_file
+from acquisition.session.journal import Journal
+from acquisition.session.judgement import Judgement
 from acquisition.session.plan import plan_steps
+from acquisition.session.records import ACCEPTED, FAILED, AcceptedFile, SessionEvent
 from drivers.presenter import Colour
 from foundation.errors import FormatError, StorageError
 
@@ -26,7 +29,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "journal.sqlite"
 
 
-def commit(journal: Journal, attempt: int, verdict: str, reason: str = "") -> None:
+def commit(journal: Journal, attempt: int, reason: str = "") -> None:
     journal.commit(
         attempt,
         file=f"frames/{attempt}.cr2",
@@ -35,18 +38,17 @@ def commit(journal: Journal, attempt: int, verdict: str, reason: str = "") -> No
         taken_at=NOW,
         exposure_s=0.5,
         ended_at=NOW + timedelta(seconds=2),
-        verdict=verdict,
-        reason=reason,
+        judgement=Judgement.of_reason("exposure", reason or None),
     )
 
 
 def test_what_is_written_is_read_again(path: Path) -> None:
-    with closing(Journal.open(path)) as journal:
+    with closing(Journal.open_for_run(path)) as journal:
         white, dark = (journal.begin(step, f"frames/{step.stem}", NOW) for step in STEPS[:2])
-        commit(journal, white, ACCEPTED)
+        commit(journal, white)
         journal.fail(dark, NOW, "the cable came off")
         journal.note(NOW, "start", "4 of 4 frames to take")
-    with closing(Journal.open(path)) as journal:
+    with closing(Journal.open_for_run(path)) as journal:
         assert journal.steps() == STEPS
         attempts = journal.attempts()
         assert [(attempt.step, attempt.verdict, attempt.has_frame) for attempt in attempts] == [
@@ -55,15 +57,15 @@ def test_what_is_written_is_read_again(path: Path) -> None:
         ]
         assert attempts[0].ended_at == NOW + timedelta(seconds=2)
         assert attempts[1].reason == "the cable came off"
-        assert journal.accepted_files() == [(0, "frames/1.cr2", 10)]
+        assert journal.accepted_files() == [AcceptedFile(1, 0, "frames/1.cr2", 10, "00")]
         assert journal.events() == [SessionEvent(NOW, "start", "4 of 4 frames to take")]
 
 
 def test_frames_come_in_the_order_of_the_plan_refused_ones_with_their_reason(path: Path) -> None:
-    with closing(Journal.open(path)) as journal:
+    with closing(Journal.open_for_run(path)) as journal:
         dark, white = journal.begin(STEPS[1], "a", NOW), journal.begin(STEPS[0], "b", NOW)
-        commit(journal, dark, ACCEPTED)
-        commit(journal, white, REFUSED, "too dark")
+        commit(journal, dark)
+        commit(journal, white, "too dark")
         again = journal.begin(STEPS[0], "c", NOW)
         assert [frame.verdict for frame in journal.frames()] == ["refused: too dark", "accepted"]
         assert [frame.accepted for frame in journal.frames()] == [False, True]
@@ -72,11 +74,11 @@ def test_frames_come_in_the_order_of_the_plan_refused_ones_with_their_reason(pat
 
 
 def test_a_journal_that_cannot_be_written_says_what_helps(path: Path) -> None:
-    with closing(Journal.open(path)) as journal:
-        with closing(sqlite3.connect(path)) as other:
-            other.execute("DROP TABLE events")
-        with pytest.raises(StorageError, match=r"cannot write .*journal\.sqlite: no such table: events; free space"):
-            journal.note(NOW, "start")
+    with (
+        closing(Journal.open(path)) as journal,
+        pytest.raises(StorageError, match=r"cannot write .*journal\.sqlite: attempt to write a readonly .*; see that"),
+    ):
+        journal.note(NOW, "start")
 
 
 def test_a_damaged_journal(path: Path) -> None:
@@ -102,12 +104,11 @@ def test_a_journal_that_may_not_be_read_is_not_damaged(path: Path, monkeypatch: 
 
 
 def test_a_journal_that_another_holds_is_not_damaged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def locked(file: Path, timeout: float) -> None:
-        raise sqlite3.OperationalError("database is locked")
-
-    monkeypatch.setattr(sqlite3, "connect", locked)
-    with pytest.raises(FormatError, match="database is locked; see that no other program holds it"):
-        Journal.open(path)
+    monkeypatch.setattr(journal_file, "READING_LIMIT_S", 0)
+    with closing(sqlite3.connect(path)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(FormatError, match="database is locked; see that no other program holds it"):
+            Journal.open(path)
 
 
 def test_a_journal_of_the_future(path: Path) -> None:

@@ -17,6 +17,7 @@ from acquisition.chart.layout import design_chart
 from acquisition.cli import main
 from acquisition.lights.illuminations import Illumination
 from acquisition.session.folder import Session
+from acquisition.session.judgement import Judgement
 from acquisition.session.monitor import open_monitor
 from acquisition.session.plan import plan_steps
 from acquisition.session.progress import duration_text
@@ -33,21 +34,17 @@ def folder(tmp_path: Path) -> Path:
     """Return a session of eight frames: two taken in ten seconds each, one refused."""
     folder = tmp_path / "night <1>"
     with Session.create(folder, "", design_chart(bits=1), LIGHTS, plan_steps(LIGHTS, 25)) as session:
-        for number, verdict, reason in ((0, "accepted", ""), (1, "accepted", ""), (2, "refused", "3 % clipped")):
+        for number, reason in ((0, None), (1, None), (2, "3 % clipped")):
             step = session.steps[number]
             begun = BEGUN + timedelta(seconds=10 * number)
             attempt = session.journal.begin(step, f"frames/{step.stem}", begun)
             received = session.receive(step.stem, lambda into: CapturedFrame("a.cr2", into.write(b"raw"), BEGUN))
             session.commit(
                 attempt,
-                file=f"frames/{received.path.name}",
-                size=received.size,
-                sha256=received.sha256,
-                taken_at=begun,
+                received,
+                Judgement.of_reason("exposure", reason),
                 exposure_s=0.5,
                 ended_at=begun + timedelta(seconds=10),
-                verdict=verdict,
-                reason=reason,
             )
         session.journal.note(BEGUN, "start", "8 <frames>")
     return folder

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 from acquisition.lights.illuminations import Illumination
-from acquisition.session.plan import SessionStep, plan_steps
+from acquisition.session.plan import RESPONSE, SessionStep, plan_steps, tie_steps
 from drivers.presenter import BLACK, WHITE, Colour
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
@@ -25,3 +27,33 @@ def test_a_step_names_its_file_so_that_files_sort_in_taking_order() -> None:
     assert stems[:3] == ["0000_white", "0001_dark", "0002_light_000"]
     assert stems == sorted(stems)
     assert SessionStep(7, "light", 5, WHITE).stem == "0007_light_005"
+
+
+def test_a_seed_shuffles_the_lights_and_nothing_else() -> None:
+    listed, shuffled = plan_steps(LIGHTS, 2), plan_steps(LIGHTS, 2, seed=1)
+    assert [step.kind for step in shuffled] == [step.kind for step in listed]
+    # numpy.random.Generator(numpy.random.PCG64(1)).permutation(5) of numpy 2.4.6
+    assert [step.illumination for step in shuffled if step.kind == "light"] == [4, 0, 1, 2, 3]
+    assert all(step.colour == LIGHTS[step.illumination].colour for step in shuffled if step.illumination is not None)
+    assert plan_steps(LIGHTS, 2, seed=1) == shuffled != plan_steps(LIGHTS, 2, seed=2)
+
+
+def test_response_frames_come_after_the_first_pair_and_are_taken_for_nothing_else() -> None:
+    steps = plan_steps(LIGHTS, 2, response=RESPONSE)
+    assert "".join(step.kind[0] for step in steps) == "wd" + "r" * len(RESPONSE) + "llwdllwdlwd"
+    response = [step for step in steps if step.kind == "response"]
+    assert tuple(step.colour for step in response) == RESPONSE
+    assert all(step.illumination is None and max(astuple(step.colour)) < 255 for step in response)
+    assert response[0].stem == "0002_response"
+    assert len(set(RESPONSE)) == len(RESPONSE)
+
+
+def test_the_steps_that_tie_a_run_to_the_one_before_go_on_in_number() -> None:
+    steps = tie_steps(40)
+    assert [step.number for step in steps] == [40, 41, 42, 43]
+    assert [step.colour for step in steps] == [
+        Colour(250, 250, 250),
+        Colour(250, 0, 0),
+        Colour(0, 250, 0),
+        Colour(0, 0, 250),
+    ]

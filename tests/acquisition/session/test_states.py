@@ -17,8 +17,10 @@ from acquisition.run import sequencer
 from acquisition.run.devices import Devices
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import take_session
-from acquisition.session import journal
+from acquisition.session import records
 from acquisition.session.folder import Session
+from acquisition.session.incoming import ReceivedFile
+from acquisition.session.judgement import Judgement
 from acquisition.session.plan import SessionStep, plan_steps
 from acquisition.session.states import ENDS, TRANSITIONS, StepState, may_follow, may_lead_to
 from drivers.camera import Camera, CameraIdentity, CapturedFrame, ExposureSettings
@@ -146,8 +148,8 @@ def watched(session: Session, watch: Watch, patch: pytest.MonkeyPatch) -> Genera
         watch.step = step.number
         watch.enter(StepState.BEGUN)
 
-    def committed(*_: object, verdict: str, **__: object) -> None:
-        watch.enter(StepState(verdict))
+    def committed(_attempt: int, _received: ReceivedFile, judgement: Judgement, *_: object, **__: object) -> None:
+        watch.enter(StepState.ACCEPTED if judgement.accepted else StepState.REFUSED)
 
     with patch.context() as patched, open_rig(SETTINGS, session.chart, session) as devices:
         patched.setattr(session.journal, "begin", after(session.journal.begin, begun))
@@ -217,4 +219,4 @@ def test_every_line_of_the_table_happens(session: Session, monkeypatch: pytest.M
 
 
 def test_the_words_are_the_journals() -> None:
-    assert tuple(state.value for state in ENDS[:3]) == (journal.ACCEPTED, journal.REFUSED, journal.FAILED)
+    assert tuple(state.value for state in ENDS[:3]) == (records.ACCEPTED, records.REFUSED, records.FAILED)

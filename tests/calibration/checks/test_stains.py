@@ -12,8 +12,8 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.framing.planes import frame_black
-from calibration.checks.stains import Stains, find_stains
-from calibration.radiometry.paper import PaperReader
+from acquisition.measures.paper import PaperReader
+from acquisition.measures.stains import Stains, find_stains
 from calibration.registration.register import register
 from calibration.sampling.samples import gather, sites_at
 from sim.world.room import Room

@@ -14,10 +14,10 @@ import pytest
 
 from acquisition.chart.layout import A_SERIES_MM, design_chart
 from acquisition.chart.model import Chart
+from acquisition.measures.polynomials import order_of, page_polynomial
 from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep, plan_steps
 from calibration.cli import main
-from calibration.fitting.polynomials import order_of, page_polynomial
 from calibration.pipeline.build import build, check
 from calibration.pipeline.frames import session_sha256
 from calibration.report.report import write_report

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from acquisition.measures.linearity import deviations
 from acquisition.session.folder import Session
 from calibration.cli import main
 from calibration.pipeline.build import build, check
-from calibration.pipeline.linearity import deviations
 from calibration.report.report import write_report
 from calibration.report.summary import summary
 from calibration.table.lut import open_lut

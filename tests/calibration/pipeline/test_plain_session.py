@@ -12,8 +12,8 @@ import pytest
 from acquisition.chart.layout import A_SERIES_MM, design_chart, paper_chart
 from acquisition.framing.tagless_field import field_mm
 from acquisition.lights.illuminations import Illumination
-from acquisition.session.journal import ACCEPTED
 from acquisition.session.plan import SessionStep
+from acquisition.session.records import ACCEPTED
 from calibration.cli import main
 from calibration.pipeline.build import build
 from calibration.report.report import write_report

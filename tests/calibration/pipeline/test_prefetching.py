@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from acquisition.session.folder import Session
-from acquisition.session.journal import FrameRecord
+from acquisition.session.records import FrameRecord
 from calibration.pipeline import prefetching
 from calibration.pipeline.build import build
 from calibration.pipeline.prefetching import prefetched

@@ -8,8 +8,8 @@ import pytest
 
 from acquisition.chart.layout import paper_chart
 from acquisition.chart.printing import drawing
+from acquisition.measures.paper import PaperReader
 from calibration.radiometry.cell_field import field_of_cells
-from calibration.radiometry.paper import PaperReader
 from drivers.presenter import WHITE, Colour
 from sim.world.drawing import Print
 from sim.world.room import Room

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from acquisition.session.journal import FrameRecord
+from acquisition.session.records import FrameRecord
 from calibration.radiometry.dark_frames import (
     DarkFrameFigures,
     HotPixels,

@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from acquisition.measures.flat_field import FlatField
+from acquisition.measures.paper import Paper
 from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep
 from calibration.cli import main
 from calibration.pipeline.build import TableProgress, append, build, check
 from calibration.pipeline.options import BuildOptions
 from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances, winsorised_means
-from calibration.radiometry.flat_field import FlatField
-from calibration.radiometry.paper import Paper
 from calibration.report.summary import summary
 from calibration.table.lut import open_lut
 from calibration.verdict.result import BuildResult

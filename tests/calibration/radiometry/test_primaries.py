@@ -10,9 +10,9 @@ import numpy.typing as npt
 import pytest
 
 from acquisition.lights.illuminations import plan_illuminations
+from acquisition.measures.flat_field import FlatField
+from acquisition.measures.paper import Paper, PaperReader
 from calibration.pipeline.build import build
-from calibration.radiometry.flat_field import FlatField
-from calibration.radiometry.paper import Paper, PaperReader
 from calibration.radiometry.primaries import Primaries, pure_lights
 from calibration.table.lut import open_lut
 from sim.world.room import Room

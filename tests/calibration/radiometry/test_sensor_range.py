@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from calibration.radiometry.sensor_range import black_drift, saturation
+from acquisition.measures.sensor_range import black_drift, saturation
 from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE
 from tests.calibration.lab import Lab

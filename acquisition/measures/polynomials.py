@@ -1,7 +1,7 @@
 """Polynomial bases: Legendre polynomials over the page and over the cube of printed codes.
 
 On their ranges Legendre polynomials are orthogonal and of order unity, which the normal equations of
-`calibration.fitting.least_squares` need.
+`acquisition.measures.least_squares` need.
 """
 
 from __future__ import annotations

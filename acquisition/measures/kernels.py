@@ -2,7 +2,7 @@
 
 Compiled for the processor at hand at the first call and kept on disk for the next. No state, no lock, and the
 interpreter's is released, so that each frame has a thread to itself. Without licence to reorder sums: a table's bytes
-depend on neither processor nor thread. They are called through `calibration.fitting.least_squares`.
+depend on neither processor nor thread. They are called through `acquisition.measures.least_squares`.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def linear_combinations(basis: _Array, factors: _Array) -> _Array:
     ndarray
         (3, N) float64.
     """
-    from calibration.fitting import kernels
+    from acquisition.measures import kernels
 
     sums = np.empty((len(factors), basis.shape[1]))
     kernels.linear_combinations(basis, factors, sums)
@@ -67,7 +67,7 @@ def least_squares(design: _Array, values: _Array, weights: _Array) -> _Array:
     weights
         (N,) float64, ≥ 0.
     """
-    from calibration.fitting import kernels
+    from acquisition.measures import kernels
 
     return kernels.weighted_fit(*(_plain(array) for array in (design, values, weights)))
 
@@ -96,7 +96,7 @@ def robust_least_squares(design: _Array, values: _Array, rounds: int) -> tuple[_
     residuals
         (N,) float64, values − design x.
     """
-    from calibration.fitting import kernels
+    from acquisition.measures import kernels
 
     return kernels.robust_fit(_plain(design), _plain(values), rounds)
 

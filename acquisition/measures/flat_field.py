@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.fitting.least_squares import product
-from calibration.fitting.polynomials import order_of, page_polynomial
+from acquisition.measures.least_squares import product
+from acquisition.measures.polynomials import order_of, page_polynomial
 
 LEAST_FIELD = 0.05
 """Where a polynomial that is extrapolated falls below this share of the mean light, the field is taken to be this:

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from calibration.fitting.least_squares import linear_combinations, robust_least_squares
-from calibration.fitting.polynomials import page_polynomial, page_powers
-from calibration.radiometry.flat_field import LEAST_FIELD, FlatField
+from acquisition.measures.flat_field import LEAST_FIELD, FlatField
+from acquisition.measures.least_squares import linear_combinations, robust_least_squares
+from acquisition.measures.polynomials import page_polynomial, page_powers
 from foundation.errors import QualityError
 
 MAX_ORDER = 6

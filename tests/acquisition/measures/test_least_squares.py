@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.fitting.least_squares import least_squares, linear_combinations, robust_least_squares
+from acquisition.measures.least_squares import least_squares, linear_combinations, robust_least_squares
 
 
 @pytest.mark.parametrize("unknowns", [1, 3, 10, 28])

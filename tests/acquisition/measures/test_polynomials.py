@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.fitting.polynomials import code_polynomial, code_powers, order_of, page_polynomial, page_powers
+from acquisition.measures.polynomials import code_polynomial, code_powers, order_of, page_polynomial, page_powers
 
 PAGE = (400.0, 300.0)
 PLACES = np.random.default_rng(3).random((400, 2)) * PAGE

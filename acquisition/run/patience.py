@@ -1,0 +1,280 @@
+"""One patience for camera, screen, projector and disk: what fails is waited for until it is mended, and said.
+
+How the sequencer uses it::
+
+    patience = Patience(clock, settings.sequence.patience_s, report, idle, beat)
+    released_at = patience.attempt(camera.expose, "the camera", idle=False)
+    patience.attempt(lambda: presenter.show(colour), "the screen")
+    patience.attempt(lambda: journal.begin(step, file, clock.now()), "the disk")
+
+or, where a try is more than one call::
+
+    pause = patience.pause("the camera", idle=False)
+    while True:
+        try:
+            frame = …
+        except DeviceError as fault:
+            pause.wait(fault)  # returns after some seconds for the next try; raises when patience ends
+        else:
+            pause.over()  # says that the run goes on, if it had said that it paused
+            break
+
+Rules that hold inside:
+
+- The first failure is tried again after a second (`retry`), so that what passes at once pauses nothing. What lasts
+  pauses the run (`paused`) with the cause that holds *now*; another cause is told as soon as it is there (`still
+  paused`); with other digits it is no other. `resumed` ends it.
+- Every few seconds of a pause come a beat, with cause and countdown, and `idle`, for the devices that are not at fault.
+- When patience ends, the error is of the first cause's class and names it first; what held at last is added.
+- Nothing that is told may end the run: a full disk, which cannot take the note of a pause, gets it when there is space.
+- What is no `CropError` passes through at once: Ctrl-C ends a pause; `beat` and `idle` may raise `KeyboardInterrupt`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final, Protocol, TypeVar
+
+from acquisition.session.progress import duration_text
+from foundation import errors
+from foundation.clock import Clock
+from foundation.errors import CropError, DeviceError, StorageError
+
+RETRY_S: Final = 1.0
+"""Before the second try: a notification in front of the picture, or a cable put back, needs no more."""
+PAUSE_S: Final = 5.0
+"""Between two tries in a pause; an operator who mends something does not notice so short a wait."""
+SLOW_S: Final = 10.0
+"""A try that failed after so long has been tried often enough by its driver: the pause is told at once."""
+TRY_S: Final = 300.0
+"""How long a try may go without a sign of life: a camera's driver renews its connection three times for a minute each,
+and waits 90 s for a frame."""
+_INSTANT_S: Final = 1e-6
+"""Resolution of simulated time: nothing shorter can be waited for."""
+
+_Result = TypeVar("_Result")
+
+
+class Report(Protocol):
+    """Where words and sentences of a run go: terminal first, then journal, then whoever is notified."""
+
+    def __call__(self, what: str, sentence: str, /) -> None:
+        """Tell what happens (``retry``, ``paused``, ``still paused``, ``resumed``, ``warming up``), with its cause."""
+        ...
+
+
+class Beat(Protocol):
+    """Where signs of life of a wait go: the journal's heartbeat, and a line on the terminal."""
+
+    def __call__(self, state: str, sentence: str, within_s: float, /) -> None:
+        """Tell the state (``paused`` or ``waiting``), what is waited for and how long, and when the next is due."""
+        ...
+
+
+def is_curable(fault: CropError) -> bool:
+    """Return whether waiting may help: any fault of a device or of the disk, but nothing that the user gave."""
+    return isinstance(fault, DeviceError | StorageError)
+
+
+class Patience:
+    """How long, and how, a run waits for what fails.
+
+    Parameters
+    ----------
+    clock
+        Measures and makes every pause.
+    limit_s
+        Seconds that one pause may last, ≥ 0; infinity: without end, 0: nothing is tried twice.
+    report
+        Told when something is tried again, pauses, changes its cause, and goes on.
+    idle
+        Keeps the other devices awake; called every few seconds. Its `DeviceError` is left to the device's own next use.
+    beat
+        Told every few seconds of a wait, with the time left in the sentence.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        limit_s: float,
+        report: Report = lambda what, sentence: None,
+        idle: Callable[[], None] = lambda: None,
+        beat: Beat = lambda state, sentence, within_s: None,
+    ) -> None:
+        self.clock = clock
+        self.limit_s = limit_s
+        self._tell, self._idle, self._beat = report, idle, beat
+        self._untold: list[tuple[str, str]] = []
+
+    def attempt(
+        self,
+        action: Callable[[], _Result],
+        name: str,
+        *,
+        curable: Callable[[CropError], bool] = is_curable,
+        idle: bool = True,
+    ) -> _Result:
+        """Return what `action` returns, tried until it succeeds or patience ends.
+
+        Parameters
+        ----------
+        action
+            One try; it must be such that a failed one leaves nothing behind.
+        name
+            What is waited for, as messages name it: "the camera", "the screen", "the disk".
+        curable
+            Whether waiting may help against a fault; another is raised at once.
+        idle
+            Whether the other devices are spoken to meanwhile: not where it is they that are waited for.
+
+        Raises
+        ------
+        CropError
+            A fault that waiting does not cure; or, of the class of the first fault, that patience has ended.
+        """
+        pause = self.pause(name, idle=idle)
+        while True:
+            try:
+                result = action()
+            except CropError as fault:
+                if not curable(fault):
+                    raise
+                pause.wait(fault)
+            else:
+                pause.over()
+                return result
+
+    def pause(self, name: str, *, idle: bool = True) -> Pause:
+        """Return what waits for `name`, and counts from its first failure; parameters as those of `attempt`."""
+        return Pause(self, name, idle)
+
+    def report(self, what: str, sentence: str) -> None:
+        """Tell what happens; where the disk cannot take it, it is told again as soon as something else can be."""
+        self._untold.append((what, sentence))
+        with suppress(StorageError):
+            while self._untold:
+                self._tell(*self._untold[0])
+                self._untold.pop(0)
+
+    def wait(self, seconds: float, state: str, sentence: Callable[[float], str], *, idle: bool = True) -> None:
+        """Let `seconds` pass, with a beat every few of them.
+
+        Parameters
+        ----------
+        seconds
+            How long, ≥ 0.
+        state
+            ``paused`` or ``waiting``, for the beat.
+        sentence
+            Given the seconds left, returns what the beat says.
+        idle
+            Whether the devices are kept awake.
+        """
+        until = self.clock.monotonic() + seconds
+        while (left := until - self.clock.monotonic()) >= _INSTANT_S:
+            self.beat(state, sentence(left), 2 * PAUSE_S + TRY_S * idle)
+            self.clock.sleep(min(left, PAUSE_S))
+            if idle:
+                with suppress(DeviceError):
+                    self._idle()
+
+    def beat(self, state: str, sentence: str, within_s: float) -> None:
+        """Give a sign of life; a disk that cannot take it does not matter."""
+        with suppress(StorageError):
+            self._beat(state, sentence, within_s)
+
+
+class Pause:
+    """The wait for one thing that fails; given by `Patience.pause`."""
+
+    def __init__(self, patience: Patience, name: str, idle: bool) -> None:
+        self._patience = patience
+        self._name = name
+        self._idle = idle
+        self._begun_trying = patience.clock.monotonic()
+        self._first: CropError | None = None
+        self._failed_at = self._begun_trying
+        self._told = ""
+
+    @property
+    def first(self) -> CropError | None:
+        """The first fault; None where nothing has failed."""
+        return self._first
+
+    @property
+    def lasted_s(self) -> float:
+        """Seconds since the first failure; 0 where nothing has failed."""
+        return 0.0 if self._first is None else self._patience.clock.monotonic() - self._failed_at
+
+    def wait(self, fault: CropError) -> None:
+        """Say what holds now, and return when it is time for the next try.
+
+        Raises
+        ------
+        CropError
+            Patience has ended: the first fault, with what holds now.
+        """
+        patience = self._patience
+        now = patience.clock.monotonic()
+        again = self._first is not None
+        if self._first is None:
+            self._first, self._failed_at = fault, now
+        left = patience.limit_s - (now - self._failed_at)
+        if left < _INSTANT_S:
+            raise self._ended(fault) from fault
+        if not again and now - self._begun_trying < SLOW_S:
+            patience.report("retry", f"{_named(self._name, fault)}")
+            patience.clock.sleep(min(RETRY_S, left))
+            return
+        kind = _kind(fault)
+        if kind != self._told:
+            how_long = "for as long as it takes" if math.isinf(patience.limit_s) else f"up to {duration_text(left)}"
+            patience.report(
+                "still paused" if self._told else "paused",
+                f"{_named(self._name, fault)} (the run waits {how_long}, and goes on by itself)",
+            )
+            self._told = kind
+        patience.wait(min(PAUSE_S, left), "paused", lambda rest: self._countdown(fault), idle=self._idle)
+        patience.beat("paused", self._countdown(fault), TRY_S)
+
+    def over(self) -> None:
+        """Say that the run goes on, where it had said that it paused."""
+        if self._told:
+            self._patience.report(
+                "resumed", f"{self._name} is ready again after a pause of {duration_text(self.lasted_s)}"
+            )
+
+    def _countdown(self, fault: CropError) -> str:
+        left = self._patience.limit_s - self.lasted_s
+        end = "waits for as long as it takes" if math.isinf(left) else f"ends in {duration_text(max(left, 0))}"
+        return f"{_named(self._name, fault)} (paused for {duration_text(self.lasted_s)}; goes on by itself, {end})"
+
+    def _ended(self, fault: CropError) -> CropError:
+        assert self._first is not None
+        first = self._first
+        if not self._patience.limit_s:
+            return first
+        at_last = "" if _kind(fault) == _kind(first) else f"; at last: {fault}"
+        waited = duration_text(self._patience.limit_s)
+        return _family(first)(
+            f"{_named(self._name, first)}{at_last}; the run waited {waited} for that and ended: when it is mended run "
+            "the same command again"
+        )
+
+
+def _named(name: str, fault: CropError) -> str:
+    """Return a fault with the name of what has it, which many name themselves."""
+    return str(fault) if str(fault).startswith(name) else f"{name}: {fault}"
+
+
+def _kind(fault: CropError) -> str:
+    """Return a fault's words without its numbers, which may change from one try to the next."""
+    return re.sub(r"\d+(?:[.,]\d+)*", "#", str(fault))
+
+
+def _family(fault: CropError) -> type[CropError]:
+    """Return the nearest class of the tree of errors; classes of drivers want more than a sentence."""
+    return next(kind for kind in type(fault).__mro__ if kind.__module__ == errors.__name__)

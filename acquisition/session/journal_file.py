@@ -1,0 +1,315 @@
+"""The file of a session's journal: its tables, and how it is opened, so that readers and the run never stop each other.
+
+Rules that hold inside:
+
+- While a run has it open the journal is in SQLite's write-ahead mode: readers see the last commit and hold nobody up.
+  When the run ends in order it is put back to one file (`-wal` and `-shm` are gone).
+- A reader creates, migrates and changes nothing. What cannot be read in place without doing so (a journal copied with
+  its `-wal`, one in a folder that cannot be written) is read from a copy in memory.
+- Where write-ahead mode does not work (file systems of a network share no memory) the journal stays in the older mode.
+
+Sources: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvantages"; sqlite.org/lockingv3.html.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from contextlib import closing
+from pathlib import Path
+from urllib.parse import quote
+
+from foundation.errors import FormatError, StorageError
+from foundation.files import storage_error
+
+JOURNAL_VERSION = 2
+"""`PRAGMA user_version` of the journals that this software writes (docs/formats.md); version 1 is read."""
+
+READABLE = (1, JOURNAL_VERSION)
+"""Versions that can be read; a run brings the older one up to date by adding what is missing."""
+
+TRY_S = 1.0
+"""How long SQLite itself waits for another program before it gives the control back: as long as Ctrl-C may wait."""
+
+READING_LIMIT_S = 10.0
+"""How long a reader waits where the journal is not in write-ahead mode: a commit takes milliseconds, a disk may stall
+for seconds."""
+
+_VERSION_1 = """
+CREATE TABLE attempts (
+    id INTEGER PRIMARY KEY,
+    step INTEGER NOT NULL,
+    kind TEXT NOT NULL,
+    illumination INTEGER,
+    file TEXT NOT NULL,
+    started_at TEXT NOT NULL,
+    ended_at TEXT,
+    taken_at TEXT,
+    exposure_s REAL,
+    size INTEGER,
+    sha256 TEXT,
+    verdict TEXT,
+    reason TEXT NOT NULL DEFAULT ''
+);
+CREATE TABLE plan (
+    step INTEGER PRIMARY KEY, kind TEXT NOT NULL, illumination INTEGER,
+    red INTEGER NOT NULL, green INTEGER NOT NULL, blue INTEGER NOT NULL
+);
+CREATE TABLE events (id INTEGER PRIMARY KEY, at TEXT NOT NULL, what TEXT NOT NULL, detail TEXT NOT NULL);
+"""
+
+_VERSION_2 = """
+CREATE TABLE IF NOT EXISTS checks (
+    attempt INTEGER NOT NULL, position INTEGER NOT NULL, name TEXT NOT NULL,
+    value REAL, low REAL, high REAL, unit TEXT NOT NULL, reason TEXT NOT NULL,
+    PRIMARY KEY (attempt, position)
+);
+CREATE TABLE IF NOT EXISTS measurements (
+    attempt INTEGER PRIMARY KEY, red REAL, green REAL, blue REAL, data BLOB NOT NULL,
+    voids INTEGER NOT NULL, lasting INTEGER NOT NULL
+);
+CREATE TABLE IF NOT EXISTS timings (
+    attempt INTEGER NOT NULL, name TEXT NOT NULL, seconds REAL NOT NULL, PRIMARY KEY (attempt, name)
+);
+CREATE TABLE IF NOT EXISTS heartbeat (
+    id INTEGER PRIMARY KEY CHECK (id = 1), at TEXT NOT NULL, pid INTEGER NOT NULL, started TEXT NOT NULL,
+    host TEXT NOT NULL, boot TEXT NOT NULL, state TEXT NOT NULL, sentence TEXT NOT NULL, until TEXT NOT NULL
+);
+CREATE TABLE IF NOT EXISTS records (key TEXT PRIMARY KEY, text TEXT NOT NULL);
+"""
+
+_TABLES = {1: {"attempts", "plan", "events"}}
+_TABLES[2] = _TABLES[1] | {"checks", "measurements", "timings", "heartbeat", "records"}
+
+_CANNOT_IN_PLACE = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
+"""What SQLite answers where it would have to write in order to read."""
+
+_NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "ceph", "fuse.glusterfs", "lustre"}
+"""File systems on which several machines work and share no memory, as /proc/self/mounts names them."""
+
+
+def is_busy(error: sqlite3.DatabaseError) -> bool:
+    """Return whether another program holds the journal, so that waiting helps."""
+    return _primary_code(error) == sqlite3.SQLITE_BUSY
+
+
+def create_file(path: Path) -> sqlite3.Connection:
+    """Return a connection to a new journal with its tables and nothing in them.
+
+    Raises
+    ------
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    try:
+        connection = _connect(path, "rwc")
+        _execute_all(connection, _VERSION_1 + _VERSION_2, JOURNAL_VERSION)
+    except sqlite3.DatabaseError as error:
+        raise StorageError(f"cannot write {path}: {error}; free space or choose another disk") from error
+    return connection
+
+
+def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
+    """Return a connection that cannot write, and the journal's version.
+
+    Raises
+    ------
+    FormatError
+        The journal cannot be read, is damaged, or of a version not known here.
+    """
+    try:
+        # A run has all three; without the third nobody is at work, and reading in place would make it.
+        if _is_write_ahead(path) and not _beside(path, "-shm").exists():
+            connection = _copied(path)
+        else:
+            connection = _opened_or_copied(path)
+        return connection, _checked(path, connection)
+    except (OSError, sqlite3.DatabaseError) as error:
+        raise reading_error(path, error) from error
+
+
+def open_for_run(path: Path) -> sqlite3.Connection:
+    """Return a connection that writes, after bringing the journal up to this version and into write-ahead mode.
+
+    The caller holds the session's folder, so that no other run is at work.
+
+    Raises
+    ------
+    FormatError
+        The journal cannot be read, is damaged, or of a version not known here.
+    StorageError
+        It can be read, but not written.
+    """
+    try:
+        connection = _connect(path, "rw")
+        version = _checked(path, connection)
+    except (OSError, sqlite3.DatabaseError) as error:
+        raise reading_error(path, error) from error
+    try:
+        if not _on_network(path):
+            connection = _in_write_ahead(path, connection)
+        if version < JOURNAL_VERSION:
+            _execute_all(connection, _VERSION_2, JOURNAL_VERSION)
+    except OSError as error:
+        connection.close()
+        raise storage_error(path, error) from error
+    except sqlite3.DatabaseError as error:
+        connection.close()
+        raise writing_error(path, error) from error
+    return connection
+
+
+def close_after_run(connection: sqlite3.Connection) -> None:
+    """Put the journal back to one file unless somebody reads it, and close it; a second call does nothing."""
+    try:
+        connection.execute("PRAGMA journal_mode = DELETE").fetchall()
+    except sqlite3.Error:
+        pass  # Somebody reads it, the disk is gone, or it is closed: the next run or reader copes with what is there.
+    finally:
+        connection.close()
+
+
+def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError:
+    """Return why a journal cannot be read, and what helps."""
+    if isinstance(error, OSError):
+        return FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk")
+    if is_busy(error):
+        return FormatError(f"cannot read {path}: {error}; see that no other program holds it")
+    if isinstance(error, sqlite3.OperationalError):
+        return FormatError(f"cannot read {path}: {error}; check its permissions and the disk")
+    return FormatError(f"{path} is damaged: {error}; restore it from a copy")
+
+
+def writing_error(path: Path, error: sqlite3.DatabaseError) -> StorageError:
+    """Return why a journal cannot be written, and what helps."""
+    if is_busy(error):
+        remedy = "end the other program that holds the session"
+    elif _primary_code(error) == sqlite3.SQLITE_FULL:
+        remedy = "free space"
+    elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
+        remedy = "see that the folder may be written and the disk is there"
+    else:
+        remedy = "check the disk and its cable"
+    return StorageError(f"cannot write {path}: {error}; {remedy}, then run the same command again")
+
+
+def _primary_code(error: sqlite3.DatabaseError) -> int:
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    return path.with_name(path.name + suffix)
+
+
+def _connect(path: Path, mode: str) -> sqlite3.Connection:
+    connection = sqlite3.connect(
+        f"file:{quote(str(path.absolute()))}?mode={mode}",
+        uri=True,
+        timeout=READING_LIMIT_S if mode == "ro" else TRY_S,
+        isolation_level=None,
+    )
+    try:
+        # A committed row must survive a power cut: it is what makes a frame count.
+        connection.execute("PRAGMA synchronous = FULL")
+    except sqlite3.DatabaseError:
+        connection.close()
+        raise
+    return connection
+
+
+def _opened_or_copied(path: Path) -> sqlite3.Connection:
+    """Return a reader of the file in its place, or of a copy where SQLite would have to write in order to read."""
+    try:
+        connection = _connect(path, "ro")
+        connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchall()
+    except sqlite3.OperationalError as error:
+        if _primary_code(error) not in _CANNOT_IN_PLACE:
+            raise
+        return _copied(path)
+    return connection
+
+
+def _copied(path: Path) -> sqlite3.Connection:
+    """Return a reader of a copy in memory, with what its side files hold."""
+    memory = sqlite3.connect(":memory:", isolation_level=None)
+    with tempfile.TemporaryDirectory(prefix="crop-") as scratch:
+        copy = Path(scratch) / path.name
+        for suffix in ("", "-wal", "-journal"):
+            if (source := _beside(path, suffix)).exists() or not suffix:
+                shutil.copyfile(source, _beside(copy, suffix))
+        with closing(_connect(copy, "rw")) as connection:
+            connection.backup(memory)
+    memory.execute("PRAGMA query_only = ON")
+    return memory
+
+
+def _is_write_ahead(path: Path) -> bool:
+    """Return whether the file's header says write-ahead mode (sqlite.org/fileformat.html, 1.3.3: offset 18 is 2).
+
+    Only asked while no `-shm` is there: closing a file gives up all locks that the process has on it.
+    """
+    if _beside(path, "-shm").exists():
+        return True
+    with path.open("rb") as stream:
+        return stream.read(20)[18:] == b"\x02\x02"
+
+
+def _checked(path: Path, connection: sqlite3.Connection) -> int:
+    """Return the journal's version; close the connection and refuse what is not known or lacks a table."""
+    try:
+        version = connection.execute("PRAGMA user_version").fetchone()[0]
+        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if version not in READABLE:
+            raise FormatError(
+                f"{path} is of version {version}, this software reads {READABLE[0]} and {READABLE[-1]}; "
+                "use the software that wrote it"
+            )
+        if lacking := _TABLES[version] - tables:
+            raise FormatError(
+                f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; restore it from a copy"
+            )
+    except BaseException:
+        connection.close()
+        raise
+    return version
+
+
+def _execute_all(connection: sqlite3.Connection, statements: str, version: int) -> None:
+    """Execute statements and set the version, all or nothing."""
+    connection.executescript(f"BEGIN IMMEDIATE; {statements} PRAGMA user_version = {version}; COMMIT;")
+
+
+def _in_write_ahead(path: Path, connection: sqlite3.Connection) -> sqlite3.Connection:
+    """Return a connection in write-ahead mode, where the file system allows it.
+
+    The mode cannot be changed while somebody reads. A reader who will not end keeps the file that he has, under no
+    name; the run goes on with a copy.
+    """
+    try:
+        connection.execute("PRAGMA journal_mode = WAL").fetchall()
+    except sqlite3.OperationalError as error:
+        if not is_busy(error):
+            raise
+        copy = _beside(path, "-copy")
+        copy.unlink(missing_ok=True)
+        connection.execute("BEGIN IMMEDIATE")  # No other writer may be at work meanwhile.
+        with closing(_connect(copy, "rwc")) as target:
+            connection.backup(target)
+        connection.execute("ROLLBACK")
+        connection.close()
+        copy.replace(path)
+        connection = _connect(path, "rw")
+        connection.execute("PRAGMA journal_mode = WAL").fetchall()
+    return connection
+
+
+def _on_network(path: Path) -> bool:
+    """Return whether the file lies on a file system that several machines work on; False where that is not known."""
+    try:
+        mounts = [line.split() for line in Path("/proc/self/mounts").read_text().splitlines()]
+    except OSError:
+        return False
+    place = path.resolve()
+    holding = [(len(at), kind) for _, at, kind, *_ in mounts if place.is_relative_to(at.replace("\\040", " "))]
+    return max(holding, default=(0, ""))[1] in _NETWORK

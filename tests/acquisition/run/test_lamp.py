@@ -1,0 +1,276 @@
+"""The lamp in simulated time: lit, warm, watched; and what a projector in trouble makes the run say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import pytest
+
+from acquisition.config import SequenceSettings
+from acquisition.run.lamp import POWER_LIMIT_S, RELIGHT_S, await_health, make_ready, require_healthy
+from acquisition.run.patience import PAUSE_S, Patience
+from drivers.links.link import Link
+from drivers.pjlink.projector import PjLinkProjector
+from drivers.pjlink.wire import NoResolution
+from drivers.projector import Fault, Lamp, Power, Severity
+from drivers.serial_projectors.optoma import OptomaProjector
+from foundation.errors import DeviceFault, LinkClosed, LinkTimeout
+from sim.buses.serial_cable import SerialPeerLink
+from sim.clock import SimulatedClock
+from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.projector import SimulatedProjector
+from sim.projectors.serial import OptomaPeer
+
+SEQUENCE = SequenceSettings(warm_up_s=600)
+
+
+class Timed(SimulatedClock):
+    """A clock by which things happen at their times, while somebody waits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.due: list[tuple[float, Callable[[], object]]] = []
+
+    def sleep(self, seconds: float) -> None:
+        end = self.monotonic() + seconds
+        while self.due and min(self.due, key=lambda one: one[0])[0] <= end:
+            first = min(self.due, key=lambda one: one[0])
+            self.due.remove(first)
+            super().sleep(max(first[0] - self.monotonic(), 0))
+            first[1]()
+        super().sleep(max(end - self.monotonic(), 0))
+
+
+@dataclass
+class Room:
+    """A projector behind PJLink, and everything that is said of it."""
+
+    power: Power = Power.ON
+    limit_s: float = 600.0
+    clock: Timed = field(default_factory=Timed)
+    said: list[tuple[float, str, str]] = field(default_factory=list[tuple[float, str, str]])
+    beats: list[tuple[float, str]] = field(default_factory=list[tuple[float, str]])
+
+    def __post_init__(self) -> None:
+        self.device = SimulatedProjector(self.clock, power=self.power)
+        self.pulled = False
+        self.cable: Link | None = None
+        self.projector = PjLinkProjector(self._connect, clock=self.clock)
+
+    def _connect(self) -> Link:
+        if self.pulled:
+            raise LinkClosed("nothing listens at 127.0.0.1:4352")
+        cable = self.cable = memory_link(PjLinkPeer(self.device))
+        return cable
+
+    def pull(self, pulled: bool = True) -> None:
+        self.pulled = pulled
+        if self.cable is not None:
+            self.cable.close()
+
+    @property
+    def patience(self) -> Patience:
+        def report(what: str, sentence: str) -> None:
+            self.said.append((self.clock.monotonic(), what, sentence))
+
+        def beat(state: str, sentence: str, within_s: float) -> None:
+            self.beats.append((self.clock.monotonic(), sentence))
+
+        return Patience(self.clock, self.limit_s, report, beat=beat)
+
+    @property
+    def words(self) -> list[str]:
+        return [what for _, what, _ in self.said]
+
+    def at(self, seconds: float, action: Callable[[], object]) -> None:
+        self.clock.due.append((seconds, action))
+
+
+def no_patience(clock: SimulatedClock) -> Patience:
+    return Patience(clock, 0)
+
+
+@pytest.mark.parametrize(("fault", "said"), [("frozen", "frozen"), ("unplugged", "no signal")])
+def test_a_picture_that_does_not_follow_is_noticed(fault: str, said: str) -> None:
+    clock = SimulatedClock()
+    beamer = SimulatedProjector(clock, power=Power.ON)
+    peer = PjLinkPeer(beamer)
+    projector = PjLinkProjector(lambda: memory_link(peer), clock=clock)
+    require_healthy(projector)
+    if fault == "frozen":
+        beamer.set_frozen(True)
+    else:
+        beamer.signal = NoResolution.NO_SIGNAL
+    with pytest.raises(DeviceFault, match=said):
+        require_healthy(projector)
+
+
+def test_a_cold_lamp_is_lit_and_given_its_minutes() -> None:
+    clock = SimulatedClock()
+    projector = SimulatedProjector(clock)
+    make_ready(projector, SEQUENCE, no_patience(clock))
+    assert projector.power() is Power.ON
+    assert clock.monotonic() >= 600 + projector.traits.warm_up_s
+
+
+def test_a_warm_lamp_is_not_waited_for() -> None:
+    clock = SimulatedClock()
+    make_ready(SimulatedProjector(clock, power=Power.ON), SEQUENCE, no_patience(clock))
+    assert clock.monotonic() == 0
+
+
+def test_a_warm_lamp_is_not_waited_for_though_the_answer_takes_its_time() -> None:
+    class Slow(SimulatedProjector):
+        def power(self) -> Power:
+            self.clock.sleep(0.1)
+            return super().power()
+
+    clock = SimulatedClock()
+    make_ready(Slow(clock, power=Power.ON), SEQUENCE, no_patience(clock))
+    assert clock.monotonic() < 1
+
+
+def test_a_projector_deaf_while_its_lamp_is_struck_is_waited_for() -> None:
+    class Deaf(SimulatedProjector):
+        def power(self) -> Power:
+            if (power := super().power()) is Power.WARMING:
+                raise LinkTimeout("the projector has not answered within 5 s")
+            return power
+
+    clock = SimulatedClock()
+    projector = Deaf(clock)
+    make_ready(projector, SEQUENCE, no_patience(clock))
+    assert clock.monotonic() >= 600 + projector.traits.warm_up_s
+
+
+def test_a_projector_that_cannot_tell_its_mute_is_told() -> None:
+    clock = SimulatedClock()
+    device = SimulatedProjector(clock, power=Power.ON)
+    device.set_muted(True)
+    make_ready(
+        OptomaProjector(lambda: SerialPeerLink(OptomaPeer(device, answers_mute=False)), clock=clock),
+        SequenceSettings(),
+        no_patience(clock),
+    )
+    assert not device.muted()
+
+
+def test_a_lamp_that_never_lights_is_given_up() -> None:
+    class Dead(SimulatedProjector):
+        def power(self) -> Power:
+            return Power.STANDBY
+
+    clock = SimulatedClock()
+    with pytest.raises(DeviceFault, match="standby"):
+        make_ready(Dead(clock), SequenceSettings(), no_patience(clock))
+    assert clock.monotonic() <= POWER_LIMIT_S + 2
+
+
+def test_the_minutes_of_a_warm_up_are_counted_down() -> None:
+    room = Room(Power.STANDBY)
+    make_ready(room.projector, SEQUENCE, room.patience)
+    assert room.words == ["warming up"]
+    assert room.said[0][2] == "the lamp was just lit; waiting 10 min 00 s until its colour is steady"
+    assert any("the lamp is being lit" in sentence for _, sentence in room.beats)
+    counted = [(at, sentence) for at, sentence in room.beats if "warms up" in sentence]
+    assert counted[0][1] == "the lamp warms up, 10 min 00 s left"
+    assert counted[-1][1] == "the lamp warms up, 5 s left"
+    times = [at for at, _ in counted]
+    assert max(after - before for before, after in pairwise(times)) <= 2 * PAUSE_S
+
+
+def test_a_lamp_that_goes_out_while_it_warms_up_gets_all_its_minutes_again() -> None:
+    room = Room(Power.STANDBY)
+    lit_again = 600.0
+
+    def relit() -> None:
+        room.device = SimulatedProjector(room.clock, power=Power.ON)
+        room.pull(False)
+
+    room.at(400, room.pull)
+    room.at(lit_again, relit)
+    make_ready(room.projector, SEQUENCE, room.patience)
+    assert room.words == ["warming up", "retry", "paused", "resumed", "warming up"]
+    assert room.clock.monotonic() >= lit_again + SEQUENCE.warm_up_s
+
+
+def test_a_picture_muted_while_the_lamp_warms_up_costs_no_minutes() -> None:
+    room = Room(Power.STANDBY)
+    room.at(200, lambda: room.device.set_muted(True))
+    room.at(300, lambda: room.device.set_muted(False))
+    make_ready(room.projector, SEQUENCE, room.patience)
+    assert room.words == ["warming up", "retry", "paused", "resumed"]
+    assert room.clock.monotonic() <= 600 + room.device.traits.warm_up_s + 2 * PAUSE_S
+
+
+def test_a_projector_that_came_back_in_standby_is_said_to_be_so() -> None:
+    room = Room()
+
+    def power_back() -> None:
+        room.device = SimulatedProjector(room.clock)
+        room.pull(False)
+
+    room.at(0, room.pull)
+    room.at(60, power_back)
+    room.at(200, lambda: room.device.switch_on())
+    room.clock.sleep(0)
+    await_health(room.projector, SEQUENCE, room.patience)
+    assert room.words == ["retry", "paused", "still paused", "still paused", "warming up", "resumed"]
+    assert "nothing listens" in room.said[1][2]
+    assert "standby" in room.said[2][2]
+    assert "warm-up" in room.said[3][2]
+    # What is said at any time is what holds then.
+    for at, sentence in room.beats:
+        if 70 < at < 195:
+            assert "standby" in sentence
+            assert "listens" not in sentence
+    assert room.clock.monotonic() >= 200 + SEQUENCE.warm_up_s
+
+
+@pytest.mark.parametrize(("away_s", "warms"), [(5.0, False), (RELIGHT_S + PAUSE_S, True)])
+def test_who_was_out_of_reach_for_long_may_have_lost_its_power(away_s: float, warms: bool) -> None:
+    room = Room()
+    room.pull()
+    room.at(away_s, lambda: room.pull(False))
+    await_health(room.projector, SEQUENCE, room.patience)
+    assert ("warming up" in room.words) == warms
+
+
+def test_a_lamp_reported_dark_while_power_is_on_is_no_warm_lamp() -> None:
+    dark = True
+
+    class Dark(SimulatedProjector):
+        def faults(self) -> tuple[Fault, ...]:
+            return (Fault("lamp", Severity.ERROR),) if dark else ()
+
+        def lamps(self) -> tuple[Lamp, ...]:
+            return (Lamp(120, lit=not dark),)
+
+    def replaced() -> None:
+        nonlocal dark
+        dark = False
+
+    clock = Timed()
+    projector = Dark(clock, power=Power.ON)
+    clock.due.append((30.0, replaced))
+    said: list[str] = []
+    await_health(projector, SEQUENCE, Patience(clock, 600, lambda what, sentence: said.append(what)))
+    assert said == ["retry", "paused", "warming up", "resumed"]
+
+
+def test_a_projector_unreachable_at_the_start_is_waited_for() -> None:
+    room = Room()
+    room.pull()
+    room.at(100, lambda: room.pull(False))
+    make_ready(room.projector, SEQUENCE, room.patience)
+    assert room.words == ["retry", "paused", "resumed"]
+
+
+def test_a_picture_muted_for_good_ends_the_run_with_its_cause() -> None:
+    room = Room()
+    room.device.set_muted(True)
+    with pytest.raises(DeviceFault, match=r"muted; .*; the run waited 10 min 00 s"):
+        await_health(room.projector, SEQUENCE, room.patience)
+    assert room.clock.monotonic() == pytest.approx(600)
