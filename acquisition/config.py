@@ -149,8 +149,9 @@ class JudgeSettings(_Settings):
     drift_percent: NotNegative = 1.0
     """Largest change of paper white from one white frame to the next, per cent: usual for a warm lamp; `build-lut`
     warns at as much."""
-    dark_percent: NotNegative = 0.5
-    """Largest light in a dark frame, of white, per cent: `build-lut` warns at as much."""
+    dark_percent: NotNegative = 5.0
+    """Largest light in a dark frame, of white, per cent: half of what `build-lut` refuses. It warns from 0.5 on, and so
+    does `acquire check`: light that is always there harms deep colours, and no frame gets better by being retaken."""
     ambient_percent: NotNegative = 0.2
     """Largest change of that light since the first dark frame, of white, per cent: `build-lut` warns at as much."""
     light_deg: NotNegative = 0.5

@@ -110,6 +110,14 @@ class Anchor:
             level[number] = np.median(np.mean(seen, axis=0)) if len(x) else np.nan
         return level
 
+    @property
+    def outlines(self) -> tuple[_Array, ...]:
+        """(K, 2) float64 each, px: outlines of the tags, or of the field; none where no chart is looked for."""
+        if not self.of_chart:
+            return ()
+        field = self.framing.field
+        return tuple(tag.corners_px for tag in self.framing.tags) if field is None else (field.corners_px,)
+
     def boxes(self) -> list[tuple[int, int, int, int]]:
         """Return what of the gauges' planes is not 0: left, top, right, bottom (exclusive)."""
         height, width = self.framing.plane.values.shape
@@ -145,8 +153,8 @@ def _brightest(values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
     height, width = smooth.shape
     found: list[tuple[int, int]] = []
     levels: list[float] = []
-    for top in np.linspace(2, height - 2, 13).astype(int)[:-1].tolist():
-        for left in np.linspace(2, width - 2, 17).astype(int)[:-1].tolist():
+    for top in range(2, height - height // 12, height // 12):
+        for left in range(2, width - width // 16, width // 16):
             part = smooth[top : top + height // 12 - 2, left : left + width // 16 - 2]
             row, column = divmod(int(part.argmax()), part.shape[1])
             found.append((left + column, top + row))
@@ -174,6 +182,7 @@ def _textures(plane: Plane) -> Framing:
                 continue
             part = energy[top:bottom, left:right]
             y, x = divmod(int(part.argmax()), part.shape[1])
-            corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)]) + (left + x, top + y)
-            tags.append(FoundTag(len(tags), corners + plane.offset_px, 0.0))
+            middle = np.array([left + x, top + y]) + plane.offset_px
+            corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
+            tags.append(FoundTag(len(tags), corners + middle, 0.0))
     return Framing(plane, tuple(tags), (), np.eye(3), 0.0, float("nan"), 1.0, True, 0.0)

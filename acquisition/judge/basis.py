@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.judge.measuring import Measured, Noise, strip_blocks
+from acquisition.judge.measuring import SEGMENTS, Measured, Noise, strip_blocks
 from foundation.robust import huber_weights, sigma_of
 
 _LIT = 0.01
@@ -27,6 +27,9 @@ _SYSTEMATIC = 0.003
 _FAINT = 0.1
 """Share of the median tile's signal below which deviations are measured against that share: a glint on a dark backdrop
 is not a fault of the picture."""
+
+_AT_REST_PX = 0.02
+"""Movement, half-size px, that no picture is moved for: the error of its measurement on a dark frame."""
 
 _ROUNDS = 6
 """Reweighted solutions in a row."""
@@ -118,27 +121,41 @@ class Basis:
         lit = strength > _LIT * np.median(strength)
         seen = frame.tiles - self.dark
         variance = _mean_variance(frame.tiles, frame.noise, blocks) + (_SYSTEMATIC * np.maximum(seen, 0)) ** 2
-        trust = lit.astype(np.float64)
-        amounts, inverse = np.zeros(3), np.eye(3)
+        trust, inverse = lit.astype(np.float64), np.eye(3)
+        # From the median of what each tile says by itself, which a person before a third of them does not move.
+        alone = np.moveaxis(design, 0, -1)[lit] + 1e-9 * strength[lit, None, None] * np.eye(3)
+        each = np.asarray(np.linalg.solve(alone, seen[lit][..., None]), dtype=np.float64)[..., 0]
+        amounts: _Array = np.median(each, axis=0)
         for _ in range(_ROUNDS):
+            off = np.sqrt(((seen - np.einsum("p,ptc->tc", amounts, design)) ** 2 / variance).sum(axis=1))
+            trust = lit * huber_weights(off, max(sigma_of(off[lit]), 1e-9)) ** 2
             weights = trust[:, None] / variance
             gram = np.einsum("ptc,tc,qtc->pq", design, weights, design)
             inverse = np.asarray(np.linalg.inv(gram + 1e-12 * np.trace(gram) * np.eye(3)), dtype=np.float64)
             amounts = inverse @ np.einsum("ptc,tc,tc->p", design, weights, seen)
-            off = np.sqrt(((seen - np.einsum("p,ptc->tc", amounts, design)) ** 2 / variance).sum(axis=1))
-            trust = lit * huber_weights(off, max(sigma_of(off[lit]), 1e-9)) ** 2
         tiles = _residuals(seen, amounts, design, self.dark, frame.noise, blocks, lit)
         return Light(amounts, inverse, tiles)
 
-    def strips(self, frame: Measured, amounts: _Array) -> Residuals | None:
-        """Return what amounts (3,) of light leave at the strips; None where these are not known."""
+    def strips(self, frame: Measured, amounts: _Array, down_px: float = 0.0, blur_px: float = 0.0) -> Residuals | None:
+        """Return what amounts (3,) of light leave at the strips; None where these are not known.
+
+        The pictures are moved down, and blurred, first if that is asked for, half-size px.
+        """
         if self.strip_maps is None or self.dark_strips is None:
             return None
-        strength = np.linalg.norm(self.strip_maps.sum(axis=0), axis=1)
+        maps = self.strip_maps
+        if blur_px > 0 or abs(down_px) > _AT_REST_PX:
+            from scipy.ndimage import gaussian_filter1d, shift
+
+            rows = maps.reshape(3, -1, SEGMENTS, 3)
+            rows = shift(rows, (0, down_px, 0, 0), order=1, mode="nearest")
+            rows = rows if blur_px == 0 else gaussian_filter1d(rows, blur_px, axis=1, mode="nearest")
+            maps = np.asarray(rows, dtype=np.float64).reshape(maps.shape)
+        strength = np.linalg.norm(maps.sum(axis=0), axis=1)
         blocks = np.full((len(strength), 1), strip_blocks(frame.places))
         lit = strength > _LIT * np.median(strength)
         seen = frame.strips - self.dark_strips
-        return _residuals(seen, amounts, self.strip_maps, self.dark_strips, frame.noise, blocks, lit)
+        return _residuals(seen, amounts, maps, self.dark_strips, frame.noise, blocks, lit)
 
 
 def _mean_variance(level: _Array, noise: Noise, blocks: _Array) -> _Array:

@@ -1,8 +1,9 @@
 """A frame as the judge keeps it: what was measured, where the chart was, and the bytes that the journal keeps of it.
 
 Format of the bytes (version 1): a zip archive of arrays as `numpy.savez` writes it, without pickled objects. `facts` is
-UTF-8 JSON as uint8; `tiles` (T, 3) float32; `strips` (S, 3) float32 or empty; `samples` (M, 2) uint16; an anchor's arrays
-begin with `anchor_`. Bytes of another version are passed over: the judge then begins anew, as at a session's start.
+UTF-8 JSON as uint8; `tiles` (T, 3) float32; `strips` (S, 3) float32 or empty; an anchor's arrays begin with `anchor_`.
+Samples of noise are not kept: the digest knows a frame again. Bytes of another version are passed over: the judge then
+begins anew, as at a session's start.
 """
 
 from __future__ import annotations
@@ -21,8 +22,7 @@ from acquisition.framing.planes import CHANNELS, Channel, Plane
 from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.tags import FoundTag
 from acquisition.judge.anchor import Anchor
-from acquisition.judge.measuring import Measured, Noise
-from acquisition.judge.places import Places
+from acquisition.judge.measuring import Measured, Noise, Places
 
 VERSION = 1
 """Of the format of the bytes."""
@@ -68,7 +68,6 @@ class Frame:
         arrays: dict[str, npt.NDArray[Any]] = {
             "tiles": frame.tiles.astype(np.float32),
             "strips": (frame.strips if with_strips else frame.strips[:0]).astype(np.float32),
-            "samples": frame.samples,
         }
         if self.anchor is not None:
             arrays |= _anchor_arrays(self.anchor)
@@ -90,7 +89,7 @@ class Frame:
                 measured = Measured(
                     tiles=arrays["tiles"].astype(np.float64),
                     strips=arrays["strips"].astype(np.float64),
-                    samples=arrays["samples"],
+                    samples=np.empty((0, 2), dtype=np.uint16),
                     digest=bytes.fromhex(facts["digest"]),
                     noise=Noise(*facts["noise"]),
                     black=facts["black"][0],

@@ -12,7 +12,8 @@ LIGHT_SIGMAS: Final = 5.5
 """Standard deviations of two degrees of freedom: exceeded by chance once in four million frames."""
 
 BRIGHTNESS_SIGMAS: Final = 6.0
-"""Standard deviations of the lamp's level: exceeded once in 500 million frames; tails of a flickering lamp are longer."""
+"""Standard deviations of the lamp's level: exceeded once in 500 million frames; tails of a flickering lamp are
+longer."""
 
 STALE_SIGMAS: Final = 3.5
 """Standard deviations off from which on the light of the frame before is asked for: few lights are so near to the one
@@ -25,11 +26,14 @@ OTHER_ADVANTAGE: Final = 20.0
 """The same for any other light of the plan: a likelihood 22 000 times larger, as there are 706 of them."""
 
 UNEVEN: Final = 0.02
-"""Deviation of a tile from the light of the whole frame, relative: an LCD's unevenness changes by as much between codes;
-a lamp's arc that wanders shifts the field by less."""
+"""Deviation of a tile from the light of the whole frame, relative: an LCD's unevenness changes by as much between
+codes; a lamp's arc that wanders shifts the field by less."""
 
 UNEVEN_WHITE: Final = 0.25
 """The same where the primaries are not known and the camera's own colours stand for them."""
+
+UNEVEN_TILES: Final = 0.05
+"""Share of the tiles that must deviate by so much there."""
 
 UNEVEN_SIGMAS: Final = 7.0
 """Standard deviations of a tile's noise: of 384 tiles in 767 frames of 100 sessions none exceeds them by chance."""
@@ -78,4 +82,5 @@ LASTING_FRAMES: Final = 3
 """Frames refused in a row for one cause that make it a lasting one: as many as a step has attempts by default."""
 
 NOMINAL_DEG: Final = 8.0
-"""Angle between two lights' codes in linear light from which on they cannot look alike, where no primaries are known."""
+"""Angle between two lights' codes in linear light from which on they cannot look alike, where no primaries are
+known."""

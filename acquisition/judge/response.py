@@ -36,7 +36,8 @@ _OWN = 0.15
 """How much of that a primary may have for itself: the three curves of a projector are much alike, LCDs least."""
 
 _LEVEL = 0.01
-"""Prior standard deviation of a primary's frame at `FULL` about its true level: a colour wheel's ½ %, and the lamp's."""
+"""Prior standard deviation of a primary's frame at `FULL` about its true level: a colour wheel's ½ %, and the
+lamp's."""
 
 _OVERLAP = 0.25
 """Prior standard deviation of the light added where primaries overlap: white segments add up to half."""
@@ -108,10 +109,11 @@ def _table() -> _Array:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The amounts (3,) expected of codes, and their covariance (3, 3) without the lamp's, both float64."""
+    """The amounts (3,) expected of codes, their covariance (3, 3) without the lamp's, and with it, all float64."""
 
     amounts: _Array
     covariance: _Array
+    with_lamp: _Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,9 +197,18 @@ class ProjectorModel:
         fixed = slopes.copy()
         fixed[:, _LAMP] = 0
         # A frame that is far from anything known could be anything between nothing and full.
-        relative = np.clip(fixed @ self.covariance @ fixed.T, -4, 4)
-        relative += np.diag(self.chroma_sd**2 + extra**2)
-        return Prediction(amounts, relative * np.outer(amounts, amounts) + _ABSOLUTE**2 * np.eye(3))
+        scale, own = np.outer(amounts, amounts), np.diag(self.chroma_sd**2 + extra**2)
+        without, total = (np.clip(part @ self.covariance @ part.T, -4, 4) + own for part in (fixed, slopes))
+        floor = _ABSOLUTE**2 * np.eye(3)
+        return Prediction(amounts, without * scale + floor, total * scale + floor)
+
+    def curves(self) -> _Array:
+        """Return (3, 256) float64: the amount of each primary alone at each code, the lamp as it is."""
+        curves = self.state[:_CURVES].reshape(3, _N) @ _table().T
+        levels = self.state[_CURVES : _CURVES + 3, None] + self.state[_LAMP]
+        amounts = np.exp(np.minimum(_POWER * _x(np.arange(256)) + curves + levels, 5))
+        amounts[:, 0] = 0
+        return np.asarray(amounts, dtype=np.float64)
 
     def compare(self, amounts: _Array, codes: Codes, added: _Array | None = None) -> Fit:
         """Return how well amounts (3,) float64 agree with codes; `added` (3, 3) is their own covariance."""
@@ -211,7 +222,8 @@ class ProjectorModel:
         sine = np.linalg.norm(np.cross(amounts, h))
         angle = float(np.degrees(np.arctan2(sine, amounts @ h))) if h.any() else 180.0
         brightness = float(np.log(max(level, 1e-6)))
-        sd = (1 / power + self.brightness_sd**2 + self.covariance[_LAMP, _LAMP]) ** 0.5
+        share = weight @ h / power
+        sd = (float(share @ expected.with_lamp @ share) + self.brightness_sd**2 + LAMP_STEP**2) ** 0.5
         return Fit(distance, angle, brightness, sd)
 
     def learn(self, amounts: _Array, codes: Codes) -> ProjectorModel:
@@ -248,9 +260,7 @@ class ProjectorModel:
         covariance[_LAMP, _LAMP] += RESTED**2
         return replace(self, covariance=covariance)
 
-    def _scatter(
-        self, off: _Array, innovation: _Array, count: int
-    ) -> tuple[tuple[float, float], tuple[float, float]]:
+    def _scatter(self, off: _Array, innovation: _Array, count: int) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the sums of squares and numbers of scatter after a frame whose logarithms are `off` (count,)."""
         mean = float(off.mean())
         # What the model does not know yet is no scatter: each frame weighs by how much of its deviation that is.
@@ -258,7 +268,8 @@ class ProjectorModel:
         spread = float(np.mean(np.diag(innovation)) - np.mean(innovation))
         weight = min(1.0, own / max(spread, 1e-12)) * (count - 1)
         chroma = (
-            self.chroma[0] + weight * min(float(((off - mean) ** 2).sum()) / max(count - 1, 1), (8 * self.chroma_sd) ** 2),
+            self.chroma[0]
+            + weight * min(float(((off - mean) ** 2).sum()) / max(count - 1, 1), (8 * self.chroma_sd) ** 2),
             self.chroma[1] + weight,
         )
         together = min(1.0, self.brightness_sd**2 / max(float(np.mean(innovation)), 1e-12))

@@ -1,0 +1,146 @@
+"""A small room whose frames are judged: a chart of 3 bits before the Test body, and everything that can go wrong."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from acquisition.chart.layout import design_chart
+from acquisition.chart.model import Chart
+from acquisition.config import LabSettings, parse_lab
+from acquisition.judge.judge import LiveJudge
+from acquisition.lights.illuminations import Illumination, plan_illuminations
+from acquisition.run.rig.simulated import sheet
+from acquisition.session.judgement import Judgement
+from acquisition.session.plan import RESPONSE, SessionStep, plan_steps
+from drivers.camera import ExposureSettings
+from drivers.presenter import Colour
+from sim.camera.dng import write_dng
+from sim.world.room import Room
+from sim.world.sensors import BODIES, Body
+from sim.world.world import World
+
+LAB = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "illuminations.csv"\n'
+
+Counts = npt.NDArray[np.uint16]
+_frames = itertools.count()
+
+
+def altered(world: World, change: Callable[[npt.NDArray[np.float32]], npt.NDArray[np.float32]]) -> World:
+    """Return the same room with another picture: `change` gets each half-size plane of a primary's light."""
+    other = copy.copy(world)
+    light = world._render().copy()  # pyright: ignore[reportPrivateUsage]
+    for primary in light:
+        for row in (0, 1):
+            for column in (0, 1):
+                primary[row::2, column::2] = change(np.ascontiguousarray(primary[row::2, column::2]))
+    other._light = light  # pyright: ignore[reportPrivateUsage]
+    return other
+
+
+def moved(world: World, dx: float, dy: float) -> World:
+    def change(plane: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        by = np.array([[1, 0, dx], [0, 1, dy]], dtype=np.float32)
+        size = (plane.shape[1], plane.shape[0])
+        warped = cv2.warpAffine(plane, by, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return np.maximum(np.asarray(warped, dtype=np.float32), 0)
+
+    return altered(world, change)
+
+
+def blurred(world: World, sigma: float) -> World:
+    return altered(world, lambda plane: np.asarray(cv2.GaussianBlur(plane, (0, 0), sigma), dtype=np.float32))
+
+
+def shaded(world: World, left: float, top: float, right: float, bottom: float, left_over: float) -> World:
+    """Return the room with something before a part of the frame, whose edges are shares of it."""
+
+    def change(plane: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        height, width = plane.shape
+        plane[int(top * height) : int(bottom * height), int(left * width) : int(right * width)] *= left_over
+        return plane
+
+    return altered(world, change)
+
+
+def with_room(world: World, **changes: Any) -> World:
+    """Return the world with a room in which something differs that is not drawn: ambient light, tone curve."""
+    other = copy.copy(world)
+    other.room = replace(world.room, **changes)
+    return other
+
+
+@dataclass
+class Bench:
+    """A judge, the room before it, and the frames of a plan."""
+
+    world: World
+    chart: Chart
+    lights: tuple[Illumination, ...]
+    steps: tuple[SessionStep, ...]
+    settings: LabSettings
+    folder: Path
+    judge: LiveJudge
+    body: Body = BODIES["Test"]
+
+    def counts(self, step: SessionStep, world: World | None = None, lamp: float = 1.0) -> Counts:
+        """Return the counts of a new frame: no two have the same noise."""
+        settings = self.settings.camera.exposure
+        return (world or self.world).expose(step.colour, settings, key=(next(_frames),), lamp=lamp)
+
+    def show(self, counts: Counts, step: SessionStep, **writing: Any) -> Judgement:
+        """Return what is said of counts."""
+        path = self.folder / "frame.dng"
+        given: dict[str, Any] = {
+            "settings": self.settings.camera.exposure,
+            "taken_at": datetime(2026, 1, 1, tzinfo=UTC),
+            **writing,
+        }
+        body = given.pop("body", self.body)
+        with path.open("wb") as stream:
+            write_dng(stream, counts, body, **given)
+        return self.judge.judge(path, step)
+
+    def take(self, step: SessionStep, world: World | None = None, lamp: float = 1.0) -> Judgement:
+        return self.show(self.counts(step, world, lamp), step)
+
+    def fork(self) -> Bench:
+        """Return the bench with a judge of its own that knows what this one does."""
+        return replace(self, judge=copy.copy(self.judge))
+
+    def light(self, red: int, green: int, blue: int, number: int = 900) -> SessionStep:
+        return SessionStep(number, "light", 0, Colour(red, green, blue))
+
+
+def bench(folder: Path, room: Room, count: int = 12, every: int = 6, lab: str = LAB, response: bool = True) -> Bench:
+    chart = design_chart(3, "A7")
+    plan = plan_illuminations()
+    order: list[int] = np.random.default_rng(room.seed).permutation(len(plan)).tolist()
+    some = tuple(replace(plan[k], index=n) for n, k in enumerate(order[:count]))
+    settings = parse_lab(lab, "LAB.toml")
+    steps = plan_steps(some, every, seed=1, response=RESPONSE if response else ())
+    world = World(sheet(chart), BODIES["Test"], room)
+    return Bench(world, chart, plan, steps, settings, folder, LiveJudge(settings, chart, plan))
+
+
+@pytest.fixture(scope="session")
+def taught(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """Make a bench whose judge has seen a whole small session under a colour wheel, all of it accepted."""
+    made = bench(tmp_path_factory.mktemp("judge"), Room(seed=3, wheel_hz=60, transfer=2.2), count=24, every=12)
+    for step in made.steps:
+        judgement = made.take(step)
+        assert judgement.accepted, f"{step}: {judgement.reason}"
+    return made
+
+
+EXPOSURE = ExposureSettings(100, 8.0, 0.5)
