@@ -170,6 +170,8 @@ class SimulatedSettings(_Settings):
     """Seed of everything that chance decides: paper, noise."""
     room: dict[str, bool | int | float | str] = {}
     """Physical parameters of the room that differ from the default; see sim.world.world.Room."""
+    events: tuple[dict[str, Any], ...] = ()
+    """What goes wrong, by frame or time; see sim.world.disturbances. May change within a session, as luck does."""
 
 
 class ReplaySettings(_Settings):

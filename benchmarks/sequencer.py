@@ -11,6 +11,7 @@ import json
 import os
 import tempfile
 import time
+from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO
 
@@ -54,6 +55,7 @@ class PreparedCamera:
     def __init__(self, screen: Screen, clock: SimulatedClock) -> None:
         self.screen, self.clock = screen, clock
         self.lit, self.dark = _raw(5000), _raw(0)
+        self.content = self.dark
 
     def identity(self) -> CameraIdentity:
         """Return a name."""
@@ -66,9 +68,14 @@ class PreparedCamera:
         """Offer none: nobody asks."""
         return ()
 
-    def capture(self, into: BinaryIO) -> CapturedFrame:
+    def expose(self) -> datetime:
+        """See what the screen shows."""
+        self.content = self.dark if self.screen.colour == BLACK else self.lit
+        return self.clock.now()
+
+    def download(self, into: BinaryIO) -> CapturedFrame:
         """Write a file."""
-        content = self.dark if self.screen.colour == BLACK else self.lit
+        content = self.content
         return CapturedFrame("IMG_0001.DNG", into.write(content), self.clock.now())
 
     def close(self) -> None:

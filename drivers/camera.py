@@ -1,7 +1,8 @@
 """The interface of a tethered camera, and the values that it takes and returns.
 
 Kept small so that a second maker fits beside the first: a camera is configured once, then asked for one raw frame
-after another, each written whole into a file that the caller opened.
+after another, each written whole into a file that the caller opened. Exposure and download are two calls, so that the
+light can be changed while the frame travels.
 """
 
 from __future__ import annotations
@@ -76,18 +77,72 @@ class Camera(Protocol):
         """
         ...
 
-    def capture(self, into: BinaryIO) -> CapturedFrame:
-        """Release the shutter without autofocus and write the raw file, whole and unchanged, to `into`.
+    def expose(self) -> datetime:
+        """Release the shutter without autofocus; return when it was released, UTC, once the light may change.
+
+        A frame that was exposed before and has not been downloaded is dropped.
+
+        Raises
+        ------
+        DeviceRefused
+            The body was never configured, or declines to take a frame.
+        DeviceError
+            No frame was taken, or none can be found; it may be exposed again.
+        """
+        ...
+
+    def download(self, into: BinaryIO) -> CapturedFrame:
+        """Write the raw file of the frame exposed last, whole and unchanged, to `into`.
+
+        A download that failed may be tried again with a new stream, and gives the same frame.
 
         Raises
         ------
         DeviceError
-            The frame did not arrive; what `into` holds is worthless and may be retaken.
+            The frame did not arrive, and what `into` holds is worthless; or the body holds no frame, or no longer, and
+            the message says so: then it must be exposed again.
         """
         ...
 
     def close(self) -> None:
         """Give the camera back to its user; a second call does nothing."""
+        ...
+
+
+@dataclass(frozen=True)
+class Supplies:
+    """What a camera has left for a long series; None is what it does not tell.
+
+    Attributes
+    ----------
+    battery
+        Charge, 0 … 1, in the few steps that the body reports.
+    mains
+        Whether it runs on mains power.
+    card_free_bytes
+        Room on the card where frames go, bytes; on all cards together where there are several.
+    saves_to_host
+        Whether frames go to the host and leave nothing on the card.
+    """
+
+    battery: float | None = None
+    mains: bool | None = None
+    card_free_bytes: int | None = None
+    saves_to_host: bool = True
+
+
+@runtime_checkable
+class ReportsSupplies(Protocol):
+    """A camera that can tell how long it will last."""
+
+    def supplies(self) -> Supplies:
+        """Return what is left of battery and card.
+
+        Raises
+        ------
+        DeviceError
+            It cannot be reached.
+        """
         ...
 
 
@@ -98,6 +153,18 @@ class NeedsKeepAlive(Protocol):
     def idle(self) -> None:
         """Keep the camera awake and empty its queue of events; call it every few seconds of a pause."""
         ...
+
+
+def capture(camera: Camera, into: BinaryIO) -> CapturedFrame:
+    """Take a frame: expose it, and write its raw file to `into`.
+
+    Raises
+    ------
+    DeviceError
+        From either; what `into` holds is worthless, and the frame may be taken again.
+    """
+    camera.expose()
+    return camera.download(into)
 
 
 def keep_awake(camera: Camera) -> None:

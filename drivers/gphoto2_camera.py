@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
+from datetime import datetime
 from typing import TYPE_CHECKING, BinaryIO
 
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
@@ -59,6 +60,7 @@ class Gphoto2Camera:
         self._clock = clock
         self._camera: gphoto2.Camera | None = None
         self._settings: ExposureSettings | None = None
+        self._exposed: tuple[gphoto2.CameraFilePath, datetime] | None = None
         self._closed = False
         library()
 
@@ -92,34 +94,50 @@ class Gphoto2Camera:
             numbers = (_number(label) for label in _choices(camera, "shutterspeed"))
             return tuple(sorted({number for number in numbers if number is not None}))
 
-    def capture(self, into: BinaryIO) -> CapturedFrame:
-        """Release the shutter and write the raw file, whole and unchanged, to `into`.
+    def expose(self) -> datetime:
+        """Release the shutter; return when it was released, UTC, once libgphoto2 names the file.
+
+        A frame that was exposed before and has not been downloaded is dropped.
 
         Raises
         ------
         DeviceRefused
             The body was never configured.
         DeviceError
-            The frame did not arrive; what `into` holds is worthless and may be retaken.
+            No frame was taken, or it cannot be reached; it may be exposed again.
         """
         settings = self._settings
         if settings is None:
-            raise DeviceRefused("the camera has no exposure settings; configure it before the first capture")
+            raise DeviceRefused("the camera has no exposure settings; configure it before the first exposure")
         gp = library()
         fresh = self._camera is None
         with self._speaking() as camera:
+            self._forget(camera)
             if fresh:
                 self._apply(camera, settings)
             released_at = self._clock.now()
-            path = camera.capture(gp.GP_CAPTURE_IMAGE)
-            try:
-                # The bytes belong to `file` and go with it.
-                file = camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)
-                size = into.write(file.get_data_and_size())
-            finally:
-                # What waits in the camera's memory would fill it; where it has gone already there is nothing to delete.
-                with contextlib.suppress(gp.GPhoto2Error):
-                    camera.file_delete(path.folder, path.name)
+            self._exposed = camera.capture(gp.GP_CAPTURE_IMAGE), released_at
+        return released_at
+
+    def download(self, into: BinaryIO) -> CapturedFrame:
+        """Write the raw file of the frame exposed last, whole and unchanged, to `into`.
+
+        It may be tried again where writing failed; after a fault of the connection libgphoto2 has forgotten the frame.
+
+        Raises
+        ------
+        DeviceError
+            The frame did not arrive, and what `into` holds is worthless; or there is none, and the message says so.
+        """
+        if self._exposed is None:
+            raise DeviceError("no exposed frame waits in the camera to be downloaded; expose it again")
+        path, released_at = self._exposed
+        gp = library()
+        with self._speaking() as camera:
+            # The bytes belong to `file` and go with it.
+            file = camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)
+            size = into.write(file.get_data_and_size())
+            self._forget(camera)
         return CapturedFrame(path.name, size, released_at)
 
     def close(self) -> None:
@@ -127,7 +145,16 @@ class Gphoto2Camera:
         self._closed = True
         self._drop()
 
+    def _forget(self, camera: gphoto2.Camera) -> None:
+        """Delete the exposed frame, if any: what waits in the camera's memory would fill it."""
+        exposed, self._exposed = self._exposed, None
+        if exposed is not None:
+            path, _ = exposed
+            with contextlib.suppress(library().GPhoto2Error):  # where it has gone already there is nothing to delete
+                camera.file_delete(path.folder, path.name)
+
     def _drop(self) -> None:
+        self._exposed = None
         # libgphoto2 takes its leave when the last reference goes; an `exit` that fails and is then repeated closes file
         # descriptors that belong to others by then.
         self._camera = None

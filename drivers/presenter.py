@@ -43,6 +43,21 @@ class Presenter(Protocol):
 
 
 @runtime_checkable
+class ReadsBack(Protocol):
+    """A presenter that can read what the screen shows, at any time after `Presenter.show`."""
+
+    def verify(self, colour: Colour) -> None:
+        """Return if the screen shows exactly `colour` everywhere now.
+
+        Raises
+        ------
+        DeviceError
+            It does not, or cannot be read; with what covers it where that is known.
+        """
+        ...
+
+
+@runtime_checkable
 class ReportsWarnings(Protocol):
     """A presenter that can report what changes, or may change, the light behind the codes that it shows."""
 

@@ -4,7 +4,7 @@ The camera's response to each cell of the simulated print is computed for the pr
 a given chromaticity is the one mixture of them that has it. A thumbnail's pixel is the mean of the cells that dithering
 would put there, so that there is neither noise of dithering nor of the sensor. Everything else is that of the commands:
 lights of the other half of the camera's images, learners of the suite, cross-validation over the whole camera, pooled
-ratios with bootstrap intervals paired by image.
+ratios with bootstrap intervals paired by image, means over the seeds.
 
     python examples/screening.py --pictures BSDS500/data/images --pictures imagenet-sample-images \
         --archives ../shared/data/benchmark --sensitivities ../shared/data/ssf --lever naive-matrix --lever random-like
@@ -17,6 +17,7 @@ weighted to the grey-world offsets of the other half's images); relit: real scen
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +30,8 @@ import numpy.typing as npt
 from scipy.spatial import Delaunay, cKDTree
 from scipy.stats import gaussian_kde
 
-from evaluation.experiments.bootstrap import paired
+from evaluation.experiments.bootstrap import STATISTICS, Statistic
+from evaluation.experiments.resampling import ErrorSample, bca, resamples
 from evaluation.learning.feature_learner import FeatureLearner
 from evaluation.learning.standard import standard_learners
 from evaluation.metrics import recovery_error
@@ -50,6 +52,7 @@ LINEAR = decode_srgb(np.arange(256) / 255)
 WIDTH = 32
 CODES = np.rint(np.arange(WIDTH) * 255 / (WIDTH - 1)).astype(np.int64)
 SIDE, SMALL = 128, 64
+RESAMPLES = 2000
 WHITE, VEIL = 0.97, 0.97
 """White point of the target over the paper's white, and the most of the print's black that is taken out."""
 
@@ -242,42 +245,65 @@ def main() -> None:
     parser.add_argument("--learners", default="regression-trees,kernel-ridge,log-chroma")
     parser.add_argument("--cameras", default=",".join(CAMERAS))
     parser.add_argument("--images", type=int, default=900)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, default=1, help="of learners, folds and training images: 0, 1, …")
     given = parser.parse_args()
     cameras = given.cameras.split(",")
     learners = {key: standard_learners()[key] for key in given.learners.split(",")}
+    seeds = range(given.seeds)
     pictures = read_pictures(given.pictures)
     real = {name: read_real(given.archives, name) for name in CAMERAS}
     prints = {name: Print(given.sensitivities, name) for name in cameras}
     known = {(c, k): features_of(one, list(real[c].images), True) for c in cameras for k, one in learners.items()}
-    errors: dict[str, dict[tuple[str, str], Floats]] = {"real": {}}
-    for camera, key in known:
+    places = {key: np.zeros((given.seeds, len(real[key[0]].lights))) for key in known}
+    errors: dict[str, dict[tuple[str, str], Floats]] = {"real": places}
+    for (camera, key), seed in itertools.product(known, seeds):
         lights = real[camera].lights
-        fold = np.random.default_rng(given.seed).permutation(len(lights)) % 3
-        found = np.zeros(len(lights))
+        fold = np.random.default_rng(seed).permutation(len(lights)) % 3
         for number in range(3):
             held = fold == number
-            model = learners[key].fit_features(known[camera, key][~held], lights[~held], given.seed)
-            found[held] = recovery_error(model.lights(known[camera, key][held]), lights[held])
-        errors["real"][camera, key] = found
+            model = learners[key].fit_features(known[camera, key][~held], lights[~held], seed)
+            found = recovery_error(model.lights(known[camera, key][held]), lights[held])
+            errors["real"][camera, key][seed, held] = found
     for lever in given.lever:
         errors[lever] = {place: np.zeros_like(found) for place, found in errors["real"].items()}
         for camera in cameras:
             others = [some for name, some in real.items() if name != camera]
             training = Training(lever, pictures, prints[camera], real[camera], others)
             halves = real[camera].halves()
-            for half in (0, 1):
-                rng = np.random.default_rng(1000 * given.seed + half)
+            for half, seed in itertools.product((0, 1), seeds):
+                rng = np.random.default_rng(1000 * seed + half)
                 other, test = halves[1 - half], halves[half]
                 turns = given.images // len(other) + 1
                 under = np.concatenate([rng.permutation(len(other)) for _ in range(turns)])[: given.images]
                 images, truths = training.make(real[camera].lights[other][under], other, rng)
                 for key, learner in learners.items():
                     made = features_of(learner, images, lever == "relit")
-                    model = learner.fit_features(made, truths, given.seed)
+                    model = learner.fit_features(made, truths, seed)
                     found = recovery_error(model.lights(known[camera, key][test]), real[camera].lights[test])
-                    errors[lever][camera, key][test] = found
+                    errors[lever][camera, key][seed, test] = found
         _tell(errors, lever, cameras, list(learners))
+
+
+def ratios_of(one: Floats, other: Floats) -> list[tuple[float, float, float]]:
+    """Return the ratio of each statistic of errors (seeds, N), a mean over the seeds, with its interval.
+
+    A resample is of images, and one that is drawn counts in every seed, as `evaluate transfer` has it.
+    """
+    samples = [[ErrorSample.of(errors) for errors in several] for several in (one, other)]
+    drawn: list[list[Floats]] = [[], []]
+    for counts in resamples(one.shape[1], 0, RESAMPLES):
+        for batches, several in zip(drawn, samples, strict=True):
+            batches.append(np.mean([sample.statistics(counts) for sample in several], axis=0))
+    estimates, left_out = (
+        [np.mean([getattr(sample, name)() for sample in several], axis=0) for several in samples]
+        for name in ("estimate", "without_each")
+    )
+    replicates = np.concatenate(drawn[0]) / np.concatenate(drawn[1])
+    value, without = estimates[0] / estimates[1], left_out[0] / left_out[1]
+    return [
+        (float(value[place]), *bca(float(value[place]), replicates[:, place], [without[:, place]], 0.95))
+        for place in range(len(STATISTICS))
+    ]
 
 
 def _tell(
@@ -285,18 +311,21 @@ def _tell(
 ) -> None:
     for base in (name for name in ("real", "naive-matrix") if name in errors and name != lever):
         for key in learners:
-            one, other = (np.concatenate([errors[name][camera, key] for camera in cameras]) for name in (lever, base))
-            ratios = {made.statistic: made.ratio for made in paired(one, other)}
+            pair = [np.concatenate([errors[name][camera, key] for camera in cameras], axis=1) for name in (lever, base)]
+            ratios = dict(zip(STATISTICS, ratios_of(*pair), strict=True))
             told = [f"{name} {ratios[name][0]:.2f} ({ratios[name][1]:.2f} – {ratios[name][2]:.2f})" for name in _SHOWN]
-            each = [
-                f"{camera} {np.median(errors[lever][camera, key]) / np.median(errors[base][camera, key]):.2f}"
-                f"/{errors[lever][camera, key].mean() / errors[base][camera, key].mean():.2f}"
-                for camera in cameras
-            ]
-            print(f"{lever} against {base}, {key}: {', '.join(told)}; {', '.join(each)}", flush=True)
+            each: list[str] = []
+            for camera in cameras:
+                alone = dict(
+                    zip(STATISTICS, ratios_of(errors[lever][camera, key], errors[base][camera, key]), strict=True)
+                )
+                each.append(f"{camera} {alone['median'][0]:.2f}/{alone['mean'][0]:.2f}")
+            medians = np.median(pair[0], axis=1) / np.median(pair[1], axis=1)
+            spread = f"; medians by seed {medians.min():.2f} … {medians.max():.2f}" if len(medians) > 1 else ""
+            print(f"{lever} against {base}, {key}: {', '.join(told)}; {', '.join(each)}{spread}", flush=True)
 
 
-_SHOWN = ("median", "mean", "worst25")
+_SHOWN: tuple[Statistic, ...] = ("median", "mean", "worst25")
 
 if __name__ == "__main__":
     main()

@@ -29,7 +29,38 @@ _REMEDIES = {
     errno.ENAMETOOLONG: "name it shorter",
     errno.ELOOP: "links there lead in a circle; name the place that is meant",
 }
-_DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG, errno.EACCES, errno.EPERM}
+_AGAIN = "then run the same command again"
+_GONE = f"the disk is gone: connect and mount it, {_AGAIN}"
+_SERVER = f"the server of that folder does not answer: see to the network and to the server, {_AGAIN}"
+_DISK_REMEDIES = {
+    "ENOSPC": f"free space or choose another disk, {_AGAIN}",
+    "EDQUOT": f"what this user may use of the disk is used up: remove files there, or ask for more, {_AGAIN}",
+    "EFBIG": f"no file may be so large there (FAT32 ends at 4 GiB; ulimit -f): choose another disk, {_AGAIN}",
+    "EROFS": (
+        "the disk can only be read, as the system makes one on which it found errors: see what dmesg says, mount it "
+        f"for writing or choose another, {_AGAIN}"
+    ),
+    "EIO": (
+        "the disk fails: see what dmesg says, check its cable, copy what is on it to another while it can be read, "
+        f"{_AGAIN}"
+    ),
+    "ENODEV": _GONE,
+    "ENXIO": _GONE,
+    "ENOMEDIUM": _GONE,
+    "ENOENT": f"its folder is gone: connect and mount the disk it was on, {_AGAIN}",
+    "ESTALE": f"the folder was taken away or mounted anew on its server: mount it again here, {_AGAIN}",
+    "ENOTCONN": _SERVER,
+    "EREMOTEIO": _SERVER,
+    "EHOSTDOWN": _SERVER,
+    "EUCLEAN": f"the file system is damaged: unmount it and have it checked (fsck), {_AGAIN}",
+    "EMFILE": f"close other programs, or allow more open files (ulimit -n), {_AGAIN}",
+    "ENFILE": f"close other programs, {_AGAIN}",
+}
+"""What helps against each fault of a disk, by the names of errno(3); not every system knows all of them."""
+_DISK_FAULTS = {getattr(errno, name): remedy for name, remedy in _DISK_REMEDIES.items() if hasattr(errno, name)}
+_NAMELESS = (_DISK_FAULTS.keys() | {errno.EACCES, errno.EPERM}) - {errno.ENOENT, errno.ENOTCONN}
+"""Faults of a write to an open file, of which the system does not say which one: these cannot be a socket's, nor a
+file's that somebody reads meanwhile."""
 
 
 def partial_path(path: Path) -> Path:
@@ -47,13 +78,24 @@ def remedy_of(error: OSError) -> str | None:
     return _REMEDIES.get(error.errno or 0)
 
 
-def storage_error(path: Path, error: OSError) -> InputError | StorageError:
-    """Return what went wrong at `path` as one sentence with its remedy; an InputError if the name is to blame."""
+def disk_remedy_of(error: OSError) -> str | None:
+    """Return what helps against a fault of the disk, not of the path; None if the fault is another."""
+    return _DISK_FAULTS.get(error.errno or 0)
+
+
+def storage_error(path: Path, error: OSError, what: str = "write") -> InputError | StorageError:
+    """Return what went wrong at `path` as one sentence with its remedy; an InputError if the name is to blame.
+
+    Parameters
+    ----------
+    what
+        What cannot be done with it: "write", "look into".
+    """
     remedy = remedy_of(error)
     by_name = remedy is not None and not isinstance(error, PermissionError)
     return (InputError if by_name else StorageError)(
-        f"cannot write {path}: {error.strerror or error}; "
-        f"{remedy or 'free space or choose another disk, then run the same command again'}"
+        f"cannot {what} {path}: {error.strerror or error}; "
+        f"{remedy or disk_remedy_of(error) or f'see to the disk, or choose another, {_AGAIN}'}"
     )
 
 
@@ -62,8 +104,7 @@ def _is_ours(error: BaseException, path: Path) -> TypeGuard[OSError]:
     if not isinstance(error, OSError):
         return False
     if not isinstance(error.filename, str | bytes):
-        # A write to an open file does not say which one; these numbers are no fault of anything but a disk.
-        return error.errno in _DISK_FAULTS
+        return error.errno in _NAMELESS
     about, partial = Path(os.fsdecode(error.filename)), partial_path(path)
     return about in (path, partial, *path.parents) or partial in about.parents
 
@@ -86,30 +127,43 @@ def make_folder(folder: Path, of: Path | None = None) -> None:
         The disk is full, read-only or gone.
     """
     path = folder if of is None else of
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
-    except OSError as error:
-        raise storage_error(path, error) from error
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            # Another program may have taken it away between two calls.
+            if os.path.lexists(folder) and not folder.is_dir():
+                raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
+        except NotADirectoryError as error:
+            raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
+        except OSError as error:
+            raise storage_error(path, error) from error
+        else:
+            return
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in `folder` durable; does nothing where the system cannot."""
+    """Make the names in `folder` durable; does nothing where the system cannot.
+
+    Raises
+    ------
+    StorageError
+        The disk fails: a name that was given may be lost when the power is.
+    """
     try:
         handle = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(handle)
-    except OSError:
-        pass
-    finally:
-        os.close(handle)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        # Systems that cannot flush a folder say EINVAL, ENOTSUP or EACCES.
+        if disk_remedy_of(error):
+            raise storage_error(folder, error) from error
 
 
 @contextmanager
-def whole_file(path: Path, final: Callable[[], Path] | None = None) -> Generator[BufferedRandom]:
+def whole_file(path: Path, final: Callable[[], Path] | None = None, *, make: bool = True) -> Generator[BufferedRandom]:
     """Open `path` for writing (and reading back) so that it appears complete, or not at all.
 
     An existing file of that name is replaced at the very end.
@@ -121,16 +175,20 @@ def whole_file(path: Path, final: Callable[[], Path] | None = None) -> Generator
     final
         Called when the content is complete and on the disk; returns the final name, in the same folder. For names
         that are known only by then, such as a raw file's suffix.
+    make
+        Whether the folder is made if it is not there: not where that means that a disk was unmounted, for the file
+        would lie on another one then.
 
     Raises
     ------
     InputError
         `path` is a folder, too long, or below a file.
     StorageError
-        The disk is full, read-only or gone. Nothing is left behind.
+        The disk is full, read-only, broken or gone. What is under the final name is the old file or the new one, whole.
     """
     partial = partial_path(path)
-    make_folder(path.parent, path)
+    if make:
+        make_folder(path.parent, path)
     try:
         with partial.open("w+b") as stream:
             yield stream
@@ -179,8 +237,16 @@ def require_free(path: Path, what: str) -> None:
     ------
     InputError
         Something is there already; the message says how to go on.
+    StorageError
+        The disk fails, so that nobody knows.
     """
-    if not path.is_dir() or any(path.iterdir()):
+    try:
+        empty = path.is_dir() and not any(path.iterdir())
+    except OSError as error:
+        if disk_remedy_of(error) is None:
+            raise
+        raise storage_error(path, error, "look into") from error
+    if not empty:
         require_free_file(path, what)
 
 
@@ -191,8 +257,16 @@ def require_free_file(path: Path, what: str) -> None:
     ------
     InputError
         Something is there already; the message says how to go on.
+    StorageError
+        The disk fails, so that nobody knows.
     """
-    if path.exists() or path.is_symlink():
+    try:
+        taken = path.exists() or path.is_symlink()
+    except OSError as error:
+        if disk_remedy_of(error) is None:
+            raise
+        raise storage_error(path, error, "look at") from error
+    if taken:
         raise InputError(f"{path} already exists; name another place for {what}, or remove what is there")
 
 

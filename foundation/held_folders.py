@@ -80,13 +80,14 @@ def held_folder(
             try:
                 place = _opened(folder, opened)
                 handle, together = _locked(place, folder, share_if is not None, opened)
+                there = _is_at(place, folder)
             except FileNotFoundError:
                 continue  # Another program gave the folder its final name between two calls.
             except BlockingIOError as error:
                 raise InputError(busy) from error
             except OSError as error:
                 raise storage_error(folder if of is None else of, error) from error
-            if not _is_at(place, folder) or (together and share_if is not None and not share_if()):
+            if not there or (together and share_if is not None and not share_if()):
                 continue
             yield FolderLock(handle)
             return
@@ -94,8 +95,14 @@ def held_folder(
 
 def _opened(folder: Path, opened: ExitStack) -> int:
     handle = os.open(folder, os.O_RDONLY)
-    opened.callback(os.close, handle)
+    opened.callback(_close, handle)
     return handle
+
+
+def _close(handle: int) -> None:
+    # Nothing was written to it: what a failing disk says now, it says of something else, too.
+    with contextlib.suppress(OSError):
+        os.close(handle)
 
 
 def _locked(place: int, folder: Path, wait: bool, opened: ExitStack) -> tuple[int | None, bool]:
@@ -112,7 +119,7 @@ def _locked(place: int, folder: Path, wait: bool, opened: ExitStack) -> tuple[in
         return place, _lock(place, wait)
     while True:
         file = os.open(LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666, dir_fd=place)
-        opened.callback(os.close, file)
+        opened.callback(_close, file)
         together = None
         with _lockless_suppressed():
             together = _lock(file, wait)

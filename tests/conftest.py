@@ -73,6 +73,7 @@ SLOW = (
     "evaluation/results/test_method_records.py",
     "evaluation/test_cli.py",
     "foundation/test_compiled.py",
+    "foundation/test_disk_faults.py",
     "generator/dataset/production/test_engines.py",
     "generator/dataset/production/test_layouts.py",
     "generator/dataset/production/test_workplace.py",

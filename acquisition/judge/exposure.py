@@ -96,7 +96,7 @@ def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str |
             f"{exposure.clipped:.1%} of the photosites are clipped, {limits.clipped_percent:g} % allowed; "
             "set a shorter exposure (acquire check recommends one) and begin a new session"
         )
-    # A dark grey by which the projector is known is dark.
+    # Of the greys by which the projector's curve is known the darkest are meant to be dark.
     if kind != "response" and exposure.brightest_dn < limits.too_dark_dn:
         return (
             f"the brightest photosites are {exposure.brightest_dn:.0f} counts above black, "
@@ -117,20 +117,14 @@ def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None
 
 
 class ExposureJudge:
-    """Judges exposure alone: `acquisition.session.judgement.FrameJudge` for frames taken by other means.
-
-    Parameters
-    ----------
-    settings
-        Limits, and the exposure that was asked for.
-    """
+    """A `acquisition.session.judgement.FrameJudge` that looks at the exposure of each frame alone."""
 
     def __init__(self, settings: LabSettings) -> None:
         self._settings = settings
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
-        """Return whether a raw file is exposed as asked for, neither clipped nor too dark, and dark if it should be."""
+        """Return whether the frame can be read and is exposed as it should be."""
         return Judgement.of_reason("exposure", judge_file(file, step.kind, self._settings))
 
     def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
-        """Nothing of earlier frames is needed."""
+        """Do nothing: no frame is held against another."""

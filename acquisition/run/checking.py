@@ -25,7 +25,7 @@ from acquisition.run.patience import Patience
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.shutter import exposure_advice, light_period_s
 from acquisition.session.plan import FrameKind
-from drivers.camera import keep_awake
+from drivers.camera import capture, keep_awake
 from drivers.presenter import BLACK, WHITE, Colour, ReportsWarnings
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import RegistrationError
@@ -121,7 +121,7 @@ def _take(devices: Devices, colour: Colour, settings: LabSettings, path: Path) -
     devices.presenter.show(colour)
     devices.clock.sleep(settings.sequence.settle_s)
     with path.open("wb") as stream:
-        devices.camera.capture(stream)
+        capture(devices.camera, stream)
     return read_raw(path)
 
 

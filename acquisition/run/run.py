@@ -13,9 +13,13 @@ from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.session.folder import Session, session_exists
 from acquisition.session.plan import plan_steps
+from foundation.console import Ending
 from foundation.errors import ConfigurationError
 
-FIXED = ("rig", "camera", "simulated", "sequence.reference_every")
+FIXED = (
+    "rig", "camera", "simulated.body", "simulated.camera", "simulated.seed", "simulated.room",
+    "sequence.reference_every",
+)  # fmt: skip
 """Settings that must stay for a whole session: they decide what its frames show."""
 
 
@@ -24,6 +28,8 @@ def run_session(
     folder: Path,
     observe: Callable[[int, int], None],
     announce: Callable[[str], None] = lambda sentence: None,
+    retake: str | None = None,
+    ending: Ending | None = None,
 ) -> RunOutcome:
     """Take the session `folder`, new or interrupted, with the rig that the settings name.
 
@@ -33,6 +39,10 @@ def run_session(
         Called with frames done and in all, once at the start and after each frame.
     announce
         Called with a sentence when the run waits, tries again, pauses and goes on.
+    retake
+        What to take again (`Session.retake`); nothing if None.
+    ending
+        By which the run learns that it is to end after the running frame.
 
     Raises
     ------
@@ -42,19 +52,23 @@ def run_session(
         See `acquisition.run.sequencer.take_session`; the session can be taken up again.
     """
     with open_session(settings, folder) as session:
+        if retake is not None:
+            session.retake(retake)
         total = len(session.steps)
         done = len(session.done_steps())
         observe(done, total)
         if done == total:
             return RunOutcome(total, 0, ())
 
-        def count(step: object, accepted: bool) -> None:
-            nonlocal done
-            done += accepted
-            observe(done, total)
-
         with open_rig(settings, session.chart, session) as devices:
-            return take_session(session, devices, settings, count, announce)
+            return take_session(
+                session,
+                devices,
+                settings,
+                observe=lambda taken: observe(total - taken.left, total),
+                announce=announce,
+                ending=ending,
+            )
 
 
 def open_session(settings: LabSettings, folder: Path) -> Session:
@@ -75,7 +89,9 @@ def open_session(settings: LabSettings, folder: Path) -> Session:
         return session
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
-    steps = plan_steps(lights, settings.sequence.reference_every)
+    sequence = settings.sequence
+    seed = sequence.seed if sequence.order == "shuffled" else None
+    steps = plan_steps(lights, sequence.reference_every, seed=seed)
     return Session.create(folder, settings.to_toml(), chart, lights, steps)
 
 

@@ -15,7 +15,7 @@ import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
 
@@ -24,6 +24,8 @@ from acquisition.lights.illuminations import Illumination, load_illuminations, s
 from acquisition.session.incoming import IncomingFile, ReceivedFile
 from acquisition.session.journal import JOURNAL_FILE, Journal, time_text
 from acquisition.session.judgement import Judgement
+from acquisition.session.mending.retaking import BAD, lights_text, newest_report, parse_lights
+from acquisition.session.mending.verification import unsound_files
 from acquisition.session.plan import SessionStep
 from acquisition.session.records import FrameRecord
 from drivers.camera import CapturedFrame
@@ -193,7 +195,7 @@ class Session:
         stem
             Name without suffix; the suffix is that of the camera's own file name.
         capture
-            Writes the whole raw file into the stream it is given; `drivers.camera.capture`.
+            Writes the whole raw file into the stream it is given; `drivers.camera.Camera.download`.
 
         Raises
         ------
@@ -270,6 +272,70 @@ class Session:
         """Put steps at the end of the plan; their numbers must be free."""
         self.journal.add_steps(steps)
         self.steps = self.journal.steps()
+
+    def verify(
+        self, observe: Callable[[int, int], None] = lambda done, total: None, at: datetime | None = None
+    ) -> tuple[str, ...]:
+        """Void the accepted frames whose files are gone or changed, so that they are taken again; return why, each.
+
+        Where older software left a step with several accepted frames, all but the newest sound one are voided too.
+
+        Parameters
+        ----------
+        observe
+            Called with files done and in all, once at the start and after each file.
+        at
+            When this happens, for the journal; now by the machine's clock if None.
+
+        Raises
+        ------
+        FormatError
+            The folder of the frames is missing.
+        StorageError
+            A file is there and cannot be read, or the journal cannot be written.
+        """
+        unsound = unsound_files(self.folder, self.journal.accepted_files(), observe)
+        for attempt, reason in unsound.items():
+            self.journal.void([attempt], at or datetime.now(UTC), reason)
+        return tuple(unsound.values())
+
+    def retake(self, selection: str, at: datetime | None = None) -> tuple[int, ...]:
+        """Void accepted frames so that they are taken again; return the lights that this is about.
+
+        Parameters
+        ----------
+        selection
+            Lights, as in ``12,40-44``; or ``bad``: what the newest report of `build-lut` beside the session refused,
+            white and dark frames included. A run that was interrupted while it took them again may be asked for the
+            same again: nothing is taken twice.
+        at
+            When this happens, for the journal; now by the machine's clock if None.
+
+        Raises
+        ------
+        InputError
+            The selection names no lights of this session.
+        FormatError
+            There is no report on it.
+        StorageError
+            The journal cannot be written.
+        """
+        at = at or datetime.now(UTC)
+        accepted = self.journal.accepted_files()
+        known = {step.number: step.illumination for step in self.steps if step.illumination is not None}
+        if selection.strip() == BAD:
+            refused = newest_report(self.folder, {frame.sha256 for frame in self.frames()})
+            chosen = [frame.attempt for frame in accepted if frame.sha256 in refused.sha256]
+            self.journal.void(chosen, at, f"refused by build-lut, as {refused.report} says")
+            return parse_lights(refused.lights, set(known.values())) if refused.lights else ()
+        lights = parse_lights(selection, set(known.values()))
+        chosen = [frame.attempt for frame in accepted if known.get(frame.step) in lights]
+        done = {known.get(frame.step) for frame in accepted}
+        asked = lights_text(lights)
+        if self.journal.records().get("retake") != asked or done.issuperset(lights):
+            self.journal.record("retake", asked)
+            self.journal.void(chosen, at, f"to be taken again, as asked for with --retake {asked}")
+        return lights
 
     def done_steps(self) -> set[int]:
         """Return the numbers of the steps whose frame was taken, accepted, and is still there in full size."""

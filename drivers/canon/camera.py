@@ -2,24 +2,27 @@
 
 Rules that hold inside:
 
-- A connection that fails is renewed, a limited number of times for one call and a limited time for each: reset, closed,
-  opened again wherever the body is now, and given the settings again. `drivers.canon.body` is one connection.
+- A connection that fails is renewed, a limited number of times and for a limited time in one call (`CanonLimits`):
+  reset, closed, opened again wherever the body is now, and given the settings again. `drivers.canon.body` is one
+  connection. Then the call fails, with its first cause: longer patience is the caller's, who can say what is awaited.
 - A release is never repeated once it may have happened: after a fault the frame is looked for in the camera's memory,
   and what is not found there is an error. So no frame is ever taken for another one's.
 - What waits in the memory before a release belongs to nobody any more, and is thrown away.
-- When a capture ends, well or badly, the body's memory is empty, or the next call empties it.
+- The exposed frame stays in the memory until it has been downloaded whole, or the next is exposed: a cable that fails
+  and a file that cannot be written cost a download, not a frame. Once downloaded, the memory is emptied.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import BinaryIO, TypeVar
 
-from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
+from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
 from drivers.canon.body import EosBody
 from drivers.canon.state import WaitingObject, plan, shutter_speeds
 from drivers.ptp.codes import ResponseCode
@@ -28,12 +31,6 @@ from drivers.ptp.transport import Transport
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
-RECOVERIES = 3
-"""How often one call renews the connection: a fault that comes back more often lasts."""
-RECOVERY_LIMIT_S = 60.0
-"""How long each renewal may take; a body that was switched off and on is back well within it."""
-FRAME_LIMIT_S = 90.0
-"""How long after its exposure a frame may be announced; libgphoto2 waits as long."""
 REDISCOVERY_S = 10.0
 """The same on a new connection, on which the body sends its whole state at once."""
 
@@ -61,15 +58,44 @@ _REMEDY = (
 _Result = TypeVar("_Result")
 
 
+@dataclass(frozen=True)
+class CanonLimits:
+    """How long one call to a body may go on against trouble before it fails; chosen, not measured.
+
+    Attributes
+    ----------
+    recoveries
+        How often a call renews the connection: a fault that comes back more often lasts.
+    recovery_s
+        Seconds after the first fault of a call in which the connection may be renewed; a body that was switched off and
+        on, or put back on its cable, is there within 10 s.
+    frame_s
+        Seconds after its exposure within which a frame may be announced, beside as much time again as it was exposed:
+        so long a dark frame takes that some bodies subtract.
+    """
+
+    recoveries: int = 3
+    recovery_s: float = 30.0
+    frame_s: float = 30.0
+
+
+_LIMITS = CanonLimits()
+
+
 @dataclass
 class _Shot:
-    """A release that has happened, or may have; objects that are `absent` cannot be its frame."""
+    """A release that has happened, or may have.
+
+    `announced` is its frame once the body has named it, `fetched` what a download has begun with; objects that are
+    `absent` cannot be its frame.
+    """
 
     body: EosBody
     released_at: datetime
     not_before: float
     until: float
     shutter_s: float
+    announced: WaitingObject | None = None
     fetched: WaitingObject | None = None
     absent: set[int] = field(default_factory=set[int])
 
@@ -83,23 +109,43 @@ class CanonEos:
         Opens a new cable to the same body, wherever it is now; called again after a fault.
     clock
         Measures and makes every pause.
+    limits
+        When a call gives up.
     """
 
-    def __init__(self, open_transport: Callable[[], Transport], clock: Clock = _SYSTEM_CLOCK) -> None:
+    def __init__(
+        self, open_transport: Callable[[], Transport], clock: Clock = _SYSTEM_CLOCK, limits: CanonLimits = _LIMITS
+    ) -> None:
         self._open_transport = open_transport
         self._clock = clock
+        self._limits = limits
+        self._fault: DeviceError | None = None
+        self._renewable_until = math.inf
         self._transport: Transport | None = None
         self._body: EosBody | None = None
         self._identity: CameraIdentity | None = None
         self._settings: ExposureSettings | None = None
+        self._shot: _Shot | None = None
         self._closed = False
 
     def identity(self) -> CameraIdentity:
         """Return maker, model, serial number and firmware."""
+        self._begin()
         return self._carry_out(EosBody.identity)
 
+    def supplies(self) -> Supplies:
+        """Return what is left of battery and card; see `drivers.camera.ReportsSupplies`.
+
+        Raises
+        ------
+        DeviceError
+            It cannot be reached.
+        """
+        self._begin()
+        return self._carry_out(EosBody.supplies)
+
     def configure(self, settings: ExposureSettings) -> None:
-        """Set and verify the exposure, raw format and destination.
+        """Set and verify the exposure, raw format and destination; a frame that was not downloaded is dropped.
 
         Raises
         ------
@@ -113,7 +159,8 @@ class CanonEos:
             body.make_ready()
             _apply(body, settings)
 
-        self._settings = None
+        self._begin()
+        self._settings = self._shot = None
         self._carry_out(configured)
         self._settings = settings
 
@@ -130,38 +177,65 @@ class CanonEos:
             body.drain()
             return shutter_speeds(body.state)
 
+        self._begin()
         return self._carry_out(listed)
 
-    def capture(self, into: BinaryIO) -> CapturedFrame:
-        """Release the shutter without autofocus and write the raw file, whole and unchanged, to `into`.
+    def expose(self) -> datetime:
+        """Release the shutter without autofocus; return when it was released, UTC, once the body announces the frame.
+
+        A frame that was exposed before and has not been downloaded is dropped.
 
         Raises
         ------
         DeviceRefused
             The body was never configured, or declines to take a frame.
         DeviceError
-            The frame did not arrive; what `into` holds is worthless and may be retaken.
+            No frame was announced; it may be exposed again.
         """
         settings = self._settings
         if settings is None:
-            raise DeviceRefused("the camera has no exposure settings; configure it before the first capture")
-        start = into.tell()
+            raise DeviceRefused("the camera has no exposure settings; configure it before the first exposure")
+        self._begin()
+        self._shot = None
         shot = self._release(settings)
         try:
-            frame = self._carry_out(lambda body: self._receive(body, shot, into, start))
+            self._carry_out(lambda body: self._await_frame(body, shot))
         except Exception:
             self._empty()
             raise
+        self._shot = shot
+        return shot.released_at
+
+    def download(self, into: BinaryIO) -> CapturedFrame:
+        """Write the raw file of the frame exposed last, whole and unchanged, to `into`.
+
+        A download that failed, for whatever reason, may be tried again with a new stream as long as the body holds the
+        frame in its memory: until the next exposure, or until it is switched off.
+
+        Raises
+        ------
+        DeviceError
+            The frame did not arrive, and what `into` holds is worthless; or there is none, and the message says so.
+        """
+        shot = self._shot
+        if shot is None:
+            raise DeviceError("no exposed frame waits in the camera to be downloaded; expose it again")
+        self._begin()
+        start = into.tell()
+        frame = self._carry_out(lambda body: self._receive(body, shot, into, start))
+        self._shot = None
         self._empty()
         return CapturedFrame(_file_name(frame), frame.size, shot.released_at)
 
     def idle(self) -> None:
         """Fetch what has happened while nothing was asked, and keep the body awake; call it now and then in a pause."""
+        self._begin()
         self._carry_out(EosBody.drain)
 
     def close(self) -> None:
         """Give the camera back to its user; a second call does nothing."""
         self._closed = True
+        self._shot = None
         body = self._body
         if body is not None:
             try:
@@ -171,9 +245,15 @@ class CanonEos:
             else:
                 self._drop(None)
 
+    def _begin(self) -> None:
+        """Begin a call: it has had no fault yet."""
+        self._fault, self._renewable_until = None, math.inf
+
     def _carry_out(self, action: Callable[[EosBody], _Result]) -> _Result:
         """Return what `action` does with a connected body, over a new connection if this one fails."""
-        for left in reversed(range(RECOVERIES + 1)):
+        renewals = 0
+        was_busy = False
+        while True:
             body = self._connected()
             try:
                 return action(body)
@@ -181,14 +261,21 @@ class CanonEos:
                 if not _curable(error):
                     raise
                 self._drop(error)
-                if not left:
-                    # A body that is busy in every session is kept so by its own settings, not by a fault.
-                    busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
+                # A body that is busy in every session is kept so by its own settings, not by a fault.
+                busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
+                late = self._clock.monotonic() >= self._renewable_until
+                if renewals == self._limits.recoveries or late or (busy and was_busy):
                     kind = DeviceRefused if busy else DeviceError
-                    raise kind(
-                        f"{error}; the connection was renewed {RECOVERIES} times without success: {_REMEDY}"
-                    ) from error
-        raise AssertionError
+                    times = "once" if renewals == 1 else f"{renewals} times"
+                    raise kind(self._given_up(error, f"the connection was renewed {times} without success")) from error
+                was_busy = busy
+                renewals += 1
+
+    def _given_up(self, last: DeviceError, tried: str) -> str:
+        """Return why a call ends, its first cause first, for whatever came of that says less."""
+        first = self._fault or last
+        at_last = "" if str(first) == str(last) else f"; at last: {last}"
+        return f"{first}; {tried}{at_last}; {_REMEDY}"
 
     def _release(self, settings: ExposureSettings) -> _Shot:
         """Return the release that has happened, or may have; one that the body declines has not."""
@@ -198,7 +285,7 @@ class CanonEos:
             _apply(body, settings)  # sends nothing unless a dial was turned
             now = self._clock.monotonic()
             exposed = now + _CERTAIN_SHARE * settings.shutter_s
-            until = now + settings.shutter_s + FRAME_LIMIT_S
+            until = now + 2 * settings.shutter_s + self._limits.frame_s
             shot = _Shot(body, self._clock.now(), exposed, until, settings.shutter_s, absent=set(body.state.waiting))
             try:
                 body.release()
@@ -208,19 +295,30 @@ class CanonEos:
 
         return self._carry_out(released)
 
-    def _receive(self, body: EosBody, shot: _Shot, into: BinaryIO, start: int) -> WaitingObject:
-        """Return the frame of a release when it is complete in `into`, from `start` on."""
+    def _await_frame(self, body: EosBody, shot: _Shot) -> WaitingObject:
+        """Return the frame of a release when the body has announced it; the same one whenever it is asked again."""
         renewed = body is not shot.body
         until = self._clock.monotonic() + shot.shutter_s + REDISCOVERY_S if renewed else shot.until
+        known = shot.announced
+
+        def wanted(waiting: WaitingObject) -> bool:
+            if known is not None and (waiting.name, waiting.size) != (known.name, known.size):
+                return False  # taken since, by a finger on the camera
+            return waiting.is_raw and waiting.handle not in shot.absent
+
+        try:
+            shot.announced = body.await_object(shot.not_before, until, wanted)
+        except LinkTimeout as error:
+            if not renewed:
+                raise  # its announcement may be lost: a new connection hears it again
+            self._shot = None
+            raise DeviceError(f"{error}, and holds none in its memory; take it again") from error
+        return shot.announced
+
+    def _receive(self, body: EosBody, shot: _Shot, into: BinaryIO, start: int) -> WaitingObject:
+        """Return the frame of a release when it is complete in `into`, from `start` on."""
         while True:
-            try:
-                frame = body.await_object(
-                    shot.not_before, until, lambda waiting: waiting.is_raw and waiting.handle not in shot.absent
-                )
-            except LinkTimeout as error:
-                if not renewed:
-                    raise  # its announcement may be lost: a new connection hears it again
-                raise DeviceError(f"{error}, and holds none in its memory; take it again") from error
+            frame = self._await_frame(body, shot)
             # What has come of the same object before a fault is good: pieces are written whole.
             offset = into.tell() - start if frame == shot.fetched else 0
             into.seek(start + offset)
@@ -232,6 +330,7 @@ class CanonEos:
                 if error.code != ResponseCode.INVALID_OBJECT_HANDLE:
                     raise
                 shot.absent.add(frame.handle)
+                shot.announced = None
                 body.free(frame)
                 continue
             return frame
@@ -253,7 +352,8 @@ class CanonEos:
         if self._body is not None:
             return self._body
         first = self._identity is None
-        end = self._clock.monotonic() + RECOVERY_LIMIT_S
+        begun = self._clock.monotonic()
+        end = min(self._renewable_until, begun + self._limits.recovery_s)
         pause = _FIRST_PAUSE_S
         while True:
             try:
@@ -265,7 +365,8 @@ class CanonEos:
                 if not curable:
                     raise
                 if self._clock.monotonic() + pause > end:
-                    raise DeviceError(f"no camera to work with: {error}; {_REMEDY}") from error
+                    waited = f"no connection for {self._clock.monotonic() - begun:.0f} s"
+                    raise DeviceError(self._given_up(error, waited)) from error
             self._clock.sleep(pause)
             pause = min(2 * pause, _LONGEST_PAUSE_S)
 
@@ -286,7 +387,10 @@ class CanonEos:
         return body
 
     def _drop(self, fault: DeviceError | None) -> None:
-        """Close the cable, with a reset where the body may still be in the midst of something."""
+        """Close the cable, with a reset where the body may still be in the midst of something; note the first fault."""
+        if fault is not None and self._fault is None:
+            self._fault = fault
+            self._renewable_until = self._clock.monotonic() + self._limits.recovery_s
         transport, self._transport, self._body = self._transport, None, None
         if transport is not None:
             if fault is not None and not isinstance(fault, LinkClosed):

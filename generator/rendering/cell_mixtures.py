@@ -7,7 +7,8 @@ For a wanted colour t the weights w of the cells near to it are to make their me
 R being what the camera sees of a cell. Weights are whole 16ths from the start, since a pixel takes one of 16 cells:
 from all 16 on the nearest cell, one 16th at a time moves from a cell to another, each time by the move that lowers
 the sum most, until none does (an exchange algorithm, V. V. Fedorov, *Theory of Optimal Experiments*, 1972, chapter
-3). It is as good as rounding the weights that are best as real numbers, and needs no solver for those.
+3). It is as good as rounding the weights that are best as real numbers, and needs no solver for those. Where no single
+move helps, two at once may: greys, on which the eye and the field's errors turn, are tried so, too.
 
 Differences are relative to t, channel by channel, and those of brightness count less than those of chromaticity: the
 field measures lights by angles, and where the print cannot show a colour, its hue is to stay rather than its
@@ -57,7 +58,16 @@ NEAR_GREY_DEG: Final = 6.0
 GREY_WITHIN_DEG: Final = 0.2
 """Angle to a wanted colour near grey from which more cells are tried."""
 
+GREY_MET_DEG: Final = 0.05
+"""Angle to grey from which two cells of a grey's mixture are exchanged at once: a tenth of what greys may be off."""
+
+PAIR_NEIGHBOURS: Final = 192
+"""Cells tried when two are exchanged at once: all pairs of moves to them take some ten milliseconds a grey."""
+
 _Array = npt.NDArray[np.float64]
+
+_GREY_SPREAD: Final = 1e-6
+"""Relative difference of channels up to which a wanted colour is a grey: rounding of the colour matrix leaves 1e-16."""
 
 _AXES: Final = np.array([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]]) / np.sqrt([[3.0], [2.0], [6.0]])
 """Brightness and two directions of chromaticity, of length 1, for relative or logarithmic differences of channels."""
@@ -120,16 +130,25 @@ def mix_cells(profile: PrintProfile, wanted: _Array) -> CellMixtures:
     places = np.log(wanted) @ scale.T
 
     def chosen(of: npt.NDArray[np.int64], neighbours: int, cost: float) -> npt.NDArray[np.int64]:
-        near: Any = tree.query(places[of], k=np.arange(1, min(neighbours, len(usable)) + 1))[1]
         out = np.empty((len(of), SLOTS), np.int64)
-        _exchange(colours, wanted[of], scale, np.ascontiguousarray(near, dtype=np.int64), cost, out)
+        _exchange(colours, wanted[of], scale, nearest(of, neighbours), cost, out)
         return out
+
+    def nearest(of: npt.NDArray[np.int64], neighbours: int) -> npt.NDArray[np.int64]:
+        near: Any = tree.query(places[of], k=np.arange(1, min(neighbours, len(usable)) + 1))[1]
+        return np.ascontiguousarray(near, dtype=np.int64)
 
     cells = chosen(np.arange(len(wanted)), NEIGHBOURS, SPREAD_COST)
     missed = angles_deg(colours[cells].mean(axis=1), wanted) > GREY_WITHIN_DEG
     again = np.flatnonzero(missed & near_grey(wanted))
     if len(again):
         cells[again] = chosen(again, WIDE_NEIGHBOURS, WIDE_SPREAD_COST)
+    off = angles_deg(colours[cells].mean(axis=1), np.ones(3)) > GREY_MET_DEG
+    greys = np.flatnonzero(off & (np.ptp(wanted, axis=1) <= _GREY_SPREAD * wanted.max(axis=1)))
+    if len(greys):
+        improved = np.ascontiguousarray(cells[greys])
+        _exchange_pairs(colours, wanted[greys], scale, nearest(greys, PAIR_NEIGHBOURS), WIDE_SPREAD_COST, improved)
+        cells[greys] = improved
     return mixtures_of(np.sort(usable[cells], axis=1).astype(np.uint16), profile, wanted)
 
 
@@ -161,6 +180,18 @@ def near_grey(colours: _Array) -> npt.NDArray[np.bool_]:
 
 
 @compiled
+def _place(colour: Any, wanted: Any, scale: Any, place: Any) -> float:
+    """Write where a colour lies from the wanted one, by what differences cost, into `place` (3,); return its square."""
+    square = 0.0
+    for axis in range(3):
+        place[axis] = 0.0
+        for channel in range(3):
+            place[axis] += scale[axis, channel] * (colour[channel] / wanted[channel] - 1.0)
+        square += place[axis] * place[axis]
+    return square
+
+
+@compiled
 def _exchange(colours: Any, wanted: Any, scale: Any, near: Any, cost: float, out: Any) -> None:
     """Write into `out` (K, 16) the cells of `near` (K, M) for each wanted colour (K, 3); see the head of this file.
 
@@ -175,16 +206,8 @@ def _exchange(colours: Any, wanted: Any, scale: Any, near: Any, cost: float, out
     for k in range(len(wanted)):
         nearest = 0
         for j in range(candidates):
-            cell = near[k, j]
-            square = 0.0
-            for axis in range(3):
-                place = 0.0
-                for channel in range(3):
-                    place += scale[axis, channel] * (colours[cell, channel] / wanted[k, channel] - 1.0)
-                places[j, axis] = place
-                square += place * place
             # In units of the square of a sum of all slots, as what follows is.
-            single[j] = cost * slots * square
+            single[j] = cost * slots * _place(colours[near[k, j]], wanted[k], scale, places[j])
             if single[j] < single[nearest]:
                 nearest = j
         counts[:] = 0
@@ -214,3 +237,46 @@ def _exchange(colours: Any, wanted: Any, scale: Any, near: Any, cost: float, out
             for _ in range(counts[j]):
                 out[k, slot] = near[k, j]
                 slot += 1
+
+
+@compiled
+def _exchange_pairs(colours: Any, wanted: Any, scale: Any, near: Any, cost: float, cells: Any) -> None:
+    """Exchange two of the cells (K, 16) of each wanted colour (K, 3) for two of `near` (K, M), while that helps."""
+    candidates = near.shape[1]
+    slots = cells.shape[1]
+    places = np.empty((candidates, 3))
+    single = np.empty(candidates)
+    held = np.empty((slots, 3))
+    held_single = np.empty(slots)
+    total = np.empty(3)
+    for k in range(len(wanted)):
+        for j in range(candidates):
+            single[j] = _place(colours[near[k, j]], wanted[k], scale, places[j]) * cost * slots
+        total[:] = 0.0
+        for i in range(slots):
+            held_single[i] = _place(colours[cells[k, i]], wanted[k], scale, held[i]) * cost * slots
+            total += held[i]
+        while True:
+            best, first, second, one, other = -1e-12, -1, -1, -1, -1
+            for i in range(slots):
+                for i2 in range(i):
+                    x = total[0] - held[i, 0] - held[i2, 0]
+                    y = total[1] - held[i, 1] - held[i2, 1]
+                    z = total[2] - held[i, 2] - held[i2, 2]
+                    before = held_single[i] + held_single[i2]
+                    before += total[0] * total[0] + total[1] * total[1] + total[2] * total[2]
+                    for j in range(candidates):
+                        xj, yj, zj = x + places[j, 0], y + places[j, 1], z + places[j, 2]
+                        gain = single[j] - before
+                        for j2 in range(j + 1):
+                            xe, ye, ze = xj + places[j2, 0], yj + places[j2, 1], zj + places[j2, 2]
+                            change = gain + single[j2] + xe * xe + ye * ye + ze * ze
+                            if change < best:
+                                best, first, second, one, other = change, i, i2, j, j2
+            if first < 0:
+                break
+            for slot, choice in ((first, one), (second, other)):
+                total += places[choice] - held[slot]
+                held[slot] = places[choice]
+                held_single[slot] = single[choice]
+                cells[k, slot] = near[k, choice]

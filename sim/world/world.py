@@ -27,12 +27,12 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from foundation.processors import processor_count
-from foundation.srgb import decode_srgb
 from sim.world.drawing import PAPER, Print, label_map
 from sim.world.geometry import Folded, View, Waviness
 from sim.world.profile import printed_reflectance
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import Body, HotPattern
+from sim.world.situation import UNDISTURBED, Situation, moved_back
 from sim.world.spectra import projector_primaries, sensitivities
 from sim.world.wear import Fold, Stain
 
@@ -82,10 +82,16 @@ class World:
         self._falloff[:, 3] = self._balance()
         self.hot = HotPattern.drawn(self._random(6), body.sensor, room.hot_per_million, room.hot_dn_per_s)
         self._lock = threading.Lock()
-        self._light: NDArray[np.float32] | None = None
+        self._rendered: dict[tuple[float, ...], NDArray[np.float32]] = {}
 
     def expose(
-        self, colour: Colour, settings: ExposureSettings, *, key: tuple[int, ...], lamp: float = 1.0
+        self,
+        colour: Colour,
+        settings: ExposureSettings,
+        *,
+        key: tuple[int, ...],
+        lamp: float = 1.0,
+        situation: Situation = UNDISTURBED,
     ) -> NDArray[np.uint16]:
         """Return a frame.
 
@@ -99,6 +105,8 @@ class World:
             Names the frame; integers 0 or more. The same key has the same noise.
         lamp
             The lamp's light over its light when new; 0 is dark.
+        situation
+            What is otherwise in this frame; where it has a picture, that is shown instead of `colour`.
 
         Returns
         -------
@@ -107,10 +115,11 @@ class World:
         """
         from sim.world.rendering import counts
 
-        light = self._render()
-        weights = np.asarray(self.drive(colour, settings, lamp * self._turned(settings, key)), dtype=np.float32)
+        of_lamp = lamp * self._turned(settings, key) * np.array(situation.lamp)
+        light, weights = self._lighting(colour, settings, of_lamp, situation)
         body, visible = self.body, self.body.visible
-        black, noise_dn, gain_e = float(body.black), body.noise_dn(settings.iso), body.gain_e(settings.iso)
+        black = body.black + situation.black_dn
+        noise_dn, gain_e = body.noise_dn(settings.iso), body.gain_e(settings.iso)
         frame = np.empty(body.sensor, dtype=np.uint16)
 
         def block(first: int, last: int) -> None:
@@ -122,7 +131,7 @@ class World:
                 part = light[:, top - visible.top : bottom - visible.top] if seen else light[:, : bottom - top, :0]
                 noise_rows, rows = noise[top - first : bottom - first], frame[top:bottom]
                 counts(part, weights, noise_rows, visible.left, black, noise_dn, gain_e, body.saturation, rows)
-            self._heat(frame[first:last], noise, weights, settings, first)
+            self._heat(frame[first:last], noise, light, weights, settings, first)
 
         _in_blocks(body.sensor[0], block)
         return frame
@@ -131,17 +140,42 @@ class World:
         self,
         frame: NDArray[np.uint16],
         noise: NDArray[np.float32],
+        light: NDArray[np.float32],
         drive: NDArray[np.float32],
         settings: ExposureSettings,
         first: int,
     ) -> None:
         """Raise the counts of hot photosites among some rows of a frame, the first of which is `first`."""
-        hot, visible, light = self.hot.within(first, first + len(frame)), self.body.visible, self._render()
+        hot, visible = self.hot.within(first, first + len(frame)), self.body.visible
         y, x = hot.rows + first - visible.top, hot.columns - visible.left
         seen = (y >= 0) & (y < visible.height) & (x >= 0) & (x < visible.width)
         lit = np.zeros(len(hot.rows))
         lit[seen] = drive.astype(np.float64) @ light[:, y[seen], x[seen]]
         hot.raise_counts(frame, noise, lit, self.body, settings.iso, settings.shutter_s)
+
+    def _lighting(
+        self, colour: Colour, settings: ExposureSettings, lamp: NDArray[np.float64], situation: Situation
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return light (3, rows, columns) on the photosites and weights (3,), whose product is a frame's signal."""
+        light, ambient = self._render(situation), np.array(situation.ambient)
+        plain = self.decoded(colour) if situation.picture is None else situation.picture[0, 0].astype(np.float64)
+        if situation.is_even:
+            return light, self._collected(plain, settings, lamp, ambient).astype(np.float32)
+        nodes, page = self._nodes(UNDISTURBED), self.sheet.page_mm
+        falling = np.empty_like(light)
+
+        def block(first: int, last: int) -> None:
+            points = self._points(nodes, first, last)
+            shown = self._collected(situation.shown(points, page, plain, self.decoded), settings, lamp, ambient)
+            shown *= situation.passed(points, page)[..., None]
+            falling[:, first:last] = light[:, first:last] * shown.transpose(2, 0, 1)
+
+        _in_blocks(self.body.visible.height, block)
+        return falling, np.ones(3, dtype=np.float32)
+
+    def decoded(self, colour: Colour) -> NDArray[np.float64]:
+        """Return (3,) float64, 0 … 1: the light of each primary that a colour's codes stand for."""
+        return self.room.light_of(np.array([colour.red, colour.green, colour.blue]))
 
     def signal(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float32]:
         """Return what a frame would be without noise, black, hot photosites and clipping.
@@ -233,16 +267,28 @@ class World:
         return self._signals(self._reflectance(rgb)) * self.field(points_mm)[:, None]
 
     def drive(
-        self, colour: Colour, settings: ExposureSettings, lamp: float | NDArray[np.float64] = 1.0
+        self,
+        colour: Colour,
+        settings: ExposureSettings,
+        lamp: float | NDArray[np.float64] = 1.0,
+        ambient: float | NDArray[np.float64] = 0.0,
     ) -> NDArray[np.float64]:
         """Return (3,) float64: how much of each primary's light at full drive a frame collects, gain included.
 
-        Parameters are those of `expose`; `lamp` may be (3,), of each primary its own.
+        Parameters are those of `expose`; `lamp` may be (3,), of each primary its own, and so may `ambient`, which is
+        added to the room's.
         """
-        codes = np.array([colour.red, colour.green, colour.blue]) / 255
-        linear = decode_srgb(codes) if self.room.transfer == "srgb" else codes**self.room.transfer
+        return self._collected(self.decoded(colour), settings, lamp, ambient)
+
+    def _collected(
+        self,
+        linear: NDArray[np.float64],
+        settings: ExposureSettings,
+        lamp: float | NDArray[np.float64],
+        ambient: float | NDArray[np.float64],
+    ) -> NDArray[np.float64]:
         leak = self.room.black_leak
-        shown = lamp * (leak + (1 - leak) * linear) + self.room.ambient
+        shown = lamp * (leak + (1 - leak) * linear) + self.room.ambient + ambient
         reference = REFERENCE_EXPOSURE
         time = settings.shutter_s / reference.shutter_s
         return shown * time * (reference.aperture / settings.aperture) ** 2 * (settings.iso / reference.iso)
@@ -336,14 +382,19 @@ class World:
     def _random(self, *key: int) -> np.random.Generator:
         return np.random.Generator(np.random.SFC64([self.room.seed, *key]))
 
-    def _render(self) -> NDArray[np.float32]:
-        """Return (3, rows, columns) float32: DN of the visible photosites under each primary alone."""
-        with self._lock:
-            if self._light is None:
-                self._light = self._lit()
-            return self._light
+    def _render(self, situation: Situation = UNDISTURBED) -> NDArray[np.float32]:
+        """Return (3, rows, columns) float32: DN of the visible photosites under each primary alone.
 
-    def _lit(self) -> NDArray[np.float32]:
+        Kept are the undisturbed rendering and one other: a chart is bumped once, then it stays.
+        """
+        with self._lock:
+            if situation.view not in self._rendered:
+                kept = self._rendered.get(UNDISTURBED.view)
+                self._rendered = {} if kept is None else {UNDISTURBED.view: kept}
+                self._rendered[situation.view] = self._lit(situation)
+            return self._rendered[situation.view]
+
+    def _lit(self, situation: Situation) -> NDArray[np.float32]:
         from sim.world.rendering import light
 
         visible, room = self.body.visible, self.room
@@ -351,11 +402,14 @@ class World:
         backdrop = np.full((1, len(self._sensitivities)), _BACKDROP_REFLECTANCE)
         reflectance = np.concatenate([self._reflectance(drawing.codes), backdrop])
         table = self._signals(reflectance).astype(np.float32)
-        nodes = self._nodes()
+        nodes = self._nodes(situation)
         # A uniform aperture of one photosite has a variance of 1/12.
-        sigma = ((2 * room.blur_px) ** 2 + 1 / 12) ** 0.5
+        sigma = ((2 * room.blur_px) ** 2 + (2 * situation.defocus_px) ** 2 + 1 / 12) ** 0.5
         channels = np.array([_CHANNELS.index(letter) for letter in self.body.pattern], dtype=np.int64).reshape(2, 2)
         out = np.empty((3, visible.height, visible.width), dtype=np.float32)
+        # The projector stays where it is.
+        falloff = self._falloff.copy()
+        falloff[:, :2] = self._moved_back(falloff[:, :2], situation)
 
         def block(first: int, last: int) -> None:
             response = self._random(3, first).standard_normal((last - first, visible.width), dtype=np.float32)
@@ -363,24 +417,38 @@ class World:
             response += np.float32(1)
             if self.stain is not None or self.fold is not None:
                 response *= self._worn_rows(nodes, channels, first, last)
-            rows, lens, falloff = out[:, first:last], self._lens, self._falloff
+            rows, lens = out[:, first:last], self._lens
             lines = drawing.x_lines, drawing.y_lines
             light(first, nodes, sigma, *lines, drawing.labels, table, channels, lens, falloff, response, rows)
 
         _in_blocks(visible.height, block)
         return out
 
-    def _worn_rows(
-        self, nodes: NDArray[np.float64], channels: NDArray[np.int64], first: int, last: int
-    ) -> NDArray[np.float32]:
-        """Return (rows, columns) float32: what stain and fold leave of the light on each photosite of some rows."""
+    def _moved_back(self, points_mm: NDArray[np.float64], situation: Situation) -> NDArray[np.float64]:
+        """Return which points of the chart lie where, undisturbed, points (..., 2) mm of it lie."""
+        if not any(situation.view):
+            # Rounding would make other counts of the undisturbed chart, here and there one.
+            return points_mm
+        view = self.view
+        by = np.array(situation.bump_mm) + np.array(situation.bump_px) * (view.distance_mm / view.focal_px)
+        return moved_back(points_mm, np.array(self.sheet.page_mm) / 2, by, situation.turn_deg)
+
+    def _points(self, nodes: NDArray[np.float64], first: int, last: int) -> NDArray[np.float64]:
+        """Return (rows, columns, 2) float64, mm: the places on the print that some rows of photosites see."""
         from scipy.ndimage import map_coordinates
 
         from sim.world.rendering import GRID_PX
 
         row, column = np.mgrid[first:last, : self.body.visible.width]
         at = np.stack([row, column]) / GRID_PX + 1
-        points = np.stack([map_coordinates(nodes[..., axis], at, order=1) for axis in (0, 1)], axis=-1)
+        return np.stack([map_coordinates(nodes[..., axis], at, order=1) for axis in (0, 1)], axis=-1)
+
+    def _worn_rows(
+        self, nodes: NDArray[np.float64], channels: NDArray[np.int64], first: int, last: int
+    ) -> NDArray[np.float32]:
+        """Return (rows, columns) float32: what stain and fold leave of the light on each photosite of some rows."""
+        row, column = np.mgrid[first:last, : self.body.visible.width]
+        points = self._points(nodes, first, last)
         channel = channels[row % 2, column % 2]
         return np.take_along_axis(self.worn(points), channel[..., None], axis=-1)[..., 0].astype(np.float32)
 
@@ -396,14 +464,14 @@ class World:
         direction = math.sin(along), math.cos(along)
         return stain, Fold(crease, direction, room.fold_mm, _SLANT) if room.fold_mm else None
 
-    def _nodes(self) -> NDArray[np.float64]:
+    def _nodes(self, situation: Situation) -> NDArray[np.float64]:
         """Return (ny, nx, 2) float64: the place on the print of every 16th photosite, one node beyond on each side."""
         from sim.world.rendering import GRID_PX
 
         visible = self.body.visible
         y, x = (np.arange(-1, (size - 1) // GRID_PX + 3) * GRID_PX for size in (visible.height, visible.width))
         photosites = np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)
-        return self.view.locate((photosites - 0.5) / 2)
+        return self._moved_back(self.view.locate((photosites - 0.5) / 2), situation)
 
 
 def _in_blocks(rows: int, work: Callable[[int, int], None]) -> None:

@@ -15,8 +15,8 @@ from typing import BinaryIO
 
 import pytest
 
-from drivers.camera import Camera, CameraIdentity, ExposureSettings
-from foundation.errors import DeviceError, DeviceRefused
+from drivers.camera import Camera, CameraIdentity, ExposureSettings, capture
+from foundation.errors import DeviceError, DeviceRefused, StorageError
 
 SETTINGS = ExposureSettings(iso=100, aperture=8, shutter_s=1 / 60)
 """What every camera under test offers."""
@@ -75,7 +75,9 @@ class CameraContract:
 
     def test_takes_nothing_before_it_knows_how(self, bench: Bench) -> None:
         with pytest.raises(DeviceRefused, match="configure"):
-            bench.camera.capture(io.BytesIO())
+            bench.camera.expose()
+        with pytest.raises(DeviceError, match="expose"):
+            bench.camera.download(io.BytesIO())
         assert bench.frames() == []
 
     def test_every_frame_is_the_one_that_was_exposed(self, bench: Bench) -> None:
@@ -84,7 +86,7 @@ class CameraContract:
         for number in range(4):
             into = io.BytesIO()
             before = bench.now()
-            captured = bench.camera.capture(into)
+            captured = capture(bench.camera, into)
             assert into.getvalue() == bench.frames()[number]
             assert captured.size == len(bench.frames()[number])
             assert captured.released_at.utcoffset() == timedelta(0)
@@ -96,11 +98,48 @@ class CameraContract:
         if bench.keeps_names:
             assert names == ["IMG_0001.CR2", "IMG_0002.CR2", "IMG_0003.CR2", "IMG_0004.CR2"]
 
+    def test_the_light_may_change_between_exposure_and_download(self, bench: Bench) -> None:
+        bench.camera.configure(SETTINGS)
+        before = bench.now()
+        released_at = bench.camera.expose()
+        assert before <= released_at <= bench.now()
+        assert len(bench.frames()) == 1
+        into = io.BytesIO()
+        captured = bench.camera.download(into)
+        assert captured.released_at == released_at
+        assert [into.getvalue()] == bench.frames()
+        with pytest.raises(DeviceError, match="expose"):
+            bench.camera.download(io.BytesIO())
+
+    def test_a_download_that_failed_is_tried_again_with_a_new_stream(self, bench: Bench) -> None:
+        class Full(io.BytesIO):
+            def write(self, data: object) -> int:
+                raise StorageError("the disk is full")
+
+        bench.camera.configure(SETTINGS)
+        bench.camera.expose()
+        for _ in range(2):
+            with pytest.raises(StorageError):
+                bench.camera.download(Full())
+        into = io.BytesIO()
+        bench.camera.download(into)
+        assert [into.getvalue()] == bench.frames()
+
+    def test_an_exposure_that_was_not_downloaded_gives_way_to_the_next(self, bench: Bench) -> None:
+        bench.camera.configure(SETTINGS)
+        bench.camera.expose()
+        bench.camera.expose()
+        into = io.BytesIO()
+        bench.camera.download(into)
+        assert into.getvalue() == bench.frames()[1]
+        with pytest.raises(DeviceError, match="expose"):
+            bench.camera.download(io.BytesIO())
+
     def test_exposes_as_configured(self, bench: Bench) -> None:
         applied = [SETTINGS, replace(SETTINGS, iso=200), replace(SETTINGS, aperture=11.0, shutter_s=1 / 125), SETTINGS]
         for settings in applied:
             bench.camera.configure(settings)
-            bench.camera.capture(io.BytesIO())
+            capture(bench.camera, io.BytesIO())
         bench.develop()
         assert bench.film.settings == applied
 
@@ -117,7 +156,7 @@ class CameraContract:
         bench.camera.configure(SETTINGS)
         into = io.BytesIO(b"before")
         into.seek(0, io.SEEK_END)
-        captured = bench.camera.capture(into)
+        captured = capture(bench.camera, into)
         assert into.getvalue() == b"before" + bench.frames()[0]
         assert captured.size == len(bench.frames()[0])
 
@@ -127,7 +166,7 @@ class CameraContract:
         assert bench.frames() == []
         bench.camera.configure(SETTINGS)
         into = io.BytesIO()
-        bench.camera.capture(into)
+        capture(bench.camera, into)
         assert into.getvalue() == bench.frames()[-1]
 
     def test_a_closed_camera_is_closed(self, bench: Bench) -> None:
@@ -135,5 +174,5 @@ class CameraContract:
         bench.camera.close()
         bench.camera.close()
         with pytest.raises(DeviceError):
-            bench.camera.capture(io.BytesIO())
+            bench.camera.expose()
         assert bench.frames() == []

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.camera import CameraIdentity, ExposureSettings
+from drivers.camera import CameraIdentity, ExposureSettings, capture
 from drivers.gphoto2_camera import Gphoto2Camera
 from foundation.clock import SystemClock
 from foundation.errors import ConfigurationError, DeviceError, DeviceRefused, LinkError
@@ -84,10 +84,10 @@ def test_a_lost_connection_is_renewed_by_the_next_call() -> None:
         camera = Gphoto2Camera(port, MODEL)
         camera.configure(SETTINGS)
     with pytest.raises(DeviceError):
-        camera.capture(io.BytesIO())
+        capture(camera, io.BytesIO())
     with served(int(port.rpartition(":")[2])) as (_, film):
         into = io.BytesIO()
-        camera.capture(into)
+        capture(camera, into)
         film.catch_up()
         assert [into.getvalue()] == film.frames
         camera.close()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.camera import CapturedFrame
+from drivers.camera import CapturedFrame, capture
 from drivers.canon.camera import CanonEos
 from drivers.canon.records import OtherRecord, TransferRequest, decode_events, encode_events
 from drivers.links.pipes import UsbPipes
@@ -105,7 +105,7 @@ def test_a_series_on_a_bad_day_is_whole(tmp_path: Path, forgetful: bool) -> None
             before = len(lab.film.frames)
             try:
                 with whole_file(tmp_path / f"{number:04d}.cr2") as stream:
-                    captured = lab.camera.capture(stream)
+                    captured = capture(lab.camera, stream)
             except DeviceError as error:
                 failed += 1
                 if not left or isinstance(error, DeviceRefused):

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from foundation import errors
-from foundation.console import EXIT_CODES, orderly_end, progress, run
+from foundation.console import EXIT_CODES, Ending, orderly_end, progress, run
 
 
 def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
@@ -66,15 +66,43 @@ def test_interruption_is_130(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == "error: interrupted; nothing of it was kept\n"
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])
-def test_a_disk_fault_that_nobody_translated_is_5(number: int, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("number", "beginning"),
+    [
+        (errno.ENOSPC, "cannot write /disk/samples.npy: No space left on device; free space or"),
+        (errno.EROFS, "cannot write /disk/samples.npy: Read-only file system; the disk can only be read"),
+        (errno.EDQUOT, "cannot write /disk/samples.npy: Disk quota exceeded; what this user may use"),
+        (errno.EIO, "cannot use /disk/samples.npy: Input/output error; the disk fails: see what dmesg says"),
+        (errno.ENODEV, "cannot use /disk/samples.npy: No such device; the disk is gone: connect and mount it"),
+        (errno.ESTALE, "cannot use /disk/samples.npy: Stale file handle; the folder was taken away or mounted anew"),
+    ],
+)
+def test_a_disk_fault_that_nobody_translated_is_5(
+    number: int, beginning: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     def fail() -> None:
-        raise OSError(number, "No space left on device", "/disk/samples.npy")
+        raise OSError(number, os.strerror(number), "/disk/samples.npy")
 
     assert run(fail) == 5
-    assert capsys.readouterr().err == (
-        "error: cannot write /disk/samples.npy: No space left on device; free space and run again\n"
-    )
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: {beginning}")
+    assert said.endswith("then run the same command again\n")
+
+
+def test_a_disk_fault_of_an_open_file_is_5(capsys: pytest.CaptureFixture[str]) -> None:
+    def fail() -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    assert run(fail) == 5
+    assert "cannot use the disk: Input/output error; the disk fails" in capsys.readouterr().err
+
+
+def test_a_missing_file_that_nobody_translated_is_no_disk_fault() -> None:
+    def fail() -> None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), "/nowhere")
+
+    with pytest.raises(FileNotFoundError):
+        run(fail)
 
 
 @pytest.mark.parametrize("name", ["/theirs/dataset.json", b"/theirs/dataset.json"])
@@ -258,3 +286,36 @@ def test_no_bar_before_there_is_something_to_count(capsys: pytest.CaptureFixture
     with progress("images") as tell:
         tell(1, 2)
     assert "1/2 images" in capsys.readouterr().err
+
+
+class TestEnding:
+    def test_a_request_ends_at_once_what_promises_nothing(self) -> None:
+        ending = Ending()
+        with pytest.raises(KeyboardInterrupt):
+            ending.ask()
+
+    def test_what_is_being_finished_is_told_once_and_cut_by_the_second_request(self) -> None:
+        said: list[str] = []
+        ending = Ending(said.append)
+        with ending.finishing("ending soon"):
+            ending.ask()
+            assert ending.asked
+            with pytest.raises(KeyboardInterrupt):
+                ending.ask()
+        assert said == ["ending soon"]
+
+    def test_a_wait_within_ends_at_once_and_does_not_begin_when_the_end_was_asked_for(self) -> None:
+        ending = Ending(lambda sentence: None)
+        with ending.finishing("ending soon"):
+            with pytest.raises(KeyboardInterrupt), ending.at_once():
+                ending.ask()
+            with pytest.raises(KeyboardInterrupt), ending.at_once():
+                raise AssertionError("begun")
+
+    def test_ctrl_c_waits_for_what_is_being_finished(self, capfd: pytest.CaptureFixture[str]) -> None:
+        before = signal.getsignal(signal.SIGINT)
+        with orderly_end() as ending, ending.finishing("ending soon"):
+            os.kill(os.getpid(), signal.SIGINT)
+            assert ending.asked
+        assert "ending soon" in capfd.readouterr().err
+        assert signal.getsignal(signal.SIGINT) == before

@@ -77,6 +77,12 @@ class TestWholeFile:
             assert path.read_text() == "old"
         assert path.read_text() == "new"
 
+    def test_a_folder_that_is_gone_is_not_made_anew_where_it_must_be_there(self, tmp_path: Path) -> None:
+        with pytest.raises(StorageError, match=r"its folder is gone: connect and mount"):  # noqa: SIM117
+            with whole_file(tmp_path / "disk" / "frame", make=False) as stream:
+                stream.write(b"raw")
+        assert names(tmp_path) == []
+
     @pytest.mark.parametrize("error", [ValueError("ours"), KeyboardInterrupt()])
     def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(
         self, tmp_path: Path, error: BaseException
@@ -89,11 +95,14 @@ class TestWholeFile:
         assert path.read_text() == "old"
         assert names(tmp_path) == ["a.csv"]
 
-    def test_a_full_disk_is_one_sentence_and_leaves_nothing(self, tmp_path: Path) -> None:
+    def test_a_disk_that_takes_no_more_is_one_sentence_and_leaves_nothing(self, tmp_path: Path) -> None:
         path = tmp_path / "big.dng"
-        with pytest.raises(StorageError, match=r"cannot write .*big\.dng: .*free space"), small_disk(10_000):  # noqa: SIM117
-            with whole_file(path) as stream:
-                stream.write(bytes(50_000))
+        with (
+            pytest.raises(StorageError, match=r"cannot write .*big\.dng: .*no file may be so large"),
+            small_disk(10_000),
+            whole_file(path) as stream,
+        ):
+            stream.write(bytes(50_000))
         assert names(tmp_path) == []
 
     def test_a_disk_that_fills_at_the_last_flush(self, tmp_path: Path) -> None:
@@ -135,6 +144,43 @@ class TestWholeFile:
         with pytest.raises(InputError, match=message):
             write_whole(tmp_path / name, "x")
         assert names(tmp_path) == ["taken"]
+
+    @pytest.mark.parametrize(
+        ("number", "remedy"),
+        [
+            (errno.ENOSPC, "free space"),
+            (errno.EDQUOT, "what this user may use"),
+            (errno.EFBIG, "no file may be so large"),
+            (errno.EROFS, "mount it for writing"),
+            (errno.EIO, "check its cable"),
+            (errno.ENODEV, "connect and mount it"),
+            (errno.ENXIO, "connect and mount it"),
+            (errno.ENOENT, "its folder is gone"),
+            (errno.ESTALE, "mount it again here"),
+            (errno.EMFILE, "ulimit -n"),
+        ],
+    )
+    def test_each_fault_of_a_disk_has_its_own_remedy(self, tmp_path: Path, number: int, remedy: str) -> None:
+        error = storage.storage_error(tmp_path, OSError(number, os.strerror(number)))
+        assert isinstance(error, StorageError)
+        assert remedy in str(error)
+        assert str(error).endswith("then run the same command again")
+        assert ("free space" in str(error)) == (number == errno.ENOSPC)
+
+    def test_a_folder_whose_names_cannot_be_flushed_is_a_fault_where_the_disk_fails(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def fail(number: int) -> None:
+            def fsync(handle: int) -> None:
+                raise OSError(number, os.strerror(number))
+
+            monkeypatch.setattr(storage.os, "fsync", fsync)
+
+        fail(errno.EIO)
+        with pytest.raises(StorageError, match="Input/output error; the disk fails"):
+            storage.sync_folder(tmp_path)
+        fail(errno.EINVAL)
+        storage.sync_folder(tmp_path)
 
     @pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])
     def test_a_place_where_nobody_may_write_keeps_its_code(self, tmp_path: Path, number: int) -> None:
@@ -218,7 +264,7 @@ class TestWholeFolder:
             raise error
         assert names(tmp_path) == []
 
-    def test_a_full_disk_is_one_sentence_and_leaves_nothing(self, tmp_path: Path) -> None:
+    def test_a_disk_that_takes_no_more_is_one_sentence_and_leaves_nothing(self, tmp_path: Path) -> None:
         path = tmp_path / "lut"
         with pytest.raises(StorageError, match=r"cannot write .*lut: "), small_disk(1000):  # noqa: SIM117
             with whole_folder(path, "the table") as folder:

@@ -6,7 +6,7 @@ import io
 from collections.abc import Callable
 from typing import Any
 
-from drivers.camera import CapturedFrame
+from drivers.camera import CapturedFrame, capture
 from drivers.canon.camera import CanonEos
 from drivers.links.pipes import UsbPipes
 from drivers.ptp.transport import Transport
@@ -45,7 +45,7 @@ class Lab:
         for left in reversed(range(attempts)):
             into = io.BytesIO()
             try:
-                captured = self.camera.capture(into)
+                captured = capture(self.camera, into)
             except DeviceError as error:
                 if not left or isinstance(error, DeviceRefused | DeviceFault):
                     raise

@@ -7,7 +7,15 @@ import numpy.typing as npt
 import pytest
 
 from foundation.angles import angles_deg
-from generator.rendering.cell_mixtures import MET_WITHIN, SLOTS, mix_cells
+from generator.rendering.cell_mixtures import (
+    _AXES,  # pyright: ignore[reportPrivateUsage]  # what differences cost is no part of the result
+    BRIGHTNESS_COST,
+    GREY_MET_DEG,
+    MET_WITHIN,
+    SLOTS,
+    WIDE_SPREAD_COST,
+    mix_cells,
+)
 from generator.rendering.print_profiles import PrintProfile
 from tests.generator.rendering.prints import printed
 
@@ -110,3 +118,28 @@ def test_charts_of_fewer_cells_say_how_far_they_are_off(bits: int) -> None:
     np.testing.assert_allclose(
         mixtures.distance, angles_deg(print_.colours[mixtures.cells].mean(axis=1), wanted), atol=1e-4
     )
+
+
+def test_no_exchange_of_two_cells_brings_a_grey_nearer() -> None:
+    # Moves of single cells alone end before that for some of these prints.
+    scale = np.array([[BRIGHTNESS_COST**0.5], [1.0], [1.0]]) * _AXES
+    for seed in range(10):
+        colours = 0.3 * np.exp(0.2 * np.random.default_rng(seed).standard_normal((64, 3)))
+        wanted = np.full((1, 3), 0.3)
+        cells = mix_cells(PrintProfile(colours, np.ones(64, np.bool_)), wanted).cells[0].astype(np.int64)
+        if angles_deg(colours[cells].mean(axis=0), wanted[0]) <= GREY_MET_DEG:
+            continue
+        places = (colours / wanted - 1) @ scale.T
+        single = WIDE_SPREAD_COST * SLOTS * (places**2).sum(axis=1)
+
+        def cost(total: npt.NDArray[np.float64], spread: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+            return (total**2).sum(axis=-1) + spread
+
+        now = cost(places[cells].sum(axis=0), single[cells].sum())
+        pairs = places[:, None] + places[None]
+        spreads = single[:, None] + single[None]
+        for i in range(SLOTS):
+            for j in range(i):
+                others = np.delete(cells, [i, j])
+                found = cost(places[others].sum(axis=0) + pairs, single[others].sum() + spreads)
+                assert found.min() >= now - 1e-9

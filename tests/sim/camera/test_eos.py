@@ -14,7 +14,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from drivers.camera import ExposureSettings
+from drivers.camera import ExposureSettings, capture
 from drivers.canon import apex
 from drivers.canon.camera import CanonEos
 from drivers.canon.datasets import DeviceInfoEx, decode_object_entries
@@ -873,7 +873,7 @@ def test_our_driver_takes_a_series(body: EosModel, without: tuple[int, ...]) -> 
     camera.configure(ExposureSettings(100, 8.0, 0.5))
     for number in range(2 * body.burst):
         into = BytesIO()
-        frame = camera.capture(into)
+        frame = capture(camera, into)
         assert into.getvalue() == film.frames[number]
         assert (frame.name, frame.released_at) == (f"IMG_{number + 1:04d}.DNG", film.exposures[number][1])
     camera.close()

@@ -1,0 +1,458 @@
+"""What goes wrong in the simulated lab while a session is taken: events as frozen values, by frame or by time.
+
+An event says from which frame to which it lasts, or from which second to which; both count since the session began,
+frames as the camera exposes them (from 0, retaken ones included), seconds by the lab's clock. It changes a frame in one
+of three places: what is shown, and the light, chart, lens and sensor (a `sim.world.situation.Situation`), or the counts
+that go into the file. All are functions of an event and a `Moment`, so that a frame comes out the same whoever asks and
+whatever was asked before.
+
+Sizes that are left out are chosen: large enough to be wrong, small enough to be overlooked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from drivers.presenter import BLACK, Colour
+from foundation.errors import ConfigurationError
+from sim.world.situation import UNDISTURBED, Blob, Patch, Place, Situation
+
+_HALF: Final[Place] = (-9.0, 0.5, 9.0, 9.0)
+"""The lower half of the picture, its overscan included."""
+
+_QUARTER: Final[Place] = (0.5, 0.35, 1.1, 1.4)
+"""A shoulder that reaches over a quarter of the chart from its lower right."""
+
+_SLANTED_DEG: Final = 30.0
+"""Direction of a push, clockwise from the right: along neither axis."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When a frame is exposed, and what is ordered.
+
+    Attributes
+    ----------
+    frame
+        Exposures before it in this session.
+    at_s
+        Seconds since the lab opened for the session.
+    colour
+        What is to be shown.
+    before
+        Of each frame before it, in taking order: its second, and what was ordered.
+    """
+
+    frame: int
+    at_s: float = 0.0
+    colour: Colour = BLACK
+    before: tuple[tuple[float, Colour], ...] = ()
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """An event: when it is there. What it does is in the subclasses.
+
+    Attributes
+    ----------
+    from_frame, to_frame
+        First and last frame; None: no last one.
+    from_s, to_s
+        First and last second; None: no limit.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
+    from_frame: int = 0
+    to_frame: int | None = None
+    from_s: float | None = None
+    to_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, first, last in (("frame", self.from_frame, self.to_frame), ("s", self.from_s, self.to_s)):
+            if first is not None and last is not None and last < first:
+                raise ValueError(f"it ends with to_{name} = {last:g} before it begins with from_{name} = {first:g}")
+
+    def is_there(self, moment: Moment) -> bool:
+        """Return whether it is there at a moment."""
+        return (
+            self.from_frame <= moment.frame
+            and (self.to_frame is None or moment.frame <= self.to_frame)
+            and (self.from_s is None or self.from_s <= moment.at_s)
+            and (self.to_s is None or moment.at_s <= self.to_s)
+        )
+
+    def shown(self, colour: Colour, moment: Moment) -> Colour:
+        """Return what is on the screen in place of `colour`."""
+        return colour
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Return the situation with what the event does to it."""
+        return situation
+
+    def counted(self, counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """Return the counts (rows, columns) uint16 that go into the file in place of `counts`."""
+        return counts
+
+
+@dataclass(frozen=True)
+class _Gradual(Disturbance):
+    """What grows evenly from its begin to its end, and then stays."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.to_frame is None and self.to_s is None:
+            raise ValueError("it grows until to_frame or to_s: one of them must be given")
+
+    def is_there(self, moment: Moment) -> bool:
+        return self.from_frame <= moment.frame and (self.from_s is None or self.from_s <= moment.at_s)
+
+    def grown(self, moment: Moment) -> float:
+        """Return how far it has grown, 0 … 1."""
+        if self.to_frame is not None:
+            return min((moment.frame - self.from_frame) / max(self.to_frame - self.from_frame, 1), 1.0)
+        assert self.to_s is not None
+        first = self.from_s or 0.0
+        return min((moment.at_s - first) / max(self.to_s - first, 1e-9), 1.0)
+
+
+@dataclass(frozen=True)
+class FrozenScreen(Disturbance):
+    """The picture sticks: the projector goes on showing what it showed in the last frame before."""
+
+    what: Literal["frozen screen"] = "frozen screen"
+
+    def shown(self, colour: Colour, moment: Moment) -> Colour:
+        """Return what was ordered for the last frame before it."""
+        for frame, (at_s, ordered) in reversed(tuple(enumerate(moment.before))):
+            if not self.is_there(Moment(frame, at_s)):
+                return ordered
+        return BLACK
+
+
+@dataclass(frozen=True)
+class PopUp(Disturbance):
+    """A window in front of the picture: its place on the page, its codes, and its share of the exposure's time."""
+
+    what: Literal["pop-up"] = "pop-up"
+    place: Place = (0.55, 0.05, 0.9, 0.3)
+    colour: tuple[int, int, int] = (255, 136, 0)
+    share: float = 1.0
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Lay the window over the picture."""
+        return replace(situation, patches=(*situation.patches, Patch(self.place, Colour(*self.colour), self.share)))
+
+
+@dataclass(frozen=True)
+class HalfChanged(Disturbance):
+    """A part of the picture, its lower half unless said, still shows the frame before."""
+
+    what: Literal["half-changed"] = "half-changed"
+    place: Place = _HALF
+    share: float = 1.0
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Leave the last colour in its place."""
+        last = moment.before[-1][1] if moment.before else BLACK
+        return replace(situation, patches=(*situation.patches, Patch(self.place, last, self.share)))
+
+
+@dataclass(frozen=True)
+class Bump(Disturbance):
+    """The chart, or the camera, has been pushed: by `px` half-size pixels at the chart's middle, or by `mm`, or both.
+
+    `direction_deg` is clockwise from the right; `turn_deg` turns the chart about its middle.
+    """
+
+    what: Literal["bump"] = "bump"
+    px: float = 0.0
+    mm: float = 0.0
+    direction_deg: float = _SLANTED_DEG
+    turn_deg: float = 0.0
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Push the chart from where it is."""
+        x, y = math.cos(math.radians(self.direction_deg)), math.sin(math.radians(self.direction_deg))
+        (px_x, px_y), (mm_x, mm_y) = situation.bump_px, situation.bump_mm
+        return replace(
+            situation,
+            bump_px=(px_x + self.px * x, px_y + self.px * y),
+            bump_mm=(mm_x + self.mm * x, mm_y + self.mm * y),
+            turn_deg=situation.turn_deg + self.turn_deg,
+        )
+
+
+@dataclass(frozen=True)
+class LampStep(Disturbance):
+    """The lamp's light changes at once by `percent`; red, green and blue each by its own with `rgb`, on top."""
+
+    what: Literal["lamp step"] = "lamp step"
+    percent: float = -10.0
+    rgb: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Dim or brighten the lamp."""
+        return _lit(situation, self.percent, self.rgb, 1.0)
+
+
+@dataclass(frozen=True)
+class LampDrift(_Gradual):
+    """The lamp's light changes evenly to `percent` at the end; the primaries each by its own with `rgb`, on top."""
+
+    what: Literal["lamp drift"] = "lamp drift"
+    percent: float = -2.0
+    rgb: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Dim or brighten the lamp."""
+        return _lit(situation, self.percent, self.rgb, self.grown(moment))
+
+
+@dataclass(frozen=True)
+class AmbientStep(Disturbance):
+    """A light goes on in the room: `percent` of the projector's white, by its primaries as `rgb` over their mean."""
+
+    what: Literal["ambient step"] = "ambient step"
+    percent: float = 1.0
+    rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Add its light."""
+        red, green, blue = (
+            light + self.percent / 100 * share for light, share in zip(situation.ambient, self.rgb, strict=True)
+        )
+        return replace(situation, ambient=(red, green, blue))
+
+
+@dataclass(frozen=True)
+class Defocus(Disturbance):
+    """The lens has been turned: further blur of standard deviation `px`, half-size pixels."""
+
+    what: Literal["defocus"] = "defocus"
+    px: float = 1.0
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Blur the picture."""
+        return replace(situation, defocus_px=math.hypot(situation.defocus_px, self.px))
+
+
+@dataclass(frozen=True)
+class Person(Disturbance):
+    """Someone stands before the chart: an ellipse at a place on the page, from where `left` of the light comes."""
+
+    what: Literal["person"] = "person"
+    place: Place = _QUARTER
+    left: float = 0.08
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Stand there."""
+        return replace(situation, blobs=(*situation.blobs, Blob(self.place, self.left)))
+
+
+@dataclass(frozen=True)
+class SensorWarming(_Gradual):
+    """The sensor warms up: its black level rises evenly by `dn` at the end."""
+
+    what: Literal["sensor warming"] = "sensor warming"
+    dn: float = 6.0
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Raise the black level."""
+        return replace(situation, black_dn=situation.black_dn + self.dn * self.grown(moment))
+
+
+@dataclass(frozen=True)
+class StaleFile(Disturbance):
+    """The camera delivers the counts of the frame before once more; with `new_header`, as taken now."""
+
+    what: Literal["stale file"] = "stale file"
+    new_header: bool = False
+
+
+@dataclass(frozen=True)
+class ZeroedStrip(Disturbance):
+    """A part of the file was lost: rows from `top` to `bottom`, shares of the sensor's height, hold zeros."""
+
+    what: Literal["zeroed strip"] = "zeroed strip"
+    top: float = 0.5
+    bottom: float = 0.55
+
+    def counted(self, counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """Return counts (rows, columns) uint16 with zeros in those rows."""
+        torn = counts.copy()
+        torn[_rows(counts, self.top, self.bottom)] = 0
+        return torn
+
+
+@dataclass(frozen=True)
+class ScrambledRows(Disturbance):
+    """A part of the file is in disorder: rows from `top` to `bottom`, shares of the sensor's height, are shuffled."""
+
+    what: Literal["scrambled rows"] = "scrambled rows"
+    top: float = 0.4
+    bottom: float = 0.6
+    seed: int = 0
+
+    def counted(self, counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """Return counts (rows, columns) uint16 with those rows in another order."""
+        torn = counts.copy()
+        rows = _rows(counts, self.top, self.bottom)
+        torn[rows] = np.random.default_rng(self.seed).permutation(counts[rows])
+        return torn
+
+
+AnyDisturbance = (
+    FrozenScreen | PopUp | HalfChanged | Bump | LampStep | LampDrift | AmbientStep | Defocus | Person | SensorWarming
+    | StaleFile | ZeroedStrip | ScrambledRows
+)  # fmt: skip
+"""Every event, by its `what`."""
+
+_LISTED: Final[TypeAdapter[tuple[AnyDisturbance, ...]]] = TypeAdapter(
+    tuple[Annotated[AnyDisturbance, Field(discriminator="what")], ...]
+)
+
+KINDS: Final = tuple(str(kind.what) for kind in get_args(AnyDisturbance))
+"""What can happen, as settings name it."""
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """Every event of a session, those that come later over those before."""
+
+    events: tuple[AnyDisturbance, ...] = ()
+
+    def at(self, moment: Moment) -> tuple[AnyDisturbance, ...]:
+        """Return the events that are there at a moment."""
+        return tuple(event for event in self.events if event.is_there(moment))
+
+    def shown(self, moment: Moment) -> Colour:
+        """Return what is on the screen."""
+        colour = moment.colour
+        for event in self.at(moment):
+            colour = event.shown(colour, moment)
+        return colour
+
+    def situation(self, moment: Moment) -> Situation:
+        """Return what is otherwise than in the undisturbed room."""
+        situation = UNDISTURBED
+        for event in self.at(moment):
+            situation = event.changed(situation, moment)
+        return situation
+
+    def counted(self, counts: NDArray[np.uint16], moment: Moment) -> NDArray[np.uint16]:
+        """Return the counts (rows, columns) uint16 that go into the file in place of those that were exposed."""
+        for event in self.at(moment):
+            counts = event.counted(counts)
+        return counts
+
+    def stale(self, moment: Moment) -> StaleFile | None:
+        """Return the event by which the camera delivers the last file again, None where it does not."""
+        return next((event for event in self.at(moment) if isinstance(event, StaleFile)), None)
+
+    def require_unshown(self, where: str) -> None:
+        """Refuse events that change what a screen shows or which file is sent: a screen that is real does so itself.
+
+        Raises
+        ------
+        ConfigurationError
+            There is such an event; `where` names the option.
+        """
+        for event in self.events:
+            if isinstance(event, FrozenScreen | HalfChanged | StaleFile):
+                raise ConfigurationError(
+                    f"{where}: {event.what} is for the simulated screen; freeze a projector by its control port, cover "
+                    "a screen by a window"
+                )
+
+    @property
+    def repeats_files(self) -> bool:
+        """Whether a file is ever delivered again."""
+        return any(isinstance(event, StaleFile) for event in self.events)
+
+
+CALM: Final = Disturbances()
+"""Nothing goes wrong."""
+
+
+def read_disturbances(listed: Sequence[Any], where: str, key: str = "simulated.events") -> Disturbances:
+    """Return the events of a settings file: tables with `what` (one of `KINDS`) and an event's own keys.
+
+    Parameters
+    ----------
+    listed
+        The tables.
+    where
+        The file, for messages.
+    key
+        Where they stand there.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such event, or it has no such key or value.
+    """
+    try:
+        return Disturbances(_LISTED.validate_python(listed))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = [part for part in first["loc"] if part not in KINDS]
+        at = ".".join([f"{key}[{place[0]}]" if place else key, *(str(part) for part in place[1:])])
+        hint = f"; known are {', '.join(KINDS)}" if first["type"].startswith("union_tag") else ""
+        raise ConfigurationError(f"{where}: {at}: {first['msg']}, got {first['input']!r}{hint}") from error
+
+
+def drawn(seed: int, frames: int, count: int, kinds: Iterable[str] = KINDS) -> Disturbances:
+    """Return so many events at random frames, each there for one frame, or from there on where it is of that kind.
+
+    Parameters
+    ----------
+    seed
+        The same seed draws the same events.
+    frames
+        Frames of the session, at least 2; none begins with the first frame, which everything is compared with.
+    count
+        How many events.
+    kinds
+        What may happen, of `KINDS`.
+    """
+    random = np.random.Generator(np.random.PCG64(seed))
+    by_name = {kind.what: kind for kind in get_args(AnyDisturbance)}
+    some = sorted(kinds, key=KINDS.index)
+    events: list[AnyDisturbance] = []
+    for _ in range(count):
+        kind = by_name[some[int(random.integers(len(some)))]]
+        first = int(random.integers(1, frames))
+        if kind is LampDrift or kind is SensorWarming:
+            events.append(kind(from_frame=first, to_frame=frames))
+        elif kind is Bump:
+            px, direction = random.uniform(0.3, 8), random.uniform(0, 360)
+            events.append(Bump(from_frame=first, px=float(px), direction_deg=float(direction)))
+        elif kind in _LASTING:
+            events.append(kind(from_frame=first))
+        else:
+            events.append(kind(from_frame=first, to_frame=first))
+    return Disturbances(tuple(events))
+
+
+_LASTING: Final = (FrozenScreen, LampStep, AmbientStep, Defocus)
+"""Events that do not end by themselves, beside a bump and what is gradual."""
+
+
+def _lit(situation: Situation, percent: float, rgb: tuple[float, float, float], grown: float) -> Situation:
+    red, green, blue = (
+        light * (1 + percent / 100 * grown) * (1 + own / 100 * grown)
+        for light, own in zip(situation.lamp, rgb, strict=True)
+    )
+    return replace(situation, lamp=(red, green, blue))
+
+
+def _rows(counts: NDArray[np.uint16], top: float, bottom: float) -> slice:
+    return slice(round(top * len(counts)), round(bottom * len(counts)))

@@ -1,0 +1,152 @@
+"""Every system call of saving and of holding a folder fails once, and from there on: one sentence, and nothing half."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import shutil
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+
+import pytest
+
+from foundation.errors import StorageError
+from foundation.files import require_free, whole_folder, write_whole
+from foundation.held_folders import held_folder
+from tests.failing_calls import DISK_FAULTS, FailingCalls, Ran, failing_calls, why_not
+
+pytestmark = pytest.mark.skipif(why_not() != "", reason=why_not())
+
+REMEDIES = {
+    errno.EIO: "check its cable",
+    errno.ENOSPC: "free space",
+    errno.EROFS: "mount it for writing",
+    errno.EDQUOT: "what this user may use",
+    errno.ENODEV: "connect and mount it",
+    errno.ESTALE: "mount it again here",
+}
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Generator[FailingCalls]:
+    with failing_calls(tmp_path) as calls:
+        yield calls
+
+
+def each_call(
+    disk: FailingCalls,
+    action: Callable[[], object],
+    before: Callable[[], object] = lambda: None,
+    numbers: Sequence[int] = DISK_FAULTS,
+) -> Generator[tuple[Ran, int, bool]]:
+    """Yield how `action` ended for each of its calls, each fault, once and lasting; what it raises is a sentence.
+
+    `before` makes everything as it was; `numbers` are the faults.
+    """
+    before()
+    first = disk.run(action)
+    assert first.error is None
+    assert first.calls
+    for number in numbers:
+        for lasting in (False, True):
+            for at in range(200):
+                before()
+                ran = disk.run(action, at, number, lasting=lasting)
+                if ran.error is not None:
+                    assert isinstance(ran.error, StorageError), f"{ran.failed}: {ran.error!r}"
+                    message = str(ran.error)
+                    assert os.strerror(number) in message
+                    assert REMEDIES[number] in message
+                    assert message.endswith("then run the same command again")
+                    assert "\n" not in message
+                if ran.failed is None:
+                    assert ran.error is None
+                    break
+                yield ran, number, lasting
+            else:
+                pytest.fail("it makes more than 200 calls")
+
+
+def test_a_call_that_fails_is_seen_to_fail(disk: FailingCalls, tmp_path: Path) -> None:
+    """The tool itself: the named call of the thread gets the error, and no other."""
+
+    def write() -> None:
+        with (tmp_path / "a").open("wb", buffering=0) as stream:
+            stream.write(b"x")
+
+    ran = disk.run(write, 0, errno.EIO, calls=("write",))
+    assert (ran.calls, ran.failed) == (("write /a",), "write /a")
+    assert isinstance(ran.error, OSError)
+    assert ran.error.errno == errno.EIO
+    assert (tmp_path / "a").read_bytes() == b""
+    assert disk.run(lambda: Path("/etc/passwd").read_text(), 0).calls == ()
+
+
+def save_old(path: Path) -> None:
+    write_whole(path, "old")
+    assert [other.name for other in path.parent.iterdir()] == [path.name]
+
+
+def test_saving_a_file_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv"
+    faults = 0
+    for ran, _, _ in each_call(disk, lambda: write_whole(path, "new" * 5000), lambda: save_old(path)):
+        assert path.read_text() in ("old", "new" * 5000)
+        if ran.error is None:
+            assert path.read_text() == "new" * 5000
+        assert {other.name for other in tmp_path.iterdir()} <= {"frames.csv", ".frames.csv.partial"}
+        faults += ran.error is not None
+    assert faults > 50
+
+
+def test_saving_a_folder_is_whole_or_a_sentence(disk: FailingCalls, tmp_path: Path) -> None:
+    path = tmp_path / "in" / "lut"
+
+    def save() -> None:
+        with whole_folder(path, "the table") as folder:
+            write_whole(folder / "a", "1")
+            write_whole(folder / "b", "2")
+
+    def clear() -> None:
+        shutil.rmtree(path.parent, ignore_errors=True)
+
+    for ran, _, _ in each_call(disk, save, clear, (errno.EIO, errno.ENOSPC)):
+        if path.exists():
+            assert {file.name: file.read_text() for file in path.iterdir()} == {"a": "1", "b": "2"}
+        else:
+            assert ran.error is not None
+
+
+@pytest.mark.parametrize("locks", [True, False])
+def test_holding_a_folder_or_a_sentence(
+    disk: FailingCalls, tmp_path: Path, locks: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flock = fcntl.flock
+    if not locks:
+
+        def no_folder(handle: int, operation: int) -> None:
+            # NFS answers so for a folder; a file in it is locked instead.
+            if Path(f"/proc/self/fd/{handle}").readlink().is_dir():
+                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+            flock(handle, operation)
+
+        monkeypatch.setattr(fcntl, "flock", no_folder)
+    held: list[bool] = []
+
+    def hold() -> None:
+        with held_folder(tmp_path / "session", "busy"):
+            held.append(True)
+
+    for ran, _, _ in each_call(disk, hold, held.clear):
+        assert len(held) == (ran.error is None)
+
+
+def test_looking_whether_a_place_is_free_or_a_sentence(disk: FailingCalls, tmp_path: Path) -> None:
+    place = tmp_path / "out"
+    place.mkdir()
+    for _ in each_call(disk, lambda: require_free(place, "the table")):
+        pass
+    place.rmdir()
+    for _ in each_call(disk, lambda: require_free(place, "the table")):
+        pass

@@ -1,0 +1,307 @@
+"""What goes wrong in the simulated lab goes wrong by as much as was said, where it was said, and nowhere else."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.presenter import BLACK, WHITE, Colour
+from drivers.raw.rawfile import read_raw
+from foundation.errors import ConfigurationError
+from sim.camera.film import WorldFilm
+from sim.clock import OPENING
+from sim.world.disturbances import (
+    KINDS,
+    AmbientStep,
+    AnyDisturbance,
+    Bump,
+    Defocus,
+    Disturbances,
+    FrozenScreen,
+    HalfChanged,
+    LampDrift,
+    LampStep,
+    Moment,
+    Person,
+    PopUp,
+    ScrambledRows,
+    SensorWarming,
+    StaleFile,
+    ZeroedStrip,
+    drawn,
+    read_disturbances,
+)
+from sim.world.drawing import Print
+from sim.world.room import REFERENCE_EXPOSURE, Room
+from sim.world.sensors import BODIES
+from sim.world.situation import OVERSCAN, Situation, moved, moved_back, projected_mm
+from sim.world.world import World
+from tests.sim.conftest import PAGE_MM
+
+RED, GREEN, GREY = Colour(255, 0, 0), Colour(0, 255, 0), Colour(128, 128, 128)
+TEST = BODIES["Test"]
+STRAIGHT = Room(
+    tilt_deg=0, pan_deg=0, roll_deg=0, k1=0, k2=0, p1=0, p2=0, waviness_mm=0, vignetting=0, projector_falloff=0,
+    response_spread=0, black_leak=0,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bare() -> World:
+    """Return bare paper in even light, seen straight on by photosites without noise to speak of."""
+    quiet = replace(TEST, read_noise_dn=0.01, sensor_noise_e=0.0, electrons_per_dn=1e6)
+    return World(Print(PAGE_MM, np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8)), quiet, STRAIGHT)
+
+
+def taken(world: World, *events: AnyDisturbance, colour: Colour = WHITE, frame: int = 5) -> NDArray[np.float64]:
+    """Return a frame's visible counts above black, with `frame` red frames before it, a minute each."""
+    before = tuple((60.0 * k, RED) for k in range(frame))
+    moment, happens = Moment(frame, 60.0 * frame, colour, before), Disturbances(events)
+    shown, situation = happens.shown(moment), happens.situation(moment)
+    counts = world.expose(shown, REFERENCE_EXPOSURE, key=(7,), situation=situation)
+    area = world.body.visible
+    counts = happens.counted(counts, moment)[area.top : area.top + area.height, area.left : area.left + area.width]
+    return counts.astype(np.float64) - world.body.black
+
+
+def at(world: World, x: float, y: float, frame: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return R, G, B at a place on the page, in shares of it: the 2×2 block that sees it."""
+    column, row = np.round(world.project(np.array(PAGE_MM) * (x, y))).astype(int)
+    block = frame[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
+    return np.array([block[0, 0], (block[0, 1] + block[1, 0]) / 2, block[1, 1]])
+
+
+def test_a_frozen_screen_shows_what_it_showed_before_it_froze(bare: World) -> None:
+    frozen = taken(bare, FrozenScreen(from_frame=5), colour=GREEN)
+    np.testing.assert_array_equal(frozen, taken(bare, colour=RED))
+    np.testing.assert_array_equal(taken(bare, FrozenScreen(from_frame=6), colour=GREEN), taken(bare, colour=GREEN))
+    before = ((0.0, RED), (1.0, GREEN), (2.0, GREY))
+    assert Disturbances((FrozenScreen(from_frame=2),)).shown(Moment(3, 3.0, WHITE, before)) == GREEN
+    assert Disturbances((FrozenScreen(from_s=0.5),)).shown(Moment(3, 3.0, WHITE, before)) == RED
+    assert Disturbances((FrozenScreen(),)).shown(Moment(3, 3.0, WHITE, before)) == BLACK
+
+
+def test_a_pop_up_lights_its_place_for_its_share_of_the_time(bare: World) -> None:
+    place = (0.2, 0.3, 0.4, 0.6)
+    frame = taken(bare, PopUp(place=place, colour=(0, 255, 0), share=0.25), colour=RED)
+    red, green = taken(bare, colour=RED), taken(bare, colour=GREEN)
+    expected = 0.75 * at(bare, 0.3, 0.45, red) + 0.25 * at(bare, 0.3, 0.45, green)
+    np.testing.assert_allclose(at(bare, 0.3, 0.45, frame), expected, atol=1.5)
+    for x, y in ((0.18, 0.45), (0.42, 0.45), (0.3, 0.28), (0.3, 0.62)):
+        np.testing.assert_allclose(at(bare, x, y, frame), at(bare, x, y, red), atol=1)
+
+
+def test_a_half_changed_picture_is_the_last_one_below(bare: World) -> None:
+    frame = taken(bare, HalfChanged(), colour=GREEN)
+    np.testing.assert_allclose(at(bare, 0.5, 0.48, frame), at(bare, 0.5, 0.48, taken(bare, colour=GREEN)), atol=1)
+    np.testing.assert_allclose(at(bare, 0.5, 0.52, frame), at(bare, 0.5, 0.52, taken(bare, colour=RED)), atol=1)
+
+
+@pytest.mark.parametrize("room_light", [0.0, 0.02])
+def test_lamp_and_room_light_are_as_bright_as_said(bare: World, room_light: float) -> None:
+    white = taken(bare).mean()
+    frame = taken(bare, LampStep(percent=-10), AmbientStep(percent=100 * room_light)).mean()
+    assert frame / white == pytest.approx(0.9 + room_light, abs=1e-3)
+    halfway = taken(bare, LampDrift(percent=-2, from_frame=0, to_frame=10)).mean()
+    assert halfway / white == pytest.approx(0.99, abs=1e-4)
+    by_time = taken(bare, LampDrift(percent=-2, from_s=200, to_s=300)).mean()
+    assert by_time / white == pytest.approx(0.98, abs=1e-4), "it stays when it has grown"
+
+
+def test_a_lamp_step_may_be_of_one_primary(bare: World) -> None:
+    step = LampStep(percent=0, rgb=(0, 0, -50))
+    np.testing.assert_allclose(taken(bare, step, colour=RED).mean(), taken(bare, colour=RED).mean(), rtol=1e-3)
+    blue = Colour(0, 0, 255)
+    np.testing.assert_allclose(taken(bare, step, colour=blue).mean(), taken(bare, colour=blue).mean() / 2, rtol=2e-3)
+
+
+def test_a_person_hides_what_is_behind(bare: World) -> None:
+    white = taken(bare)
+    frame = taken(bare, Person(place=(0.2, 0.2, 0.6, 0.8), left=0.05))
+    ratio = at(bare, 0.4, 0.5, frame) / at(bare, 0.4, 0.5, white)
+    np.testing.assert_allclose(ratio, 0.05, atol=2e-3)
+    np.testing.assert_array_equal(at(bare, 0.65, 0.5, frame), at(bare, 0.65, 0.5, white))
+    np.testing.assert_array_equal(at(bare, 0.22, 0.22, frame), at(bare, 0.22, 0.22, white))
+
+
+def _centres(world: World, frame: NDArray[np.float64], *events: Bump) -> NDArray[np.float64]:
+    """Return (12, 2) half-size px: where the black squares of `tests.sim.conftest.squares` are, by their weight."""
+    green = (frame[:-1:2, 1::2] + frame[1::2, :-1:2]) / 2
+    dark = green[: frame.shape[0] // 2].max() - green
+    x, y = np.meshgrid([25.37, 66.11, 107.83, 151.29], [24.71, 61.05, 99.43])
+    found: list[tuple[float, float]] = []
+    for middle in world.project(np.stack([x.ravel(), y.ravel()], axis=-1)):
+        column, row = (round(float(one)) for one in middle)
+        part = dark[row - 26 : row + 27, column - 26 : column + 27]
+        part = np.where(part > 0.5 * part.max(), 1.0, part / (0.5 * part.max()) * (part > 0.05 * part.max()))
+        rows, columns = np.mgrid[row - 26 : row + 27, column - 26 : column + 27]
+        found.append((float((part * columns).sum() / part.sum()), float((part * rows).sum() / part.sum())))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("px", "direction"), [(0.3, 0.0), (1.0, 30.0), (8.0, 200.0)])
+def test_a_bump_moves_the_chart_by_so_many_pixels(square_world: World, px: float, direction: float) -> None:
+    still = _centres(square_world, taken(square_world))
+    pushed = _centres(square_world, taken(square_world, Bump(px=px, direction_deg=direction)))
+    by = (pushed - still).mean(axis=0)
+    expected = px * np.array([np.cos(np.radians(direction)), np.sin(np.radians(direction))])
+    # The chart is rolled by 1.5° and turned by more.
+    np.testing.assert_allclose(by, expected, atol=0.02 + 0.035 * px)
+
+
+def test_millimetres_are_millimetres_on_the_print(square_world: World) -> None:
+    view = square_world.view
+    still = _centres(square_world, taken(square_world))
+    pushed = _centres(square_world, taken(square_world, Bump(mm=1.0, direction_deg=0.0)))
+    assert (pushed - still).mean(axis=0)[0] == pytest.approx(view.focal_px / view.distance_mm, rel=0.03)
+
+
+def test_a_turned_chart_turns_about_its_middle() -> None:
+    points = np.array([[100.0, 50.0], [90.0, 62.5]])
+    there = moved(points, (90, 62.5), (1, 0), 90.0)
+    np.testing.assert_allclose(there, [[90 + 12.5 + 1, 62.5 + 10], [91, 62.5]])
+    np.testing.assert_allclose(moved_back(there, (90, 62.5), (1, 0), 90.0), points, atol=1e-12)
+
+
+def test_the_projector_does_not_move_with_the_chart() -> None:
+    room = replace(STRAIGHT, projector_falloff=0.4)
+    world = World(Print(PAGE_MM, np.empty((0, 4)), np.empty((0, 3), dtype=np.uint8)), TEST, room)
+    inner = (slice(100, -100), slice(100, -100))
+    still, pushed = taken(world)[inner], taken(world, Bump(mm=8.0))[inner]
+    # Bare paper shows no movement but that of the light: there is none beyond the noise.
+    assert abs(np.mean(pushed / still) - 1) < 1e-3
+    assert np.corrcoef(pushed[::7, ::7].ravel(), still[::7, ::7].ravel())[0, 1] > 0.9
+
+
+def test_defocus_blurs_edges_by_its_standard_deviation() -> None:
+    page = Print(PAGE_MM, np.array([[0.0, 0.0, 90.0, 125.0]]), np.zeros((1, 3), dtype=np.uint8))
+    world = World(page, TEST, STRAIGHT)
+
+    def spread(*events: Defocus) -> float:
+        row = taken(world, *events)[101:401:2, ::2].mean(axis=0)
+        step = np.abs(np.diff(row[150:250]))
+        place = np.arange(len(step))
+        return float(np.average((place - np.average(place, weights=step)) ** 2, weights=step))
+
+    assert spread(Defocus(px=3.0)) - spread() == pytest.approx(9.0, rel=0.1)
+
+
+def test_a_warming_sensor_raises_black_and_nothing_else(bare: World) -> None:
+    dark = taken(bare, colour=BLACK)
+    warm = taken(bare, SensorWarming(dn=6, from_frame=0, to_frame=10), colour=BLACK)
+    assert (warm - dark).mean() == pytest.approx(3.0, abs=0.05)
+    difference = taken(bare, SensorWarming(dn=6, from_frame=0, to_frame=10)) - taken(bare)
+    assert difference.mean() == pytest.approx(3.0, abs=0.05)
+
+
+def test_a_projected_picture_lights_each_place_by_its_own(bare: World) -> None:
+    picture = np.zeros((90, 160, 3), dtype=np.float32)
+    picture[:45, :80, 0] = 1
+    picture[45:, 80:] = 0.25
+    area = bare.body.visible
+
+    def lit(shown: NDArray[np.float32]) -> NDArray[np.float64]:
+        counts = bare.expose(GREEN, REFERENCE_EXPOSURE, key=(7,), situation=Situation(picture=shown))
+        counts = counts[area.top : area.top + area.height, area.left : area.left + area.width]
+        return counts.astype(np.float64) - bare.body.black
+
+    frame, red, white = lit(picture), taken(bare, colour=RED), taken(bare)
+    np.testing.assert_allclose(at(bare, 0.25, 0.25, frame), at(bare, 0.25, 0.25, red), atol=1)
+    np.testing.assert_allclose(at(bare, 0.75, 0.75, frame), 0.25 * at(bare, 0.75, 0.75, white), atol=1)
+    np.testing.assert_allclose(at(bare, 0.75, 0.25, frame), 0, atol=1)
+    plain = lit(np.full((1, 1, 3), 0.5, dtype=np.float32))
+    np.testing.assert_allclose(plain, lit(np.full((9, 16, 3), 0.5, dtype=np.float32)), atol=1)
+    np.testing.assert_allclose(at(bare, 0.5, 0.5, plain), 0.5 * at(bare, 0.5, 0.5, white), atol=1)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 16 / 9, 4.0])
+def test_the_picture_covers_the_page_and_little_more(aspect: float) -> None:
+    left, top, right, bottom = projected_mm(PAGE_MM, aspect)
+    assert (right - left) / (bottom - top) == pytest.approx(aspect)
+    assert (left + right, top + bottom) == pytest.approx(PAGE_MM)
+    beyond = min(-left / PAGE_MM[0], -top / PAGE_MM[1])
+    assert beyond == pytest.approx(OVERSCAN)
+
+
+def test_strips_and_rows_are_those_named(bare: World) -> None:
+    counts = np.arange(100, dtype=np.uint16)[:, None] * np.ones(3, np.uint16)
+    torn = ZeroedStrip(top=0.5, bottom=0.55).counted(counts)
+    assert np.flatnonzero((torn != counts).any(axis=1)).tolist() == [50, 51, 52, 53, 54]
+    assert not torn[50:55].any()
+    mixed = ScrambledRows(top=0.2, bottom=0.6).counted(counts)
+    assert sorted(mixed[:, 0].tolist()) == list(range(100))
+    np.testing.assert_array_equal(mixed[:20], counts[:20])
+    assert np.count_nonzero(mixed[20:60, 0] != counts[20:60, 0]) > 30
+
+
+def test_a_stale_file_is_the_one_before(plain_world: World, tmp_path: Path) -> None:
+    shown = [RED, GREEN, GREY]
+    events = Disturbances((StaleFile(from_frame=1, to_frame=1), StaleFile(from_frame=2, to_frame=2, new_header=True)))
+    film = WorldFilm(plain_world, lambda: shown[0], lambda: 1.0, "1", {}, events)
+    files: list[bytes] = []
+    for number in range(4):
+        into = io.BytesIO()
+        film.expose(REFERENCE_EXPOSURE, OPENING + timedelta(seconds=10 * number), into)
+        files.append(into.getvalue())
+        shown.append(shown.pop(0))
+    assert files[1] == files[0]
+    assert files[2] != files[0]
+    pictures = [_counts(file, tmp_path / f"{number}.dng") for number, file in enumerate(files)]
+    np.testing.assert_array_equal(pictures[2], pictures[0])
+    assert not np.array_equal(pictures[3], pictures[0])
+
+
+def _counts(file: bytes, path: Path) -> NDArray[np.uint16]:
+    path.write_bytes(file)
+    return np.asarray(read_raw(path).sensor)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_event_is_there_when_said_and_leaves_other_frames_as_they_are(bare: World, kind: str) -> None:
+    end = {"to_frame": 9} if kind in ("lamp drift", "sensor warming") else {"to_frame": 4}
+    size = {"px": 2.0} if kind == "bump" else {}
+    (event,) = read_disturbances([{"what": kind, "from_frame": 3, **end, **size}], "LAB.toml").events
+    assert event.what == kind
+    assert [event.is_there(Moment(frame)) for frame in range(2, 5)] == [False, True, True]
+    undisturbed = taken(bare, colour=GREEN, frame=2)
+    np.testing.assert_array_equal(taken(bare, event, colour=GREEN, frame=2), undisturbed)
+
+
+@pytest.mark.parametrize(
+    ("event", "words"),
+    [
+        ({"what": "earthquake"}, "known are frozen screen, pop-up, half-changed"),
+        ({"from_frame": 3}, "simulated.events[0]"),
+        ({"what": "bump", "size": 3}, "simulated.events[0].size"),
+        ({"what": "pop-up", "colour": [1, 2]}, "simulated.events[0].colour"),
+        ({"what": "lamp drift"}, "to_frame or to_s: one of them must be given"),
+        ({"what": "person", "from_frame": 5, "to_frame": 3}, "ends with to_frame = 3 before it begins"),
+    ],
+)
+def test_an_event_that_cannot_be_is_one_sentence(event: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        read_disturbances([event], "LAB.toml")
+    assert str(caught.value).startswith("LAB.toml: simulated.events[0]")
+    assert words in str(caught.value)
+
+
+def test_a_seed_draws_the_same_events() -> None:
+    assert drawn(3, 100, 20) == drawn(3, 100, 20)
+    assert drawn(3, 100, 20) != drawn(4, 100, 20)
+    everything = drawn(1, 100, 200).events
+    assert {event.what for event in everything} == set(KINDS)
+    assert all(1 <= event.from_frame < 100 for event in everything)
+
+
+def test_what_a_real_screen_does_itself_is_not_pretended() -> None:
+    for event in (FrozenScreen(), HalfChanged(), StaleFile()):
+        with pytest.raises(ConfigurationError, match=f"--event: {event.what} is for the simulated screen"):
+            Disturbances((Bump(px=1.0), event)).require_unshown("--event")
+    Disturbances((Bump(px=1.0), Person())).require_unshown("--event")
