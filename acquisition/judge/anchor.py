@@ -81,11 +81,17 @@ class Anchor:
         return cls(kept, gauges, paper, chart is not None)
 
     def shift(self, mosaic: Mosaic, black: _Array, channel: Channel) -> Shift:
-        """Return how far the chart has moved, and how much softer it is, in a later frame's colour."""
+        """Return how far the chart has moved, and how much softer it is, in a later frame's colour.
+
+        `black` (2, 2) float64 counts, of that frame.
+        """
         return shift_between(self.gauges[channel], self.framing, gauges_of(mosaic, channel, black, self.framing))
 
     def displacement(self, mosaic: Mosaic, black: _Array, channel: Channel) -> tuple[float, float] | None:
-        """Return how far the tags have moved however far that is, px right and down; None where they are not seen."""
+        """Return how far the tags have moved however far that is, px right and down; None where they are not seen.
+
+        `black` (2, 2) float64 counts, of the frame.
+        """
         if not self.of_chart or not self.framing.tags:
             return None
         found = {tag.id: tag.centre_px for tag in find_tags(plane_of(mosaic, channel, black))}
@@ -96,7 +102,7 @@ class Anchor:
         return dx, dy
 
     def paper_level(self, mosaic: Mosaic, black: _Array, phases: dict[Channel, tuple[tuple[int, int], ...]]) -> _Array:
-        """Return (3,) float64: camera RGB of bare paper above black, mean over all its places."""
+        """Return (3,) float64: camera RGB of bare paper above `black` (2, 2) float64, median over all its places."""
         blocks = mosaic.block_planes()
         x, y = self.paper.T
         around = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]

@@ -173,4 +173,7 @@ def _residuals(
     off = seen - expected
     relative = np.where(lit, np.linalg.norm(off, axis=1) / against, np.nan)
     variance = _mean_variance(expected + np.maximum(dark, 0), noise, blocks).sum(axis=1)
-    return Residuals(relative, np.sqrt(variance) / against, off.sum(axis=1) / against)
+    total = (expected + np.maximum(dark, 0)).sum(axis=1)
+    usual = float(np.median(total[lit])) if lit.any() else 0.0
+    signed = off.sum(axis=1) / np.maximum(total, max(_FAINT * usual, 1e-6))
+    return Residuals(relative, np.sqrt(variance) / against, signed)

@@ -31,6 +31,9 @@ _BLURRED = 0.02
 _CONTRAST = 2.0
 """Contrast of the chart at a tile's edges, over the mean of the brighter tile: tags, paper, cells."""
 
+_BY_TURNS = 0.1
+"""Share of deviating rows that are brighter, or darker, from which on they are rows of another place."""
+
 _EDGE = 0.15
 """Relative deviation of a row for each px that the chart lies sideways: cells at a strip's ends are others."""
 
@@ -95,7 +98,8 @@ def _judge_rows(basis: Basis, light: Light, frame: Measured, moved_px: _Array, u
             return [*checks, Check("blur", sigma, None, None, "px", reason)]
     # Rows of another place are brighter and darker by turns; a shadow or another light is one of both.
     signed = rest.signed[wrong]
-    if uneven and abs(float(signed.mean())) > 0.5 * float(np.abs(signed).mean()):
+    brighter = float((signed > 0).mean())
+    if uneven and min(brighter, 1 - brighter) < _BY_TURNS:
         return checks
     rows = np.flatnonzero(wrong.reshape(-1, SEGMENTS).any(axis=1))
     reason = (
@@ -115,13 +119,12 @@ def _wrong_rows(basis: Basis, rest: Residuals, moved_px: _Array) -> npt.NDArray[
     if not seen.any():
         return np.zeros(len(seen), dtype=np.bool_)
     usual = max(sigma_of(rest.signed[seen]), 1e-6)
-    # Three channels' noise adds up in the sum that is compared.
     # A row at the print's edge changes with the least movement.
     assert basis.strip_maps is not None
     strength = np.linalg.norm(basis.strip_maps.sum(axis=0), axis=1).reshape(-1, SEGMENTS)
     steep = np.abs(np.gradient(strength, axis=0)).ravel() / np.maximum(strength.ravel(), 1e-6)
     least = limits.ROW_DEVIATION + (_EDGE + steep) * float(np.hypot(*moved_px))
-    room = np.maximum(least, limits.ROW_SIGMAS * np.maximum(usual, 1.8 * rest.noise))
+    room = np.maximum(least, limits.ROW_SIGMAS * np.maximum(usual, rest.noise))
     return np.asarray(np.abs(np.where(seen, rest.signed, 0.0)) > room)
 
 

@@ -79,7 +79,7 @@ class Places:
 
     @cached_property
     def sampled(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Rows and columns (`SAMPLES`,) of blocks spread evenly, and without a lattice, over the frame."""
+        """Rows (M,) and columns (M,) of blocks spread evenly, and without a lattice, over the frame."""
         chosen = np.random.default_rng(7).choice(self.rows * self.columns, min(SAMPLES, self.rows * self.columns))
         chosen.sort()
         return chosen // self.columns, chosen % self.columns

@@ -69,13 +69,23 @@ _LEAST_CHROMA, _LEAST_BRIGHTNESS = 0.0006, 0.0006
 """Scatter that is reckoned with however steady the lights were: tiles and tone curves are not known better."""
 
 _SUBSETS: tuple[tuple[int, ...], ...] = ((0, 1), (0, 2), (1, 2), (0, 1, 2))
+"""Primaries that overlap: each pair, and all three."""
+
+_TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if primary in subset]
+"""What each overlap adds to each of its primaries."""
 
 _N = len(_NODES)
+"""Nodes of a curve; the state holds three curves, three levels, the overlaps, and the lamp's level, in this order."""
+
 _CURVES = 3 * _N
-_TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if primary in subset]
+"""Entries of the state that are curves."""
+
 _OVERLAPS = slice(_CURVES + 3, _CURVES + 3 + len(_TERMS))
 _LAMP = _CURVES + 3 + len(_TERMS)
+"""Entry of the state that is the lamp's level, the last one."""
+
 _SIZE = _LAMP + 1
+"""Entries of the state."""
 
 _Array = npt.NDArray[np.float64]
 Codes = tuple[int, int, int]

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -24,8 +22,9 @@ from acquisition.run.rig.simulated import sheet
 from acquisition.session.judgement import Judgement
 from acquisition.session.plan import RESPONSE, SessionStep, plan_steps
 from drivers.camera import ExposureSettings
-from drivers.presenter import Colour
+from drivers.presenter import BLACK, Colour
 from sim.camera.dng import write_dng
+from sim.world.disturbances import AnyDisturbance, Disturbances, Moment
 from sim.world.room import Room
 from sim.world.sensors import BODIES, Body
 from sim.world.world import World
@@ -34,50 +33,6 @@ LAB = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "illuminations.c
 
 Counts = npt.NDArray[np.uint16]
 _frames = itertools.count()
-
-
-def altered(world: World, change: Callable[[npt.NDArray[np.float32]], npt.NDArray[np.float32]]) -> World:
-    """Return the same room with another picture: `change` gets each half-size plane of a primary's light."""
-    other = copy.copy(world)
-    light = world._render().copy()  # pyright: ignore[reportPrivateUsage]
-    for primary in light:
-        for row in (0, 1):
-            for column in (0, 1):
-                primary[row::2, column::2] = change(np.ascontiguousarray(primary[row::2, column::2]))
-    other._light = light  # pyright: ignore[reportPrivateUsage]
-    return other
-
-
-def moved(world: World, dx: float, dy: float) -> World:
-    def change(plane: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        by = np.array([[1, 0, dx], [0, 1, dy]], dtype=np.float32)
-        size = (plane.shape[1], plane.shape[0])
-        warped = cv2.warpAffine(plane, by, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        return np.maximum(np.asarray(warped, dtype=np.float32), 0)
-
-    return altered(world, change)
-
-
-def blurred(world: World, sigma: float) -> World:
-    return altered(world, lambda plane: np.asarray(cv2.GaussianBlur(plane, (0, 0), sigma), dtype=np.float32))
-
-
-def shaded(world: World, left: float, top: float, right: float, bottom: float, left_over: float) -> World:
-    """Return the room with something before a part of the frame, whose edges are shares of it."""
-
-    def change(plane: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        height, width = plane.shape
-        plane[int(top * height) : int(bottom * height), int(left * width) : int(right * width)] *= left_over
-        return plane
-
-    return altered(world, change)
-
-
-def with_room(world: World, **changes: Any) -> World:
-    """Return the world with a room in which something differs that is not drawn: ambient light, tone curve."""
-    other = copy.copy(world)
-    other.room = replace(world.room, **changes)
-    return other
 
 
 @dataclass
@@ -93,10 +48,17 @@ class Bench:
     judge: LiveJudge
     body: Body = BODIES["Test"]
 
-    def counts(self, step: SessionStep, world: World | None = None, lamp: float = 1.0) -> Counts:
-        """Return the counts of a new frame: no two have the same noise."""
-        settings = self.settings.camera.exposure
-        return (world or self.world).expose(step.colour, settings, key=(next(_frames),), lamp=lamp)
+    def counts(self, step: SessionStep, *events: AnyDisturbance, before: Colour = BLACK) -> Counts:
+        """Return the counts of a new frame, after one of a colour: no two have the same noise."""
+        moment = Moment(0, 0.0, step.colour, ((-1.0, before),))
+        gone_wrong = Disturbances(events)
+        counts = self.world.expose(
+            gone_wrong.shown(moment),
+            self.settings.camera.exposure,
+            key=(next(_frames),),
+            situation=gone_wrong.situation(moment),
+        )
+        return gone_wrong.counted(counts, moment)
 
     def show(self, counts: Counts, step: SessionStep, **writing: Any) -> Judgement:
         """Return what is said of counts."""
@@ -111,8 +73,8 @@ class Bench:
             write_dng(stream, counts, body, **given)
         return self.judge.judge(path, step)
 
-    def take(self, step: SessionStep, world: World | None = None, lamp: float = 1.0) -> Judgement:
-        return self.show(self.counts(step, world, lamp), step)
+    def take(self, step: SessionStep, *events: AnyDisturbance, before: Colour = BLACK) -> Judgement:
+        return self.show(self.counts(step, *events, before=before), step)
 
     def fork(self) -> Bench:
         """Return the bench with a judge of its own that knows what this one does."""
