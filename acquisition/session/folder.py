@@ -22,7 +22,7 @@ from typing import BinaryIO
 from acquisition.chart.model import Chart, load_chart
 from acquisition.lights.illuminations import Illumination, load_illuminations, save_illuminations
 from acquisition.session.incoming import IncomingFile, ReceivedFile
-from acquisition.session.journal import JOURNAL_FILE, Journal, time_text
+from acquisition.session.journal import JOURNAL_FILE, PATIENCE_S, Journal, time_text
 from acquisition.session.judgement import Judgement
 from acquisition.session.mending.retaking import BAD, lights_text, newest_report, parse_lights
 from acquisition.session.mending.verification import unsound_files
@@ -129,8 +129,20 @@ class Session:
             raise
 
     @classmethod
-    def open_for_run(cls, folder: Path) -> Session:
+    def open_for_run(
+        cls,
+        folder: Path,
+        patience_s: float = PATIENCE_S,
+        announce: Callable[[str], None] = lambda sentence: None,
+    ) -> Session:
         """Open a session folder to take frames into it; it is held until it is closed, and `frames.csv` is made anew.
+
+        Parameters
+        ----------
+        folder
+            The session.
+        patience_s, announce
+            How another program is waited for that writes the journal; see `Journal.open_for_run`.
 
         Raises
         ------
@@ -145,7 +157,7 @@ class Session:
         busy = f"{folder} is being taken by another program; wait for it, or look with acquire status"
         with ExitStack() as opened:
             opened.enter_context(held_folder(folder, busy))
-            journal = Journal.open_for_run(path)
+            journal = Journal.open_for_run(path, patience_s, announce)
             opened.callback(journal.close)
             session = cls(folder, journal, opened)
             session.write_frames_csv()
