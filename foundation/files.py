@@ -134,6 +134,8 @@ def make_folder(folder: Path, of: Path | None = None) -> None:
             # Another program may have taken it away between two calls.
             if os.path.lexists(folder) and not folder.is_dir():
                 raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
+        except NotADirectoryError as error:
+            raise InputError(f"cannot write {path}: {_PART_IS_A_FILE}") from error
         except OSError as error:
             raise storage_error(path, error) from error
         else:
