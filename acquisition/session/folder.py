@@ -121,7 +121,7 @@ class Session:
         FormatError
             The folder is no session, one of a version not known here, or its lights are not those of its plan.
         """
-        journal = Journal.open(_journal_path(folder))
+        journal = Journal.open(journal_path(folder))
         try:
             return cls(folder, journal)
         except BaseException:
@@ -153,7 +153,7 @@ class Session:
         StorageError
             The folder cannot be written.
         """
-        path = _journal_path(folder)
+        path = journal_path(folder)
         busy = f"{folder} is being taken by another program; wait for it, or look with acquire status"
         with ExitStack() as opened:
             opened.enter_context(held_folder(folder, busy))
@@ -420,19 +420,33 @@ def session_exists(folder: Path) -> bool:
     InputError
         The folder holds something that is no session.
     """
-    if (folder / JOURNAL_FILE).is_file():
+    if _is_file(folder / JOURNAL_FILE):
         return True
     require_free(folder, "the session")
     return False
 
 
-def _journal_path(folder: Path) -> Path:
+def journal_path(folder: Path) -> Path:
+    """Return the path of a session's journal.
+
+    Raises
+    ------
+    FormatError
+        There is none, or it cannot be looked for.
+    """
     path = folder / JOURNAL_FILE
-    if not path.is_file():
+    if not _is_file(path):
         raise FormatError(
             f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import"
         )
     return path
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk") from error
 
 
 def _codes(colour: Colour) -> str:

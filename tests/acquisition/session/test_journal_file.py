@@ -158,7 +158,11 @@ def test_patience_ends_with_a_sentence_and_nothing_is_lost(path: Path, monkeypat
 
 def test_where_machines_share_no_memory_a_reader_is_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_file, "TRY_S", 0.01)
-    monkeypatch.setattr(journal_file, "_on_network", lambda path: True)
+
+    def shared(_: Path) -> bool:
+        return True
+
+    monkeypatch.setattr(journal_file, "_on_network", shared)
     said: list[str] = []
     with closing(Journal.open_for_run(path, 60)) as journal:
         assert set(files(path)) == {"journal.sqlite"}
