@@ -13,6 +13,7 @@ from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.session.folder import Session, session_exists
 from acquisition.session.plan import plan_steps
+from foundation.console import Ending
 from foundation.errors import ConfigurationError
 
 FIXED = (
@@ -28,6 +29,7 @@ def run_session(
     observe: Callable[[int, int], None],
     announce: Callable[[str], None] = lambda sentence: None,
     retake: str | None = None,
+    ending: Ending | None = None,
 ) -> RunOutcome:
     """Take the session `folder`, new or interrupted, with the rig that the settings name.
 
@@ -39,6 +41,8 @@ def run_session(
         Called with a sentence when the run waits, tries again, pauses and goes on.
     retake
         What to take again (`Session.retake`); nothing if None.
+    ending
+        By which the run learns that it is to end after the running frame.
 
     Raises
     ------
@@ -56,13 +60,15 @@ def run_session(
         if done == total:
             return RunOutcome(total, 0, ())
 
-        def count(step: object, accepted: bool) -> None:
-            nonlocal done
-            done += accepted
-            observe(done, total)
-
         with open_rig(settings, session.chart, session) as devices:
-            return take_session(session, devices, settings, count, announce)
+            return take_session(
+                session,
+                devices,
+                settings,
+                observe=lambda taken: observe(total - taken.left, total),
+                announce=announce,
+                ending=ending,
+            )
 
 
 def open_session(settings: LabSettings, folder: Path) -> Session:
@@ -83,7 +89,9 @@ def open_session(settings: LabSettings, folder: Path) -> Session:
         return session
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
-    steps = plan_steps(lights, settings.sequence.reference_every)
+    sequence = settings.sequence
+    seed = sequence.seed if sequence.order == "shuffled" else None
+    steps = plan_steps(lights, sequence.reference_every, seed=seed)
     return Session.create(folder, settings.to_toml(), chart, lights, steps)
 
 
