@@ -4,22 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from acquisition.chart.model import load_chart
-from acquisition.config import LabSettings, parse_lab
+from acquisition.config import LabSettings
 from acquisition.lights.illuminations import load_illuminations
+from acquisition.run.planning.work import planned_steps, require_same
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.session.folder import Session, session_exists
-from acquisition.session.plan import plan_steps
-from foundation.errors import ConfigurationError
-
-FIXED = (
-    "rig", "camera", "simulated.body", "simulated.camera", "simulated.seed", "simulated.room",
-    "sequence.reference_every",
-)  # fmt: skip
-"""Settings that must stay for a whole session: they decide what its frames show."""
 
 
 def run_session(
@@ -76,39 +68,11 @@ def open_session(settings: LabSettings, folder: Path) -> Session:
     if session_exists(folder):
         session = Session.open_for_run(folder)
         try:
-            _require_same(session, settings)
+            require_same(session, settings)
         except BaseException:
             session.close()
             raise
         return session
     chart = load_chart(settings.chart)
     lights = load_illuminations(settings.illuminations)
-    steps = plan_steps(lights, settings.sequence.reference_every)
-    return Session.create(folder, settings.to_toml(), chart, lights, steps)
-
-
-def _require_same(session: Session, settings: LabSettings) -> None:
-    before = parse_lab(session.settings_text(), str(session.folder / "session.toml"))
-    for key in FIXED:
-        old, new = _value(before, key), _value(settings, key)
-        if old != new:
-            raise ConfigurationError(
-                f"{session.folder} was begun with {key} = {old!r}, {settings.file} says {new!r}; "
-                "put the old value back, or name a new session folder"
-            )
-    if load_chart(settings.chart).sha256 != session.chart.sha256:
-        raise ConfigurationError(
-            f"{session.folder} was begun with another chart than {settings.chart}; name that, or a new session folder"
-        )
-    if load_illuminations(settings.illuminations) != session.illuminations:
-        raise ConfigurationError(
-            f"{session.folder} was begun with other lights than {settings.illuminations}; "
-            "name those, or a new session folder"
-        )
-
-
-def _value(settings: LabSettings, key: str) -> Any:
-    value: Any = settings.model_dump()
-    for part in key.split("."):
-        value = value[part]
-    return value
+    return Session.create(folder, settings.to_toml(), chart, lights, planned_steps(settings, lights))
