@@ -276,18 +276,54 @@ def status(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> 
 
 @app.command(epilog=EXIT_CODES)
 def monitor(
-    session: Annotated[Path, typer.Argument(help="Session folder.")],
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0 takes a free one.")] = 8707,
+    session: Annotated[Path, typer.Argument(help="Session folder; one that is not there yet is waited for.")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 8707,
+    host: Annotated[
+        str,
+        typer.Option(help="Address to listen on; 0.0.0.0 lets other machines in the house look, a phone for one."),
+    ] = "127.0.0.1",
 ) -> None:
-    """Show a session's state as a live web page on this machine, until interrupted.
+    """Show a session as a live web page, until interrupted.
 
-    Reads SESSION anew for each request, also while it is being taken; writes nothing.
+    Reads SESSION, also while it is being taken; writes nothing and never holds a run up. With --host the address holds
+    a token, new at each start: whoever has the address can look, and nobody can change anything. It is printed as a QR
+    code, too.
     """
-    from acquisition.session.monitor import open_monitor
+    from acquisition.monitor.access import is_loopback, reachable_addresses
+    from acquisition.monitor.server import open_monitor
 
-    with open_monitor(session, port) as server, suppress(KeyboardInterrupt):
-        print(f"http://127.0.0.1:{server.server_address[1]}/ shows {session}; Ctrl-C ends it", flush=True)
+    with open_monitor(session, port, host) as server, suppress(KeyboardInterrupt):
+        addresses = [f"http://{name}:{server.port}/{server.path}" for name in reachable_addresses(host)]
+        print(f"{' and '.join(addresses)} shows {session}; Ctrl-C ends it", flush=True)
+        if not is_loopback(host):
+            print(
+                "warning: everybody who has this address and can reach this machine can look at the session, and what "
+                "is sent is not encrypted; use it in your own network only",
+                file=sys.stderr,
+            )
+            if sys.stdout.isatty():
+                from acquisition.monitor.qr import qr_text
+
+                print(qr_text(addresses[0]), flush=True)
         server.serve_forever()
+
+
+@app.command(epilog=EXIT_CODES)
+def report(
+    session: Annotated[Path, typer.Argument(help="Session folder.")],
+    out: Annotated[
+        Path | None, typer.Argument(help="HTML file, replaced if it is there; SESSION/report.html by default.")
+    ] = None,
+) -> None:
+    """Write what the monitor's page shows as one HTML file, pictures and all, to be kept or mailed.
+
+    Reads SESSION, also while it is being taken. acquire run writes the same file when it ends.
+    """
+    from acquisition.monitor.report import REPORT_FILE, save_report
+
+    path = session / REPORT_FILE if out is None else out
+    save_report(session, path)
+    print(f"{path}: written")
 
 
 @app.command("import", epilog=EXIT_CODES)

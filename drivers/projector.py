@@ -1,6 +1,7 @@
 """The interface of a projector's control port: its lamp, its faults, its name.
 
-What the projector *shows* is set elsewhere; see `drivers.presenter`.
+What the projector *shows* is set elsewhere; see `drivers.presenter`. A question that a projector does not know is
+answered as one that it cannot tell, never as an error: few know all that their standard has.
 """
 
 from __future__ import annotations
@@ -70,8 +71,8 @@ class Projector(Protocol):
         """Begin to switch off; returns at once, `power` shows when it is done."""
         ...
 
-    def muted(self) -> bool:
-        """Return whether the picture is blanked by mute."""
+    def muted(self) -> bool | None:
+        """Return whether the picture is blanked by mute; None where the projector is on and cannot tell."""
         ...
 
     def set_muted(self, muted: bool) -> None:
@@ -79,11 +80,11 @@ class Projector(Protocol):
         ...
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return every fault reported now; empty when healthy."""
+        """Return every fault reported now; empty when healthy, and where the projector cannot tell."""
         ...
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return every lamp; empty for a lampless projector."""
+        """Return every lamp; empty for a lampless projector, and for one that does not count hours."""
         ...
 
     def close(self) -> None:

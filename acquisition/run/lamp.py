@@ -47,8 +47,7 @@ def make_ready(projector: Projector, sequence: SequenceSettings, patience: Patie
         It does not carry out a command, or could not be reached for as long as patience lasts.
     """
     found_lit = _light(projector, patience)
-    if patience.attempt(lambda: _muted(projector), _NAME):
-        patience.attempt(lambda: projector.set_muted(False), _NAME)
+    patience.attempt(lambda: _unmute(projector), _NAME)
     went_out = _outlast(projector, patience)
     if not found_lit or went_out:
         _warm_up(projector, sequence, patience)
@@ -153,12 +152,14 @@ def _power(projector: Projector) -> Power | None:
         return None
 
 
-def _muted(projector: Projector) -> bool:
-    try:
-        return projector.muted()
-    except DeviceRefused:
-        # Some do not know it before mute was first set.
-        return True
+def _unmute(projector: Projector) -> None:
+    muted = projector.muted()
+    if muted:
+        projector.set_muted(False)
+    elif muted is None:
+        # Some cannot tell before mute was first set, some neither tell nor set it.
+        with suppress(DeviceRefused):
+            projector.set_muted(False)
 
 
 def _is_lit(projector: Projector) -> bool:

@@ -5,6 +5,8 @@ Rules that hold inside:
 - The picture fills one whole display in the mode that the desktop set: no scaling, no cursor, no frame.
 - `show` returns when the drawn frame and what the display's server shows are exactly the colour, in every pixel: on X,
   the screen is read over another connection, as a screenshot program does; on Windows and macOS, the front buffer.
+  `verify` reads it again, as often as is asked.
+- A display that was away for a while is filled again by the next `show`, if it comes back in the mode that it had.
 - One thread owns the window: the one that opened it. OpenGL contexts and GLFW want it so.
 - The window belongs to this process: however that ends, killed included, the window goes with it.
 - GLFW and OpenGL are used in this folder and nowhere else; GLFW runs while anything here is open.
@@ -30,7 +32,7 @@ import numpy.typing as npt
 from drivers.display import opengl
 from drivers.display.displays import Display, choose_display, displays_of, list_displays, running_glfw
 from drivers.display.opengl import OpenGl
-from drivers.display.x11 import XScreen, is_lost
+from drivers.display.x11 import XScreen, is_dark, is_lost
 from drivers.presenter import BLACK, Colour
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError
@@ -52,6 +54,8 @@ _DIGITS: Final = (
     "111100111001111", "111100111101111", "111001001001001", "111101111101111", "111101111001111",
 )  # fmt: skip
 """0 … 9 in 3×5 blocks, rows from the top."""
+
+_LOOK: Final = "look for a window or notification in front, desktop scaling, or a colour filter"
 
 _SYSTEM_CLOCK = SystemClock()
 
@@ -109,18 +113,29 @@ class FullScreen:
             A pixel has another colour, the display is gone, or another thread than its own asks.
         """
         self._require_usable()
-        self._glfw.poll_events()
-        if self._screen is not None and is_lost(self._glfw.get_x11_display()):
-            raise DeviceError(
-                f"the X server of display {self.display} is gone: somebody logged out, or it crashed; log in, then run "
-                "again"
-            )
+        self._require_server()
         if not self._is_full():
-            raise DeviceError(
-                f"the window no longer fills display {self.display}; check its cable and the desktop's display "
-                "settings, then open it again"
-            )
+            self._fill_again()
+        self._require_lit()
         self._present(colour)
+
+    def verify(self, colour: Colour) -> None:
+        """Return if every pixel of the screen is exactly `colour` now, read once; see `drivers.presenter.ReadsBack`.
+
+        On X what the server shows is read, whoever drew it, and a window in front is named. On Windows and macOS it is
+        the window's own front buffer, which knows nothing of a window in front.
+
+        Raises
+        ------
+        DeviceError
+            A pixel has another colour, the display is gone or dark, or another thread than its own asks.
+        """
+        self._require_usable()
+        self._require_server()
+        self._require_full()
+        self._require_lit()
+        self._glfw.make_context_current(self._window)
+        self._require(self._read_screen(), colour, "the screen shows")
 
     def identify(self) -> None:
         """Show the display's number in big white blocks on black, to identify it among the others."""
@@ -240,6 +255,46 @@ class FullScreen:
             self._clock.sleep(_LOOK_AGAIN_S)
             self._glfw.poll_events()
 
+    def _fill_again(self) -> None:
+        """Fill the display anew after it was away, switched off or in another mode; it must be as it was."""
+        glfw = self._glfw
+        for found, monitor in displays_of(glfw):
+            if (found.name, found.width, found.height) == (
+                self.display.name,
+                self.display.width,
+                self.display.height,
+            ):
+                self.display, self._monitor = found, monitor
+                glfw.set_window_monitor(
+                    self._window, monitor, 0, 0, found.width, found.height, found.refresh_hz or glfw.DONT_CARE
+                )
+                with contextlib.suppress(DeviceError):
+                    self._wait_until_full()
+                break
+        self._require_full()
+
+    def _require_server(self) -> None:
+        self._glfw.poll_events()
+        if self._screen is not None and is_lost(self._glfw.get_x11_display()):
+            raise DeviceError(
+                f"the X server of display {self.display} is gone: somebody logged out, or it crashed; log in, then run "
+                "again"
+            )
+
+    def _require_full(self) -> None:
+        if not self._is_full():
+            there = "; ".join(str(found) for found, _ in displays_of(self._glfw)) or "none"
+            raise DeviceError(
+                f"the window no longer fills display {self.display}; displays now: {there}; check its cable and the "
+                "desktop's display settings, until it is as it was"
+            )
+
+    def _require_lit(self) -> None:
+        if self._screen is not None and is_dark(self._glfw.get_x11_display()):
+            raise DeviceError(
+                f"power saving keeps display {self.display} dark; move the mouse, and switch it off (xset -dpms)"
+            )
+
     def _is_full(self) -> bool:
         glfw, display = self._glfw, self.display
         if not glfw.get_window_monitor(self._window):
@@ -252,7 +307,7 @@ class FullScreen:
     def _present(self, colour: Colour) -> None:
         self._glfw.make_context_current(self._window)
         self._fill(colour)
-        self._require(self._read_buffer(opengl.BACK), colour, "OpenGL drew")
+        self._require(self._read_buffer(opengl.BACK), colour, "OpenGL drew", on_screen=False)
         self._glfw.swap_buffers(self._window)
         self._gl.finish()
         deadline = self._clock.monotonic() + CONFIRMING_S
@@ -289,17 +344,31 @@ class FullScreen:
         np.bitwise_and(self._drawn, np.uint32(0xFFFFFF), out=self._drawn)
         return self._drawn
 
-    def _require(self, pixels: npt.NDArray[np.uint32], colour: Colour, subject: str) -> None:
+    def _require(self, pixels: npt.NDArray[np.uint32], colour: Colour, subject: str, *, on_screen: bool = True) -> None:
         expected = colour.red << 16 | colour.green << 8 | colour.blue
         wrong = pixels != expected
         if wrong.any():
-            first = int(pixels[wrong][0])
+            rows, columns = np.flatnonzero(wrong.any(axis=1)), np.flatnonzero(wrong.any(axis=0))
+            top, left = int(rows[0]), int(columns[0])
+            first_column = int(np.flatnonzero(wrong[top])[0])
+            first = int(pixels[top, first_column])
             found = f"({first >> 16}, {first >> 8 & 255}, {first & 255})"
+            size = f"{int(columns[-1]) - left + 1}×{int(rows[-1]) - top + 1} px"
             raise DeviceError(
                 f"{subject} {found} in place of ({colour.red}, {colour.green}, {colour.blue}) in "
-                f"{np.count_nonzero(wrong)} of {wrong.size} pixels of display {self.display}; "
-                "look for a window or notification in front, desktop scaling, or a colour filter"
+                f"{np.count_nonzero(wrong)} of {wrong.size} pixels of display {self.display}, within {size} at "
+                f"{left:+d}{top:+d}; {self._what_covers(first_column, top) if on_screen else _LOOK}"
             )
+
+    def _what_covers(self, column: int, row: int) -> str:
+        """Return what lies in front of a pixel, as far as it can be known, and what to do."""
+        cover = None
+        if self._screen is not None:
+            own: int = self._glfw.get_x11_window(self._window)
+            cover = self._screen.cover(self.display.x + column, self.display.y + row, own)
+        if cover is not None:
+            return f"in front of it lies {cover}: close it, and switch such windows and notifications off"
+        return _LOOK
 
     def _bent_ramp(self) -> str:
         try:

@@ -8,6 +8,7 @@ Rules that hold inside:
 - The hold on screen saver and power saving ends with the connection, hence with the process, however that ends.
 
 Sources: X Window System Protocol, GetImage, QueryExtension and GetProperty; MIT-SCREEN-SAVER extension 1.1, Suspend;
+DPMS extension 1.2;
 Xlib, XSetIOErrorHandler(3) and XSetIOErrorExitHandler(3), the latter from libX11 1.7 on.
 """
 
@@ -19,6 +20,7 @@ import ctypes
 import numpy as np
 import numpy.typing as npt
 
+from drivers.display.stacking import Cookie, Cover, WindowStack
 from foundation.errors import DeviceError
 
 _Z_PIXMAP = 2
@@ -31,6 +33,8 @@ _REPLY_ATOM = 8
 """Offset of `atom` in an InternAtom reply."""
 _ANY_TYPE = 0
 """AnyPropertyType of GetProperty: the value is wanted whatever its type."""
+_DPMS_ON = 0
+"""Power level of a display that is lit (DPMS extension 1.2, DPMSInfo; 1 standby, 2 suspend, 3 off)."""
 
 
 _lost: set[int] = set()
@@ -65,8 +69,19 @@ def is_lost(display: int) -> bool:
     return display in _lost
 
 
-class _Cookie(ctypes.Structure):
-    _fields_ = (("sequence", ctypes.c_uint),)
+def is_dark(display: int) -> bool:
+    """Return whether power saving keeps the displays of an Xlib connection dark now; False where it cannot tell."""
+    with contextlib.suppress(OSError, AttributeError):
+        extension = ctypes.CDLL("libXext.so.6")
+        first, second = ctypes.c_int(), ctypes.c_int()
+        extension.DPMSQueryExtension.argtypes = [ctypes.c_void_p] * 3
+        if not extension.DPMSQueryExtension(display, ctypes.byref(first), ctypes.byref(second)):
+            return False
+        level, enabled = ctypes.c_uint16(), ctypes.c_uint8()
+        extension.DPMSInfo.argtypes = [ctypes.c_void_p] * 3
+        answered = extension.DPMSInfo(display, ctypes.byref(level), ctypes.byref(enabled))
+        return bool(answered and enabled.value and level.value != _DPMS_ON)
+    return False
 
 
 class _Screens(ctypes.Structure):
@@ -139,6 +154,12 @@ class XScreen:
         finally:
             self._libc.free(reply)
 
+    def cover(self, x: int, y: int, own: int) -> Cover | None:
+        """Return the window that lies over the window `own` at a place of the screen; None where none does."""
+        if self._connection is None:
+            return None
+        return WindowStack(self._xcb, self._connection, self._root).cover(x, y, own)
+
     def has_extension(self, name: str) -> bool:
         """Return whether the server has the extension `name`."""
         if self._connection is None:
@@ -184,7 +205,7 @@ class XScreen:
         with contextlib.suppress(OSError, AttributeError):
             saver = ctypes.CDLL("libxcb-screensaver.so.0")
             saver.xcb_screensaver_suspend_checked.argtypes = [ctypes.c_void_p, ctypes.c_uint32]
-            saver.xcb_screensaver_suspend_checked.restype = _Cookie
+            saver.xcb_screensaver_suspend_checked.restype = Cookie
             cookie = saver.xcb_screensaver_suspend_checked(self._connection, 1)
             failure = self._xcb.xcb_request_check(self._connection, cookie)
             self._libc.free(failure)
@@ -201,20 +222,20 @@ def _declare(xcb: ctypes.CDLL) -> None:
         "xcb_setup_roots_iterator": (_Screens, [pointer]),
         "xcb_screen_next": (None, [ctypes.POINTER(_Screens)]),
         "xcb_get_image": (
-            _Cookie,
+            Cookie,
             [pointer, ctypes.c_uint8, integer, half, half, ctypes.c_uint16, ctypes.c_uint16, integer],
         ),
-        "xcb_get_image_reply": (pointer, [pointer, _Cookie, ctypes.POINTER(pointer)]),
+        "xcb_get_image_reply": (pointer, [pointer, Cookie, ctypes.POINTER(pointer)]),
         "xcb_get_image_data": (pointer, [pointer]),
         "xcb_get_image_data_length": (ctypes.c_int, [pointer]),
-        "xcb_query_extension": (_Cookie, [pointer, ctypes.c_uint16, ctypes.c_char_p]),
-        "xcb_query_extension_reply": (pointer, [pointer, _Cookie, pointer]),
-        "xcb_intern_atom": (_Cookie, [pointer, ctypes.c_uint8, ctypes.c_uint16, ctypes.c_char_p]),
-        "xcb_intern_atom_reply": (pointer, [pointer, _Cookie, pointer]),
-        "xcb_get_property": (_Cookie, [pointer, ctypes.c_uint8, integer, integer, integer, integer, integer]),
-        "xcb_get_property_reply": (pointer, [pointer, _Cookie, pointer]),
+        "xcb_query_extension": (Cookie, [pointer, ctypes.c_uint16, ctypes.c_char_p]),
+        "xcb_query_extension_reply": (pointer, [pointer, Cookie, pointer]),
+        "xcb_intern_atom": (Cookie, [pointer, ctypes.c_uint8, ctypes.c_uint16, ctypes.c_char_p]),
+        "xcb_intern_atom_reply": (pointer, [pointer, Cookie, pointer]),
+        "xcb_get_property": (Cookie, [pointer, ctypes.c_uint8, integer, integer, integer, integer, integer]),
+        "xcb_get_property_reply": (pointer, [pointer, Cookie, pointer]),
         "xcb_get_property_value_length": (ctypes.c_int, [pointer]),
-        "xcb_request_check": (pointer, [pointer, _Cookie]),
+        "xcb_request_check": (pointer, [pointer, Cookie]),
         "xcb_disconnect": (None, [pointer]),
     }
     for name, (answer, arguments) in signatures.items():

@@ -7,12 +7,15 @@ Rules that hold inside:
   more over a new one; every command here may be repeated without harm.
 - After a fault of cable or protocol the connection is dropped, so that a late answer never meets a later question.
 - Class 2 is used only where the projector reports that it has it: others may never answer.
+- Projectors in the field do not know all of their class. What a question cannot be asked for (`ERR1`, `ERR2`) is None,
+  or empty, and not asked again; `ERR3` means that it may be asked later. Only commands are refused.
 """
 
 from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
+from typing import TypeVar
 
 from drivers.links.link import Link
 from drivers.pjlink import notices, wire
@@ -34,6 +37,8 @@ DEFAULT_TIMEOUT_S = 5.0
 """The standard asks for an answer within 2 s; real projectors take longer while they warm up."""
 
 _SYSTEM_CLOCK = SystemClock()
+
+_Answer = TypeVar("_Answer")
 
 
 def random_nonce() -> bytes:
@@ -122,6 +127,7 @@ class PjLinkProjector:
         self._label = label
         self._clock = clock
         self._connection: _Connection | None = None
+        self._unknown: set[PjLinkRequest] = set()
 
     def identity(self) -> ProjectorIdentity:
         """Return maker, model and name; empty what the projector does not say."""
@@ -139,30 +145,36 @@ class PjLinkProjector:
         """Begin to switch off; refused while it warms up."""
         self._set("POWR", "0")
 
-    def muted(self) -> bool:
-        """Return whether the picture is blanked by mute; refused unless the projector is on."""
-        return wire.parse_mute(self._ask("AVMT"))
+    def muted(self) -> bool | None:
+        """Return whether the picture is blanked by mute, None where it cannot tell; refused unless it is on."""
+        value = self._ask_if_known("AVMT")
+        return None if value is None else wire.parse_mute(value)
 
     def set_muted(self, muted: bool) -> None:
         """Blank picture and sound, or show them; refused unless the projector is on."""
         self._set("AVMT", wire.format_mute(muted))
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return every fault reported now; empty when healthy."""
-        return wire.parse_faults(self._ask("ERST"))
+        """Return every fault reported now; empty when healthy, and where the projector cannot tell, or not now."""
+        request = PjLinkRequest("ERST")
+        if request in self._unknown:
+            self.power()  # to be silent because the cable is out must not look like health
+            return ()
+        reply = self._exchange(request)
+        if self._cannot_tell(request, reply) or reply.error is ErrorCode.UNAVAILABLE:
+            return ()
+        return wire.parse_faults(self._value(reply))
 
     def lamps(self) -> tuple[Lamp, ...]:
         """Return every lamp; empty for a lampless projector, which does not know the question."""
-        reply = self._exchange(PjLinkRequest("LAMP"))
-        if reply.error is ErrorCode.UNDEFINED:
-            return ()
-        return wire.parse_lamps(self._value(reply))
+        value = self._ask_if_known("LAMP")
+        return () if value is None else wire.parse_lamps(value)
 
     def pjlink_class(self) -> int:
         """Return the class of PJLink that the projector speaks, 1 or 2; asked once."""
         if self._class is None:
-            reply = self._exchange(PjLinkRequest("CLSS"))
-            self._class = 1 if reply.error is ErrorCode.UNDEFINED else wire.parse_class(self._value(reply))
+            value = self._ask_if_known("CLSS")
+            self._class = 1 if value is None else wire.parse_class(value)
         return self._class
 
     def other_information(self) -> str:
@@ -206,52 +218,55 @@ class PjLinkProjector:
         else:
             self._set_class_2("INPT", code)
 
-    def input_resolution(self) -> Resolution | NoResolution:
-        """Return the resolution of the signal, or why it has none; class 2."""
-        return wire.parse_input_resolution(self._ask_class_2("IRES"))
+    def input_resolution(self) -> Resolution | NoResolution | None:
+        """Return the resolution of the signal, or why it has none; None where it cannot tell; class 2."""
+        value = self._ask_class_2("IRES")
+        return None if value is None else wire.parse_input_resolution(value)
 
-    def recommended_resolution(self) -> Resolution:
-        """Return the resolution that the projector shows best, mostly that of its panels; class 2."""
-        return wire.parse_resolution(self._ask_class_2("RRES"))
+    def recommended_resolution(self) -> Resolution | None:
+        """Return the resolution that the projector shows best, mostly that of its panels; as `input_resolution`."""
+        value = self._ask_class_2("RRES")
+        return None if value is None else wire.parse_resolution(value)
 
-    def frozen(self) -> bool:
-        """Return whether the picture is frozen: it then no longer follows the signal; class 2."""
-        return wire.parse_freeze(self._ask_class_2("FREZ"))
+    def frozen(self) -> bool | None:
+        """Return whether the picture is frozen: it then no longer follows the signal; as `input_resolution`."""
+        value = self._ask_class_2("FREZ")
+        return None if value is None else wire.parse_freeze(value)
 
     def set_frozen(self, frozen: bool) -> None:
         """Freeze the picture, or let it follow the signal again; refused unless the projector is on; class 2."""
         self._set_class_2("FREZ", wire.format_freeze(frozen))
 
     def picture_fault(self) -> str | None:
-        """Return whether the picture is frozen or no signal arrives, as far as class 2 can say; None with class 1."""
-        if self.pjlink_class() < 2:
+        """Return whether the picture is frozen or no signal arrives, as far as the projector can tell; else None."""
+        if self._told(self.pjlink_class, 1) < 2:
             return None
-        if self.frozen():
+        if self._told(self.frozen, None):
             return "the projector's picture is frozen; release freeze on its remote control"
-        if self.input_resolution() is NoResolution.NO_SIGNAL:
+        if self._told(self.input_resolution, None) is NoResolution.NO_SIGNAL:
             return "no signal arrives at the projector's input; check the cable, the input and the display's settings"
         return None
 
     def serial_number(self) -> str:
-        """Return the serial number; class 2."""
-        return self._ask_class_2("SNUM")
+        """Return the serial number, empty where it has none to tell; class 2."""
+        return self._ask_class_2("SNUM") or ""
 
     def software_version(self) -> str:
-        """Return the version of its software; class 2."""
-        return self._ask_class_2("SVER")
+        """Return the version of its software, empty where it does not tell; class 2."""
+        return self._ask_class_2("SVER") or ""
 
     def filter_hours(self) -> int | None:
         """Return the hours of its filter, 0 where it does not count them, None where it has no filter; class 2."""
-        value = self._ask_for_part("FILT")
+        value = self._ask_class_2("FILT")
         return None if value is None else wire.parse_hours(value)
 
     def lamp_models(self) -> tuple[str, ...]:
         """Return the part numbers of lamps that fit; empty for a lampless projector; class 2."""
-        return wire.parse_models(self._ask_for_part("RLMP") or "")
+        return wire.parse_models(self._ask_class_2("RLMP") or "")
 
     def filter_models(self) -> tuple[str, ...]:
         """Return the part numbers of filters that fit; empty for a projector without; class 2."""
-        return wire.parse_models(self._ask_for_part("RFIL") or "")
+        return wire.parse_models(self._ask_class_2("RFIL") or "")
 
     def close(self) -> None:
         """Hang up; the power state stays."""
@@ -266,15 +281,34 @@ class PjLinkProjector:
     def _ask(self, command: str, level: int = 1) -> str:
         return self._value(self._exchange(PjLinkRequest(command, level=level)))
 
-    def _ask_class_2(self, command: str) -> str:
+    def _ask_class_2(self, command: str) -> str | None:
         self._require_class_2(command)
-        return self._ask(command, level=2)
+        return self._ask_if_known(command, level=2)
 
-    def _ask_for_part(self, command: str) -> str | None:
-        """Return what a projector reports of a part, None where it does not know the question for want of the part."""
-        self._require_class_2(command)
-        reply = self._exchange(PjLinkRequest(command, level=2))
-        return None if reply.error is ErrorCode.UNDEFINED else self._value(reply)
+    def _ask_if_known(self, command: str, level: int = 1) -> str | None:
+        """Return what the projector answers, None where it does not know the question, or has no such part."""
+        request = PjLinkRequest(command, level=level)
+        if request in self._unknown:
+            return None
+        reply = self._exchange(request)
+        return None if self._cannot_tell(request, reply) else self._value(reply)
+
+    def _cannot_tell(self, request: PjLinkRequest, reply: PjLinkReply) -> bool:
+        """Return whether a question is unknown to the projector, and remember it: that does not change."""
+        # A question has no parameter that could be out of range; whoever says so does not know it either.
+        unknown = reply.error in (ErrorCode.UNDEFINED, ErrorCode.OUT_OF_PARAMETER)
+        if unknown:
+            self._unknown.add(request)
+        return unknown
+
+    def _told(self, question: Callable[[], _Answer], unknown: _Answer) -> _Answer:
+        """Return what is answered now, `unknown` where the projector declines to answer now."""
+        try:
+            return question()
+        except DeviceRefused:
+            if self._connection is None:
+                raise  # it refused the connection, not the question
+            return unknown
 
     def _input_name(self, code: str) -> str:
         # Names are a courtesy: some projectors keep them back in standby, or have none.

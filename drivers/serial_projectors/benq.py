@@ -182,9 +182,14 @@ class BenqProjector:
         if self.power() not in (Power.STANDBY, Power.COOLING):
             self._command("pow", "off")
 
-    def muted(self) -> bool:
-        """Return whether the picture is blanked; refused unless the projector is on."""
-        return on_or_off("blank", self._command("blank"))
+    def muted(self) -> bool | None:
+        """Return whether the picture is blanked, None where it cannot tell; refused unless the projector is on."""
+        try:
+            return on_or_off("blank", self._command("blank"))
+        except Blocked:
+            raise
+        except DeviceRefused:
+            return None
 
     def set_muted(self, muted: bool) -> None:
         """Blank the picture, or show it; refused unless the projector is on."""

@@ -6,6 +6,8 @@ Rules that hold inside:
   by the colon alone.
 - One command at a time. ``PWR ON`` and ``PWR OFF`` are answered only when they are done, after up to 130 s: until then
   nothing else is asked, and `EpsonProjector.power` says what is under way.
+- ``ERR`` means "not now" or "not known"; of a projector that is on, the latter: what it then does not answer it cannot
+  tell.
 - The language has no question for the model: `EpsonProjector.identity` gives the serial number as the name.
 
 Source: Epson, ESC/VP21 Command User's Guide (PWR, SOURCE, MSEL, times, ERR). Not confirmed by a manual: the state 09,
@@ -220,9 +222,11 @@ class EpsonProjector:
             case Power.STANDBY | Power.COOLING:
                 pass
 
-    def muted(self) -> bool:
-        """Return whether the picture is blanked by mute; refused unless the projector is on."""
-        value = self._get("MUTE")
+    def muted(self) -> bool | None:
+        """Return whether the picture is blanked by mute, None where it cannot tell; refused unless it is on."""
+        value = self._get_if_known("MUTE")
+        if value is None:
+            return None
         if value not in ("ON", "OFF"):
             raise ProtocolError(f"{self._label} answers MUTE={value}; expected ON or OFF")
         return value == "ON"
@@ -239,17 +243,19 @@ class EpsonProjector:
             raise ProtocolError(f"{self._label} answers {reply!r} to MUTE; expected the colon alone")
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return the fault reported now; empty when healthy, and during warm-up and cooling, when none is reported."""
+        """Return the fault reported now; empty when healthy, and where it reports none, as in warm-up and cooling."""
         try:
             return parse_faults(self._get("ERR"))
         except DeviceRefused:
-            if self.power() in (Power.WARMING, Power.COOLING):
+            if self.power() in (Power.WARMING, Power.COOLING, Power.ON):
                 return ()
             raise
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return every lamp; refused where the projector does not report its hours now."""
-        value = self._get("LAMP")
+        """Return every lamp; empty where the projector has no hours, refused where it does not report them now."""
+        value = self._get_if_known("LAMP")
+        if value is None:
+            return ()
         if not re.fullmatch(r"[0-9]+( +[0-9]+)*", value):
             raise ProtocolError(f"{self._label} answers LAMP={value}; expected hours")
         lit = self.power() in (Power.ON, Power.WARMING)
@@ -299,6 +305,15 @@ class EpsonProjector:
             return value_of(name, reply)
         except ProtocolError:
             self._exchange.close()
+            raise
+
+    def _get_if_known(self, name: str) -> str | None:
+        """Return the value of `name`; None where a projector that is on refuses to tell it."""
+        try:
+            return self._get(name)
+        except DeviceRefused:
+            if self.power() is Power.ON:
+                return None
             raise
 
     def _greet(self, exchange: Exchange) -> None:

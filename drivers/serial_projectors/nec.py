@@ -65,13 +65,15 @@ INFORMATION = NecCommand(3, 0x8A)
 
 UNKNOWN_COMMAND = (0, 0)
 """The two bytes with which a command is refused (table of error codes)."""
+UNKNOWN_TO_MODEL = (0, 1)
+"""What this model has not (same table)."""
 POWER_IS_OFF = (2, 0x0D)
 """Not possible in standby (same table)."""
 EXECUTION_FAILED = (2, 0x0E)
 """Not confirmed by a manual."""
 _FAILURES = {
-    (0, 0): "it does not know this command",
-    (0, 1): "its model cannot do this",
+    UNKNOWN_COMMAND: "it does not know this command",
+    UNKNOWN_TO_MODEL: "its model cannot do this",
     (1, 0): "it does not know this value",
     (1, 1): "it has no such terminal",
     (2, 3): "it cannot be set now",
@@ -229,6 +231,10 @@ def parse_text(data: bytes) -> str:
     return data.split(b"\0")[0].decode("ascii", "replace").strip()
 
 
+class _NotKnown(DeviceRefused):
+    """The projector, or its model, does not know a command."""
+
+
 class NecProjector:
     """A `drivers.projector.Projector` over NEC's control commands."""
 
@@ -271,9 +277,11 @@ class NecProjector:
             self._ask(POWER_OFF)
             self._ordered_off = True
 
-    def muted(self) -> bool:
-        """Return whether the picture is muted."""
-        data = self._ask(MUTES)
+    def muted(self) -> bool | None:
+        """Return whether the picture is muted, None where it cannot tell."""
+        data = self._ask_if_known(MUTES)
+        if data is None:
+            return None
         if not data or data[0] not in (0, 1):
             raise ProtocolError(f"{self._label} answers {quoted(data)} to its mutes; expected 00 or 01 first")
         return data[0] == 1
@@ -283,17 +291,30 @@ class NecProjector:
         self._ask(MUTE_ON if muted else MUTE_OFF)
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return every fault reported now; empty when healthy. Only lamp and temperature have warnings."""
-        return parse_errors(self._ask(ERRORS))
+        """Return every fault reported now; empty when healthy, and where its model does not report any.
+
+        Only lamp and temperature have warnings.
+        """
+        return parse_errors(self._ask_if_known(ERRORS) or b"")
 
     def lamps(self) -> tuple[Lamp, ...]:
-        """Return its first lamp, or what lights it instead."""
-        _, seconds = parse_information(self._ask(INFORMATION))
+        """Return its first lamp, or what lights it instead; empty where its model does not count hours."""
+        data = self._ask_if_known(INFORMATION)
+        if data is None:
+            return ()
+        _, seconds = parse_information(data)
         return (Lamp(seconds // 3600, self.power() in (Power.ON, Power.WARMING)),)
 
     def close(self) -> None:
         """Release the cable; the power state stays."""
         self._exchange.close()
+
+    def _ask_if_known(self, command: NecCommand) -> bytes | None:
+        """Return what a question is answered, None where the model does not know it."""
+        try:
+            return self._ask(command)
+        except _NotKnown:
+            return None
 
     def _ask(self, command: NecCommand) -> bytes:
         reply = self._exchange.ask(encode_command(command), take_reply)
@@ -307,4 +328,5 @@ class NecProjector:
             raise DeviceFault(f"{self._label} failed to carry out {asked}; look at its indicators")
         high, low = reply.failed
         reason = _FAILURES.get(reply.failed, "look up this code in its manual")
-        raise DeviceRefused(f"{self._label} refuses {asked} with {high:02X}h {low:02X}h: {reason}")
+        kind = _NotKnown if reply.failed in (UNKNOWN_COMMAND, UNKNOWN_TO_MODEL) else DeviceRefused
+        raise kind(f"{self._label} refuses {asked} with {high:02X}h {low:02X}h: {reason}")

@@ -192,13 +192,11 @@ class OptomaProjector:
             case Power.STANDBY | Power.COOLING:
                 pass
 
-    def muted(self) -> bool:
-        """Return whether the picture is blanked; refused where it cannot be read and was not set by this driver."""
+    def muted(self) -> bool | None:
+        """Return whether the picture is blanked; None where it cannot be read and was not set by this driver."""
         try:
             return self._get(AV_MUTE_STATE) == "1"
         except DeviceRefused:
-            if self._muted is None:
-                raise
             return self._muted
 
     def set_muted(self, muted: bool) -> None:

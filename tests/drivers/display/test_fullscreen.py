@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
@@ -20,9 +20,10 @@ import numpy as np
 import pytest
 
 from acquisition.lights.illuminations import plan_illuminations
+from drivers.display import fullscreen
 from drivers.display.displays import Display, choose_display, list_displays
 from drivers.display.fullscreen import FullScreen, identify_displays
-from drivers.display.x11 import XScreen
+from drivers.display.x11 import XScreen, is_dark
 from drivers.presenter import BLACK, WHITE, Colour
 from foundation.errors import ConfigurationError, DeviceError
 from sim.clock import SimulatedClock
@@ -94,11 +95,125 @@ def test_a_window_in_front_is_noticed(screen: FullScreen) -> None:
     try:
         glfw.show_window(notification)
         glfw.poll_events()
-        with pytest.raises(DeviceError, match=r"the screen shows .* in place of \(9, 9, 9\) in \d+ of 230400 pixels"):
+        with pytest.raises(
+            DeviceError,
+            match=r"the screen shows .* in place of \(9, 9, 9\) in \d+ of 230400 pixels of display 1: screen 640×360 "
+            r"at \+0\+0, 0 Hz, within 100×50 px at \+\d+\+\d+; in front of it lies “You have mail”.*, 100×50 px at ",
+        ):
             screen.show(Colour(9, 9, 9))
+        with pytest.raises(DeviceError, match="in front of it lies “You have mail”"):
+            screen.verify(Colour(9, 9, 9))
     finally:
         glfw.destroy_window(notification)
     screen.show(Colour(9, 9, 9))
+    screen.verify(Colour(9, 9, 9))
+
+
+def test_a_pop_up_after_the_colour_came_is_noticed_and_named(screen: FullScreen, virtual: VirtualScreen) -> None:
+    colour = Colour(255, 136, 0)
+    screen.show(colour)
+    screen.verify(colour)
+    with messaging(virtual, "Low battery"):
+        with pytest.raises(DeviceError, match=r"in front of it lies “Low battery” \(Xmessage\), "):
+            screen.verify(colour)
+        picture = virtual.picture()
+        assert np.count_nonzero(picture != 0xFF8800) > 100
+    # What it covered stays wrong, with nobody in front, until it is painted again.
+    until(lambda: "in front of it" not in covered(screen, colour))
+    screen.show(colour)
+    screen.verify(colour)
+
+
+def test_a_pop_up_in_a_window_managers_frame_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    openbox = shutil.which("openbox")
+    if openbox is None:
+        pytest.skip("openbox is not installed (Debian: openbox)")
+    colour = Colour(3, 99, 7)
+    with virtual_screen(tmp_path, "640x360") as server:
+        monkeypatch.setenv("DISPLAY", server.display)
+        with running([openbox, "--sm-disable"]):
+            until(lambda: "_NET_SUPPORTING_WM_CHECK" in properties())
+            with contextlib.closing(FullScreen()) as presenter:
+                presenter.show(colour)
+                presenter.verify(colour)
+                with messaging(server, "Updates are ready"):
+                    # It may be seen before it has its frame, and covered by ours again until it is raised.
+                    until(lambda: "“Updates are ready” (Xmessage)" in covered(presenter, colour))
+                until(lambda: shows(presenter, colour))
+                presenter.verify(colour)
+
+
+def test_a_picture_that_changed_in_one_corner_is_noticed(screen: FullScreen, virtual: VirtualScreen) -> None:
+    colour = Colour(10, 20, 30)
+    screen.show(colour)
+    with messaging(virtual, "speck", "+639+359"):
+        said = covered(screen, colour)
+    assert "in 1 of 230400 pixels" in said
+    assert "within 1×1 px at +639+359; in front of it lies “speck” (Xmessage), " in said
+
+
+def test_a_picture_of_another_colour_is_noticed_and_nobody_is_blamed(screen: FullScreen) -> None:
+    screen.show(Colour(10, 20, 30))
+    with pytest.raises(
+        DeviceError, match=r"\(10, 20, 30\) in place of \(10, 20, 31\) in 230400 of .*; look for a window"
+    ):
+        screen.verify(Colour(10, 20, 31))
+
+
+def test_verifying_reads_every_pixel_once(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
+    colour = Colour(1, 2, 3)
+    screen.show(colour)
+    reads: list[tuple[int, ...]] = []
+    read = XScreen.read
+
+    def counted(self: XScreen, x: int, y: int, width: int, height: int) -> Picture:
+        reads.append((x, y, width, height))
+        return read(self, x, y, width, height)
+
+    monkeypatch.setattr(XScreen, "read", counted)
+    screen.verify(colour)
+    assert reads == [(0, 0, 640, 360)], "read once, all of it, and not waited for"
+
+
+@contextlib.contextmanager
+def running(command: list[str]) -> Generator[subprocess.Popen[bytes]]:
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+@contextlib.contextmanager
+def messaging(server: VirtualScreen, title: str, place: str = "+100+80") -> Generator[None]:
+    """Let another program put a window in front, and return when it is seen; it goes at the end of the block."""
+    program = shutil.which("xmessage")
+    if program is None:
+        pytest.skip("xmessage is not installed (Debian: x11-utils)")
+    before = server.picture()
+    with running([program, "-title", title, "-geometry", place, "look"]):
+        until(lambda: not np.array_equal(server.picture(), before))
+        yield
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, "it never came"
+        time.sleep(0.005)
+
+
+def covered(presenter: FullScreen, colour: Colour) -> str:
+    """Return what `verify` says, empty where all is well."""
+    try:
+        presenter.verify(colour)
+    except DeviceError as error:
+        return str(error)
+    return ""
+
+
+def properties() -> str:
+    return subprocess.run(["xprop", "-root"], capture_output=True, text=True, check=True).stdout
 
 
 def test_what_opengl_does_not_draw_is_noticed(screen: FullScreen, virtual: VirtualScreen) -> None:
@@ -125,8 +240,15 @@ def test_a_display_that_goes_away_is_noticed(outputs: str) -> None:
     try:
         presenter.show(WHITE)
         subprocess.run([xrandr, "--output", "DUMMY1", "--off"], check=True)
-        with pytest.raises(DeviceError, match=r"no longer fills display 2: DUMMY1|no 480×270 pixels at"):
-            presenter.show(Colour(9, 9, 9))
+        for use in (presenter.show, presenter.verify):
+            with pytest.raises(
+                DeviceError, match=r"no longer fills display 2: DUMMY1.*; displays now: 1: DUMMY0|no 480"
+            ):
+                use(Colour(9, 9, 9))
+        subprocess.run([xrandr, "--output", "DUMMY1", "--mode", "480x270", "--right-of", "DUMMY0"], check=True)
+        until(lambda: shows(presenter, Colour(9, 9, 9)))
+        presenter.verify(Colour(9, 9, 9))
+        assert plain(screenshot(outputs, 1120, 360)[:270, 640:]) == Colour(9, 9, 9)
     finally:
         presenter.close()
         subprocess.run([xrandr, "--output", "DUMMY1", "--mode", "480x270", "--right-of", "DUMMY0"], check=True)
@@ -134,12 +256,35 @@ def test_a_display_that_goes_away_is_noticed(outputs: str) -> None:
         presenter.show(WHITE)
 
 
-def test_a_window_moved_away_is_noticed(screen: FullScreen) -> None:
+def shows(presenter: FullScreen, colour: Colour) -> bool:
+    """Return whether a presenter can show a colour now."""
+    try:
+        presenter.show(colour)
+    except DeviceError:
+        return False
+    return True
+
+
+def test_a_window_moved_away_is_noticed_and_put_back(screen: FullScreen, virtual: VirtualScreen) -> None:
     import glfw
 
     glfw.set_window_monitor(glfw.get_current_context(), cast("Any", None), 10, 10, 300, 200, 0)
     with pytest.raises(DeviceError, match="no longer fills display 1: screen 640×360"):
-        screen.show(WHITE)
+        screen.verify(BLACK)
+    screen.show(WHITE)
+    assert plain(virtual.picture()) == WHITE
+
+
+def test_a_display_that_power_saving_keeps_dark_is_noticed(screen: FullScreen, monkeypatch: pytest.MonkeyPatch) -> None:
+    # No server without a monitor has power saving: only that its absence is no darkness is seen on a real one.
+    asked: list[bool] = []
+    monkeypatch.setattr(fullscreen, "is_dark", lambda display: asked.append(is_dark(display)))  # pyright: ignore[reportUnknownArgumentType, reportUnknownLambdaType]
+    screen.show(WHITE)
+    assert asked == [False]
+    monkeypatch.setattr(fullscreen, "is_dark", lambda display: True)  # pyright: ignore[reportUnknownArgumentType, reportUnknownLambdaType]
+    for use in (screen.show, screen.verify):
+        with pytest.raises(DeviceError, match=r"power saving keeps display 1: screen 640×360 .* dark"):
+            use(WHITE)
 
 
 def test_a_window_that_is_asked_to_close_stays(screen: FullScreen, virtual: VirtualScreen) -> None:

@@ -297,6 +297,97 @@ def test_what_class_2_tells() -> None:
     assert script.ended()
 
 
+def class_2(*conversation: bytes) -> PjLinkProjector:
+    return driver(Script(b"PJLINK 0\r", b"%1CLSS ?\r", b"%1CLSS=2\r", *conversation))
+
+
+@pytest.mark.parametrize("code", [b"ERR1", b"err1", b"ERR2"])
+def test_a_class_2_projector_that_does_not_know_a_question_cannot_tell(code: bytes) -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1CLSS ?\r", b"%1CLSS=2\r",
+        b"%2FREZ ?\r", b"%2FREZ=" + code + b"\r",
+        b"%2IRES ?\r", b"%2IRES=" + code + b"\r",
+        b"%2RRES ?\r", b"%2RRES=" + code + b"\r",
+        b"%2SNUM ?\r", b"%2SNUM=" + code + b"\r",
+        b"%2SVER ?\r", b"%2SVER=" + code + b"\r",
+        b"%2FILT ?\r", b"%2FILT=" + code + b"\r",
+        b"%1AVMT ?\r", b"%1AVMT=" + code + b"\r",
+        b"%1LAMP ?\r", b"%1LAMP=" + code + b"\r",
+        b"%1ERST ?\r", b"%1ERST=" + code + b"\r",
+        b"%1POWR ?\r", b"%1POWR=1\r",
+    )  # fmt: skip
+    projector = driver(script)
+    # What it does not know it is asked once.
+    for _ in range(2):
+        assert projector.picture_fault() is None
+    assert projector.frozen() is None
+    assert projector.input_resolution() is None
+    assert projector.recommended_resolution() is None
+    assert projector.serial_number() == ""
+    assert projector.software_version() == ""
+    assert projector.filter_hours() is None
+    assert projector.muted() is None
+    assert projector.lamps() == ()
+    assert projector.faults() == ()
+    # Health is not taken from silence: the second time it is asked for its power instead.
+    assert projector.faults() == ()
+    assert script.ended()
+
+
+def test_a_projector_that_cannot_tell_whether_it_is_frozen_is_asked_for_its_signal() -> None:
+    projector = class_2(b"%2FREZ ?\r", b"%2FREZ=ERR1\r", b"%2IRES ?\r", b"%2IRES=-\r")
+    assert "no signal" in (projector.picture_fault() or "")
+    projector = class_2(b"%2FREZ ?\r", b"%2FREZ=0\r", b"%2IRES ?\r", b"%2IRES=ERR1\r", b"%2FREZ ?\r", b"%2FREZ=1\r")
+    assert projector.picture_fault() is None
+    assert "frozen" in (projector.picture_fault() or "")
+
+
+def test_what_a_projector_does_not_tell_now_it_is_asked_again() -> None:
+    script = Script(
+        b"PJLINK 0\r",
+        b"%1CLSS ?\r", b"%1CLSS=ERR3\r",
+        b"%1CLSS ?\r", b"%1CLSS=2\r",
+        b"%2FREZ ?\r", b"%2FREZ=ERR3\r",
+        b"%2IRES ?\r", b"%2IRES=ERR3\r",
+        b"%2FREZ ?\r", b"%2FREZ=1\r",
+        b"%1ERST ?\r", b"%1ERST=ERR3\r",
+        b"%1ERST ?\r", b"%1ERST=010000\r",
+        b"%1AVMT ?\r", b"%1AVMT=ERR3\r",
+        b"%1AVMT ?\r", b"%1AVMT=31\r",
+    )  # fmt: skip
+    projector = driver(script)
+    assert projector.picture_fault() is None
+    assert projector.picture_fault() is None
+    assert "frozen" in (projector.picture_fault() or "")
+    assert projector.faults() == ()
+    assert projector.faults() == (Fault("lamp", Severity.WARNING),)
+    with pytest.raises(DeviceRefused, match="standby"):
+        projector.muted()
+    assert projector.muted()
+    assert script.ended()
+
+
+def test_a_failure_that_the_projector_reports_is_no_ignorance() -> None:
+    with pytest.raises(DeviceFault, match="ERR4 to FREZ"):
+        class_2(b"%2FREZ ?\r", b"%2FREZ=ERR4\r").picture_fault()
+    with pytest.raises(DeviceFault, match="ERR4 to ERST"):
+        driver(Script(b"PJLINK 0\r", b"%1ERST ?\r", b"%1ERST=ERR4\r")).faults()
+
+
+def test_a_wrong_password_is_no_ignorance() -> None:
+    script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1CLSS ?\r", b"PJLINK ERRA\r")
+    with pytest.raises(DeviceRefused, match="refuses the password"):
+        driver(script, password=PASSWORD).picture_fault()
+
+
+def test_a_command_that_the_projector_does_not_know_is_refused() -> None:
+    projector = class_2(b"%2FREZ 0\r", b"%2FREZ=ERR1\r", b"%2FREZ ?\r", b"%2FREZ=0\r")
+    with pytest.raises(DeviceRefused, match="ERR1 to FREZ 0: it does not know this command"):
+        projector.set_frozen(False)
+    assert projector.frozen() is False
+
+
 @pytest.mark.parametrize("answer", [b"%1CLSS=1\r", b"%1CLSS=ERR1\r"])
 def test_class_1_is_never_asked_what_class_2_knows(answer: bytes) -> None:
     script = Script(b"PJLINK 0\r", b"%1CLSS ?\r", answer)

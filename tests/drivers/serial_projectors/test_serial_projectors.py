@@ -224,8 +224,21 @@ def test_epson_on_the_way_tells_no_fault_and_still_its_power() -> None:
     projector.switch_on()
     assert projector.faults() == ()
     script.more(b":")
-    with pytest.raises(DeviceRefused):
-        projector.faults()
+    assert projector.faults() == (), "of a projector that is on, ERR means that it does not know the question"
+    assert script.ended()
+
+
+def test_epson_that_is_on_and_does_not_know_a_question_cannot_tell() -> None:
+    on, off = (b"PWR?\r", b"PWR=01\r:"), (b"PWR?\r", b"PWR=04\r:")
+    projector, script = epson_script(
+        (b"MUTE?\r", b"ERR\r:"), on, (b"LAMP?\r", b"ERR\r:"), on, (b"MUTE?\r", b"ERR\r:"), off,
+        (b"LAMP?\r", b"ERR\r:"), off, (b"ERR?\r", b"ERR\r:"), off,
+    )  # fmt: skip
+    assert projector.muted() is None
+    assert projector.lamps() == ()
+    for ask in (projector.muted, projector.lamps, projector.faults):
+        with pytest.raises(DeviceRefused, match="wait until its power is on"):
+            ask()
     assert script.ended()
 
 
@@ -396,6 +409,12 @@ def test_benq_names_lamps_and_refusals() -> None:
         projector.muted()
 
 
+@pytest.mark.parametrize("answer", [b"Illegal format", b"Unsupported item"])
+def test_benq_that_does_not_know_its_mute_cannot_tell(answer: bytes) -> None:
+    projector, _ = benq_script((b"\r*blank=?#\r", b">*blank=?#\r\n*" + answer + b"#\r\n>"))
+    assert projector.muted() is None
+
+
 def optoma_script(*turns: tuple[bytes, tuple[bytes, ...] | bytes]) -> tuple[OptomaProjector, Script]:
     script = Script(*turns)
     return OptomaProjector(lambda: script, clock=SimulatedClock()), script
@@ -445,12 +464,11 @@ def test_optoma_mute_lamp_model_and_refusal() -> None:
     assert script.ended()
 
 
-def test_optoma_mute_that_nobody_knows_is_refused() -> None:
+def test_optoma_mute_that_nobody_knows_cannot_be_told() -> None:
     device = SimulatedProjector(SimulatedClock(), Power.ON)
     peer = OptomaPeer(device, answers_mute=False)
     projector = OptomaProjector(lambda: SerialPeerLink(peer))
-    with pytest.raises(DeviceRefused):
-        projector.muted()
+    assert projector.muted() is None
     projector.set_muted(True)
     assert projector.muted()
 
@@ -510,6 +528,19 @@ def test_nec_switches_and_mutes() -> None:
         projector.set_muted(False)
     projector.switch_off()
     assert projector.power() is Power.COOLING, "it was told to switch off, so that is what it is switching to"
+    assert script.ended()
+
+
+@pytest.mark.parametrize(("reason", "sum_"), [("00 00", (0x68, 0x6B, 0x70)), ("00 01", (0x69, 0x6C, 0x71))])
+def test_nec_that_does_not_know_a_question_cannot_tell(reason: str, sum_: tuple[int, ...]) -> None:
+    projector, script = nec_script(
+        ("00 85 00 00 01 03 89", f"A0 85 01 40 02 {reason} {sum_[0]:02X}"),
+        ("00 88 00 00 00 88", f"A0 88 01 40 02 {reason} {sum_[1]:02X}"),
+        ("03 8A 00 00 00 8D", f"A3 8A 01 40 02 {reason} {sum_[2]:02X}"),
+    )
+    assert projector.muted() is None
+    assert projector.faults() == ()
+    assert projector.lamps() == ()
     assert script.ended()
 
 

@@ -1,0 +1,150 @@
+"""What is asked first of a run that nobody attends: whether it lives, is good, when it is done, what must be done."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+
+from acquisition.monitor.rows import AttemptView
+from acquisition.session.heartbeat import AGAIN, Heartbeat
+from acquisition.session.plan import SessionStep
+from acquisition.session.records import ACCEPTED, FAILED, REFUSED, VOIDED
+
+RECENT = 50
+"""Attempts whose median interval stands for the time that a frame takes now: enough that retakes and references do not
+sway it, few enough to follow a change of the settings."""
+
+LAB_CLOCK_S = 600.0
+"""How far the lab's clock may be from that of the wall for the end to be told as a time of day; a simulated lab's time
+passes otherwise, and an attempt that is older than this says nothing of when the run will end."""
+
+
+@dataclass(frozen=True)
+class Head:
+    """How a session stands.
+
+    Attributes
+    ----------
+    state
+        ``running``, ``waiting`` or ``paused`` as the run says it; ``complete``; ``incomplete``: it has ended and frames
+        are left; ``stopped``: killed or power lost; ``unknown``: the journal has no sign of life; ``absent``, ``gone``,
+        ``unreadable``: there is no journal to read, yet, or any more.
+    sentence
+        The same in words, with the remedy behind a semicolon where there is one; empty while there is nothing to say.
+    alive
+        Whether a run is at work.
+    beat, until
+        When it last gave a sign of life, and when the next is due, by the wall clock; None if it never did.
+    total, done, lights_total, lights_done
+        Frames of the plan, and those that are accepted; the same of the lights alone.
+    refused, failed, voided
+        Attempts that ended so.
+    seconds_per_frame
+        Median interval of the newest `RECENT` attempts; None before the second.
+    remaining_s
+        Time left by the lab's clock; None while it is unknown.
+    eta
+        When all frames are there, by the wall clock; None where that cannot be told.
+    last
+        When the newest frame was released, by the lab's clock.
+    """
+
+    state: str
+    sentence: str
+    alive: bool = False
+    beat: datetime | None = None
+    until: datetime | None = None
+    total: int = 0
+    done: int = 0
+    lights_total: int = 0
+    lights_done: int = 0
+    refused: int = 0
+    failed: int = 0
+    voided: int = 0
+    seconds_per_frame: float | None = None
+    remaining_s: float | None = None
+    eta: datetime | None = None
+    last: datetime | None = None
+
+
+def head_of(
+    steps: Sequence[SessionStep],
+    attempts: Collection[AttemptView],
+    heartbeat: Heartbeat | None,
+    now: datetime,
+    *,
+    process_alive: bool | None,
+    name: str,
+) -> Head:
+    """Return how a session stands.
+
+    Parameters
+    ----------
+    steps
+        The plan.
+    attempts
+        All attempts, oldest first.
+    heartbeat
+        The newest sign of life; None where the journal has none.
+    now
+        Wall clock.
+    process_alive
+        Whether the process that gave it is there; None if that cannot be told.
+    name
+        The session's folder, for the sentence that says what comes next.
+    """
+    done = {view.step for view in attempts if view.verdict == ACCEPTED} & {step.number for step in steps}
+    verdicts = [view.verdict for view in attempts]
+    state, sentence = _state_of(heartbeat, now, process_alive, len(steps) - len(done), len(steps), name)
+    alive = state in ("running", "waiting", "paused")
+    pace = _pace(attempts)
+    left = len(steps) - len(done)
+    remaining = None if pace is None else pace * left
+    newest = max((view.started_at for view in attempts), default=None)
+    near = (
+        heartbeat is not None
+        and newest is not None
+        and state == "running"
+        and abs((heartbeat.at - newest).total_seconds()) < LAB_CLOCK_S
+    )
+    return Head(
+        state,
+        sentence,
+        alive,
+        heartbeat.at if heartbeat else None,
+        heartbeat.until if heartbeat else None,
+        total=len(steps),
+        done=len(done),
+        lights_total=sum(step.kind == "light" for step in steps),
+        lights_done=sum(step.kind == "light" and step.number in done for step in steps),
+        refused=verdicts.count(REFUSED),
+        failed=verdicts.count(FAILED),
+        voided=verdicts.count(VOIDED),
+        seconds_per_frame=pace,
+        remaining_s=remaining,
+        eta=now + timedelta(seconds=remaining) if near and remaining is not None else None,
+        last=max((view.taken_at for view in attempts if view.taken_at is not None), default=None),
+    )
+
+
+def _state_of(
+    heartbeat: Heartbeat | None, now: datetime, process_alive: bool | None, left: int, total: int, name: str
+) -> tuple[str, str]:
+    over = heartbeat is None or heartbeat.state == "ended" or heartbeat.is_dead(now, process_alive)
+    if over and total and not left:
+        return "complete", f"complete, {total} frames; next: build-lut {name} LUT/"
+    if heartbeat is None:
+        return "unknown", f"{left} of {total} frames are left, and the journal has no sign of life of a run"
+    if heartbeat.is_dead(now, process_alive):
+        return "stopped", heartbeat.sentence_for(now, process_alive)
+    if heartbeat.state == "ended":
+        return "incomplete", heartbeat.sentence or f"ended with {left} of {total} frames left; {AGAIN}"
+    return heartbeat.state, heartbeat.sentence
+
+
+def _pace(attempts: Collection[AttemptView]) -> float | None:
+    """Return the median interval of the newest attempts, seconds."""
+    intervals = [view.seconds for view in list(attempts)[-RECENT:] if view.seconds is not None]
+    return statistics.median(intervals) if intervals else None

@@ -1,0 +1,121 @@
+"""`report.html` of a session: what the live page shows at its end, in one file that needs no server and no network.
+
+Pictures stand in it, those of refused frames first, up to a bound; `previews/` and the raw files have the others.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from acquisition.monitor.encoding import head_json
+from acquisition.monitor.head import Head
+from acquisition.monitor.page import still_page
+from acquisition.monitor.pictures import preview_path, read_picture
+from acquisition.monitor.reading import SessionView, read_session
+from acquisition.monitor.rows import AttemptView
+from acquisition.monitor.watching import SessionWatch
+from acquisition.session.folder import Session
+from acquisition.session.heartbeat import Process
+from acquisition.session.progress import duration_text
+from acquisition.session.records import ACCEPTED
+from foundation.errors import FormatError
+from foundation.files import write_whole
+
+REPORT_FILE = "report.html"
+"""Name of a session's report in its folder."""
+
+MOST_PICTURES_BYTES = 6 << 20
+"""Bytes of all pictures in a report: with the third that base64 adds it can still be mailed (10 MB at most servers)."""
+
+
+def write_session_report(session: Session) -> Path:
+    """Write the report of a session into its folder, in place of one that is there, and return its path.
+
+    To be called at the end of a run, also by the run itself: a run that goes on in this very process counts as ended.
+
+    Raises
+    ------
+    FormatError
+        The journal cannot be read.
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    path = session.folder / REPORT_FILE
+    save_report(session.folder, path)
+    return path
+
+
+def save_report(folder: Path, path: Path) -> None:
+    """Write the report of the session in `folder` to `path`, in place of a file that is there.
+
+    Raises
+    ------
+    FormatError
+        The folder is no session, or its journal cannot be read.
+    InputError
+        The path cannot be a file's.
+    StorageError
+        The disk is full, read-only or gone.
+    """
+    read_session(folder)
+    watch = SessionWatch(folder)
+    state, view = watch.state(), watch.view()
+    if state is None or view is None:
+        raise FormatError(f"{folder} has gone while its report was made; name a session")
+    now = datetime.now(UTC)
+    head = _ended(view).head(now)
+    state["head"] = head_json(head)
+    state["pictures"] = {str(number): _data_url(data) for number, data in _pictures(folder, view.attempts)}
+    name = f"{view.name}, report of {now.astimezone():%Y-%m-%d %H:%M}"
+    write_whole(path, still_page(name, _plain(head), state).text)
+
+
+def _ended(view: SessionView) -> SessionView:
+    """Return a session whose run, if this process is at it, has ended."""
+    beat = view.heartbeat
+    if beat is None or beat.process != Process.own() or beat.state == "ended":
+        return view
+    return replace(view, heartbeat=replace(beat, state="ended", sentence=""))
+
+
+def _pictures(folder: Path, attempts: Sequence[AttemptView]) -> Iterator[tuple[int, bytes]]:
+    """Yield attempts with their pictures, as many as fit: the refused ones, then the last, then evenly spread ones."""
+    left = MOST_PICTURES_BYTES
+    refused = [view for view in attempts if view.has_frame and view.verdict not in (None, ACCEPTED)]
+    accepted = [view for view in attempts if view.verdict == ACCEPTED]
+    for view in [*refused, *(accepted[place] for place in _spread(len(accepted)))]:
+        data = read_picture(preview_path(folder, view.file))
+        if data and len(data) <= left:
+            left -= len(data)
+            yield view.id, data
+
+
+def _spread(count: int) -> list[int]:
+    """Return 0 … count − 1 so that any number of them from the front is spread evenly; the last and the first lead."""
+    places = dict.fromkeys([count - 1, 0] if count else [])
+    step = count
+    while step > 1:
+        step = (step + 1) // 2
+        places |= dict.fromkeys(range(0, count, step))
+    return list(places)
+
+
+def _data_url(data: bytes) -> str:
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+
+
+def _plain(head: Head) -> str:
+    """Return the most important of it in a few lines."""
+    return "\n".join(
+        (
+            head.sentence,
+            f"frames {head.done} of {head.total}, lights {head.lights_done} of {head.lights_total}",
+            f"refused {head.refused}, failed {head.failed}, voided {head.voided}",
+            f"a frame took {duration_text(head.seconds_per_frame)}",
+            "Pictures and plots are shown by a script, which this viewer does not run; open the file in a browser.",
+        )
+    )

@@ -1,0 +1,491 @@
+// The page of a session. The state comes from state.json, or stands in the page itself (a report): then nothing is asked.
+
+const POLL_MS = 2000;
+const POLL_HIDDEN_MS = 10000;
+const ANSWER_LIMIT_MS = 10000;
+const EVENTS_SHOWN = 100;
+const REFUSED_SHOWN = 12;
+const STATES = {
+  running: ["▶", "running"], waiting: ["…", "waiting"], paused: ["‖", "paused"], complete: ["■", "complete"],
+  incomplete: ["■", "ended, incomplete"], stopped: ["✕", "stopped"], gone: ["✕", "no session"], absent: ["…", "not begun"],
+  unknown: ["?", "no sign of life known"],
+};
+const LOUD = new Set(["paused", "incomplete", "stopped", "complete"]);
+const WHITE = "white since the first: red ─ green ╌ blue ┈";
+const BLACK = "black: red ─ green ╌ blue ┈";
+const PACE = "seconds a frame";
+// Plots in the order in which an operator asks; what is not named here follows in the order of the journal.
+const PLOT_ORDER = [WHITE, "white drift", BLACK, "dark", "ambient", "movement", "blur", PACE];
+
+const $ = (id) => document.getElementById(id);
+const embedded = $("embedded");
+const model = { cursor: "", head: { state: "unknown", sentence: "" }, session: null, frames: new Map(), events: [], units: {} };
+let chosen = null;
+let allRefused = false;
+let clockOffset = 0;
+let answeredAt = Date.now();
+let sound = null;
+let drawn = { plots: [], strip: null };
+
+const now = () => Date.now() + clockOffset;
+const timeText = (ms) => (ms ? new Date(ms).toLocaleTimeString([], { hour12: false }) : "–");
+const dayText = (ms) => (ms ? new Date(ms).toLocaleString([], { hour12: false }) : "–");
+
+function durationText(seconds) {
+  if (seconds === null || seconds === undefined) return "unknown";
+  const whole = Math.max(0, Math.round(seconds));
+  const hours = Math.floor(whole / 3600);
+  const minutes = Math.floor((whole % 3600) / 60);
+  const rest = whole % 60;
+  if (hours) return `${hours} h ${String(minutes).padStart(2, "0")} min`;
+  return minutes ? `${minutes} min ${String(rest).padStart(2, "0")} s` : `${rest} s`;
+}
+
+// State: what came is put into the model ---------------------------------------------------------------------------
+
+function take(state) {
+  const before = model.head.state;
+  const whole = state.session !== undefined;
+  model.cursor = state.cursor;
+  model.head = state.head;
+  if (whole) {
+    const same = model.session && model.session.name === state.session.name;
+    model.session = state.session;
+    model.frames = new Map();
+    model.events = [];
+    model.units = {};
+    if (!same) chosen = null;
+  }
+  Object.assign(model.units, state.units);
+  for (const frame of state.frames ?? []) model.frames.set(frame.id, frame);
+  model.events = model.events.concat(state.events ?? []).slice(-EVENTS_SHOWN);
+  if (before !== model.head.state && answeredOnce) announceState();
+  answeredOnce = true;
+  if (whole) drawSession();
+  if (whole || (state.frames ?? []).length) drawFrames(whole, state.frames ?? []);
+  if (whole || (state.events ?? []).length) drawEvents();
+  drawHead();
+}
+let answeredOnce = false;
+
+function announceState() {
+  const [, word] = STATES[model.head.state] ?? STATES.unknown;
+  $("said").textContent = `The run is now: ${word}. ${model.head.sentence}`;
+  if (sound && LOUD.has(model.head.state)) beep(model.head.state === "complete" ? 1 : 3);
+}
+
+function beep(times) {
+  for (let index = 0; index < times; index += 1) {
+    const tone = sound.createOscillator();
+    const gain = sound.createGain();
+    gain.gain.value = 0.2;
+    tone.frequency.value = 660;
+    tone.connect(gain).connect(sound.destination);
+    tone.start(sound.currentTime + 0.4 * index);
+    tone.stop(sound.currentTime + 0.4 * index + 0.22);
+  }
+}
+
+// Frames -----------------------------------------------------------------------------------------------------------
+
+const inOrder = () => [...model.frames.values()].sort((one, other) => one.id - other.id);
+const stepOf = (frame) => model.session.steps.get(frame.step);
+const codesText = (codes) => codes.join(" ");
+const fillOf = (codes) => `rgb(${codes.join(",")})`;
+
+function nameOf(step) {
+  if (!step) return "a frame that the plan does not name";
+  if (step.kind !== "light") return `${step.kind} frame ${step.number}`;
+  const light = model.session.lights.get(step.light);
+  return `light ${step.light}${light && light.cct ? ` (${short(light.cct)} K)` : ""}`;
+}
+
+/** Return the frame that the page shows: the chosen one, else the newest that has a verdict. */
+function frameShown(frames) {
+  if (chosen !== null && model.frames.has(chosen)) return model.frames.get(chosen);
+  return frames.findLast((frame) => frame.verdict) ?? null;
+}
+
+function drawSession() {
+  const { session } = model;
+  session.steps = new Map(session.steps.map(([number, kind, light, ...codes]) => [number, { number, kind, light, codes }]));
+  session.lights = new Map(session.lights.map(([index, kind, cct, at, ...codes]) => [index, { index, kind, cct, at, codes }]));
+  $("name").textContent = session.name;
+  drawn.planned.clear();
+  drawn.seen.clear();
+  $("records").replaceChildren(
+    ...session.records.flatMap(([key, text]) => [element("dt", {}, key), element("dd", {}, text)]),
+  );
+}
+
+function drawFrames(whole, changed) {
+  const frames = inOrder();
+  const byLight = new Map();
+  for (const frame of frames) {
+    const step = stepOf(frame);
+    if (step && step.kind === "light") byLight.set(step.light, [...(byLight.get(step.light) ?? []), frame]);
+  }
+  const touched = whole ? model.session.lights.keys() : new Set(changed.map((frame) => stepOf(frame)?.light).filter((light) => light !== null && light !== undefined));
+  for (const light of touched) drawLight(light, byLight.get(light) ?? []);
+  drawReach(frames);
+  drawWall(frames);
+  drawSeries(frames);
+  drawRefused(frames);
+  drawChoice(frames);
+}
+
+function drawLight(index, frames) {
+  const light = model.session.lights.get(index);
+  if (!light) return;
+  const accepted = frames.findLast((frame) => frame.verdict === "accepted");
+  const last = frames[frames.length - 1];
+  const open = last && !last.verdict && model.head.alive;
+  const state = open ? "shown" : accepted ? "accepted" : frames.some((frame) => ["refused", "voided"].includes(frame.verdict)) ? "refused" : "planned";
+  const form = light.kind === "blackbody" ? "diamond" : "circle";
+  const title = `light ${index}, ${codesText(light.codes)}${light.cct ? `, ${short(light.cct)} K` : ""}: ${state}`;
+  drawn.planned.plane.mark(index, light.at, { form, state, fill: fillOf(light.codes), title });
+  const seen = accepted ?? frames.findLast((frame) => frame.seen_at);
+  drawn.seen.plane.mark(index, seen?.seen_at ?? null, { form, state: accepted ? "accepted" : "refused", fill: fillOf(light.codes), title });
+}
+
+/** Draw what the projector's primaries, as they were seen, can make: straight lines, since light adds up. */
+function drawReach(frames) {
+  const primaries = [0, 1, 2].map((channel) =>
+    frames.findLast((frame) => {
+      const step = stepOf(frame);
+      return frame.seen_at && step?.kind === "response" && step.codes.every((code, at) => (code > 0) === (at === channel));
+    }),
+  );
+  if (primaries.every(Boolean)) drawn.seen.plane.drawReach(primaries.map((frame) => frame.seen_at));
+}
+
+function drawWall(frames) {
+  const last = frames[frames.length - 1];
+  const open = last && !last.verdict && model.head.alive ? stepOf(last) : null;
+  const swatch = $("swatch");
+  if (!open) {
+    swatch.style.background = "";
+    swatch.setAttribute("aria-label", "nothing known");
+    $("wall").replaceChildren(model.head.alive ? "Between two frames" : "Not known: nothing is being taken");
+    return;
+  }
+  swatch.style.background = fillOf(open.codes);
+  swatch.setAttribute("aria-label", `sRGB ${codesText(open.codes)}`);
+  $("wall").replaceChildren(element("b", {}, codesText(open.codes)), element("br"), `${nameOf(open)}, frame ${open.number} of the plan, since ${timeText(last.at)}`);
+}
+
+function choose(id, frames = inOrder()) {
+  chosen = id;
+  drawChoice(frames);
+}
+
+function stride(by) {
+  const frames = inOrder();
+  if (!frames.length) return;
+  const at = frames.indexOf(frameShown(frames));
+  const to = Math.max(0, Math.min(frames.length - 1, at + by));
+  choose(to === frames.length - 1 && by > 0 ? null : frames[to].id, frames);
+}
+
+function drawChoice(frames) {
+  const frame = frameShown(frames);
+  const index = frames.indexOf(frame);
+  const light = frame ? stepOf(frame)?.light ?? null : null;
+  $("frame-title").textContent = chosen === null ? "Last frame" : "Chosen frame";
+  $("latest").disabled = chosen === null;
+  $("previous").disabled = index <= 0;
+  $("next").disabled = index < 0 || index >= frames.length - 1;
+  for (const side of ["planned", "seen"]) drawn[side].plane.choose(light);
+  for (const plot of [...drawn.plots, drawn.strip]) {
+    if (!plot) continue;
+    plot.cursor.setAttribute("visibility", frame ? "visible" : "hidden");
+    const x = across(index, frames.length, plot === drawn.strip ? STRIP : PLOT);
+    plot.cursor.setAttribute("x1", x);
+    plot.cursor.setAttribute("x2", x);
+  }
+  drawPicture(frame);
+  if (!frame) return;
+  const step = stepOf(frame);
+  const verdict = frame.verdict || "under way";
+  $("frame-caption").replaceChildren(
+    `${nameOf(step)}, shown as ${step ? codesText(step.codes) : "?"}, at ${dayText(frame.taken ?? frame.at)}: `,
+    element("b", frame.verdict === "accepted" ? {} : { class: "bad" }, verdict),
+    frame.reason ? `: ${frame.reason}` : "",
+  );
+  $("checks").tBodies[0].replaceChildren(
+    ...Object.entries(frame.checks ?? {}).map(([name, [value, low, high, reason]]) => {
+      const unit = model.units[name] ?? "";
+      const row = [element("th", { scope: "row" }, `${reason ? "✕ " : ""}${name}`), element("td", { class: "number" }, withUnit(value, unit)), element("td", { class: "number note" }, limitText(low, high, unit))];
+      return element("tr", reason ? { class: "bad" } : {}, ...row);
+    }),
+  );
+  const timings = Object.entries(frame.timings ?? {}).map(([what, seconds]) => `${what} ${short(seconds)} s`);
+  $("timings").textContent = timings.length ? `Time: ${timings.join(", ")}` : "";
+}
+
+function pictureOf(frame) {
+  if (embedded) return model.pictures[frame.id] ?? null;
+  return frame.preview ? `frame/${frame.id}.jpg?${frame.preview}` : null;
+}
+
+function drawPicture(frame) {
+  const source = frame ? pictureOf(frame) : null;
+  const picture = $("picture");
+  const without = $("no-picture");
+  picture.hidden = source === null;
+  without.hidden = source !== null;
+  without.textContent = !frame ? "No frame yet" : embedded ? "Not among this report's pictures" : "No picture of this frame";
+  if (source === null) {
+    picture.removeAttribute("src");
+    return;
+  }
+  if (picture.getAttribute("src") !== source) picture.src = source;
+  picture.alt = `${nameOf(stepOf(frame))}: ${frame.verdict || "under way"}${frame.reason ? `, ${frame.reason}` : ""}`;
+}
+
+// Series -----------------------------------------------------------------------------------------------------------
+
+function seriesOf(frames) {
+  const series = new Map();
+  const add = (name, unit, point, least = 0) => {
+    if (point.value === null || point.value === undefined) return;
+    if (!series.has(name)) series.set(name, { name, unit, least, points: [] });
+    series.get(name).points.push({ low: null, high: null, good: true, curve: 0, ...point });
+  };
+  let white = null;
+  frames.forEach((frame, index) => {
+    const kind = stepOf(frame)?.kind;
+    if (kind === "white" && frame.seen && frame.verdict === "accepted") {
+      white ??= frame.seen;
+      frame.seen.forEach((value, curve) => add(WHITE, "%", { index, value: (100 * value) / white[curve], curve }, 1));
+    }
+    if (kind === "dark" && frame.seen) frame.seen.forEach((value, curve) => add(BLACK, "DN", { index, value, curve }, 2));
+    for (const [name, [value, low, high, reason]] of Object.entries(frame.checks ?? {})) {
+      add(name, model.units[name], { index, value, low, high, good: !reason });
+    }
+    add(PACE, "s", { index, value: frame.seconds }, 0.5);
+  });
+  const rank = (name) => (PLOT_ORDER.includes(name) ? PLOT_ORDER.indexOf(name) : PLOT_ORDER.length);
+  return [...series.values()].sort((one, other) => rank(one.name) - rank(other.name));
+}
+
+function drawSeries(frames) {
+  const count = frames.length;
+  const refusals = frames.filter((frame) => frame.verdict && frame.verdict !== "accepted").length;
+  $("series-note").textContent = `${count} attempts in the order in which they were made, ${refusals} without an accepted frame; dashed lines are limits, crosses lie beyond.`;
+  drawn.strip = stripOf(frames);
+  drawn.strip.svg.setAttribute("aria-label", `Verdicts of ${count} attempts`);
+  $("verdicts").replaceChildren(drawn.strip.svg);
+  drawn.plots = seriesOf(frames).map((one) => plotOf({ ...one, count }));
+  $("series").replaceChildren(...drawn.plots.map((plot) => plot.box));
+}
+
+function chooseAt(event, plot) {
+  const svg = event.target.closest("svg");
+  const frames = inOrder();
+  if (!svg || !frames.length) return;
+  const x = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse()).x;
+  const share = (x - plot.left) / (plot.width - plot.left - plot.right);
+  const index = Math.max(0, Math.min(frames.length - 1, Math.round(share * (frames.length - 1))));
+  choose(frames[index].id, frames);
+}
+
+// Refusals and events ----------------------------------------------------------------------------------------------
+
+function drawRefused(frames) {
+  const bad = frames.filter((frame) => ["refused", "voided", "failed"].includes(frame.verdict)).reverse();
+  const shown = allRefused ? bad : bad.slice(0, REFUSED_SHOWN);
+  const again = new Set(frames.filter((frame) => frame.verdict === "accepted").map((frame) => frame.step));
+  $("refused-title").textContent = bad.length ? `Refused frames (${bad.length})` : "Refused frames";
+  $("more").hidden = bad.length <= REFUSED_SHOWN;
+  $("more").textContent = allRefused ? "Show the newest" : `Show all ${bad.length}`;
+  if (!bad.length) {
+    $("refused").replaceChildren(element("p", { class: "note" }, "None."));
+    return;
+  }
+  $("refused").replaceChildren(...shown.map((frame) => refusalOf(frame, again.has(frame.step))));
+}
+
+function refusalOf(frame, mended) {
+  const name = nameOf(stepOf(frame));
+  const button = element("button", { type: "button", class: "name" }, `${name}: ${frame.verdict}`);
+  button.addEventListener("click", () => {
+    choose(frame.id);
+    $("frame-title").focus();
+  });
+  const parts = [button];
+  const source = pictureOf(frame);
+  if (source) parts.push(element("img", { src: source, alt: `${name}, ${frame.verdict}`, loading: "lazy" }));
+  parts.push(element("p", {}, frame.reason || "no reason recorded"));
+  parts.push(element("p", { class: "note" }, `${dayText(frame.taken ?? frame.at)}; ${mended ? "taken again since and accepted" : "not yet taken again"}`));
+  return element("article", { class: "refusal" }, ...parts);
+}
+
+function drawEvents() {
+  $("events").replaceChildren(
+    ...[...model.events].reverse().map(([at, what, detail]) => element("tr", {}, element("td", { class: "number" }, dayText(at)), element("th", { scope: "row" }, what), element("td", {}, detail))),
+  );
+}
+
+// Head: what is asked at three in the morning ----------------------------------------------------------------------
+
+function fact(name, value, bad = false) {
+  return element("div", {}, element("dt", {}, name), element("dd", bad ? { class: "bad" } : {}, value));
+}
+
+function drawHead() {
+  const { head } = model;
+  const [glyph, word] = STATES[head.state] ?? STATES.unknown;
+  $("top").dataset.state = head.state;
+  $("state").textContent = `${glyph} ${word}`;
+  const share = head.total ? head.done / head.total : 0;
+  $("bar").style.width = `${(100 * share).toFixed(2)}%`;
+  const bar = $("progress");
+  bar.setAttribute("aria-valuemax", head.total || 1);
+  bar.setAttribute("aria-valuenow", head.done ?? 0);
+  bar.setAttribute("aria-valuetext", `${head.done ?? 0} of ${head.total ?? 0} frames`);
+  document.title = `${glyph} ${head.done ?? 0}/${head.total ?? 0} ${model.session?.name ?? ""}`;
+  drawIcon(share);
+  const facts = [];
+  if (head.total) {
+    facts.push(fact("lights", `${head.lights_done} of ${head.lights_total}`), fact("frames", `${head.done} of ${head.total}`));
+    if (head.done < head.total) facts.push(fact("time left", head.alive ? durationText(head.remaining_s) : "stands still", !head.alive));
+    if (head.eta && head.alive) facts.push(fact("done at about", timeText(head.eta)));
+    if (head.seconds_per_frame) facts.push(fact("a frame", `${short(head.seconds_per_frame)} s`));
+    facts.push(fact("refused", String(head.refused), head.refused > 0), fact("failed", String(head.failed), head.failed > 0));
+    if (head.voided) facts.push(fact("voided", String(head.voided), true));
+  }
+  if (head.last) facts.push(fact("last frame", timeText(head.last)));
+  if (!embedded && head.beat) facts.push(element("div", { id: "beat" }));
+  $("facts").replaceChildren(...facts);
+  drawBanner();
+  drawClock();
+}
+
+function drawBanner() {
+  const { head } = model;
+  const banner = $("banner");
+  const quiet = head.state === "running" || !head.sentence;
+  banner.hidden = quiet;
+  banner.className = ["stopped", "incomplete", "gone"].includes(head.state) ? "bad" : head.state === "complete" ? "good" : "";
+  // The house's sentences name the fault, then, after a semicolon, the remedy.
+  const [fault, ...remedy] = (head.sentence ?? "").split("; ");
+  const text = quiet ? "" : `${fault}\u0000${remedy.join("; ")}`;
+  if ($("banner-text").dataset.text !== text) {
+    $("banner-text").dataset.text = text;
+    $("banner-text").replaceChildren(...(quiet ? [] : [element("strong", {}, fault), remedy.join("; ")]));
+  }
+}
+
+/** Draw what changes with time alone: the countdown, the age of the last sign of life, and whether we are answered. */
+function drawClock() {
+  if (embedded) return;
+  const { head } = model;
+  const left = head.until && head.alive && head.state !== "running" ? (head.until - now()) / 1000 : null;
+  $("countdown").textContent = left === null ? "" : left > 0 ? `Next sign of life within ${durationText(left)} (by ${timeText(head.until)})` : "Late: looking whether it still lives";
+  const beat = $("beat");
+  if (beat) beat.replaceChildren(element("dt", {}, "sign of life"), element("dd", {}, head.alive ? `${durationText((now() - head.beat) / 1000)} ago` : dayText(head.beat)));
+  const silent = Date.now() - answeredAt > 2 * ANSWER_LIMIT_MS;
+  $("offline").hidden = !silent;
+  if (silent) $("offline").textContent = `acquire monitor has not answered since ${timeText(answeredAt)}: what stands here is old. The run itself may well go on; look at its terminal, or start acquire monitor again.`;
+}
+
+/** Draw the tab's icon: a ring that fills, in the colour of the state. */
+function drawIcon(share) {
+  const colours = { running: "#2f8fd0", complete: "#2f8fd0", waiting: "#e0a000", paused: "#e0a000" };
+  const colour = colours[model.head.state] ?? "#d9541e";
+  const round = 2 * Math.PI * 11;
+  const svg = `<svg xmlns="${SVG}" viewBox="0 0 32 32"><circle cx="16" cy="16" r="11" fill="none" stroke="#8888" stroke-width="8"/><circle cx="16" cy="16" r="11" fill="none" stroke="${colour}" stroke-width="8" stroke-dasharray="${round * share} ${round}" transform="rotate(-90 16 16)"/></svg>`;
+  document.querySelector("link[rel=icon]").href = `data:image/svg+xml,${encodeURIComponent(svg)}`;
+}
+
+// Asking -----------------------------------------------------------------------------------------------------------
+
+async function poll() {
+  try {
+    const answer = await fetch(`state.json?since=${encodeURIComponent(model.cursor)}`, { cache: "no-store", signal: AbortSignal.timeout(ANSWER_LIMIT_MS) });
+    if (!answer.ok) throw new Error(`answered ${answer.status}`);
+    answeredAt = Date.now();
+    clockOffset = Date.parse(answer.headers.get("Date")) + 500 - answeredAt;
+    if (answer.status !== 204) take(await answer.json());
+  } catch (error) {
+    // Said by the page once it has lasted (drawClock); a fault of the page itself belongs in the console.
+    if (!["TypeError", "TimeoutError", "AbortError"].includes(error.name) && !String(error.message).startsWith("answered")) console.error(error);
+  }
+  drawClock();
+  waiting = setTimeout(poll, document.hidden ? POLL_HIDDEN_MS : POLL_MS);
+}
+let waiting = null;
+
+function legend() {
+  const mark = (state, form, text) => {
+    const path = shape("path", { class: `mark ${state}`, d: markPath(form, 8, 8, 4.5) });
+    if (state === "accepted" || state === "shown") path.setAttribute("fill", "#c9a227");
+    return element("li", {}, shape("svg", { viewBox: "0 0 16 16", "aria-hidden": "true" }, path), text);
+  };
+  $("legend").replaceChildren(mark("planned", "circle", "planned"), mark("accepted", "circle", "taken"), mark("accepted", "diamond", "taken, black body"), mark("shown", "circle", "on the wall"), mark("refused", "cross", "refused"));
+  $("lights-note").textContent = "Each light at r = R/(R+G+B), b = B/(R+G+B), in its own colour. A mark out of its place in the plane of what was seen was lit by another light than ordered.";
+}
+
+function planeIn(id, label) {
+  const box = $(id);
+  const plane = () => new Plane(box, label, (light) => {
+    const frame = inOrder().findLast((one) => stepOf(one)?.kind === "light" && stepOf(one).light === light);
+    if (frame) choose(frame.id);
+  });
+  const made = { plane: plane() };
+  made.clear = () => {
+    box.replaceChildren();
+    made.plane = plane();
+  };
+  return made;
+}
+
+function begin() {
+  drawn.planned = planeIn("planned", "Chromaticities of the lights as planned");
+  drawn.seen = planeIn("seen", "Chromaticities of the lights as seen by the camera");
+  legend();
+  $("previous").addEventListener("click", () => stride(-1));
+  $("next").addEventListener("click", () => stride(1));
+  $("latest").addEventListener("click", () => choose(null));
+  $("more").addEventListener("click", () => {
+    allRefused = !allRefused;
+    drawRefused(inOrder());
+  });
+  $("verdicts").addEventListener("click", (event) => chooseAt(event, STRIP));
+  $("series").addEventListener("click", (event) => chooseAt(event, PLOT));
+  $("picture").addEventListener("error", () => {
+    $("picture").hidden = true;
+    $("no-picture").hidden = false;
+  });
+  document.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.altKey || event.metaKey) return;
+    const frames = inOrder();
+    const acts = { ArrowLeft: () => stride(-1), ArrowRight: () => stride(1), Home: () => frames.length && choose(frames[0].id, frames), End: () => choose(null), Escape: () => choose(null) };
+    if (!acts[event.key]) return;
+    acts[event.key]();
+    event.preventDefault();
+  });
+  if (embedded) {
+    $("sound").hidden = true;
+    const state = JSON.parse(embedded.textContent);
+    model.pictures = state.pictures;
+    take(state);
+    return;
+  }
+  $("sound").addEventListener("click", () => {
+    sound = sound ? (sound.close(), null) : new AudioContext();
+    $("sound").setAttribute("aria-pressed", String(Boolean(sound)));
+    $("sound").textContent = sound ? "Sound on" : "Sound off";
+    if (sound) beep(1);
+  });
+  document.addEventListener("visibilitychange", () => {
+    if (document.hidden) return;
+    clearTimeout(waiting);
+    poll();
+  });
+  setInterval(drawClock, 1000);
+  poll();
+}
+
+begin();

@@ -1,0 +1,130 @@
+"""How a session stands: what is said when it runs, pauses, ends, or is killed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from acquisition.monitor.head import Head, head_of
+from acquisition.monitor.rows import AttemptView, with_seconds
+from acquisition.session.heartbeat import Heartbeat, Process, RunState
+from acquisition.session.plan import plan_steps
+from tests.acquisition.monitor.made_up import LIGHTS
+
+NOW = datetime(2026, 3, 1, 23, 0, tzinfo=UTC)
+STEPS = plan_steps(LIGHTS, 25)
+HERE = Process.own()
+ELSEWHERE = Process(7, "1", "another-machine", "boot")
+
+
+def attempts(count: int, verdict: str | None = "accepted", seconds: float = 5.0) -> tuple[AttemptView, ...]:
+    """Return attempts at the first steps, the newest a moment ago."""
+    begun = [NOW - timedelta(seconds=seconds * (count - number)) for number in range(count)]
+    views = [
+        AttemptView(number + 1, number, f"frames/{number}.cr2", at, at, at, verdict, "")
+        for number, at in enumerate(begun)
+    ]
+    return with_seconds(views, [])
+
+
+def heartbeat(state: RunState, *, ago: float = 2.0, within: float = 10.0, process: Process = HERE) -> Heartbeat:
+    at = NOW - timedelta(seconds=ago)
+    return Heartbeat(at, process, state, f"{state} as it should", at + timedelta(seconds=within))
+
+
+def head(views: Sequence[AttemptView], beat: Heartbeat | None, alive: bool | None = True, now: datetime = NOW) -> Head:
+    return head_of(STEPS, views, beat, now, process_alive=alive, name="night")
+
+
+@pytest.mark.parametrize("state", ["running", "waiting", "paused"])
+def test_a_run_says_what_it_does(state: RunState) -> None:
+    stands = head(attempts(3), heartbeat(state))
+    assert (stands.state, stands.sentence, stands.alive) == (state, f"{state} as it should", True)
+
+
+def test_time_left_is_that_of_the_frames_left() -> None:
+    stands = head(attempts(3), heartbeat("running"))
+    assert (stands.done, stands.total, stands.lights_done) == (3, 8, 1)
+    assert stands.seconds_per_frame == 5.0
+    assert stands.remaining_s == 25.0
+    assert stands.eta == NOW + timedelta(seconds=25)
+
+
+def test_where_the_labs_time_is_another_no_time_of_day_is_told() -> None:
+    simulated = [
+        AttemptView(
+            one.id, one.step, one.file, one.started_at - timedelta(days=40), None, None, one.verdict, "", seconds=5.0
+        )
+        for one in attempts(3)
+    ]
+    stands = head(simulated, heartbeat("running"))
+    assert stands.remaining_s == 25.0
+    assert stands.eta is None
+
+
+def test_a_killed_run_is_told_at_once_where_it_ran() -> None:
+    stands = head(attempts(3), heartbeat("running", ago=1.0), alive=False)
+    assert stands.state == "stopped"
+    assert not stands.alive
+    assert "killed or power lost: run the same command again" in stands.sentence
+    assert stands.eta is None
+
+
+@pytest.mark.parametrize(("late_s", "state"), [(29.0, "paused"), (31.0, "stopped")])
+def test_elsewhere_a_missing_sign_of_life_is_waited_for(late_s: float, state: str) -> None:
+    beat = heartbeat("paused", process=ELSEWHERE)
+    stands = head(attempts(3), beat, alive=None, now=beat.until + timedelta(seconds=late_s))
+    assert stands.state == state
+
+
+def test_the_process_itself_is_looked_for() -> None:
+    child = subprocess.run(
+        [sys.executable, "-c", "from acquisition.session.heartbeat import Process; print(repr(Process.own()))"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    gone = eval(child.stdout, {"Process": Process})
+    assert HERE.is_alive()
+    assert not gone.is_alive()
+
+
+def test_all_frames_there_and_nobody_at_work_is_complete_and_says_what_comes_next() -> None:
+    for beat, alive in ((heartbeat("ended"), True), (heartbeat("running"), False), (None, None)):
+        stands = head(attempts(8), beat, alive=alive)
+        assert stands.state == "complete"
+        assert stands.sentence == "complete, 8 frames; next: build-lut night LUT/"
+    assert head(attempts(8), heartbeat("running")).state == "running"
+
+
+def test_an_end_with_frames_left_is_incomplete_with_its_cause() -> None:
+    stands = head(attempts(5), heartbeat("ended"))
+    assert (stands.state, stands.sentence) == ("incomplete", "ended as it should")
+    silent = Heartbeat(NOW, HERE, "ended", "", NOW)
+    assert head(attempts(5), silent).sentence == "ended with 3 of 8 frames left; run the same command again"
+
+
+def test_a_journal_without_signs_of_life_says_so() -> None:
+    assert head(attempts(5), None).state == "unknown"
+    assert head((), None).state == "unknown"
+
+
+def test_refused_failed_and_voided_are_told_apart_and_none_of_them_counts() -> None:
+    views = [*attempts(1), *attempts(1, "refused"), *attempts(1, "failed"), *attempts(1, "voided"), *attempts(1, None)]
+    stands = head(views, heartbeat("running"))
+    assert (stands.done, stands.refused, stands.failed, stands.voided) == (1, 1, 1, 1)
+
+
+def test_a_frame_of_a_step_that_the_plan_does_not_have_does_not_count() -> None:
+    stray = AttemptView(1, 99, "frames/x.cr2", NOW, NOW, NOW, "accepted", "")
+    assert head([stray], heartbeat("running")).done == 0
+
+
+def test_the_time_between_two_runs_is_no_frames() -> None:
+    first, second, third = attempts(3)
+    timed = with_seconds([first, second, third], [second.started_at])
+    assert [one.seconds for one in timed] == [None, None, 5.0]
