@@ -233,8 +233,10 @@ def run(
     if dry_run:
         _print_plan(settings, session, retake)
         return
-    with orderly_end(), progress("frames") as advance:
-        outcome = run_session(settings, session, advance, lambda sentence: print(sentence, file=sys.stderr), retake)
+    with orderly_end() as ending, progress("frames") as advance:
+        outcome = run_session(
+            settings, session, advance, lambda sentence: print(sentence, file=sys.stderr), retake, ending
+        )
     if not outcome.complete:
         raise QualityError(
             f"{outcome.left} of {outcome.total} frames are without an accepted frame; " + "; ".join(outcome.refused)

@@ -337,11 +337,11 @@ def draw_data(plan: Plan, bands: Mapping[str, tuple[float, float]]) -> list[str]
 def draw_step() -> str:
     """Return the drawing of what a step of a session goes through."""
     sys.path.insert(0, str(ROOT))
-    from acquisition.session.states import ENDS, TRANSITIONS, UNDER_WAY, StepState
+    from acquisition.session.states import AHEAD, ENDS, TRANSITIONS, UNDER_WAY, StepState
 
     wide, left, right, lane = 112, 340, 680, 830
-    path = [StepState.PLANNED, *UNDER_WAY, StepState.ACCEPTED]
-    aside = {StepState.FAILED: 2.0, StepState.INTERRUPTED: 4.5, StepState.REFUSED: 6.2}
+    path = [*AHEAD, *UNDER_WAY, StepState.ACCEPTED]
+    aside = {StepState.FAILED: 2.6, StepState.INTERRUPTED: 5.4, StepState.REFUSED: 6.7, StepState.VOIDED: 8.0}
     places = {state: (left, 30.0 + 66 * row) for row, state in enumerate(path)}
     places |= {state: (right, 30 + 66 * row) for state, row in aside.items()}
     if set(places) != set(StepState) or set(ENDS) != {StepState.ACCEPTED, *aside}:
@@ -363,8 +363,10 @@ def draw_step() -> str:
             parts.append(arrow(((x + 40, y + BOX_HEIGHT), (x + 40, to_y))))
             parts.append(text(x + 30, (y + BOX_HEIGHT + to_y) / 2 + 4, line.cause, 11, GREY, anchor="end"))
         elif x == to_x:
-            parts.append(arrow(((x, y + 13), (20, y + 13), (20, to_y + 13), (x, to_y + 13)), dashed=True))
-            parts.append(text(30, y + 7, line.cause, 11, GREY))
+            # The longest way back lies outside.
+            far = 20 + 12 * (path.index(StepState.ACCEPTED) - path.index(line.before)) // 2
+            parts.append(arrow(((x, y + 13), (far, y + 13), (far, to_y + 13), (x, to_y + 13)), dashed=True))
+            parts.append(text(far + 10, y + 7, line.cause, 11, GREY))
         elif to_x > x:
             parts.append(arrow(((x + wide, y + 13), (to_x, to_y + 13))))
             share, aside_px = 0.25, -6 if to_y >= y else 16

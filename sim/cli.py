@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Sequence
-from contextlib import ExitStack
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,8 +15,13 @@ from foundation import console
 from foundation.console import EXIT_CODES
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from sim.camera.film import Film
     from sim.projectors.projector import SimulatedProjector
     from sim.world.drawing import Print
+    from sim.world.world import World
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -25,9 +31,15 @@ app = typer.Typer(
 )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
-    return console.run(lambda: app(args=argv, prog_name="sim"))
+def main(argv: Sequence[str] | None = None, read_chart: Callable[[Path], Print] | None = None) -> int:
+    """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`).
+
+    Parameters
+    ----------
+    read_chart
+        Returns the print of a chart.json. Charts are known above this package, so whoever stands there hands it in.
+    """
+    return console.run(lambda: app(args=argv, prog_name="sim", obj=read_chart))
 
 
 @app.callback()
@@ -48,6 +60,14 @@ def projector(
         str | None, typer.Option(metavar="HOST:PORT", help="Send PJLink status notices there, by UDP.")
     ] = None,
     serial: Annotated[str | None, typer.Option(help="Language on a serial port: benq, epson, nec or optoma.")] = None,
+    lit: Annotated[bool, typer.Option("--lit", help="Begin with the lamp burning, not in standby.")] = False,
+    warm_up: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="Time to warm up.")] = 30.0,
+    cool_down: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="Time to cool down.")] = 60.0,
+    pjlink_class: Annotated[int, typer.Option("--class", min=1, max=2, help="Class of PJLink.")] = 2,
+    answer_after: Annotated[
+        float,
+        typer.Option(min=0, max=10, metavar="SECONDS", help="Time to answer by PJLink; of real ones .05 to 2."),
+    ] = 0.0,
 ) -> None:
     """Serve a simulated projector: standby, 30 s of warm-up, on, 60 s of cooling.
 
@@ -57,33 +77,43 @@ def projector(
     cable, 3 when the port is taken.
     """
     from drivers.pjlink.wire import MAX_PASSWORD
+    from drivers.projector import Power
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError, InputError
-    from sim.projectors.projector import SimulatedProjector
+    from sim.projectors.projector import ProjectorTraits, SimulatedProjector
 
     if (pjlink is None) == (serial is None):
         raise ConfigurationError("one projector has one cable: either --pjlink PORT or --serial LANGUAGE")
     if pjlink is None and (password, udp, notify) != (None, None, None):
         raise ConfigurationError("--password, --udp and --notify are PJLink's; a serial cable has none of them")
+    if serial is not None and (answer_after or pjlink_class != 2):
+        raise ConfigurationError("--answer-after and --class are PJLink's; a serial cable has neither")
     if password is not None and not 1 <= len(password) <= MAX_PASSWORD:
         raise InputError(
             f"the password has {len(password)} characters; PJLink allows at least 1, at most {MAX_PASSWORD}"
         )
-    device = SimulatedProjector(SystemClock())
+    traits = ProjectorTraits(warm_up_s=warm_up, cool_down_s=cool_down, pjlink_class=pjlink_class)
+    device = SimulatedProjector(SystemClock(), Power.ON if lit else Power.STANDBY, traits)
     if serial is not None:
         _serve_serial(device, serial)
     elif pjlink is not None:
-        _serve_network(device, pjlink, password, udp, None if notify is None else _host_and_port(notify))
+        controller = None if notify is None else _host_and_port(notify)
+        _serve_network(device, pjlink, password, udp, controller, answer_after)
 
 
 def _serve_network(
-    device: SimulatedProjector, pjlink: int, password: str | None, udp: int | None, controller: tuple[str, int] | None
+    device: SimulatedProjector,
+    pjlink: int,
+    password: str | None,
+    udp: int | None,
+    controller: tuple[str, int] | None,
+    answer_s: float,
 ) -> None:
     from sim.projectors.pjlink import serve_pjlink
     from sim.projectors.pjlink_notices import ProjectorDatagrams
 
     with ExitStack() as served:
-        host, port = served.enter_context(serve_pjlink(device, pjlink, password)).address
+        host, port = served.enter_context(serve_pjlink(device, pjlink, password, answer_s=answer_s)).address
         if udp is not None or controller is not None:
             datagrams = served.enter_context(ProjectorDatagrams(device, udp or 0, controller))
             if udp is not None:
@@ -108,14 +138,37 @@ def _serve_serial(device: SimulatedProjector, name: str) -> None:
 
 @app.command()
 def camera(
+    context: typer.Context,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port for PTP/IP; 0 picks a free one.")] = None,
     usbip: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port for USB/IP; 3240 is the usual.")] = None,
     model: Annotated[str, typer.Option(help="EOS 550D, EOS 6D Mark II, or Test: a small frame.")] = "EOS 550D",
+    chart: Annotated[Path | None, typer.Option(help="chart.json of the print before it; grey squares else.")] = None,
+    room: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="What differs from the default room, as LAB.toml's.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything that chance decides: paper, noise.")] = 1,
+    watch_screen: Annotated[
+        str | None,
+        typer.Option(metavar="SCREEN", help="X screen that lights the chart: :1, 640x360+0+0, or :1,640x360+0+0."),
+    ] = None,
+    watch_projector: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="PJLink projector that throws it; a steady lamp else.")
+    ] = None,
+    projector_password: Annotated[str | None, typer.Option(help="Its PJLink password.")] = None,
+    event: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TABLE", help="What goes wrong, as in LAB.toml: '{ what = \"bump\", px = 1.0 }'."),
+    ] = None,
 ) -> None:
     """Serve a simulated Canon EOS on a network or a USB cable: it photographs grey squares under white light.
 
-    Reads and writes no file. Prints the address it listens on, then serves until interrupted (Ctrl-C), which is its
-    proper end: exit code 0. Exit code 2 when there is no such model or not exactly one cable, 3 when the port is taken.
+    With --watch-screen it photographs the chart as the pixels of that screen light it while the shutter is open, in
+    real time: a window in front lights its place, for its share of the exposure. With --watch-projector the projector's
+    power, mute, freeze and input count, too. So `acquire` can be rehearsed as in a lab (docs/how-to/rehearsal.md).
+
+    Writes no file. Prints the address it listens on, and what each exposure of a watched screen saw; serves until
+    interrupted (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there is no such model, chart, room or
+    screen, or not exactly one cable, 3 when the port is taken or the screen cannot be reached.
 
     With --port, any software that speaks PTP/IP can use it, for instance (both connections go to one port):
 
@@ -128,7 +181,6 @@ def camera(
     from concurrent.futures import ThreadPoolExecutor
 
     from drivers.canon.apex import SHUTTER
-    from drivers.presenter import WHITE
     from drivers.ptp.codes import Property
     from foundation.clock import SystemClock
     from foundation.errors import ConfigurationError
@@ -137,8 +189,7 @@ def camera(
     from sim.buses.usbip import serve_usbip
     from sim.camera.eos import SimulatedEos
     from sim.camera.eos_bodies import EOS_BODIES
-    from sim.camera.film import WorldFilm
-    from sim.world.room import REFERENCE_EXPOSURE, Room
+    from sim.world.room import REFERENCE_EXPOSURE, read_room
     from sim.world.sensors import BODIES
     from sim.world.world import World
 
@@ -146,10 +197,19 @@ def camera(
         raise ConfigurationError("one camera has one cable: either --port N for PTP/IP or --usbip N for USB/IP")
     if model not in EOS_BODIES:
         raise ConfigurationError(f"--model {model!r}: known are {', '.join(sorted(EOS_BODIES))}")
-    # A lamp that ages would be dark by now: its drift counts from the day when the simulated lab opened.
-    world = World(_grey_squares(), BODIES[model], Room(lamp_drift_per_hour=0))
-    film = WorldFilm(world, lambda: WHITE, lambda: 1.0, "0000000001", {})
-    with ThreadPoolExecutor(1, "developing") as executor:
+    if watch_screen is None and (watch_projector, projector_password) != (None, None):
+        raise ConfigurationError("a projector throws a screen's picture: --watch-projector needs --watch-screen")
+    changes = dict(_setting("--room", given) for given in room or ())
+    # A lamp that ages would be dark by now: unless asked for, its drift counts from no day at all.
+    world = World(
+        _grey_squares() if chart is None else _print(context, chart),
+        BODIES[model],
+        read_room(seed, {"lamp_drift_per_hour": 0.0} | changes, "the command line", "--room"),
+    )
+    with ExitStack() as opened:
+        film = opened.enter_context(_film(world, watch_screen, watch_projector, projector_password, event or []))
+        # One frame may be exposed while others are still developed.
+        executor = opened.enter_context(ThreadPoolExecutor(3, "developing"))
         eos = SimulatedEos(EOS_BODIES[model], film, SystemClock(), auto_power_off_s=0, executor=executor)
         eos.set_menu(Property.EOS_SHUTTER_SPEED, SHUTTER.code(REFERENCE_EXPOSURE.shutter_s))
         if port is not None:
@@ -159,6 +219,82 @@ def camera(
             device = PtpUsbDevice(eos, UsbIdentity(*eos.body.usb, serial=eos.serial, name=eos.body.model))
             with serve_usbip([device], usbip) as server:
                 _until_interrupted("USB/IP camera {} at {}:{}, bus id 1-1".format(eos.body.model, *server.address))
+
+
+@contextmanager
+def _film(
+    world: World, screen: str | None, projector: str | None, password: str | None, events: Sequence[str]
+) -> Generator[Film]:
+    """Yield pictures of a world under white light, or lit by a screen that is watched."""
+    from drivers.links.tcp import TcpLink
+    from drivers.pjlink.projector import PjLinkProjector
+    from drivers.presenter import WHITE
+    from foundation.clock import SystemClock
+    from sim.camera.film import WatchedFilm, WorldFilm
+    from sim.projectors.watching import Beam, ScreenPlace, Screenshots
+    from sim.world.disturbances import read_disturbances
+    from sim.world.room import REFERENCE_EXPOSURE
+
+    listed = [_value("--event", text, text) for text in events]
+    happens = read_disturbances(listed, "the command line", "--event")
+    serial = "0000000001"
+    if screen is None:
+        yield WorldFilm(world, lambda: WHITE, lambda: 1.0, serial, {}, happens)
+        return
+    happens.require_unshown("--event")
+    clock, pictures = SystemClock(), Screenshots(ScreenPlace.parse(screen))
+    # A screen that is not there now is a mistake; later it is an accident of the rehearsal.
+    pictures.take()
+    asked = None
+    if projector is not None:
+        host, port = _host_and_port(projector)
+        asked = PjLinkProjector(lambda: TcpLink.connect(host, port, 5.0), password, label=projector, clock=clock)
+        asked.power()
+    with Beam(pictures, asked, world.room.light_of, clock) as beam:
+        # The first frame would else come seconds late.
+        world.signal(WHITE, REFERENCE_EXPOSURE)
+
+        def gather(number: int, seconds: float) -> tuple[NDArray[np.float32], float]:
+            print(f"exposure {number} begins, {seconds:g} s", flush=True)
+            thrown = beam.gather(seconds, lambda: print(f"exposure {number} half over", flush=True))
+            print(f"exposure {number} ends: {thrown}", flush=True)
+            return thrown.picture, thrown.lamp
+
+        yield WatchedFilm(world, gather, serial, happens, clock.now())
+
+
+def _print(context: typer.Context, chart: Path) -> Print:
+    """Return the print of a chart, by the reader that `main` was given."""
+    from foundation.errors import ConfigurationError
+
+    read: Callable[[Path], Print] | None = context.obj
+    if read is None:
+        raise ConfigurationError(f"--chart {chart}: charts are read by the program sim; this is sim.cli alone")
+    return read(chart)
+
+
+def _setting(option: str, given: str) -> tuple[str, Any]:
+    """Return name and value of ``name=value``; the value as TOML has it, text also without quotes."""
+    from foundation.errors import InputError
+
+    name, equals, value = given.partition("=")
+    if not name or not equals:
+        raise InputError(f"{option} {given!r}: NAME=VALUE expected, such as waviness_mm=1.5")
+    try:
+        return name, _value(option, value, given)
+    except InputError:
+        return name, value
+
+
+def _value(option: str, text: str, given: str) -> Any:
+    import tomllib
+
+    from foundation.errors import InputError
+
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{option} {given!r} is not TOML: {error}") from error
 
 
 def _grey_squares() -> Print:

@@ -8,18 +8,37 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from foundation import console
 from foundation.console import EXIT_CODES, orderly_end, progress
+from sim import cli as devices
 from sim.cli import app
+
+if TYPE_CHECKING:
+    from sim.world.drawing import Print
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `sim` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
-    return console.run(lambda: app(args=argv, prog_name="sim"))
+    return devices.main(argv, read_print)
+
+
+def read_print(chart: Path) -> Print:
+    """Return the print of a chart.json, as the simulated room hangs it up.
+
+    Raises
+    ------
+    InputError, FormatError
+        There is no such file, or it is no chart's.
+    """
+    from acquisition.chart.model import load_chart
+    from acquisition.chart.printing import drawing
+    from sim.world.drawing import Print
+
+    drawn = drawing(load_chart(chart))
+    return Print(drawn.page_mm, drawn.rectangles_mm, drawn.rgb)
 
 
 @app.command(epilog=EXIT_CODES)

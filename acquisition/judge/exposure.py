@@ -14,7 +14,8 @@ import numpy as np
 
 from acquisition.config import LabSettings, LimitSettings
 from acquisition.framing.planes import CLIPPING_SHARE, frame_black
-from acquisition.session.plan import FrameKind
+from acquisition.session.judgement import Judgement
+from acquisition.session.plan import FrameKind, SessionStep
 from drivers.camera import ExposureSettings
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import FormatError
@@ -95,7 +96,8 @@ def refusal(exposure: Exposure, kind: FrameKind, limits: LimitSettings) -> str |
             f"{exposure.clipped:.1%} of the photosites are clipped, {limits.clipped_percent:g} % allowed; "
             "set a shorter exposure (acquire check recommends one) and begin a new session"
         )
-    if exposure.brightest_dn < limits.too_dark_dn:
+    # Of the greys by which the projector's curve is known the darkest are meant to be dark.
+    if kind != "response" and exposure.brightest_dn < limits.too_dark_dn:
         return (
             f"the brightest photosites are {exposure.brightest_dn:.0f} counts above black, "
             f"at least {limits.too_dark_dn:g} expected; is the projector on, its picture not muted, the lens cap off?"
@@ -112,3 +114,17 @@ def judge_file(path: Path, kind: FrameKind, settings: LabSettings) -> str | None
     # What was asked for is not known of frames taken by other means.
     differs = None if settings.rig == "imported" else disagreement(mosaic, settings.camera.exposure)
     return differs or refusal(measure_exposure(mosaic), kind, settings.limits)
+
+
+class ExposureJudge:
+    """A `acquisition.session.judgement.FrameJudge` that looks at the exposure of each frame alone."""
+
+    def __init__(self, settings: LabSettings) -> None:
+        self._settings = settings
+
+    def judge(self, file: Path, step: SessionStep) -> Judgement:
+        """Return whether the frame can be read and is exposed as it should be."""
+        return Judgement.of_reason("exposure", judge_file(file, step.kind, self._settings))
+
+    def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
+        """Do nothing: no frame is held against another."""

@@ -16,29 +16,27 @@ class StepState(Enum):
     """Where a step is; the value is the word shown to the reader, and the journal's verdict where there is one."""
 
     PLANNED = "planned"
-    BEGUN = "begun"
     LIT = "lit"
     SETTLED = "settled"
+    BEGUN = "begun"
     EXPOSED = "exposed"
+    FETCHED = "fetched"
     SAVED = "saved"
     JUDGED = "judged"
     ACCEPTED = "accepted"
     REFUSED = "refused"
     FAILED = "failed"
     INTERRUPTED = "interrupted"
+    VOIDED = "voided"
 
 
-UNDER_WAY = (
-    StepState.BEGUN,
-    StepState.LIT,
-    StepState.SETTLED,
-    StepState.EXPOSED,
-    StepState.SAVED,
-    StepState.JUDGED,
-)
+AHEAD = (StepState.PLANNED, StepState.LIT, StepState.SETTLED)
+"""States of a step of which the journal shows nothing yet: another may still come before it."""
+
+UNDER_WAY = (StepState.BEGUN, StepState.EXPOSED, StepState.FETCHED, StepState.SAVED, StepState.JUDGED)
 """States of an attempt without a verdict, in their order; the journal shows all of them as a row without one."""
 
-ENDS = (StepState.ACCEPTED, StepState.REFUSED, StepState.FAILED, StepState.INTERRUPTED)
+ENDS = (StepState.ACCEPTED, StepState.REFUSED, StepState.FAILED, StepState.INTERRUPTED, StepState.VOIDED)
 """How an attempt ends. Only an accepted frame is used; every frame whose file is complete is kept."""
 
 
@@ -52,22 +50,27 @@ class Transition:
 
 
 TRANSITIONS = (
-    Transition(StepState.PLANNED, StepState.BEGUN, "the projector is healthy; the journal has a row"),
-    Transition(StepState.BEGUN, StepState.LIT, "the presenter shows the step's codes"),
+    Transition(StepState.PLANNED, StepState.LIT, "the presenter shows the codes"),
     Transition(StepState.LIT, StepState.SETTLED, "settle_s have passed"),
-    Transition(StepState.SETTLED, StepState.EXPOSED, "the camera has released and handed over its raw file"),
-    Transition(StepState.EXPOSED, StepState.SAVED, "the file is complete on the disk, hashed and renamed"),
-    Transition(StepState.SAVED, StepState.JUDGED, "decoded and measured; the projector asked for its health"),
-    Transition(StepState.JUDGED, StepState.ACCEPTED, "nothing is wrong; the journal's row is committed"),
-    Transition(StepState.JUDGED, StepState.REFUSED, "the frame or the projector is at fault"),
-    Transition(StepState.BEGUN, StepState.FAILED, "the presenter fails"),
-    Transition(StepState.SETTLED, StepState.FAILED, "the camera fails"),
-    Transition(StepState.EXPOSED, StepState.FAILED, "bytes are missing"),
-    Transition(StepState.REFUSED, StepState.BEGUN, "another attempt, now or in the next run"),
-    Transition(StepState.FAILED, StepState.BEGUN, "another attempt, now or in the next run"),
-    Transition(StepState.INTERRUPTED, StepState.BEGUN, "the next run"),
-    Transition(StepState.ACCEPTED, StepState.BEGUN, "the next run finds its file gone or cut"),
-    *(Transition(state, StepState.INTERRUPTED, "Ctrl-C, a crash, a power cut") for state in UNDER_WAY),
+    Transition(StepState.SETTLED, StepState.BEGUN, "the journal has a row"),
+    Transition(StepState.BEGUN, StepState.EXPOSED, "the light may change; the screen was read back"),
+    Transition(StepState.EXPOSED, StepState.FETCHED, "the camera has handed over its raw file"),
+    Transition(StepState.FETCHED, StepState.SAVED, "it is complete on the disk, hashed and renamed"),
+    Transition(StepState.SAVED, StepState.JUDGED, "decoded and measured, beside the next exposure"),
+    Transition(StepState.JUDGED, StepState.ACCEPTED, "nothing is wrong; the row is committed"),
+    Transition(StepState.JUDGED, StepState.REFUSED, "the frame, the screen or the projector is at fault"),
+    Transition(StepState.BEGUN, StepState.FAILED, "the camera fails"),
+    Transition(StepState.EXPOSED, StepState.FAILED, "the frame cannot be fetched"),
+    Transition(StepState.FETCHED, StepState.FAILED, "the disk does not take it"),
+    Transition(StepState.LIT, StepState.PLANNED, "a refused light, or the end, comes first"),
+    Transition(StepState.SETTLED, StepState.PLANNED, "the end comes first"),
+    Transition(StepState.REFUSED, StepState.LIT, "another attempt, now or in the next run"),
+    Transition(StepState.FAILED, StepState.LIT, "another attempt, when its cause is gone"),
+    Transition(StepState.INTERRUPTED, StepState.LIT, "the next run"),
+    Transition(StepState.ACCEPTED, StepState.VOIDED, "the next reference is refused, or the file damaged"),
+    Transition(StepState.VOIDED, StepState.LIT, "another attempt, now or in the next run"),
+    Transition(StepState.ACCEPTED, StepState.LIT, "its file is gone, or lights want a reference"),
+    *(Transition(state, StepState.INTERRUPTED, "Ctrl-C twice, a crash, a power cut") for state in UNDER_WAY),
 )
 """Every transition that a step can make."""
 
@@ -80,7 +83,8 @@ def may_follow(before: StepState, after: StepState) -> bool:
 def may_lead_to(before: StepState, after: StepState) -> bool:
     """Return whether `after` can be the next state that the journal shows after `before`.
 
-    Of an attempt under way the journal shows that it has begun; the states up to its end are passed over.
+    Of a light that is shown the journal shows nothing, and of an attempt under way that it has begun; the states up to
+    its end are passed over.
     """
     reached, waiting = set[StepState](), [before]
     while waiting:
@@ -88,6 +92,6 @@ def may_lead_to(before: StepState, after: StepState) -> bool:
         for line in TRANSITIONS:
             if line.before is state and line.after not in reached:
                 reached.add(line.after)
-                if line.after in UNDER_WAY and line.after is not StepState.BEGUN:
+                if line.after in (*AHEAD, *UNDER_WAY) and line.after is not StepState.BEGUN:
                     waiting.append(line.after)
     return after in reached

@@ -31,6 +31,8 @@ _REPLY_PRESENT = 8
 """Offset of `present` in a QueryExtension reply."""
 _REPLY_ATOM = 8
 """Offset of `atom` in an InternAtom reply."""
+_REPLY_SIZE = (16, 18)
+"""Offsets of `width` and `height` in a GetGeometry reply."""
 _ANY_TYPE = 0
 """AnyPropertyType of GetProperty: the value is wanted whatever its type."""
 _DPMS_ON = 0
@@ -91,7 +93,14 @@ class _Screens(ctypes.Structure):
 
 
 class XScreen:
-    """The screen of the X server that DISPLAY names.
+    """The screen of an X server.
+
+    Parameters
+    ----------
+    display
+        The server's name, such as ``:1``; None: what DISPLAY names.
+    keep_awake
+        Whether to hold off screen saver and power saving while this is open.
 
     Raises
     ------
@@ -99,7 +108,7 @@ class XScreen:
         The server cannot be reached, or libxcb is not installed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, display: str | None = None, *, keep_awake: bool = True) -> None:
         try:
             self._xcb = ctypes.CDLL("libxcb.so.1")
         except OSError as error:
@@ -108,17 +117,40 @@ class XScreen:
         self._libc.free.argtypes = [ctypes.c_void_p]
         _declare(self._xcb)
         number = ctypes.c_int()
-        self._connection: int | None = self._xcb.xcb_connect(None, ctypes.byref(number))
+        self._connection: int | None = self._xcb.xcb_connect(
+            None if display is None else display.encode(), ctypes.byref(number)
+        )
         if self._xcb.xcb_connection_has_error(self._connection):
             self.close()
-            raise DeviceError("the X server cannot be reached; check DISPLAY and that this user may open it")
+            named = "DISPLAY" if display is None else display
+            raise DeviceError(f"the X server cannot be reached; check {named} and that this user may open it")
         screens = self._xcb.xcb_setup_roots_iterator(self._xcb.xcb_get_setup(self._connection))
         for _ in range(number.value):
             self._xcb.xcb_screen_next(ctypes.byref(screens))
         self._root: int = screens.data[0]
         self._seen: npt.NDArray[np.uint32] = np.empty((0, 0), np.uint32)
-        self.stays_awake = self._suspend_saver()
+        self.stays_awake = keep_awake and self._suspend_saver()
         """Whether screen saver and power saving are held off while this is open."""
+
+    def size(self) -> tuple[int, int]:
+        """Return width and height of the whole screen now, px; a change of mode changes them.
+
+        Raises
+        ------
+        DeviceError
+            The server is gone.
+        """
+        if self._connection is None:
+            raise DeviceError("the screen was closed; open it again")
+        cookie = self._xcb.xcb_get_geometry(self._connection, self._root)
+        failure = ctypes.c_void_p()
+        reply = self._xcb.xcb_get_geometry_reply(self._connection, cookie, ctypes.byref(failure))
+        if not reply:
+            self._libc.free(failure)
+            raise DeviceError("the X server is gone: somebody logged out, or it crashed; log in, then run again")
+        width, height = (ctypes.c_uint16.from_address(reply + at).value for at in _REPLY_SIZE)
+        self._libc.free(reply)
+        return width, height
 
     def read(self, x: int, y: int, width: int, height: int) -> npt.NDArray[np.uint32]:
         """Return what the server shows there, (height, width) uint32, 0xRRGGBB; the next call writes over it.
@@ -225,6 +257,8 @@ def _declare(xcb: ctypes.CDLL) -> None:
             Cookie,
             [pointer, ctypes.c_uint8, integer, half, half, ctypes.c_uint16, ctypes.c_uint16, integer],
         ),
+        "xcb_get_geometry": (Cookie, [pointer, integer]),
+        "xcb_get_geometry_reply": (pointer, [pointer, Cookie, pointer]),
         "xcb_get_image_reply": (pointer, [pointer, Cookie, ctypes.POINTER(pointer)]),
         "xcb_get_image_data": (pointer, [pointer]),
         "xcb_get_image_data_length": (ctypes.c_int, [pointer]),

@@ -237,7 +237,11 @@ def memory_link(peer: PjLinkPeer) -> Link:
 
 
 def serve_pjlink(
-    projector: SimulatedProjector, port: int = 0, password: str | None = None, host: str | None = None
+    projector: SimulatedProjector,
+    port: int = 0,
+    password: str | None = None,
+    host: str | None = None,
+    answer_s: float = 0.0,
 ) -> TcpServer:
     """Return a running server that speaks PJLink for `projector`; close it, or use it in a `with` block.
 
@@ -247,6 +251,8 @@ def serve_pjlink(
         0 picks a free one, which the server's `address` names.
     host
         Where to listen; loopback unless given.
+    answer_s
+        How long it takes to answer, seconds of its clock.
 
     Raises
     ------
@@ -263,6 +269,7 @@ def serve_pjlink(
             except LinkTimeout:
                 continue
             if answer:
+                projector.clock.sleep(answer_s)
                 link.write(answer, wire.IDLE_LIMIT_S)
 
     return TcpServer(handle, port) if host is None else TcpServer(handle, port, host)

@@ -357,6 +357,21 @@ class Disturbances:
         """Return the event by which the camera delivers the last file again, None where it does not."""
         return next((event for event in self.at(moment) if isinstance(event, StaleFile)), None)
 
+    def require_unshown(self, where: str) -> None:
+        """Refuse events that change what a screen shows or which file is sent: a screen that is real does so itself.
+
+        Raises
+        ------
+        ConfigurationError
+            There is such an event; `where` names the option.
+        """
+        for event in self.events:
+            if isinstance(event, FrozenScreen | HalfChanged | StaleFile):
+                raise ConfigurationError(
+                    f"{where}: {event.what} is for the simulated screen; freeze a projector by its control port, cover "
+                    "a screen by a window"
+                )
+
     @property
     def repeats_files(self) -> bool:
         """Whether a file is ever delivered again."""

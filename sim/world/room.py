@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, Literal
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
 from drivers.camera import ExposureSettings
+from foundation.errors import ConfigurationError
+from foundation.srgb import decode_srgb
 from sim.world.profile import ProfileName
 from sim.world.spectra import LampSpectrum, PaperName
 
@@ -114,6 +122,11 @@ class Room:
     profile: ProfileName = "unmanaged"
     paper: PaperName = "poster"
 
+    def light_of(self, codes: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+        """Return the light of primaries, any shape, 0 … 1 of the full, that codes 0 … 255 of any integer dtype give."""
+        share = codes / 255
+        return decode_srgb(share) if self.transfer == "srgb" else share**self.transfer
+
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; 0 or more is expected")
@@ -129,3 +142,34 @@ class Room:
         ):  # fmt: skip
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is expected")
+
+
+def read_room(seed: int, changes: Mapping[str, Any], where: str, key: str) -> Room:
+    """Return the default room with a seed and the changes of a settings file or a command line.
+
+    Parameters
+    ----------
+    seed
+        Of the room.
+    changes
+        What differs, by the names of `Room`, without its seed.
+    where, key
+        What they were read from, and where they stand there, for messages.
+
+    Raises
+    ------
+    ConfigurationError
+        A parameter is unknown, of the wrong type or out of its range.
+    """
+    known = sorted(field.name for field in fields(Room) if field.name != "seed")
+    for name in changes:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+            raise ConfigurationError(f"{where}: unknown key '{key}.{name}'; {hint}")
+    try:
+        return TypeAdapter(Room).validate_python({"seed": seed, **changes})
+    except ValidationError as error:
+        first = error.errors()[0]
+        at = ".".join([key, *(str(part) for part in first["loc"][:1])])
+        raise ConfigurationError(f"{where}: {at}: {first['msg']}, got {first['input']!r}") from error

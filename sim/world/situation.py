@@ -118,7 +118,8 @@ class Situation:
     @property
     def is_even(self) -> bool:
         """Whether every place of the chart gets, and shows, the same share of each primary's light."""
-        return self.picture is None and not self.patches and not self.blobs
+        plain = self.picture is None or self.picture.shape[:2] == (1, 1)
+        return plain and not self.patches and not self.blobs
 
     @property
     def view(self) -> tuple[float, ...]:

@@ -27,7 +27,6 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from foundation.processors import processor_count
-from foundation.srgb import decode_srgb
 from sim.world.drawing import PAPER, Print, label_map
 from sim.world.geometry import Folded, View, Waviness
 from sim.world.profile import printed_reflectance
@@ -159,9 +158,10 @@ class World:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return light (3, rows, columns) on the photosites and weights (3,), whose product is a frame's signal."""
         light, ambient = self._render(situation), np.array(situation.ambient)
+        plain = self.decoded(colour) if situation.picture is None else situation.picture[0, 0].astype(np.float64)
         if situation.is_even:
-            return light, self.drive(colour, settings, lamp, ambient).astype(np.float32)
-        nodes, page, plain = self._nodes(UNDISTURBED), self.sheet.page_mm, self.decoded(colour)
+            return light, self._collected(plain, settings, lamp, ambient).astype(np.float32)
+        nodes, page = self._nodes(UNDISTURBED), self.sheet.page_mm
         falling = np.empty_like(light)
 
         def block(first: int, last: int) -> None:
@@ -175,8 +175,7 @@ class World:
 
     def decoded(self, colour: Colour) -> NDArray[np.float64]:
         """Return (3,) float64, 0 … 1: the light of each primary that a colour's codes stand for."""
-        codes = np.array([colour.red, colour.green, colour.blue]) / 255
-        return decode_srgb(codes) if self.room.transfer == "srgb" else codes**self.room.transfer
+        return self.room.light_of(np.array([colour.red, colour.green, colour.blue]))
 
     def signal(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float32]:
         """Return what a frame would be without noise, black, hot photosites and clipping.

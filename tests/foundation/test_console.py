@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from foundation import errors
-from foundation.console import EXIT_CODES, orderly_end, progress, run
+from foundation.console import EXIT_CODES, Ending, orderly_end, progress, run
 
 
 def test_success_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
@@ -286,3 +286,36 @@ def test_no_bar_before_there_is_something_to_count(capsys: pytest.CaptureFixture
     with progress("images") as tell:
         tell(1, 2)
     assert "1/2 images" in capsys.readouterr().err
+
+
+class TestEnding:
+    def test_a_request_ends_at_once_what_promises_nothing(self) -> None:
+        ending = Ending()
+        with pytest.raises(KeyboardInterrupt):
+            ending.ask()
+
+    def test_what_is_being_finished_is_told_once_and_cut_by_the_second_request(self) -> None:
+        said: list[str] = []
+        ending = Ending(said.append)
+        with ending.finishing("ending soon"):
+            ending.ask()
+            assert ending.asked
+            with pytest.raises(KeyboardInterrupt):
+                ending.ask()
+        assert said == ["ending soon"]
+
+    def test_a_wait_within_ends_at_once_and_does_not_begin_when_the_end_was_asked_for(self) -> None:
+        ending = Ending(lambda sentence: None)
+        with ending.finishing("ending soon"):
+            with pytest.raises(KeyboardInterrupt), ending.at_once():
+                ending.ask()
+            with pytest.raises(KeyboardInterrupt), ending.at_once():
+                raise AssertionError("begun")
+
+    def test_ctrl_c_waits_for_what_is_being_finished(self, capfd: pytest.CaptureFixture[str]) -> None:
+        before = signal.getsignal(signal.SIGINT)
+        with orderly_end() as ending, ending.finishing("ending soon"):
+            os.kill(os.getpid(), signal.SIGINT)
+            assert ending.asked
+        assert "ending soon" in capfd.readouterr().err
+        assert signal.getsignal(signal.SIGINT) == before

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import usbip
@@ -17,6 +18,7 @@ from drivers.pjlink.projector import PjLinkProjector
 from drivers.pjlink.search import NoticePort, search
 from drivers.projector import Power
 from sim.cli import main
+from tests.drivers.display.x_servers import virtual_screen
 
 SIM = [sys.executable, "-c", "from sim.cli import main; raise SystemExit(main())"]
 
@@ -149,3 +151,65 @@ def test_lends_a_camera_over_usb_ip_until_interrupted() -> None:
             process.kill()
     assert [(entry["idVendor"], entry["idProduct"]) for entry in found] == [(0x04A9, 0x32CA)]
     assert (process.returncode, out, err) == (0, "stopped\n", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--room", "wavy=1"], "the command line: unknown key '--room.wavy'"),
+        (["--room", "fill"], "--room 'fill': NAME=VALUE expected"),
+        (["--room", "profile=shiny"], "--room.profile"),
+        (["--watch-projector", "127.0.0.1:4352"], "--watch-projector needs --watch-screen"),
+        (["--watch-screen", "HDMI-1"], "'HDMI-1' is no screen"),
+        (["--event", "{ what = 'bump'"], "is not TOML"),
+        (["--event", "{ what = 'flood' }"], "known are frozen screen"),
+        (
+            ["--watch-screen", ":1", "--event", "{ what = 'frozen screen' }"],
+            "frozen screen is for the simulated screen",
+        ),
+        (["--chart", "chart.json"], "charts are read by the program sim"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_one_sentence(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    assert main(["camera", "--port", "0", "--model", "Test", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert words in error
+
+
+def test_a_screen_or_projector_that_is_not_there_ends_with_3(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    arguments = ["camera", "--port", "0", "--model", "Test", "--watch-screen"]
+    assert main([*arguments, ":999"]) == 3
+    assert "check :999" in capsys.readouterr().err
+    with TcpServer(lambda link: None) as server:
+        port = server.address[1]
+    with virtual_screen(tmp_path, "64x48") as screen:
+        assert main([*arguments, screen.display, "--watch-projector", f"127.0.0.1:{port}"]) == 3
+    assert f"nothing listens at 127.0.0.1:{port}" in capsys.readouterr().err
+
+
+def test_a_projector_takes_its_time_as_told() -> None:
+    options = ["--warm-up", "0", "--cool-down", "0", "--class", "1", "--answer-after", "0.01"]
+    with subprocess.Popen([*SIM, "projector", "--pjlink", "0", *options], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            host, port = process.stdout.readline().split()[-1].split(":")
+            projector = PjLinkProjector(lambda: TcpLink.connect(host, int(port), 10.0), timeout=10.0)
+            assert projector.pjlink_class() == 1
+            projector.switch_on()
+            assert projector.power() is Power.ON
+            projector.switch_off()
+            assert projector.power() is Power.STANDBY
+            projector.close()
+        finally:
+            process.kill()
+
+
+def test_a_serial_projector_answers_at_its_own_pace(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["projector", "--serial", "nec", "--answer-after", "1"]) == 2
+    assert "--answer-after and --class are PJLink's" in capsys.readouterr().err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from acquisition.config import LabSettings, notify_label
+from acquisition.config import LabSettings
 from acquisition.run.planning.answers import Answers
 from acquisition.run.planning.plan import RunPlan, is_offered
 from acquisition.run.planning.sizes import RETAKEN_SHARE, bytes_text
@@ -13,6 +13,7 @@ from acquisition.run.shutter import holds_whole_turns, light_period_s
 from acquisition.session.plan import KINDS
 from acquisition.session.progress import duration_text
 from foundation.errors import counted
+from foundation.notices import target_label
 
 
 def plan_lines(plan: RunPlan) -> tuple[str, ...]:
@@ -31,7 +32,7 @@ def plan_lines(plan: RunPlan) -> tuple[str, ...]:
         ("projector", answers.projector or "not under control, or not asked"),
     ]
     if settings.sequence.notify:
-        lines.append(("notices", f"to {notify_label(settings.sequence.notify)}"))
+        lines.append(("notices", f"to {target_label(settings.sequence.notify)}"))
     lines += [("not asked", sentence) for sentence in answers.unasked]
     lines += [("doubt", sentence) for sentence in plan.doubts]
     lines += [("fault", str(fault)) for fault in plan.faults]

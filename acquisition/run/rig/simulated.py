@@ -8,15 +8,13 @@ from __future__ import annotations
 
 from collections import Counter
 from contextlib import ExitStack
-from dataclasses import fields, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from pydantic import TypeAdapter, ValidationError
-
 from acquisition.chart.model import Chart
 from acquisition.chart.printing import drawing
-from acquisition.config import LabSettings, unknown_key
+from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
 from acquisition.session.folder import Session
 from drivers.canon.camera import CanonEos
@@ -37,7 +35,7 @@ from sim.spectral.sensitivities import known_sensitivities
 from sim.world.body_settings import find_body
 from sim.world.disturbances import read_disturbances
 from sim.world.drawing import Print
-from sim.world.room import Room
+from sim.world.room import Room, read_room
 from sim.world.sensors import BODIES, Body
 from sim.world.world import World
 
@@ -141,16 +139,7 @@ def simulated_room(settings: LabSettings) -> Room:
     ConfigurationError
         A parameter is unknown or of the wrong type.
     """
-    known = [field.name for field in fields(Room) if field.name != "seed"]
-    for key in settings.simulated.room:
-        if key not in known:
-            raise unknown_key(f"simulated.room.{key}", known, settings.file)
-    try:
-        return TypeAdapter(Room).validate_python({"seed": settings.simulated.seed, **settings.simulated.room})
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(["simulated.room", *(str(part) for part in first["loc"][:1])])
-        raise ConfigurationError(f"{settings.file}: {key}: {first['msg']}, got {first['input']!r}") from error
+    return read_room(settings.simulated.seed, settings.simulated.room, settings.file, "simulated.room")
 
 
 def _exposed(session: Session | None) -> Counter[Colour]:

@@ -431,3 +431,24 @@ def test_the_times_of_a_session_are_those_between_its_frames(tmp_path: Path, lab
     frame_s = outline(settings, night).frame_s
     assert frame_s is not None
     assert timedelta(seconds=frame_s) == gaps[len(gaps) // 2]
+
+
+def test_a_run_checks_its_plan_before_anything_moves(
+    lab: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(lab.parent)._replace(free=10**8)
+
+    def small(path: Path) -> object:
+        return usage
+
+    monkeypatch.setattr(shutil, "disk_usage", small)
+    before = contents(lab.parent)
+    assert main(["run", str(lab), str(lab.parent / "night")]) == 5
+    assert "are missing; free them" in capsys.readouterr().err
+    assert contents(lab.parent) == before
+
+
+def test_nothing_is_taken_again_of_a_session_that_was_not_begun(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", str(lab), str(lab.parent / "night"), "--retake", "1"]) == 2
+    assert "leave --retake out" in capsys.readouterr().err
+    assert not (lab.parent / "night").exists()

@@ -41,7 +41,7 @@ from sim.world.disturbances import (
 from sim.world.drawing import Print
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import BODIES
-from sim.world.situation import moved, moved_back
+from sim.world.situation import OVERSCAN, Situation, moved, moved_back, projected_mm
 from sim.world.world import World
 from tests.sim.conftest import PAGE_MM
 
@@ -201,6 +201,35 @@ def test_a_warming_sensor_raises_black_and_nothing_else(bare: World) -> None:
     assert difference.mean() == pytest.approx(3.0, abs=0.05)
 
 
+def test_a_projected_picture_lights_each_place_by_its_own(bare: World) -> None:
+    picture = np.zeros((90, 160, 3), dtype=np.float32)
+    picture[:45, :80, 0] = 1
+    picture[45:, 80:] = 0.25
+    area = bare.body.visible
+
+    def lit(shown: NDArray[np.float32]) -> NDArray[np.float64]:
+        counts = bare.expose(GREEN, REFERENCE_EXPOSURE, key=(7,), situation=Situation(picture=shown))
+        counts = counts[area.top : area.top + area.height, area.left : area.left + area.width]
+        return counts.astype(np.float64) - bare.body.black
+
+    frame, red, white = lit(picture), taken(bare, colour=RED), taken(bare)
+    np.testing.assert_allclose(at(bare, 0.25, 0.25, frame), at(bare, 0.25, 0.25, red), atol=1)
+    np.testing.assert_allclose(at(bare, 0.75, 0.75, frame), 0.25 * at(bare, 0.75, 0.75, white), atol=1)
+    np.testing.assert_allclose(at(bare, 0.75, 0.25, frame), 0, atol=1)
+    plain = lit(np.full((1, 1, 3), 0.5, dtype=np.float32))
+    np.testing.assert_allclose(plain, lit(np.full((9, 16, 3), 0.5, dtype=np.float32)), atol=1)
+    np.testing.assert_allclose(at(bare, 0.5, 0.5, plain), 0.5 * at(bare, 0.5, 0.5, white), atol=1)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 16 / 9, 4.0])
+def test_the_picture_covers_the_page_and_little_more(aspect: float) -> None:
+    left, top, right, bottom = projected_mm(PAGE_MM, aspect)
+    assert (right - left) / (bottom - top) == pytest.approx(aspect)
+    assert (left + right, top + bottom) == pytest.approx(PAGE_MM)
+    beyond = min(-left / PAGE_MM[0], -top / PAGE_MM[1])
+    assert beyond == pytest.approx(OVERSCAN)
+
+
 def test_strips_and_rows_are_those_named(bare: World) -> None:
     counts = np.arange(100, dtype=np.uint16)[:, None] * np.ones(3, np.uint16)
     torn = ZeroedStrip(top=0.5, bottom=0.55).counted(counts)
@@ -269,3 +298,10 @@ def test_a_seed_draws_the_same_events() -> None:
     everything = drawn(1, 100, 200).events
     assert {event.what for event in everything} == set(KINDS)
     assert all(1 <= event.from_frame < 100 for event in everything)
+
+
+def test_what_a_real_screen_does_itself_is_not_pretended() -> None:
+    for event in (FrozenScreen(), HalfChanged(), StaleFile()):
+        with pytest.raises(ConfigurationError, match=f"--event: {event.what} is for the simulated screen"):
+            Disturbances((Bump(px=1.0), event)).require_unshown("--event")
+    Disturbances((Bump(px=1.0), Person())).require_unshown("--event")

@@ -1,0 +1,181 @@
+"""Which frame is taken next: the plan's open steps, what must be taken again, and what closes a run.
+
+A value that changes: no device, no clock, no file. The pipeline (`acquisition.run.pipeline`) asks it for the next step
+and tells it how each ended.
+
+Rules that hold inside:
+
+- Open steps are taken in the plan's order, so that a refused one comes before those behind it.
+- A reference that voids other frames is taken again before them: it shows whether the cause is still there.
+- Lights are followed by a white and a dark frame. Where the last lights of a run have none behind them, because they
+  were taken again, the last pair of the plan is taken once more.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+
+from acquisition.session.plan import FrameKind, SessionStep
+
+GIVEN_UP_IN_A_ROW = 3
+"""Steps given up one after another after which going on makes no sense: something lasting is wrong. One may be chance,
+and two neighbours may share a cause that passes."""
+
+REFERENCES: tuple[FrameKind, ...] = ("white", "dark")
+"""Kinds of frames that lights are held against."""
+
+
+class Agenda:
+    """The steps of a session that are still to be taken in this run.
+
+    Parameters
+    ----------
+    steps
+        The whole plan, in taking order.
+    done
+        Numbers of the steps that have an accepted frame.
+    attempts
+        Tries that a step has in this run, ≥ 1.
+    first
+        Numbers of the steps that are taken before all others, in their order, done or not.
+    unclosed
+        Kinds of references that must still follow lights that were taken in earlier runs; see `unclosed_kinds`.
+    """
+
+    def __init__(
+        self,
+        steps: Sequence[SessionStep],
+        done: Collection[int],
+        attempts: int,
+        first: Iterable[int] = (),
+        unclosed: Collection[str] = (),
+    ) -> None:
+        self._steps = {step.number: step for step in steps}
+        self._first = list(first)
+        self._open = {step.number for step in steps if step.number not in done} | set(self._first)
+        self._attempts = attempts
+        self._tries: Counter[int] = Counter()
+        self._under_way: set[int] = set()
+        self._given_up: dict[int, str] = {}
+        self._in_a_row = 0
+        self._unclosed: set[str] = set(unclosed)
+        last = {step.kind: step.number for step in steps if step.kind in REFERENCES}
+        self._closing = [last[kind] for kind in REFERENCES if kind in last]
+
+    def __len__(self) -> int:
+        """Return how many steps are without an accepted frame, given up or under way included."""
+        return len(self._open)
+
+    @property
+    def given_up(self) -> tuple[str, ...]:
+        """Why steps were left for the next run, a sentence each, in the order in which they were."""
+        return tuple(f"{step_name(self._steps[number])}: {reason}" for number, reason in self._given_up.items())
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether so many steps were given up in a row that something lasting is wrong."""
+        return self._in_a_row >= GIVEN_UP_IN_A_ROW
+
+    def next(self) -> SessionStep | None:
+        """Return the step to take next; None while nothing is to be taken that is not under way."""
+        ready = self._open - self._under_way - self._given_up.keys()
+        number = next((number for number in self._first if number in ready), min(ready, default=None))
+        if number is None and not self._under_way:
+            number = self._reopened()
+        return None if number is None else self._steps[number]
+
+    def begin(self, step: SessionStep) -> None:
+        """Note that an attempt at `step` begins."""
+        self._under_way.add(step.number)
+        self._tries[step.number] += 1
+
+    def withdraw(self, step: SessionStep) -> None:
+        """Note that the attempt under way came to nothing by no fault of the frame: it is no try."""
+        self._under_way.discard(step.number)
+        self._tries[step.number] -= 1
+
+    def retry(self) -> None:
+        """Give the steps that were given up their tries again: somebody has had time to remove the cause."""
+        for number in self._given_up:
+            self._tries[number] = 0
+        self._given_up.clear()
+        self._in_a_row = 0
+
+    def accept(self, step: SessionStep) -> None:
+        """Note that the attempt under way gave an accepted frame."""
+        self._under_way.discard(step.number)
+        self._open.discard(step.number)
+        self._forget_first(step.number)
+        if step.kind == "light":
+            self._unclosed.update(REFERENCES)
+        self._unclosed.discard(step.kind)
+        # A dark frame is accepted where no light reaches the chart, too.
+        if step.kind != "dark":
+            self._in_a_row = 0
+
+    def refuse(self, step: SessionStep, reason: str, *, before_others: bool = False) -> bool:
+        """Note that the attempt under way gave no frame that can be used; return whether the step is tried again.
+
+        Parameters
+        ----------
+        before_others
+            Whether it is tried before all other steps.
+        """
+        self._under_way.discard(step.number)
+        self._open.add(step.number)
+        if self._tries[step.number] >= self._attempts:
+            self._give_up(step.number, reason)
+            return False
+        if before_others and step.number not in self._first:
+            self._first.append(step.number)
+        return True
+
+    def void(self, numbers: Iterable[int], reason: str) -> None:
+        """Open steps again whose frames cannot be trusted any more; those without a try left are given up."""
+        for number in numbers:
+            self._open.add(number)
+            if self._tries[number] >= self._attempts:
+                self._give_up(number, reason)
+
+    def _give_up(self, number: int, reason: str) -> None:
+        if number not in self._given_up:
+            self._in_a_row += 1
+        self._given_up[number] = reason
+        self._forget_first(number)
+
+    def _forget_first(self, number: int) -> None:
+        if number in self._first:
+            self._first.remove(number)
+
+    def _reopened(self) -> int | None:
+        """Return the reference that is taken once more to close the lights; None where none is needed or left."""
+        for number in self._closing:
+            if self._steps[number].kind in self._unclosed and number not in self._given_up:
+                # Its tries are new: what is asked for is another frame, not another try at one.
+                self._unclosed.discard(self._steps[number].kind)
+                self._tries[number] = 0
+                self._open.add(number)
+                return number
+        return None
+
+
+def unclosed_kinds(taken: Iterable[str]) -> frozenset[str]:
+    """Return the kinds of references that are missing behind the last light of accepted frames in taking order.
+
+    Examples
+    --------
+    >>> sorted(unclosed_kinds(["white", "dark", "light", "white"]))
+    ['dark']
+    """
+    unclosed: set[str] = set()
+    for kind in taken:
+        if kind == "light":
+            unclosed.update(REFERENCES)
+        unclosed.discard(kind)
+    return frozenset(unclosed)
+
+
+def step_name(step: SessionStep) -> str:
+    """Return what a sentence calls a step."""
+    return f"light {step.illumination}" if step.illumination is not None else f"{step.kind} frame {step.number}"

@@ -1,0 +1,133 @@
+"""What is taken next: plain values, without a device."""
+
+from __future__ import annotations
+
+import pytest
+
+from acquisition.lights.illuminations import Illumination
+from acquisition.run.agenda import GIVEN_UP_IN_A_ROW, Agenda, unclosed_kinds
+from acquisition.session.plan import SessionStep, plan_steps
+from drivers.presenter import Colour
+
+STEPS = plan_steps([Illumination(n, "uniform", None, Colour(255, n, 0)) for n in range(4)], 2)
+"""white 0, dark 1, light 2, 3, white 4, dark 5, light 6, 7, white 8, dark 9."""
+
+
+def take(agenda: Agenda, refused: dict[int, int] | None = None) -> list[int]:
+    """Take all that is listed, one after another; `refused` maps steps to how often they are. Return the steps."""
+    left, taken = dict(refused or {}), list[int]()
+    while (step := agenda.next()) is not None:
+        agenda.begin(step)
+        taken.append(step.number)
+        if left.get(step.number, 0):
+            left[step.number] -= 1
+            agenda.refuse(step, "dark")
+        else:
+            agenda.accept(step)
+    return taken
+
+
+def test_open_steps_come_in_the_plans_order() -> None:
+    agenda = Agenda(STEPS, {0, 1, 3}, 3)
+    assert len(agenda) == 7
+    assert take(agenda) == [2, 4, 5, 6, 7, 8, 9]
+    assert len(agenda) == 0
+
+
+def test_what_is_under_way_is_not_taken_twice() -> None:
+    agenda = Agenda(STEPS, set(), 3)
+    first = begun(agenda)
+    assert begun(agenda).number == 1
+    agenda.refuse(first, "too dark")
+    assert begun(agenda).number == 0, "a refused step comes before those behind it"
+    assert begun(agenda).number == 2
+
+
+def begun(agenda: Agenda) -> SessionStep:
+    """Return the next step, begun."""
+    step = agenda.next()
+    assert step is not None
+    agenda.begin(step)
+    return step
+
+
+def test_a_step_without_a_try_left_waits_for_the_next_run() -> None:
+    agenda = Agenda(STEPS, set(), 3)
+    assert take(agenda, {2: 9}) == [0, 1, 2, 2, 2, 3, 4, 5, 6, 7, 8, 9]
+    assert agenda.given_up == ("light 0: dark",)
+    assert len(agenda) == 1
+
+
+def test_a_fault_of_a_device_is_no_try() -> None:
+    agenda = Agenda(STEPS, set(), 1)
+    agenda.withdraw(begun(agenda))
+    assert take(agenda) == list(range(10))
+
+
+def test_lights_that_were_taken_again_last_are_closed_by_another_pair() -> None:
+    agenda = Agenda(STEPS, {step.number for step in STEPS} - {6}, 3)
+    assert take(agenda) == [6, 8, 9]
+    assert len(agenda) == 0
+
+
+def test_lights_of_an_earlier_run_are_closed_too() -> None:
+    assert unclosed_kinds(["white", "dark", "light", "white", "dark"]) == frozenset()
+    unclosed = unclosed_kinds(["white", "dark", "white", "dark", "light"])
+    agenda = Agenda(STEPS, {step.number for step in STEPS} - {1}, 3, unclosed=unclosed)
+    assert take(agenda) == [1, 8], "the dark frame that is open closes them as well"
+
+
+def test_a_reference_that_voids_is_probed_before_what_it_voids() -> None:
+    agenda = Agenda(STEPS, {0, 1, 2, 3}, 3)
+    white = begun(agenda)
+    assert white.number == 4
+    agenda.refuse(white, "the picture is stuck", before_others=True)
+    agenda.void([2, 3], "voided")
+    assert take(agenda) == [4, 2, 3, 5, 6, 7, 8, 9]
+
+
+def test_the_last_lights_that_are_voided_are_closed_again() -> None:
+    agenda = Agenda(STEPS, set(range(8)), 3)
+    agenda.refuse(begun(agenda), "the picture is stuck", before_others=True)
+    agenda.void([6, 7], "voided")
+    assert take(agenda) == [8, 6, 7, 9, 8], "a white frame lies behind the lights that were taken again"
+
+
+def test_frames_are_not_voided_for_ever() -> None:
+    agenda = Agenda(STEPS, set(), 2)
+    for _ in range(2):
+        for _ in range(4):
+            agenda.accept(begun(agenda))
+        agenda.void([0, 1, 2, 3], "voided")
+    assert agenda.is_stuck
+    assert len(agenda.given_up) == 4
+
+
+def test_some_steps_given_up_in_a_row_are_a_lasting_cause() -> None:
+    agenda = Agenda(STEPS, set(), 1)
+    for number in range(GIVEN_UP_IN_A_ROW):
+        assert not agenda.is_stuck
+        agenda.refuse(begun(agenda), f"{number}")
+    assert agenda.is_stuck
+    agenda.retry()
+    assert not agenda.is_stuck
+    assert take(agenda) == list(range(10))
+
+
+@pytest.mark.parametrize(("kind", "stuck"), [("dark", True), ("white", False)])
+def test_a_dark_frame_shows_nothing_of_the_light(kind: str, stuck: bool) -> None:
+    agenda = Agenda(STEPS, {0, 1, 2, 3, 6, 7, 8, 9}, 1)
+    steps = {step.kind: step for step in (begun(agenda), begun(agenda))}
+    for step in STEPS[2:4]:
+        agenda.void([step.number], "")
+        agenda.begin(step)
+        agenda.refuse(step, "dark")
+    good, other = (steps["dark"], steps["white"]) if kind == "dark" else (steps["white"], steps["dark"])
+    agenda.accept(good)
+    agenda.refuse(other, "dark")
+    assert agenda.is_stuck == stuck
+
+
+def test_what_comes_first_comes_first_though_it_was_done() -> None:
+    agenda = Agenda(STEPS, set(range(9)), 3, first=[4, 1])
+    assert take(agenda) == [4, 1, 9]

@@ -1,0 +1,480 @@
+"""Frames one behind another against scripted devices: their order in time, refusals, voids, faults, and the end."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Iterable
+from datetime import timedelta
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.lights.illuminations import Illumination
+from acquisition.run.patience import PAUSE_S
+from acquisition.run.pipeline import Taken
+from acquisition.run.sequencer import RunOutcome, take_session
+from acquisition.session.folder import Session
+from acquisition.session.judgement import Check, Judgement
+from acquisition.session.plan import SessionStep
+from drivers.presenter import BLACK, WHITE, Colour
+from drivers.projector import Power
+from foundation.console import Ending
+from foundation.errors import DeviceError, DeviceFault, LinkTimeout, QualityError, StorageError
+from tests.acquisition.run.scripted import DOWNLOAD_S, EXPOSE_S, GLARE, LIGHTS, NIGHT, SETTINGS, TURNED, WELL, Lab
+
+SETTLE_S = SETTINGS.sequence.settle_s
+PATIENT = SETTINGS.model_copy(update={"sequence": SETTINGS.sequence.model_copy(update={"patience_s": 60.0})})
+"""Each try in a pause costs rows on a disk; a minute has as many as are needed."""
+FOUR = tuple(Illumination(n, "uniform", None, Colour(255, 40 * n, 0)) for n in range(4))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "session"
+
+
+class ScriptedJudge:
+    """Accepts every frame but those that the script lists by their number, from 0, in the order of judging."""
+
+    def __init__(self, script: dict[int, Judgement] | None = None) -> None:
+        self.script = script or {}
+        self.judged: list[SessionStep] = []
+        self.recalled: list[tuple[int, bytes, bool]] = []
+
+    def judge(self, file: Path, step: SessionStep) -> Judgement:
+        assert file.is_file(), "a frame is judged when it is whole on the disk"
+        self.judged.append(step)
+        number = len(self.judged) - 1
+        return self.script.get(number, Judgement((Check("light", 1.0, 0.0, 2.0, "°"),), measurement=b"%d" % number))
+
+    def recall(self, step: SessionStep, measurement: bytes, accepted: bool) -> None:
+        self.recalled.append((step.number, measurement, accepted))
+
+
+def refused(reason: str, *, voids: bool = False, lasting: bool = False) -> Judgement:
+    return Judgement((Check("light", 9.0, 0.0, 2.0, "°", reason),), measurement=b"bad", voids=voids, lasting=lasting)
+
+
+def run(lab: Lab, judge: ScriptedJudge | None = None, **more: Any) -> RunOutcome:
+    return take_session(lab.session, lab.devices, PATIENT, judge, **more)
+
+
+class TestTime:
+    def test_every_light_is_shown_once_and_its_frame_kept(self, folder: Path) -> None:
+        lab = Lab(folder)
+        assert run(lab).complete
+        assert lab.screen.shown == [WHITE, BLACK, LIGHTS[0].colour, LIGHTS[1].colour, WHITE, BLACK]
+        assert lab.camera.exposed == lab.screen.shown
+        assert lab.projector.power() is Power.COOLING, "a complete session switches the lamp off"
+        assert lab.verdicts() == ["accepted"] * 6
+
+    def test_the_download_hides_in_the_settling(self, folder: Path) -> None:
+        assert DOWNLOAD_S < SETTLE_S
+        lab = Lab(folder)
+        run(lab)
+        periods = [later - earlier for earlier, later in pairwise(lab.camera.released)]
+        assert periods == [timedelta(seconds=EXPOSE_S + SETTLE_S)] * 5
+
+    def test_no_light_is_exposed_before_it_has_settled(self, folder: Path) -> None:
+        lab = Lab(folder, {1: NIGHT, 3: NIGHT})
+        shown: list[float] = []
+        show = lab.screen.show
+        expose = lab.camera.expose
+        settled: list[float] = []
+
+        def showing(colour: Colour) -> None:
+            show(colour)
+            shown.append(lab.clock.monotonic())
+
+        def exposing() -> Any:
+            settled.append(lab.clock.monotonic() - shown[-1])
+            return expose()
+
+        lab.screen.show = showing  # type: ignore[method-assign]
+        lab.camera.expose = exposing  # type: ignore[method-assign]
+        assert run(lab).complete
+        assert min(settled) >= SETTLE_S - 1e-9
+
+    def test_attempts_tile_the_time_of_the_run(self, folder: Path) -> None:
+        lab = Lab(folder)
+        run(lab)
+        attempts = lab.session.journal.attempts()
+        assert all(earlier.ended_at == later.started_at for earlier, later in pairwise(attempts))
+
+    def test_every_step_of_an_attempt_has_its_time_in_the_journal(self, folder: Path) -> None:
+        lab = Lab(folder)
+        run(lab)
+        timings = lab.session.journal.timings()
+        assert len(timings) == 6
+        for attempt in timings.values():
+            assert set(attempt) == {"show", "settle", "expose", "download", "save", "judge", "waited"}
+            assert attempt["expose"] == pytest.approx(EXPOSE_S)
+            assert attempt["download"] == pytest.approx(DOWNLOAD_S)
+        second = timings[min(timings) + 1]
+        assert second["settle"] == pytest.approx(SETTLE_S - DOWNLOAD_S), "what is left of it after the download"
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("bad", "reason"),
+        [(NIGHT, "is the projector on"), (GLARE, "clipped"), (TURNED, "0.4 instead of 0.5"), (b"garbage", "raw")],
+    )
+    def test_a_bad_frame_is_kept_refused_and_taken_again(self, folder: Path, bad: bytes, reason: str) -> None:
+        lab = Lab(folder, {2: bad})
+        assert run(lab).complete
+        frames = [frame for frame in lab.session.frames() if not frame.accepted]
+        assert len(frames) == 1
+        assert reason in frames[0].verdict
+        assert (folder / frames[0].file).read_bytes() == bad
+        assert len(lab.session.frames()) == 7
+
+    def test_the_next_frame_is_under_way_when_one_is_refused(self, folder: Path) -> None:
+        lab = Lab(folder)
+        said: list[str] = []
+        assert run(lab, ScriptedJudge({2: refused("another light")}), announce=said.append).complete
+        assert [step for step, _ in lab.taken()] == ["w0", "d1", "l2", "l3", "l2", "w4", "d5"]
+        assert lab.verdicts()[2] == "refused"
+        assert said == ["refused: light 0: another light (it is taken again)"]
+
+    def test_a_light_that_is_taken_again_behind_the_last_white_is_closed_by_another(self, folder: Path) -> None:
+        lab = Lab(folder)
+        assert run(lab, ScriptedJudge({3: refused("another light")})).complete
+        assert [step for step, _ in lab.taken()] == ["w0", "d1", "l2", "l3", "w4", "l3", "d5", "w4"]
+
+    def test_a_step_without_a_try_left_is_left_for_the_next_run(self, folder: Path) -> None:
+        lab = Lab(folder)
+        judge = ScriptedJudge({2: refused("a"), 4: refused("b"), 6: refused("c")})
+        outcome = run(lab, judge)
+        assert not outcome.complete
+        assert outcome.refused == ("light 0: c",)
+        assert outcome.left == 1
+        assert lab.projector.power() is Power.ON
+        assert run(lab, ScriptedJudge()).complete
+
+    def test_what_was_measured_of_earlier_frames_is_recalled(self, folder: Path) -> None:
+        lab = Lab(folder)
+        run(lab, ScriptedJudge({3: refused("another light"), 5: refused("again"), 7: refused("again")}))
+        earlier = lab.session.journal.attempts()
+        judge = ScriptedJudge()
+        assert run(lab, judge).complete
+        assert [(number, accepted) for number, _, accepted in judge.recalled] == [
+            (attempt.step, attempt.verdict == "accepted") for attempt in earlier
+        ]
+
+    def test_a_covered_screen_refuses_the_frame_and_the_judge_does_not_learn_from_it(self, folder: Path) -> None:
+        lab = Lab(folder)
+        lab.screen.covered = {0}
+        judge = ScriptedJudge()
+        assert run(lab, judge).complete
+        first, *rest = lab.session.frames()
+        assert first.verdict == "refused: a window of Notes covers the picture; close it"
+        assert all(frame.accepted for frame in rest)
+        assert len(judge.judged) == len(rest)
+
+    def test_what_was_taken_since_the_last_good_reference_is_voided(self, folder: Path) -> None:
+        lab = Lab(folder, lights=FOUR, reference_every=2)
+        # w0 d1 l2 l3 w4: the picture has been stuck since light 2.
+        judge = ScriptedJudge({4: refused("the picture is stuck", voids=True)})
+        assert run(lab, judge).complete
+        assert [step for step, _ in lab.taken()] == [
+            *("w0", "d1", "l2", "l3", "w4", "d5"),
+            *("w4", "l2", "l3", "d5", "l6", "l7", "w8", "d9"),
+        ]
+        voided = [step for step, verdict in lab.taken() if verdict == "voided"]
+        assert voided == ["l2", "l3", "d5"], "and what was under way, but not the dark frame beside the good white"
+        accepted = [attempt.step for attempt in lab.session.journal.attempts() if attempt.verdict == "accepted"]
+        assert sorted(accepted) == list(range(10)), "each step once"
+
+    def test_what_lasts_pauses_and_goes_on_when_it_is_removed(self, folder: Path) -> None:
+        lab = Lab(folder)
+        moved = refused("the chart has moved by 3.1 px", lasting=True)
+        judge = ScriptedJudge({2: moved, 4: moved})
+        said: list[str] = []
+        assert run(lab, judge, announce=said.append).complete
+        words = [sentence.split(":")[0] for sentence in said]
+        assert words == ["refused", "retry", "refused", "paused", "resumed"]
+        assert "the chart has moved by 3.1 px" in said[3]
+        assert lab.verdicts().count("refused") == 2
+
+    def test_what_lasts_ends_the_run_when_patience_does(self, folder: Path) -> None:
+        lab = Lab(folder, dict.fromkeys(range(1000), NIGHT))
+        begun = lab.clock.monotonic()
+        with pytest.raises(QualityError, match="is the projector on"):
+            run(lab)
+        assert lab.clock.monotonic() - begun >= PATIENT.sequence.patience_s
+        assert len(lab.session.frames()) < 40, "a pause does not fill the disk"
+        lab.camera.script = {}
+        assert run(lab).complete
+
+
+class TestFaults:
+    @pytest.mark.parametrize("fault", [LinkTimeout("no answer"), DeviceError("lost")])
+    def test_a_lost_frame_is_taken_again(self, folder: Path, fault: Exception) -> None:
+        lab = Lab(folder, {2: fault})
+        assert run(lab).complete
+        assert lab.verdicts() == ["accepted", "accepted", "failed", "accepted", "accepted", "accepted", "accepted"]
+        assert len(list((folder / "frames").iterdir())) == 6
+
+    def test_a_download_is_tried_again_while_the_body_holds_the_frame(self, folder: Path) -> None:
+        lab = Lab(folder)
+        lab.camera.downloads = {2: LinkTimeout("the cable")}
+        assert run(lab).complete
+        assert lab.verdicts() == ["accepted"] * 6
+        assert lab.camera.captures == 6
+
+    def test_a_frame_that_cannot_be_fetched_is_exposed_again(self, folder: Path) -> None:
+        lab = Lab(folder)
+        download, calls = lab.camera.download, 0
+
+        def lost(into: Any) -> Any:
+            nonlocal calls
+            calls += 1
+            if calls == 3:
+                lab.camera.held = None
+            return download(into)
+
+        lab.camera.download = lost  # type: ignore[method-assign]
+        assert run(lab).complete
+        assert lab.verdicts().count("failed") == 1
+        assert "holds no frame" in next(a.reason for a in lab.session.journal.attempts() if a.verdict == "failed")
+
+    def test_a_cut_transfer_is_noticed(self, folder: Path) -> None:
+        lab = Lab(folder)
+        lab.camera.claims = len(WELL) + 1
+        said: list[str] = []
+        assert run(lab, announce=said.append).complete
+        assert "bytes" in said[0]
+        assert all(len(path.read_bytes()) in (len(WELL), len(NIGHT)) for path in (folder / "frames").iterdir())
+
+    def test_a_device_that_stays_silent_ends_the_run_when_patience_does(self, folder: Path) -> None:
+        lab = Lab(folder, dict.fromkeys(range(3, 2000), LinkTimeout("no answer from the camera")))
+        said: list[str] = []
+        with pytest.raises(LinkTimeout, match="no answer"):
+            run(lab, announce=said.append)
+        assert [sentence.split(":")[0] for sentence in said[:2]] == ["retry", "paused"]
+        assert len(lab.session.frames()) == 3, "the frame before was saved and judged"
+        lab.camera.script = {}
+        assert run(lab).complete
+
+    def test_a_camera_that_exposes_and_never_delivers_ends_the_run(self, folder: Path) -> None:
+        lab = Lab(folder)
+
+        def never(into: Any) -> Any:
+            lab.camera.held = None
+            raise DeviceError("the card cannot be read")
+
+        lab.camera.download = never  # type: ignore[method-assign]
+        with pytest.raises(DeviceError, match="the card cannot be read"):
+            run(lab)
+        assert lab.clock.monotonic() < 2 * PATIENT.sequence.patience_s
+
+    def test_a_screen_that_fails_is_waited_for_and_costs_no_frame(self, folder: Path) -> None:
+        lab = Lab(folder)
+        lab.screen.fails = dict.fromkeys(range(2, 6), DeviceError("a screen saver covers the picture"))
+        said: list[str] = []
+        assert run(lab, announce=said.append).complete
+        assert [sentence.split(":")[0] for sentence in said] == ["retry", "paused", "resumed"]
+        assert lab.verdicts() == ["accepted"] * 6
+
+    @pytest.mark.parametrize("place", ["download", "save", "commit", "begin", "fail"])
+    def test_a_full_disk_is_waited_for(self, folder: Path, place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        lab = Lab(folder, {3: DeviceError("lost")})
+        full = failing(StorageError("No space left on device"), calls=range(2, 5))
+        if place == "download":
+            monkeypatch.setattr(Session, "incoming", full(Session.incoming))
+        elif place == "save":
+            from acquisition.session.incoming import IncomingFile
+
+            monkeypatch.setattr(IncomingFile, "complete", full(IncomingFile.complete, IncomingFile.abandon))
+        elif place == "commit":
+            monkeypatch.setattr(Session, "commit", full(Session.commit))
+        else:
+            journal = type(lab.session.journal)
+            first = {"begin": range(2, 5), "fail": range(3)}[place]
+            full = failing(StorageError("No space left on device"), calls=first)
+            monkeypatch.setattr(journal, place, full(getattr(journal, place)))
+        said: list[str] = []
+        assert run(lab, announce=said.append).complete
+        assert any("No space left" in sentence for sentence in said)
+        accepted = [attempt.step for attempt in lab.session.journal.attempts() if attempt.verdict == "accepted"]
+        assert sorted(accepted) == list(range(6)), "each step once"
+        if place in ("download", "commit", "begin", "fail"):
+            assert lab.camera.captures == 7, "the frame in the camera was not lost"
+
+    def test_a_disk_that_never_saves_ends_the_run(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        from acquisition.session.incoming import IncomingFile
+
+        lab = Lab(folder)
+        broken = failing(StorageError("Input/output error"), calls=range(100_000))
+        monkeypatch.setattr(IncomingFile, "complete", broken(IncomingFile.complete, IncomingFile.abandon))
+        with pytest.raises(StorageError, match="Input/output error"):
+            run(lab)
+        assert lab.clock.monotonic() < 2 * PATIENT.sequence.patience_s
+
+    def test_the_first_fault_is_kept_though_saving_what_was_taken_fails_too(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        lab = Lab(folder)
+        commits = 0
+
+        def broken(*given: Any, **named: Any) -> None:
+            nonlocal commits
+            commits += 1
+            raise (RuntimeError if commits == 1 else StorageError)(f"fault {commits}")
+
+        monkeypatch.setattr(Session, "commit", broken)
+        quick = SETTINGS.model_copy(update={"sequence": SETTINGS.sequence.model_copy(update={"patience_s": 0.0})})
+        with pytest.raises(RuntimeError, match="fault 1") as raised:
+            take_session(lab.session, lab.devices, quick)
+        assert raised.value.__notes__ == ["then: fault 2"]
+
+    def test_a_lamp_that_fails_ends_the_run_when_patience_does(self, folder: Path) -> None:
+        from drivers.projector import Severity
+
+        lab = Lab(folder)
+
+        def fail(taken: Taken) -> None:
+            if lab.camera.captures == 3:
+                lab.projector.break_part("lamp", Severity.ERROR)
+
+        with pytest.raises(DeviceFault, match="lamp"):
+            run(lab, observe=fail)
+        assert lab.clock.monotonic() >= PATIENT.sequence.patience_s
+        lab.projector.repair()
+        lab.projector.switch_on()
+        assert run(lab).complete
+
+
+def failing(error: Exception, calls: Iterable[int]) -> Callable[..., Callable[..., Any]]:
+    """Return a decorator that raises `error` in the calls with these numbers, from 0, after a clearing up."""
+    bad = set(calls)
+    count = 0
+
+    def decorate(real: Callable[..., Any], clear: Callable[..., Any] | None = None) -> Callable[..., Any]:
+        def call(*given: Any, **named: Any) -> Any:
+            nonlocal count
+            count += 1
+            if count - 1 in bad:
+                if clear is not None:
+                    clear(given[0])
+                raise error
+            return real(*given, **named)
+
+        return call
+
+    return decorate
+
+
+class TestEnding:
+    def test_the_first_request_ends_after_the_running_frame(self, folder: Path) -> None:
+        lab = Lab(folder)
+        said: list[str] = []
+        ending = Ending(said.append)
+        expose = lab.camera.expose
+
+        def asked() -> Any:
+            released = expose()
+            if lab.camera.captures == 3:
+                ending.ask()
+            return released
+
+        lab.camera.expose = asked  # type: ignore[method-assign]
+        with pytest.raises(KeyboardInterrupt):
+            run(lab, ending=ending)
+        assert said == ["ending after this frame; press Ctrl-C again to end at once"]
+        assert lab.verdicts() == ["accepted"] * 3, "what was exposed is downloaded, saved, judged, in the journal"
+        assert (folder / "frames.csv").read_text().count("accepted") == 3
+        assert run(lab).complete
+        assert lab.verdicts() == ["accepted"] * 6
+
+    def test_a_request_while_a_light_settles_exposes_no_more(self, folder: Path) -> None:
+        lab = Lab(folder)
+        ending = Ending(lambda sentence: None)
+        sleep = lab.clock.sleep
+
+        def sleeping(seconds: float) -> None:
+            sleep(seconds)
+            if lab.camera.captures == 2 and seconds < SETTLE_S - DOWNLOAD_S + 1e-6 and not ending.asked:
+                ending.ask()
+
+        lab.clock.sleep = sleeping  # type: ignore[method-assign]
+        with pytest.raises(KeyboardInterrupt):
+            run(lab, ending=ending)
+        assert lab.camera.captures == 2
+        assert lab.verdicts() == ["accepted"] * 2
+
+    def test_the_second_request_ends_at_once_and_loses_nothing_that_is_on_the_disk(self, folder: Path) -> None:
+        lab = Lab(folder)
+        ending = Ending(lambda sentence: None)
+        download = lab.camera.download
+
+        def asked(into: Any) -> Any:
+            captured = download(into)
+            if lab.camera.captures == 3:
+                ending.ask()
+                ending.ask()
+            return captured
+
+        lab.camera.download = asked  # type: ignore[method-assign]
+        with pytest.raises(KeyboardInterrupt):
+            run(lab, ending=ending)
+        assert lab.verdicts() == ["accepted", "accepted", None]
+        assert not [path for path in (folder / "frames").iterdir() if path.name.startswith(".")]
+        assert run(lab).complete
+
+    def test_a_pause_ends_at_once(self, folder: Path) -> None:
+        lab = Lab(folder, dict.fromkeys(range(2, 1000), LinkTimeout("no answer")))
+        ending = Ending(lambda sentence: None)
+        sleep = lab.clock.sleep
+
+        def sleeping(seconds: float) -> None:
+            if seconds == PAUSE_S:
+                ending.ask()
+            sleep(seconds)
+
+        lab.clock.sleep = sleeping  # type: ignore[method-assign]
+        with pytest.raises(KeyboardInterrupt):
+            run(lab, ending=ending)
+        assert lab.clock.monotonic() < 60
+
+    def test_the_last_frame_is_no_interruption(self, folder: Path) -> None:
+        lab = Lab(folder)
+        ending = Ending(lambda sentence: None)
+
+        def ask(taken: Taken) -> None:
+            if taken.left == 1:
+                ending.ask()
+
+        assert run(lab, ending=ending, observe=ask).complete
+
+
+def test_the_number_left_counts_what_was_voided(folder: Path) -> None:
+    lab = Lab(folder, lights=FOUR, reference_every=2)
+    left: list[int] = []
+    judge = ScriptedJudge({4: refused("the picture is stuck", voids=True)})
+
+    def count(taken: Taken) -> None:
+        left.append(taken.left)
+
+    assert run(lab, judge, observe=count).complete
+    assert left[:5] == [9, 8, 7, 6, 8]
+    assert left[-1] == 0
+
+
+def test_errno_of_a_disk_is_ours(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import os
+
+    lab = Lab(folder)
+    real, calls = os.fsync, 0
+
+    def full(handle: int) -> None:
+        nonlocal calls
+        calls += 1
+        if 4 <= calls < 7:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert run(lab).complete

@@ -1,0 +1,264 @@
+"""A screen that is watched lights the chart by what its pixels showed, where and for as long as they did."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.pjlink.projector import PjLinkProjector
+from drivers.pjlink.wire import Input
+from drivers.projector import Power
+from foundation.errors import DeviceError, DeviceRefused, InputError, LinkClosed
+from sim.clock import SimulatedClock
+from sim.projectors.pjlink import PjLinkPeer, memory_link
+from sim.projectors.projector import ProjectorTraits, SimulatedProjector
+from sim.projectors.watching import (
+    FINEST_PX,
+    SAMPLE_S,
+    WARMING_SHARE,
+    Beam,
+    LampState,
+    ScreenPlace,
+    Screenshots,
+    ask,
+    picture_light,
+)
+from sim.world.room import Room
+from tests.drivers.display.x_servers import virtual_screen
+
+WHITE, RED = 0xFFFFFF, 0xFF0000
+LINEAR = np.linspace(0, 1, 256, dtype=np.float32)
+
+
+def light_of(codes: NDArray[np.int64]) -> NDArray[np.float64]:
+    return codes / 255
+
+
+@dataclass
+class Shown:
+    """A screen whose pixels are a function of the time."""
+
+    clock: SimulatedClock
+    pixels: Callable[[float], NDArray[np.uint32]]
+    looks: list[float] = field(default_factory=list)
+
+    def take(self) -> NDArray[np.uint32]:
+        self.looks.append(self.clock.monotonic())
+        return self.pixels(self.clock.monotonic())
+
+    def close(self) -> None:
+        self.looks.append(-1.0)
+
+
+def plain(code: int) -> NDArray[np.uint32]:
+    return np.full((9, 16), code, dtype=np.uint32)
+
+
+def thrown(pixels: Callable[[float], NDArray[np.uint32]], seconds: float = 0.5) -> tuple[NDArray[np.float32], float]:
+    clock = SimulatedClock()
+    with Beam(Shown(clock, pixels), None, light_of, clock) as beam:
+        light = beam.gather(seconds)
+    return light.picture, light.lamp
+
+
+def test_a_plain_screen_is_plain_light() -> None:
+    picture, lamp = thrown(lambda at: plain(0x336699))
+    np.testing.assert_allclose(picture, [[[0x33 / 255, 0x66 / 255, 0x99 / 255]]], rtol=1e-6)
+    assert lamp == pytest.approx(1.0)
+
+
+def test_a_window_lights_its_place_for_its_share_of_the_exposure() -> None:
+    def pixels(at: float) -> NDArray[np.uint32]:
+        shown = plain(WHITE)
+        if 0.1 <= at < 0.3:
+            shown[2:5, 3:9] = RED
+        return shown
+
+    picture, _ = thrown(pixels, 0.5)
+    expected = np.ones((9, 16, 3))
+    expected[2:5, 3:9, 1:] = 0.6
+    np.testing.assert_allclose(picture, expected, atol=SAMPLE_S / 0.5)
+
+
+def test_half_the_time_is_half_the_light_not_half_the_code() -> None:
+    clock = SimulatedClock()
+    shown = Shown(clock, lambda at: plain(WHITE if at < 0.5 else 0))
+    with Beam(shown, None, Room().light_of, clock) as beam:
+        picture = beam.gather(1.0).picture
+    np.testing.assert_allclose(picture, 0.5, atol=SAMPLE_S)
+
+
+def test_the_shutter_closes_in_time_and_halfway_is_told_once() -> None:
+    clock = SimulatedClock()
+    shown = Shown(clock, lambda at: plain(WHITE))
+    halves: list[float] = []
+    with Beam(shown, None, light_of, clock) as beam:
+        beam.gather(0.5, lambda: halves.append(clock.monotonic()))
+    assert clock.monotonic() == pytest.approx(0.5)
+    assert halves == [pytest.approx(0.25, abs=SAMPLE_S)]
+    assert shown.looks[-1] == -1.0, "the screen is released"
+
+
+def test_a_screen_that_cannot_be_read_is_black() -> None:
+    def pixels(at: float) -> NDArray[np.uint32]:
+        if at < 0.25:
+            return plain(WHITE)
+        raise DeviceError("gone")
+
+    picture, lamp = thrown(pixels)
+    np.testing.assert_allclose(picture, 0.5, atol=SAMPLE_S / 0.5)
+    assert lamp == pytest.approx(1.0), "the lamp still burns, and leaks"
+
+
+def test_a_change_of_mode_within_an_exposure() -> None:
+    def pixels(at: float) -> NDArray[np.uint32]:
+        shown = np.full((9, 16) if at < 0.25 else (18, 20), WHITE, dtype=np.uint32)
+        shown[0, 0] = 0
+        return shown
+
+    picture, _ = thrown(pixels)
+    assert picture.shape == (18, 20, 3)
+    np.testing.assert_allclose(picture[9:, 10:], 1, atol=1e-6)
+
+
+def test_a_large_picture_is_averaged_in_light() -> None:
+    pixels = np.zeros((1080, 1920), dtype=np.uint32)
+    pixels[::2] = WHITE
+    picture = picture_light(pixels, LINEAR)
+    assert picture.shape == (270, FINEST_PX, 3)
+    np.testing.assert_allclose(picture, 0.5, atol=1e-6)
+    assert picture_light(np.full((1080, 1920), RED, dtype=np.uint32), LINEAR).tolist() == [[[1.0, 0.0, 0.0]]]
+
+
+@dataclass
+class Answers:
+    """A projector that says what it is told to say; a test changes it and waits until it was asked again."""
+
+    state: Power = Power.ON
+    is_muted: bool = False
+    is_frozen: bool | None = False
+    source: str | None = "31"
+    gone: bool = False
+    asked: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+
+    def power(self) -> Power:
+        if self.gone:
+            raise LinkClosed("nobody there")
+        return self.state
+
+    def muted(self) -> bool:
+        return self.is_muted
+
+    def input(self) -> Input:
+        if self.source is None:
+            raise DeviceRefused("ERR1")
+        return Input(self.source)
+
+    def frozen(self) -> bool:
+        self.asked.release()
+        if self.is_frozen is None:
+            raise DeviceRefused("class 1")
+        return self.is_frozen
+
+    def close(self) -> None:
+        pass
+
+    def await_questions(self) -> None:
+        """Return when what it is now was asked for, and taken in."""
+        # The first answer may have been under way; the second comes after the first was taken in.
+        for _ in range(3):
+            self.asked.acquire()
+
+
+@pytest.mark.parametrize(
+    ("answers", "state"),
+    [
+        (Answers(), LampState(1.0, False, "31")),
+        (Answers(is_muted=True), LampState(0.0)),
+        (Answers(state=Power.STANDBY), LampState(0.0)),
+        (Answers(state=Power.COOLING), LampState(0.0)),
+        (Answers(state=Power.WARMING), LampState(WARMING_SHARE)),
+        (Answers(gone=True), LampState(0.0)),
+        (Answers(is_frozen=None, source=None), LampState(1.0)),
+        (Answers(is_frozen=True), LampState(1.0, True, "31")),
+    ],
+)
+def test_what_a_projector_says_is_its_light(answers: Answers, state: LampState) -> None:
+    assert ask(answers) == state
+
+
+@pytest.mark.parametrize("pjlink_class", [1, 2])
+def test_the_question_is_understood_by_a_projector_of_either_class(pjlink_class: int) -> None:
+    device = SimulatedProjector(SimulatedClock(), Power.ON, ProjectorTraits(pjlink_class=pjlink_class))
+    peer = PjLinkPeer(device)
+    projector = PjLinkProjector(lambda: memory_link(peer))
+    assert ask(projector) == LampState(1.0, False, "31")
+    device.set_frozen(True)
+    assert ask(projector).frozen == (pjlink_class == 2)
+    device.set_muted(True)
+    assert ask(projector).share == 0
+
+
+def test_a_frozen_picture_stays_and_another_input_is_black() -> None:
+    clock, answers = SimulatedClock(), Answers()
+    codes = [RED]
+    with Beam(Shown(clock, lambda at: plain(codes[0])), answers, light_of, clock) as beam:
+
+        def seen() -> list[float]:
+            answers.await_questions()
+            return beam.gather(0.1).picture[0, 0].tolist()
+
+        assert seen() == [1.0, 0.0, 0.0]
+        answers.is_frozen = True
+        assert seen() == [1.0, 0.0, 0.0]
+        codes[0] = WHITE
+        assert seen() == [1.0, 0.0, 0.0]
+        answers.is_frozen = False
+        assert seen() == [1.0, 1.0, 1.0]
+        answers.source = "32"
+        assert seen() == [0.0, 0.0, 0.0]
+        answers.source = "31"
+        assert seen() == [1.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        (":1", ScreenPlace(":1")),
+        ("lab:1.0", ScreenPlace("lab:1.0")),
+        ("640x360+10+20", ScreenPlace(None, (10, 20, 640, 360))),
+        (":1,640x360+0+0", ScreenPlace(":1", (0, 0, 640, 360))),
+    ],
+)
+def test_a_screen_is_named(text: str, place: ScreenPlace) -> None:
+    assert ScreenPlace.parse(text) == place
+
+
+@pytest.mark.parametrize("text", ["", "1", ":", "640x360", ":1,640x360", ":1;640x360+0+0", "HDMI-1"])
+def test_what_names_no_screen_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="is no screen; expected DISPLAY"):
+        ScreenPlace.parse(text)
+
+
+def test_screenshots_are_of_the_place_and_come_back_with_the_server(tmp_path: Path) -> None:
+    with virtual_screen(tmp_path, "64x48", cursor=True) as server:
+        whole = Screenshots(ScreenPlace(server.display))
+        part = Screenshots(ScreenPlace(server.display, (8, 4, 20, 10)))
+        off = Screenshots(ScreenPlace(server.display, (60, 4, 20, 10)))
+        picture = server.picture()
+        np.testing.assert_array_equal(whole.take()[:20, :20], picture[:20, :20])
+        assert whole.take().shape == (48, 64)
+        np.testing.assert_array_equal(part.take(), picture[4:14, 8:28])
+        with pytest.raises(DeviceError, match="shows no 20×10 pixels"):
+            off.take()
+        server.end()
+        with pytest.raises(DeviceError):
+            whole.take()
+        with pytest.raises(DeviceError, match=f"check {server.display}"):
+            whole.take()
