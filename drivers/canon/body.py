@@ -3,7 +3,8 @@
 Rules that hold inside:
 
 - Every step is one that the recorded conversations have, or one that libgphoto2 takes; an operation that the body does
-  not list is never sent.
+  not list is never sent. One that it lists and does not know all the same (0x2005) is not sent again, and done without
+  where that is possible: serial number, room on the host, staying awake, half of the ways to release and to fetch.
 - GetEvent is asked until it has nothing more, but never without end: some firmware repeats itself.
 - A body keeps a frame in its memory until TransferComplete, and refuses the next when that memory is full. So every
   object that it announces is fetched or thrown away, and freed in either case.
@@ -19,12 +20,12 @@ import contextlib
 from collections.abc import Callable
 from typing import BinaryIO
 
-from drivers.camera import CameraIdentity
+from drivers.camera import CameraIdentity, Supplies
 from drivers.canon.records import decode_events
-from drivers.canon.state import EosState, WaitingObject, host_destination
+from drivers.canon.state import EosState, WaitingObject, battery_level, host_destination, power_source
 from drivers.canon.values import PropertySetting, number_value
 from drivers.ptp.codes import CaptureDestination, Operation, Property, ReleaseButton, ResponseCode
-from drivers.ptp.datasets import DeviceInfo
+from drivers.ptp.datasets import DeviceInfo, StorageInfo, decode_u32_array
 from drivers.ptp.session import PASSING_LIMIT_S, START_TIMEOUT_S, OperationDeclined, PtpSession
 from drivers.ptp.transport import Transport
 from foundation.clock import Clock
@@ -62,6 +63,21 @@ _FREE_TRIES = 3
 """Few, as the next `make_ready` tries again."""
 _LASTING = (ResponseCode.INVALID_OBJECT_HANDLE, ResponseCode.SESSION_NOT_OPEN, ResponseCode.DEVICE_BUSY)
 """Responses to a request for a piece that asking again does not change."""
+_NOT_GOT = (ResponseCode.OPERATION_NOT_SUPPORTED, ResponseCode.EOS_UNKNOWN_COMMAND)
+"""Responses to an operation that a body has not got, whatever it lists."""
+_NOTHING_THERE = (
+    ResponseCode.PARAMETER_NOT_SUPPORTED,
+    ResponseCode.INVALID_STORAGE_ID,
+    ResponseCode.DEVICE_PROP_NOT_SUPPORTED,
+    ResponseCode.ACCESS_DENIED,
+    ResponseCode.STORE_NOT_AVAILABLE,
+    ResponseCode.INVALID_PARAMETER,
+)
+"""Responses to a question after something that a body has not got: a card, a property."""
+_SLOT_FILLED = 0xFFFF
+"""Bits of a storage number that are 0 where there is no card in the slot (ISO 15740, 5.2.1)."""
+_MAX_CARDS = 8
+"""Cards that are asked for their room; bodies have one or two."""
 _RELEASE_RESULTS = {
     1: "it finds no focus: set the lens to MF",
     3: "its mirror is up: switch mirror lockup off",
@@ -87,6 +103,7 @@ class EosBody:
         self._session = PtpSession(transport, clock)
         self._info = DeviceInfo()
         self._destination: bytes | None = None
+        self._unsupported: set[int] = set()
         self._spoken_at = clock.monotonic()
         self.state = EosState()
 
@@ -122,12 +139,19 @@ class EosBody:
         self._session.call(Operation.EOS_SET_REMOTE_MODE, _REMOTE_ON)
         self._session.call(Operation.EOS_SET_EVENT_MODE, _REMOTE_ON)
         self.drain()
-        if self._offers(Operation.EOS_REQUEST_DEVICE_PROP_VALUE):
-            self._session.call(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, Property.EOS_SERIAL_NUMBER)
+        if self._requested(Property.EOS_SERIAL_NUMBER):
             self._settled(lambda: Property.EOS_SERIAL_NUMBER in self.state.values)
         if not self.state.lists:
             raise ProtocolError(f"{self.label} sends no state when asked for events; switch it off and on")
         self._receive_frames()
+
+    def supplies(self) -> Supplies:
+        """Return what is left of battery and card, as far as the body tells."""
+        self.drain()
+        level = self._battery_level()
+        mains = power_source(self.state)
+        saves_to_host = self.state.holds(Property.EOS_CAPTURE_DESTINATION, number_value(CaptureDestination.HOST))
+        return Supplies(level, mains, self._card_free_bytes(), saves_to_host)
 
     def disconnect(self) -> None:
         """Give the body back as it was found; a fault of the cable goes to the caller."""
@@ -193,13 +217,21 @@ class EosBody:
         DeviceRefused
             The body declines; no frame was taken.
         """
-        if not self._offers(Operation.EOS_REMOTE_RELEASE_ON):
-            parameters, _ = self._session.call(Operation.EOS_REMOTE_RELEASE, timeout=CAPTURE_TIMEOUT_S)
-            result = parameters[0] if parameters else 0
-            if result:
-                reason = _RELEASE_RESULTS.get(result, f"result 0x{result:x}")
-                raise DeviceRefused(f"{self.label} does not release: {reason}")
-            return
+        if self._offers(Operation.EOS_REMOTE_RELEASE_ON):
+            try:
+                self._press()
+            except OperationDeclined as error:
+                if not self._lacks(Operation.EOS_REMOTE_RELEASE_ON, error):
+                    raise
+            else:
+                return
+        parameters, _ = self._session.call(Operation.EOS_REMOTE_RELEASE, timeout=CAPTURE_TIMEOUT_S)
+        result = parameters[0] if parameters else 0
+        if result:
+            reason = _RELEASE_RESULTS.get(result, f"result 0x{result:x}")
+            raise DeviceRefused(f"{self.label} does not release: {reason}")
+
+    def _press(self) -> None:
         for left in reversed(range(RELEASE_TRIES)):
             try:
                 self._session.call(
@@ -279,7 +311,9 @@ class EosBody:
             try:
                 self._session.call(Operation.EOS_TRANSFER_COMPLETE, waiting.handle)
             except OperationDeclined as error:
-                if error.code != ResponseCode.INVALID_OBJECT_HANDLE:  # else it has gone, which is as well
+                # What has gone is as well, and where nothing can be freed the body frees it by itself.
+                gone = error.code == ResponseCode.INVALID_OBJECT_HANDLE
+                if not gone and not self._lacks(Operation.EOS_TRANSFER_COMPLETE, error):
                     if left:
                         self._clock.sleep(_PAUSES_S[-1])
                     continue
@@ -294,13 +328,15 @@ class EosBody:
     def _piece(self, waiting: WaitingObject, offset: int) -> bytes:
         """Return the next bytes of an object; fewer than were asked for are good, for the rest follows."""
         wanted = min(PIECE_BYTES, waiting.size - offset)
-        operation = Operation.EOS_GET_PARTIAL_OBJECT
-        if not self._offers(operation):
-            operation = Operation.GET_PARTIAL_OBJECT
         for left in reversed(range(_PIECE_TRIES)):
+            operation = Operation.EOS_GET_PARTIAL_OBJECT
+            if not self._offers(operation):
+                operation = Operation.GET_PARTIAL_OBJECT
             try:
                 sent, data = self._session.call(operation, waiting.handle, offset, wanted)
             except OperationDeclined as error:
+                if operation == Operation.EOS_GET_PARTIAL_OBJECT and self._lacks(operation, error):
+                    continue
                 if not left or error.code in _LASTING:
                     raise
             else:
@@ -324,8 +360,7 @@ class EosBody:
         if not self.state.holds(Property.EOS_CAPTURE_DESTINATION, host):
             self._destination = self.state.values.get(Property.EOS_CAPTURE_DESTINATION, self._destination)
             self._send(Property.EOS_CAPTURE_DESTINATION, host)
-        if self._offers(Operation.EOS_PC_HDD_CAPACITY):
-            self._session.call(Operation.EOS_PC_HDD_CAPACITY, _HOST_CLUSTERS, _HOST_CLUSTER_BYTES, 1)
+        self._optional(Operation.EOS_PC_HDD_CAPACITY, _HOST_CLUSTERS, _HOST_CLUSTER_BYTES, 1)
         self.drain()
         self._verify(Property.EOS_CAPTURE_DESTINATION, host)
 
@@ -335,10 +370,8 @@ class EosBody:
     def _verify(self, code: int, value: bytes) -> None:
         if self._settled(lambda: self.state.holds(code, value)):
             return
-        if self._offers(Operation.EOS_REQUEST_DEVICE_PROP_VALUE):
-            self._session.call(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, code)
-            if self._settled(lambda: self.state.holds(code, value)):
-                return
+        if self._requested(code) and self._settled(lambda: self.state.holds(code, value)):
+            return
         came = self.state.values.get(code)
         raise DeviceRefused(
             f"{self.label} was given {value.hex()} for property 0x{code:04x} and reports "
@@ -368,5 +401,49 @@ class EosBody:
                 with contextlib.suppress(OperationDeclined):
                     self._session.call(Operation.EOS_KEEP_DEVICE_ON, patience=0.0)
 
+    def _battery_level(self) -> float | None:
+        level = battery_level(self.state)
+        if level is None and Property.BATTERY_LEVEL in self._info.properties:
+            answer = self._optional(Operation.GET_DEVICE_PROP_VALUE, Property.BATTERY_LEVEL)
+            # 0 may stand for power from elsewhere (ISO 15740, 13.4.1); an empty battery would not answer.
+            if answer is not None and answer[1][:1] not in (b"", b"\0"):
+                level = min(answer[1][0], 100) / 100
+        return level
+
+    def _card_free_bytes(self) -> int | None:
+        """Return the room on all cards together; None where there is no card, or none is told of."""
+        listed = self._optional(Operation.EOS_GET_STORAGE_IDS)
+        if listed is None:
+            return None
+        free: list[int] = []
+        for storage in decode_u32_array(listed[1], "the list of cards")[:_MAX_CARDS]:
+            if storage & _SLOT_FILLED:
+                told = self._optional(Operation.EOS_GET_STORAGE_INFO, storage)
+                if told is not None:
+                    free.append(StorageInfo.decode(told[1]).free)
+        return sum(free) if free else None
+
+    def _requested(self, code: int) -> bool:
+        """Ask for a property whose value an event will bring; return whether the body takes the question."""
+        return self._optional(Operation.EOS_REQUEST_DEVICE_PROP_VALUE, code) is not None
+
+    def _optional(self, operation: Operation, *parameters: int) -> tuple[tuple[int, ...], bytes] | None:
+        """Return what an operation answers; None where the body has not got it, or declines these parameters."""
+        if not self._offers(operation):
+            return None
+        try:
+            return self._session.call(operation, *parameters)
+        except OperationDeclined as error:
+            if not self._lacks(operation, error) and error.code not in _NOTHING_THERE:
+                raise
+            return None
+
+    def _lacks(self, operation: Operation, error: OperationDeclined) -> bool:
+        """Return whether a body has not got an operation that it lists, by its answer; it is not asked again then."""
+        if error.code not in _NOT_GOT:
+            return False
+        self._unsupported.add(operation)
+        return True
+
     def _offers(self, operation: int) -> bool:
-        return operation in self._info.operations
+        return operation in self._info.operations and operation not in self._unsupported

@@ -2,8 +2,9 @@
 
 Rules that hold inside:
 
-- A connection that fails is renewed, a limited number of times for one call and a limited time for each: reset, closed,
-  opened again wherever the body is now, and given the settings again. `drivers.canon.body` is one connection.
+- A connection that fails is renewed, a limited number of times and for a limited time in one call (`CanonLimits`):
+  reset, closed, opened again wherever the body is now, and given the settings again. `drivers.canon.body` is one
+  connection. Then the call fails, with its first cause: longer patience is the caller's, who can say what is awaited.
 - A release is never repeated once it may have happened: after a fault the frame is looked for in the camera's memory,
   and what is not found there is an error. So no frame is ever taken for another one's.
 - What waits in the memory before a release belongs to nobody any more, and is thrown away.
@@ -14,13 +15,14 @@ Rules that hold inside:
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import BinaryIO, TypeVar
 
-from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
+from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
 from drivers.canon.body import EosBody
 from drivers.canon.state import WaitingObject, plan, shutter_speeds
 from drivers.ptp.codes import ResponseCode
@@ -29,12 +31,6 @@ from drivers.ptp.transport import Transport
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceError, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
 
-RECOVERIES = 3
-"""How often one call renews the connection: a fault that comes back more often lasts."""
-RECOVERY_LIMIT_S = 60.0
-"""How long each renewal may take; a body that was switched off and on is back well within it."""
-FRAME_LIMIT_S = 90.0
-"""How long after its exposure a frame may be announced; libgphoto2 waits as long."""
 REDISCOVERY_S = 10.0
 """The same on a new connection, on which the body sends its whole state at once."""
 
@@ -60,6 +56,30 @@ _REMEDY = (
 )
 
 _Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class CanonLimits:
+    """How long one call to a body may go on against trouble before it fails; chosen, not measured.
+
+    Attributes
+    ----------
+    recoveries
+        How often a call renews the connection: a fault that comes back more often lasts.
+    recovery_s
+        Seconds after the first fault of a call in which the connection may be renewed; a body that was switched off and
+        on, or put back on its cable, is there within 10 s.
+    frame_s
+        Seconds after its exposure within which a frame may be announced, beside as much time again as it was exposed:
+        so long a dark frame takes that some bodies subtract.
+    """
+
+    recoveries: int = 3
+    recovery_s: float = 30.0
+    frame_s: float = 30.0
+
+
+_LIMITS = CanonLimits()
 
 
 @dataclass
@@ -89,11 +109,18 @@ class CanonEos:
         Opens a new cable to the same body, wherever it is now; called again after a fault.
     clock
         Measures and makes every pause.
+    limits
+        When a call gives up.
     """
 
-    def __init__(self, open_transport: Callable[[], Transport], clock: Clock = _SYSTEM_CLOCK) -> None:
+    def __init__(
+        self, open_transport: Callable[[], Transport], clock: Clock = _SYSTEM_CLOCK, limits: CanonLimits = _LIMITS
+    ) -> None:
         self._open_transport = open_transport
         self._clock = clock
+        self._limits = limits
+        self._fault: DeviceError | None = None
+        self._renewable_until = math.inf
         self._transport: Transport | None = None
         self._body: EosBody | None = None
         self._identity: CameraIdentity | None = None
@@ -103,7 +130,19 @@ class CanonEos:
 
     def identity(self) -> CameraIdentity:
         """Return maker, model, serial number and firmware."""
+        self._begin()
         return self._carry_out(EosBody.identity)
+
+    def supplies(self) -> Supplies:
+        """Return what is left of battery and card; see `drivers.camera.ReportsSupplies`.
+
+        Raises
+        ------
+        DeviceError
+            It cannot be reached.
+        """
+        self._begin()
+        return self._carry_out(EosBody.supplies)
 
     def configure(self, settings: ExposureSettings) -> None:
         """Set and verify the exposure, raw format and destination; a frame that was not downloaded is dropped.
@@ -120,6 +159,7 @@ class CanonEos:
             body.make_ready()
             _apply(body, settings)
 
+        self._begin()
         self._settings = self._shot = None
         self._carry_out(configured)
         self._settings = settings
@@ -137,6 +177,7 @@ class CanonEos:
             body.drain()
             return shutter_speeds(body.state)
 
+        self._begin()
         return self._carry_out(listed)
 
     def expose(self) -> datetime:
@@ -154,6 +195,7 @@ class CanonEos:
         settings = self._settings
         if settings is None:
             raise DeviceRefused("the camera has no exposure settings; configure it before the first exposure")
+        self._begin()
         self._shot = None
         shot = self._release(settings)
         try:
@@ -178,6 +220,7 @@ class CanonEos:
         shot = self._shot
         if shot is None:
             raise DeviceError("no exposed frame waits in the camera to be downloaded; expose it again")
+        self._begin()
         start = into.tell()
         frame = self._carry_out(lambda body: self._receive(body, shot, into, start))
         self._shot = None
@@ -186,6 +229,7 @@ class CanonEos:
 
     def idle(self) -> None:
         """Fetch what has happened while nothing was asked, and keep the body awake; call it now and then in a pause."""
+        self._begin()
         self._carry_out(EosBody.drain)
 
     def close(self) -> None:
@@ -201,9 +245,15 @@ class CanonEos:
             else:
                 self._drop(None)
 
+    def _begin(self) -> None:
+        """Begin a call: it has had no fault yet."""
+        self._fault, self._renewable_until = None, math.inf
+
     def _carry_out(self, action: Callable[[EosBody], _Result]) -> _Result:
         """Return what `action` does with a connected body, over a new connection if this one fails."""
-        for left in reversed(range(RECOVERIES + 1)):
+        renewals = 0
+        was_busy = False
+        while True:
             body = self._connected()
             try:
                 return action(body)
@@ -211,14 +261,21 @@ class CanonEos:
                 if not _curable(error):
                     raise
                 self._drop(error)
-                if not left:
-                    # A body that is busy in every session is kept so by its own settings, not by a fault.
-                    busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
+                # A body that is busy in every session is kept so by its own settings, not by a fault.
+                busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
+                late = self._clock.monotonic() >= self._renewable_until
+                if renewals == self._limits.recoveries or late or (busy and was_busy):
                     kind = DeviceRefused if busy else DeviceError
-                    raise kind(
-                        f"{error}; the connection was renewed {RECOVERIES} times without success: {_REMEDY}"
-                    ) from error
-        raise AssertionError
+                    times = "once" if renewals == 1 else f"{renewals} times"
+                    raise kind(self._given_up(error, f"the connection was renewed {times} without success")) from error
+                was_busy = busy
+                renewals += 1
+
+    def _given_up(self, last: DeviceError, tried: str) -> str:
+        """Return why a call ends, its first cause first, for whatever came of that says less."""
+        first = self._fault or last
+        at_last = "" if str(first) == str(last) else f"; at last: {last}"
+        return f"{first}; {tried}{at_last}; {_REMEDY}"
 
     def _release(self, settings: ExposureSettings) -> _Shot:
         """Return the release that has happened, or may have; one that the body declines has not."""
@@ -228,7 +285,7 @@ class CanonEos:
             _apply(body, settings)  # sends nothing unless a dial was turned
             now = self._clock.monotonic()
             exposed = now + _CERTAIN_SHARE * settings.shutter_s
-            until = now + settings.shutter_s + FRAME_LIMIT_S
+            until = now + 2 * settings.shutter_s + self._limits.frame_s
             shot = _Shot(body, self._clock.now(), exposed, until, settings.shutter_s, absent=set(body.state.waiting))
             try:
                 body.release()
@@ -295,7 +352,8 @@ class CanonEos:
         if self._body is not None:
             return self._body
         first = self._identity is None
-        end = self._clock.monotonic() + RECOVERY_LIMIT_S
+        begun = self._clock.monotonic()
+        end = min(self._renewable_until, begun + self._limits.recovery_s)
         pause = _FIRST_PAUSE_S
         while True:
             try:
@@ -307,7 +365,8 @@ class CanonEos:
                 if not curable:
                     raise
                 if self._clock.monotonic() + pause > end:
-                    raise DeviceError(f"no camera to work with: {error}; {_REMEDY}") from error
+                    waited = f"no connection for {self._clock.monotonic() - begun:.0f} s"
+                    raise DeviceError(self._given_up(error, waited)) from error
             self._clock.sleep(pause)
             pause = min(2 * pause, _LONGEST_PAUSE_S)
 
@@ -328,7 +387,10 @@ class CanonEos:
         return body
 
     def _drop(self, fault: DeviceError | None) -> None:
-        """Close the cable, with a reset where the body may still be in the midst of something."""
+        """Close the cable, with a reset where the body may still be in the midst of something; note the first fault."""
+        if fault is not None and self._fault is None:
+            self._fault = fault
+            self._renewable_until = self._clock.monotonic() + self._limits.recovery_s
         transport, self._transport, self._body = self._transport, None, None
         if transport is not None:
             if fault is not None and not isinstance(fault, LinkClosed):

@@ -1,13 +1,15 @@
 """The event records of Canon's EOS bodies, as bytes and as values.
 
 GetEvent answers a chain of records: size (32 bits, these included), type (32), body; a record of size 8 and type 0
-ends it. The first answer after SetEventMode holds the camera's whole state, later ones what has changed since.
+ends it, which some bodies leave out. The first answer after SetEventMode holds the camera's whole state, later ones
+what has changed since.
 
 Rules that hold inside:
 
 - ``decode`` and ``encode`` undo each other on well-formed bytes. A record whose type or inner form is not known stays
   as it came, in `OtherRecord`, and is skipped by its size; a record that contradicts itself raises `ProtocolError`.
-- Counts and sizes are checked before they are believed; more than `MAX_EVENTS` bytes are refused unread.
+- Counts and sizes are checked before they are believed; more than `MAX_EVENTS` bytes are refused unread, and more than
+  `MAX_RECORDS` records once so many have been read.
 
 Source: no public standard; layouts as recorded from an EOS 60D and an EOS 400D, and as libgphoto2 2.5.34 reads them.
 """
@@ -28,6 +30,9 @@ from foundation.errors import ProtocolError
 
 MAX_EVENTS: Final = 4 << 20
 """Bytes of the longest answer to GetEvent that is read; a body left alone for a day queues some 250 kB."""
+
+MAX_RECORDS: Final = 1 << 16
+"""Records of one answer; a body left alone queues some 8000 in half a day (as users of libgphoto2 report)."""
 
 _HEADER_LENGTH: Final = 8
 """Bytes of a record's size and type."""
@@ -156,17 +161,21 @@ _NOTICES: frozenset[int] = frozenset(
 def decode_events(data: bytes) -> tuple[Record, ...]:
     """Return the records that GetEvent (0x9116) answers, without the closing one; no bytes are no records.
 
+    A chain that ends with its last record, or with NULs, is whole: no cable hands on a part of an answer as all of it.
+
     Raises
     ------
     ProtocolError
-        The chain is longer than `MAX_EVENTS`, is not closed, or a record does not hold what its sizes say.
+        The chain is longer than `MAX_EVENTS` or `MAX_RECORDS`, or a record does not hold what its sizes say.
     """
-    if not data:
-        return ()
     cursor = Cursor(data, "GetEvent", MAX_EVENTS)
     records: list[Record] = []
     while True:
         place = cursor.at
+        if not any(data[place : place + _HEADER_LENGTH]) and not any(data[place:]):
+            return tuple(records)
+        if len(records) == MAX_RECORDS:
+            raise ProtocolError(f"GetEvent gives more than {MAX_RECORDS} records; switch the camera off and on")
         size, kind = cursor.u32("the size of a record"), cursor.u32("the type of a record")
         if kind == EosEvent.END and size == _HEADER_LENGTH:
             return tuple(records)

@@ -6,6 +6,8 @@ Rules that hold inside:
 - What a body does not report is no problem: properties come and go between bodies, and only what is known to spoil a
   series is named.
 - Nothing is taken for settable that the body does not list.
+- What a body reports costs no more memory than `MAX_PROPERTIES` values of `MAX_VALUE` bytes, and as many lists; what is
+  beyond that is passed over, for no real body comes near it.
 
 Source: layouts and numbers as recorded from an EOS 60D; the number of mirror lockup among the custom functions as
 ExifTool names it (CanonCustom::Functions2).
@@ -15,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from drivers.camera import ExposureSettings
 from drivers.canon.apex import APERTURE, ISO, SHUTTER, Scale
@@ -45,6 +48,12 @@ from foundation.errors import DeviceRefused, InputError, ProtocolError
 MIRROR_LOCKUP_FUNCTION = 0x060F
 """Number of mirror lockup among the custom functions, on bodies that have it there."""
 
+MAX_PROPERTIES = 1024
+"""Properties that are remembered; a real body reports 80 to 300."""
+MAX_VALUE = 1 << 14
+"""Bytes of a property's value that are remembered; the longest known, of focus points, has some 5000."""
+MAX_LIST = 1024
+"""Values of a property's list that are remembered; the longest known, of image formats, has 31 and of Kelvin 76."""
 _MAX_WAITING = 64
 """Objects that are remembered; more than a body's memory holds."""
 _NOT_RAW = (ObjectFormat.EXIF_JPEG, ObjectFormat.JFIF, ObjectFormat.MOV, ObjectFormat.MOV2)
@@ -52,6 +61,13 @@ _NOT_RAW_SUFFIXES = (".jpg", ".jpeg", ".hif", ".mov", ".mp4")
 _SILENT_OR_PLAIN = (DriveMode.SINGLE, DriveMode.SINGLE_SILENT)
 _BATTERY_LOW = 0
 """Of EOS_BATTERY_POWER: 0 is low, as libgphoto2 reads it."""
+_BATTERY_LEVELS = {_BATTERY_LOW: 0.0, 5: 0.25, 1: 0.5, 4: 0.75, 2: 1.0}
+"""Of EOS_BATTERY_POWER, as libgphoto2 reads it; other numbers are not known."""
+_BATTERY_MAINS = 0xFFFFFFFF
+"""Of EOS_BATTERY_POWER: mains power, as Canon's EDSDK has it of the same state; not seen on the wire."""
+
+
+_Kept = TypeVar("_Kept")
 
 
 @dataclass(frozen=True)
@@ -102,13 +118,17 @@ class EosState:
         for record in records:
             match record:
                 case PropertyChanged(Property.EOS_CUSTOM_FUNCTIONS, value):
-                    self.functions.update(custom_functions(value))
+                    for number, first in custom_functions(value[:MAX_VALUE]).items():
+                        _remember(self.functions, number, first)
                 case PropertyChanged(code, value):
-                    self.values[code] = value
+                    if len(value) <= MAX_VALUE:
+                        _remember(self.values, code, value)
                 case AvailableValues(code, values):
-                    self.lists[code] = values
+                    if len(values) <= MAX_LIST:
+                        _remember(self.lists, code, values)
                 case AvailableFormats(code, formats):
-                    self.formats[code] = formats
+                    if len(formats) <= MAX_LIST:
+                        _remember(self.formats, code, formats)
                 case TransferRequest():
                     self._announce(WaitingObject(record.handle, record.format, record.size, record.name))
                 case ObjectEvent(EosEvent.OBJECT_ADDED | EosEvent.OBJECT_ADDED_64, entry):
@@ -142,6 +162,22 @@ class EosState:
         self.waiting[waiting.handle] = waiting
         while len(self.waiting) > _MAX_WAITING:
             del self.waiting[next(iter(self.waiting))]
+
+
+def battery_level(state: EosState) -> float | None:
+    """Return the charge that a body reports, 0 … 1 in quarters; None where it does not, or runs on mains power."""
+    power = state.number(Property.EOS_BATTERY_POWER)
+    return None if power is None else _BATTERY_LEVELS.get(power)
+
+
+def power_source(state: EosState) -> bool | None:
+    """Return whether a body runs on mains power; None where that is not known: it reports a battery for both."""
+    return True if state.number(Property.EOS_BATTERY_POWER) == _BATTERY_MAINS else None
+
+
+def _remember(kept: dict[int, _Kept], code: int, value: _Kept) -> None:
+    if code in kept or len(kept) < MAX_PROPERTIES:
+        kept[code] = value
 
 
 def custom_functions(value: bytes) -> dict[int, int]:

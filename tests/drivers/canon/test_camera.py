@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from typing import Any
@@ -11,9 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.camera import CameraIdentity, ExposureSettings, capture
+from drivers.camera import CameraIdentity, ExposureSettings, ReportsSupplies, capture
 from drivers.canon.camera import CanonEos
 from drivers.canon.records import (
+    AvailableValues,
     Notice,
     OtherRecord,
     PropertyChanged,
@@ -22,16 +24,26 @@ from drivers.canon.records import (
     decode_events,
     encode_events,
 )
-from drivers.canon.state import EosState, custom_functions, problems
-from drivers.canon.values import ImageFile, ImageFormat
+from drivers.canon.state import (
+    MAX_LIST,
+    MAX_PROPERTIES,
+    MAX_VALUE,
+    EosState,
+    battery_level,
+    custom_functions,
+    power_source,
+    problems,
+)
+from drivers.canon.values import ImageFile, ImageFormat, number_value
 from drivers.links.pipes import Pipe, UsbPipes
 from drivers.links.usb import open_usb
 from drivers.ptp.codes import AeMode, CaptureDestination, EosEvent, Operation, Property, ResponseCode
 from drivers.ptp.ip_transport import IpTransport
 from drivers.ptp.messages import PtpEvent, PtpRequest, PtpResponse
+from drivers.ptp.reception import Reception
 from drivers.ptp.transport import Transaction, Transport
 from drivers.ptp.usb_transport import UsbTransport
-from foundation.errors import DeviceError, DeviceRefused, LinkClosed, StorageError
+from foundation.errors import DeviceError, DeviceRefused, LinkClosed, ProtocolError, StorageError
 from sim.buses import faults
 from sim.buses.faults import Occasion
 from sim.buses.ptpip_server import serve_ptpip
@@ -660,10 +672,222 @@ def test_a_camera_that_is_gone_for_good_says_what_to_do(lab: Lab) -> None:
     lab.cable = gone
     lab.device = lab.eos
     lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
-    with pytest.raises(DeviceError, match="no camera to work with: no camera on USB; check the cable and the battery"):
+    begun = lab.clock.monotonic()
+    with pytest.raises(DeviceError, match=r"^no camera on USB; no connection for \d+ s; check the cable and"):
         lab.take(attempts=1)
+    assert lab.clock.monotonic() - begun <= 30
     lab.cable = lambda transport: transport
     lab.take()
+
+
+def test_the_first_cause_is_kept_and_what_came_of_it_told_after(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    busy = faults.Declining(
+        lab.eos, ResponseCode.GENERAL_ERROR, Occasion({Operation.EOS_REMOTE_RELEASE_ON}, times=None)
+    )
+    lab.device = busy
+
+    def gone(transport: Transport) -> Transport:
+        raise LinkClosed("no camera on USB")
+
+    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    lab.camera.idle()
+    lab.cable = gone
+    with pytest.raises(
+        DeviceError, match=r"^.*GENERAL_ERROR.*; no connection for \d+ s; at last: no camera on USB; check the cable"
+    ):
+        lab.take(attempts=1)
+
+
+@pytest.mark.parametrize("kind", ["busy", "silent", "gone", "never announced"])
+def test_no_call_is_silent_for_long(kind: str) -> None:
+    lab = Lab()
+    lab.camera.configure(SETTINGS)
+    always = Occasion({Operation.EOS_GET_EVENT}, times=None)
+    lab.device = {
+        "busy": lambda: faults.Declining(lab.eos, ResponseCode.DEVICE_BUSY, always),
+        "silent": lambda: faults.Hanging(lab.eos, always),
+        "gone": lambda: lab.eos,
+        "never announced": lambda: Announcing(lab.eos, lambda records: tuple(r for r in records if not is_frame(r))),
+    }[kind]()
+    if kind == "gone":
+        lab.cable = gone_for_good
+    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    begun = lab.clock.monotonic()
+    with pytest.raises(DeviceError):
+        lab.camera.expose()
+    # A bare answer may take 20 s, what declines it 10 s, and the connection is renewed for 30 s after that at most.
+    assert lab.clock.monotonic() - begun <= {"busy": 45, "silent": 75, "gone": 30, "never announced": 45}[kind]
+
+
+def gone_for_good(transport: Transport) -> Transport:
+    raise LinkClosed("no camera on USB")
+
+
+def test_a_cable_that_fails_between_exposure_and_download_costs_no_frame(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    for number in range(3):
+        lab.camera.expose()
+        lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+        into = io.BytesIO()
+        lab.camera.download(into)
+        assert into.getvalue() == lab.film.frames[number]
+        assert lab.waiting() == 0
+    assert len(lab.film.frames) == 3
+
+
+def test_a_cable_that_stays_out_for_a_while_costs_no_frame_either(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    lab.camera.expose()
+    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    lab.cable = gone_for_good
+    for _ in range(3):
+        with pytest.raises(DeviceError, match="no camera on USB"):
+            lab.camera.download(io.BytesIO())
+    lab.cable = lambda transport: transport
+    into = io.BytesIO()
+    lab.camera.download(into)
+    assert [into.getvalue()] == lab.film.frames
+
+
+def test_a_body_that_forgets_its_frames_says_so_once(lab: Lab) -> None:
+    lab = Lab(forgetful=True)
+    lab.camera.configure(SETTINGS)
+    lab.camera.expose()
+    lab.camera._drop(None)  # pyright: ignore[reportPrivateUsage] - the cable is pulled
+    with pytest.raises(DeviceError, match="holds none in its memory; take it again"):
+        lab.camera.download(io.BytesIO())
+    with pytest.raises(DeviceError, match="no exposed frame waits"):
+        lab.camera.download(io.BytesIO())
+    lab.take(attempts=1)
+
+
+def test_a_finger_on_the_camera_between_exposure_and_download_changes_no_frame(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    lab.camera.expose()
+    lab.press()
+    into = io.BytesIO()
+    lab.camera.download(into)
+    assert into.getvalue() == lab.film.frames[0]
+    assert len(lab.film.frames) == 2
+    assert lab.waiting() == 0
+
+
+def test_configuring_drops_a_frame_that_was_not_downloaded(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    lab.camera.expose()
+    lab.camera.configure(SETTINGS)
+    assert lab.waiting() == 0
+    with pytest.raises(DeviceError, match="no exposed frame waits"):
+        lab.camera.download(io.BytesIO())
+
+
+OPTIONAL = (
+    Operation.EOS_REQUEST_DEVICE_PROP_VALUE,
+    Operation.EOS_PC_HDD_CAPACITY,
+    Operation.EOS_KEEP_DEVICE_ON,
+    Operation.EOS_REMOTE_RELEASE_ON,
+    Operation.EOS_REMOTE_RELEASE_OFF,
+    Operation.EOS_GET_PARTIAL_OBJECT,
+    Operation.EOS_GET_STORAGE_IDS,
+    Operation.EOS_GET_STORAGE_INFO,
+    Operation.CLOSE_SESSION,
+)
+
+
+@pytest.mark.parametrize("answer", [ResponseCode.OPERATION_NOT_SUPPORTED, ResponseCode.EOS_UNKNOWN_COMMAND])
+@pytest.mark.parametrize("code", OPTIONAL, ids=[code.name for code in OPTIONAL])
+def test_an_optional_operation_that_a_body_lists_and_has_not_got(code: Operation, answer: int) -> None:
+    lab = Lab()
+    asked: list[int] = []
+
+    class Listening(faults.TroubledResponder):
+        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+            asked.append(request.code)
+            return super().answer(request, data)
+
+    class Rooming(faults.TroubledResponder):
+        """Has room for frames, and does not know how to be told of it."""
+
+        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+            answered = super().answer(request, data)
+            if request.code != Operation.EOS_PC_HDD_CAPACITY:
+                return answered
+            return Answer(PtpResponse(answer, request.transaction))
+
+    lab.device = Listening(
+        Rooming(lab.eos)
+        if code == Operation.EOS_PC_HDD_CAPACITY
+        else faults.Declining(lab.eos, answer, Occasion({code}, times=None))
+    )
+    lab.camera.configure(SETTINGS)
+    for _ in range(3):
+        lab.take(attempts=1)
+        lab.clock.sleep(20)
+        lab.camera.idle()
+        lab.camera.supplies()
+    assert lab.openings == 1
+    assert lab.waiting() == 0
+    if code not in (Operation.EOS_KEEP_DEVICE_ON, Operation.EOS_REMOTE_RELEASE_OFF):
+        assert asked.count(code) <= 1, "it is not asked again"
+    lab.camera.close()
+
+
+def test_a_body_that_closes_no_chain_of_events(lab: Lab) -> None:
+    class Open(faults.TroubledResponder):
+        def answer(self, request: PtpRequest, data: bytes | None) -> Answer:
+            answer = super().answer(request, data)
+            if request.code != Operation.EOS_GET_EVENT or answer.data is None:
+                return answer
+            return Answer(answer.response, answer.data.removesuffix(encode_events()))
+
+    lab.device = Open(lab.eos)
+    goes_on(lab)
+    assert lab.openings == 1
+
+
+# What is left of battery and card.
+
+
+@pytest.mark.parametrize(("charge", "level"), [(1.0, 1.0), (0.72, 0.75), (0.5, 0.5), (0.26, 0.25), (0.05, 0.0)])
+def test_the_battery_is_told_in_quarters(charge: float, level: float) -> None:
+    assert Lab(battery=charge).camera.supplies().battery == level
+
+
+def test_what_a_body_has_left(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    supplies = lab.camera.supplies()
+    assert isinstance(lab.camera, ReportsSupplies)
+    assert (supplies.battery, supplies.mains, supplies.saves_to_host) == (1.0, None, True)
+    card = lab.eos._card  # pyright: ignore[reportPrivateUsage]
+    assert card is not None
+    assert supplies.card_free_bytes == card.free
+    lab.eos._card = None  # pyright: ignore[reportPrivateUsage] - it is taken out
+    assert lab.camera.supplies().card_free_bytes is None
+
+
+def test_asking_for_supplies_costs_no_exposed_frame(lab: Lab) -> None:
+    lab.camera.configure(SETTINGS)
+    lab.camera.expose()
+    lab.camera.supplies()
+    into = io.BytesIO()
+    lab.camera.download(into)
+    assert [into.getvalue()] == lab.film.frames
+
+
+@pytest.mark.parametrize(
+    ("power", "level", "mains"), [(0, 0.0, None), (5, 0.25, None), (3, None, None), (0xFFFFFFFF, None, True)]
+)
+def test_the_numbers_of_the_battery(power: int, level: float | None, mains: bool | None) -> None:
+    state = EosState()
+    state.take([PropertyChanged(Property.EOS_BATTERY_POWER, number_value(power))])
+    assert (battery_level(state), power_source(state)) == (level, mains)
+
+
+def test_a_body_that_reports_its_battery_by_the_standard_alone() -> None:
+    properties = tuple(spec for spec in EOS_550D.properties if spec.code != Property.EOS_BATTERY_POWER)
+    lab = Lab(replace(EOS_550D, properties=properties), battery=0.75)
+    assert lab.camera.supplies().battery == 0.75
 
 
 def test_a_camera_that_never_was_is_told_at_once() -> None:
@@ -727,6 +951,48 @@ def test_mirror_lockup_among_recorded_custom_functions(body: str, recording: lis
 @given(st.binary(max_size=200))
 def test_custom_functions_of_any_bytes_are_none_or_some(value: bytes) -> None:
     assert all(isinstance(number, int) for number in custom_functions(value))
+
+
+def test_what_a_body_claims_costs_little_memory() -> None:
+    state = EosState()
+    tracemalloc.start()
+    for batch in range(40):
+        state.take(PropertyChanged(batch << 8 | number, bytes(2 * MAX_VALUE)) for number in range(256))
+        state.take(PropertyChanged(batch << 8 | number, bytes(64)) for number in range(256))
+        state.take(AvailableValues(batch << 8 | number, tuple(range(16))) for number in range(256))
+        state.take([AvailableValues(0xD103, tuple(range(2 * MAX_LIST)))])
+        functions = b"".join(number_value(batch << 8 | number) + number_value(0) for number in range(256))
+        group = 4 * number_value(1) + number_value(256) + functions
+        state.take([PropertyChanged(Property.EOS_CUSTOM_FUNCTIONS, group)])
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(state.values) == len(state.lists) == len(state.functions) == MAX_PROPERTIES
+    assert peak < 4 << 20
+
+
+@given(st.lists(st.tuples(st.integers(0, 2**32 - 1), st.binary(max_size=40)), max_size=50))
+def test_what_a_body_reports_is_kept_as_it_came_last(changes: list[tuple[int, bytes]]) -> None:
+    state = EosState()
+    plain = [(code, value) for code, value in changes if code != Property.EOS_CUSTOM_FUNCTIONS]
+    state.take(PropertyChanged(code, value) for code, value in plain)
+    assert state.values == dict(plain)
+
+
+@pytest.mark.parametrize("length", [1 << 32, (1 << 32) - 1, 5 << 20, 1 << 40])
+def test_an_answer_of_gigabytes_is_refused_before_it_is_read(length: int) -> None:
+    # 32 bits of a container say at most 4 GiB, or that the end is not known; PTP/IP has 64.
+    reception = Reception(PtpRequest(Operation.EOS_GET_EVENT, 7), None, "the camera")
+    with pytest.raises(ProtocolError, match="at most 4194304 were expected"):
+        reception.start(7, length)
+
+
+def test_an_answer_without_end_is_refused_at_its_bound() -> None:
+    reception = Reception(PtpRequest(Operation.EOS_GET_EVENT, 7), None, "the camera")
+    reception.start(7, None)
+    for _ in range(64):
+        reception.take(bytes(1 << 16))
+    with pytest.raises(ProtocolError, match="at most 4194304 were expected"):
+        reception.take(b"x")
 
 
 @given(st.lists(st.integers(0, 200), max_size=300))

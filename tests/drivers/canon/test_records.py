@@ -160,12 +160,31 @@ def test_what_follows_the_end_is_no_record() -> None:
     assert canon.decode_events(canon.encode_events() + b"\xff" * 5) == ()
 
 
+@pytest.mark.parametrize("end", ["", "0000", "00000000 00000000", "00000000 00000000 00000000", "08000000 00000000"])
+def test_some_bodies_leave_the_closing_record_out(end: str) -> None:
+    record = bytes.fromhex("10000000 89c10000 03d10000 68000000")
+    assert canon.decode_events(record + bytes.fromhex(end)) == (PropertyChanged(0xD103, b"\x68\0\0\0"),)
+    assert canon.decode_events(2 * record + bytes.fromhex(end)) == 2 * (PropertyChanged(0xD103, b"\x68\0\0\0"),)
+
+
+@given(st.lists(RECORDS, min_size=1, max_size=6).map(tuple))
+def test_any_records_come_back_without_the_closing_one(records: tuple[Record, ...]) -> None:
+    assert canon.decode_events(canon.encode_events(records).removesuffix(canon.encode_events())) == records
+
+
+def test_more_records_than_any_body_queues_are_refused() -> None:
+    notice = bytes.fromhex("0c000000 8bc10000 01000000")
+    assert len(canon.decode_events(canon.MAX_RECORDS * notice)) == canon.MAX_RECORDS
+    with pytest.raises(ProtocolError, match="more than 65536 records"):
+        canon.decode_events((canon.MAX_RECORDS + 1) * notice)
+
+
 @pytest.mark.parametrize(
     ("octets", "says"),
     [
-        ("10000000 89c10000 03d10000 68000000", "the size of a record at byte 16 needs 4 bytes, but only 0 follow"),
+        ("10000000 89c10000 03d10000 68000000 08", "the size of a record at byte 16 needs 4 bytes, but only 1 follow"),
         ("07000000 89c10000", "the size of a record at byte 0 is 7; expected at least 8"),
-        ("00000000 00000000", "expected at least 8"),
+        ("00000000 00000000 01", "expected at least 8"),
         ("ffffffff 89c10000 03d10000", r"PROPERTY_CHANGED \(0xc189\) at byte 8 needs 4294967287 bytes"),
         ("0a000000 89c10000 03d1 08000000 00000000", "record 0 at byte 0: PROPERTY_CHANGED"),
         (
