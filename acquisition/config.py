@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import difflib
 import math
+import shlex
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 import tomli_w
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, ValidationError
 
 from drivers.camera import ExposureSettings
 from foundation.errors import ConfigurationError
-from foundation.notices import MASK, require_target, target_label
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -26,9 +27,54 @@ _SECRETS = ("sequence.notify", "lab.projector.password")
 """Keys whose values are in no message, nor in `session.toml`: a session is copied, shown and published."""
 
 
+MASK = "…"
+"""What stands for a secret."""
+
+
+def is_webhook(target: str) -> bool:
+    """Return whether a target is a URL to post to, rather than a command."""
+    return target.lower().startswith(("http://", "https://"))
+
+
+def target_label(target: str) -> str:
+    """Return what may be shown of a target: a URL's scheme and host, or a command's first word.
+
+    The rest may be a secret: a webhook's path is one, and so are user names, queries and most arguments.
+
+    Examples
+    --------
+    >>> target_label("https://user:word@ntfy.example/lab?auth=tk_1"), target_label("curl -H 'Authorization: x' y")
+    ('https://ntfy.example/…', 'curl …')
+    """
+    if is_webhook(target):
+        parts = urlsplit(target)
+        return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}/{MASK}"
+    words = shlex.split(target)
+    return " ".join([*words[:1], *([MASK] if words[1:] else [])])
+
+
+def _require_target(target: str) -> None:
+    """Require that a target is a URL with a host, or a command line; empty is nobody.
+
+    Raises
+    ------
+    ValueError
+        It is neither; the message does not hold it.
+    """
+    if not is_webhook(target):
+        # A quotation that does not end is refused here.
+        shlex.split(target)
+        return
+    parts = urlsplit(target)
+    if not parts.hostname or parts.port == 0:
+        raise ValueError("a URL names a host, as in https://ntfy.sh/my-lab")
+    if not target.removesuffix(f"/{MASK}").isascii() or any(character.isspace() for character in target):
+        raise ValueError("a URL has no spaces and no letters but ASCII's; write them as %20 and the like")
+
+
 def _target_checked(target: str) -> str:
     """Return the target of notices as it is; refuse one that is neither a URL nor a command line."""
-    require_target(target)
+    _require_target(target)
     return target
 
 

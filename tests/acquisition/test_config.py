@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.config import LabSettings, load_lab, parse_lab
+from acquisition.config import LabSettings, load_lab, parse_lab, target_label
 from acquisition.run.shutter import require_whole_turns
 from foundation.errors import ConfigurationError
-from foundation.notices import target_label
 
 MINIMAL = 'rig = "simulated"\nchart = "c/chart.json"\nilluminations = "lights.csv"\n'
 

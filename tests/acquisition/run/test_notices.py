@@ -19,8 +19,8 @@ from typing import Any
 
 import pytest
 
-from foundation import notices
-from foundation.notices import Notices
+from acquisition.run import notices
+from acquisition.run.notices import Notices
 
 AT = datetime(2026, 1, 1, 3, 12, 45, tzinfo=UTC)
 

@@ -34,55 +34,14 @@ from datetime import datetime
 from typing import Final
 from urllib.parse import unquote, urlsplit, urlunsplit
 
+from acquisition.config import is_webhook, target_label
+
 LIMIT_S: Final = 20.0
 """How long a receiver may take; a message to a telephone takes seconds."""
 ENDING_S: Final = 2.0
 """How much longer the end waits for the last one, so that a receiver that is too slow is named."""
 QUEUED: Final = 100
 """Notices that may wait for a slow receiver; more are dropped."""
-MASK: Final = "…"
-"""What stands for a secret."""
-
-
-def is_webhook(target: str) -> bool:
-    """Return whether a target is a URL to post to, rather than a command."""
-    return target.lower().startswith(("http://", "https://"))
-
-
-def target_label(target: str) -> str:
-    """Return what may be shown of a target: a URL's scheme and host, or a command's first word.
-
-    The rest may be a secret: a webhook's path is one, and so are user names, queries and most arguments.
-
-    Examples
-    --------
-    >>> target_label("https://user:word@ntfy.example/lab?auth=tk_1"), target_label("curl -H 'Authorization: x' y")
-    ('https://ntfy.example/…', 'curl …')
-    """
-    if is_webhook(target):
-        parts = urlsplit(target)
-        return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}/{MASK}"
-    words = shlex.split(target)
-    return " ".join([*words[:1], *([MASK] if words[1:] else [])])
-
-
-def require_target(target: str) -> None:
-    """Require that a target is a URL with a host, or a command line; empty is nobody.
-
-    Raises
-    ------
-    ValueError
-        It is neither; the message does not hold it.
-    """
-    if not is_webhook(target):
-        # A quotation that does not end is refused here.
-        shlex.split(target)
-        return
-    parts = urlsplit(target)
-    if not parts.hostname or parts.port == 0:
-        raise ValueError("a URL names a host, as in https://ntfy.sh/my-lab")
-    if not target.removesuffix(f"/{MASK}").isascii() or any(character.isspace() for character in target):
-        raise ValueError("a URL has no spaces and no letters but ASCII's; write them as %20 and the like")
 
 
 class Notices:
