@@ -231,22 +231,27 @@ def run(
 
 
 @app.command(epilog=EXIT_CODES)
-def status(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
-    """Show how far a session is, how long it will take, and what was refused.
+def status(
+    session: Annotated[Path, typer.Argument(help="Session folder.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for programs.")] = False,
+) -> None:
+    """Show how far a session is, how long it will take, what was measured last, and what was refused.
 
-    Reads SESSION, also while it is being taken; writes nothing.
+    Reads SESSION, also while it is being taken; writes nothing. Says so when the run was killed.
     """
-    from acquisition.session.folder import Session
-    from acquisition.session.progress import duration_text, session_progress
+    import json
+    from datetime import UTC, datetime
 
-    with Session.open(session) as opened:
-        state = session_progress(opened)
-    print(f"frames  {state.done} of {state.total}")
-    print(f"lights  {state.lights_done} of {state.lights_total}")
-    print(f"left    {duration_text(state.remaining_s)}")
-    print(f"refused {state.refused}, failed {state.failed}")
-    for reason in state.refusals:
-        print(f"  {reason}")
+    from acquisition.monitor.reading import read_session
+    from acquisition.session.folder import journal_path
+    from acquisition.status import status_json, status_lines
+
+    journal_path(session)
+    view, now = read_session(session), datetime.now(UTC)
+    if as_json:
+        print(json.dumps(status_json(view, now), indent=2))
+    else:
+        print("\n".join(status_lines(view, now)))
 
 
 @app.command(epilog=EXIT_CODES)

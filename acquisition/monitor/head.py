@@ -10,6 +10,7 @@ from datetime import datetime, timedelta
 from acquisition.monitor.rows import AttemptView
 from acquisition.session.heartbeat import AGAIN, Heartbeat
 from acquisition.session.plan import SessionStep
+from acquisition.session.progress import time_left
 from acquisition.session.records import ACCEPTED, FAILED, REFUSED, VOIDED
 
 RECENT = 50
@@ -44,7 +45,7 @@ class Head:
     seconds_per_frame
         Median interval of the newest `RECENT` attempts; None before the second.
     remaining_s
-        Time left by the lab's clock; None while it is unknown.
+        Time left by the lab's clock, retakes and references included; None while it is unknown.
     eta
         When all frames are there, by the wall clock; None where that cannot be told.
     last
@@ -101,7 +102,9 @@ def head_of(
     alive = state in ("running", "waiting", "paused")
     pace = _pace(attempts)
     left = len(steps) - len(done)
-    remaining = None if pace is None else pace * left
+    recent = [view for view in list(attempts)[-RECENT:] if view.verdict is not None]
+    gained = sum(view.verdict in (ACCEPTED, VOIDED) for view in recent)
+    remaining = time_left([view.seconds for view in recent if view.seconds is not None], len(recent), gained, left)
     newest = max((view.started_at for view in attempts), default=None)
     near = (
         heartbeat is not None
