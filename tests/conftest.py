@@ -47,7 +47,7 @@ SLOW = (
     "drivers/display/test_fullscreen.py",
     "drivers/ptp/test_malformed.py",
     "drivers/raw/test_rawfile.py",
-    "drivers/test_gphoto2_camera.py",
+    "drivers/gphoto2_camera/test_camera.py",
     "end_to_end",
     "evaluation/commands/test_choosing.py",
     "evaluation/commands/test_compare.py",
