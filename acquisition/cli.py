@@ -7,13 +7,16 @@ from collections.abc import Sequence
 from contextlib import suppress
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from foundation import console
 from foundation.console import EXIT_CODES, orderly_end
 from foundation.errors import InputError, QualityError, first_of
+
+if TYPE_CHECKING:
+    from acquisition.config import LabSettings
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -207,18 +210,29 @@ def run(
             "beside SESSION. What was taken of them before is kept and not used.",
         ),
     ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run",
+            help="Open and ask every device, print what the run would take, need and find, and what would end it; "
+            "nothing is lit, released, shown or written.",
+        ),
+    ] = False,
 ) -> None:
     """Take the session, or take up one that was interrupted.
 
-    Reads LAB.toml, the chart and the lights it names. Writes SESSION: session.toml, chart.json, illuminations.csv,
-    frames/, journal.sqlite, frames.csv. Interrupt it as you like and run it again. Ends with 4 when some frames were
-    refused; the next run tries those again.
+    What a dry run prints is checked before anything moves. Reads LAB.toml, the chart and the lights it names. Writes
+    SESSION: session.toml, chart.json, illuminations.csv, frames/, journal.sqlite, frames.csv. Interrupt it as you like
+    and run it again. Ends with 4 when some frames were refused; the next run tries those again.
     """
     from acquisition.config import load_lab
     from acquisition.run.run import run_session
     from foundation.console import progress
 
     settings = load_lab(lab)
+    if dry_run:
+        _print_plan(settings, session, retake)
+        return
     with orderly_end() as ending, progress("frames") as advance:
         outcome = run_session(
             settings, session, advance, lambda sentence: print(sentence, file=sys.stderr), retake, ending
@@ -230,23 +244,41 @@ def run(
     print(f"{session}: complete, {outcome.total} frames; next: build-lut {session} LUT/")
 
 
+def _print_plan(settings: LabSettings, session: Path, retake: str | None) -> None:
+    from acquisition.run.planning.dry_run import dry_run
+    from acquisition.run.planning.text import plan_lines
+
+    if retake is not None:
+        raise InputError("a dry run voids nothing; leave --retake out")
+    with orderly_end():
+        plan = dry_run(settings, session)
+    for line in plan_lines(plan):
+        print(line)
+    plan.require()
+
+
 @app.command(epilog=EXIT_CODES)
-def status(session: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
-    """Show how far a session is, how long it will take, and what was refused.
+def status(
+    session: Annotated[Path, typer.Argument(help="Session folder.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for programs.")] = False,
+) -> None:
+    """Show how far a session is, how long it will take, what was measured last, and what was refused.
 
-    Reads SESSION, also while it is being taken; writes nothing.
+    Reads SESSION, also while it is being taken; writes nothing. Says so when the run was killed.
     """
-    from acquisition.session.folder import Session
-    from acquisition.session.progress import duration_text, session_progress
+    import json
+    from datetime import UTC, datetime
 
-    with Session.open(session) as opened:
-        state = session_progress(opened)
-    print(f"frames  {state.done} of {state.total}")
-    print(f"lights  {state.lights_done} of {state.lights_total}")
-    print(f"left    {duration_text(state.remaining_s)}")
-    print(f"refused {state.refused}, failed {state.failed}")
-    for reason in state.refusals:
-        print(f"  {reason}")
+    from acquisition.monitor.reading import read_session
+    from acquisition.session.folder import journal_path
+    from acquisition.status import status_json, status_lines
+
+    journal_path(session)
+    view, now = read_session(session), datetime.now(UTC)
+    if as_json:
+        print(json.dumps(status_json(view, now), indent=2))
+    else:
+        print("\n".join(status_lines(view, now)))
 
 
 @app.command(epilog=EXIT_CODES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import statistics
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from datetime import datetime, timedelta
 from acquisition.monitor.rows import AttemptView
 from acquisition.session.heartbeat import AGAIN, Heartbeat
 from acquisition.session.plan import SessionStep
+from acquisition.session.progress import time_left
 from acquisition.session.records import ACCEPTED, FAILED, REFUSED, VOIDED
 
 RECENT = 50
@@ -44,7 +46,7 @@ class Head:
     seconds_per_frame
         Median interval of the newest `RECENT` attempts; None before the second.
     remaining_s
-        Time left by the lab's clock; None while it is unknown.
+        Time left by the lab's clock, retakes and references included; None while it is unknown.
     eta
         When all frames are there, by the wall clock; None where that cannot be told.
     last
@@ -101,7 +103,9 @@ def head_of(
     alive = state in ("running", "waiting", "paused")
     pace = _pace(attempts)
     left = len(steps) - len(done)
-    remaining = None if pace is None else pace * left
+    recent = [view for view in list(attempts)[-RECENT:] if view.verdict is not None]
+    gained = sum(view.verdict in (ACCEPTED, VOIDED) for view in recent)
+    remaining = time_left([view.seconds for view in recent if view.seconds is not None], len(recent), gained, left)
     newest = max((view.started_at for view in attempts), default=None)
     near = (
         heartbeat is not None
@@ -134,7 +138,7 @@ def _state_of(
 ) -> tuple[str, str]:
     over = heartbeat is None or heartbeat.state == "ended" or heartbeat.is_dead(now, process_alive)
     if over and total and not left:
-        return "complete", f"complete, {total} frames; next: build-lut {name} LUT/"
+        return "complete", f"complete, {total} frames; next: build-lut {shlex.quote(name)} LUT/"
     if heartbeat is None:
         return "unknown", f"{left} of {total} frames are left, and the journal has no sign of life of a run"
     if heartbeat.is_dead(now, process_alive):

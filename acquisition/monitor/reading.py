@@ -90,7 +90,7 @@ def read_session(folder: Path, before: SessionView | None = None) -> SessionView
     """
     path = folder / JOURNAL_FILE
     connection, version = open_to_read(path)
-    journal = Journal(path, connection, version, writes=False)
+    journal = Journal(path, connection, version)
     with closing(journal):
         try:
             # One transaction: a verdict is never seen without its checks.

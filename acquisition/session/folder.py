@@ -22,7 +22,7 @@ from typing import BinaryIO
 from acquisition.chart.model import Chart, load_chart
 from acquisition.lights.illuminations import Illumination, load_illuminations, save_illuminations
 from acquisition.session.incoming import IncomingFile, ReceivedFile
-from acquisition.session.journal import JOURNAL_FILE, Journal, time_text
+from acquisition.session.journal import JOURNAL_FILE, PATIENCE_S, Journal, time_text
 from acquisition.session.judgement import Judgement
 from acquisition.session.mending.retaking import BAD, lights_text, newest_report, parse_lights
 from acquisition.session.mending.verification import unsound_files
@@ -121,7 +121,7 @@ class Session:
         FormatError
             The folder is no session, one of a version not known here, or its lights are not those of its plan.
         """
-        journal = Journal.open(_journal_path(folder))
+        journal = Journal.open(journal_path(folder))
         try:
             return cls(folder, journal)
         except BaseException:
@@ -129,8 +129,20 @@ class Session:
             raise
 
     @classmethod
-    def open_for_run(cls, folder: Path) -> Session:
+    def open_for_run(
+        cls,
+        folder: Path,
+        patience_s: float = PATIENCE_S,
+        announce: Callable[[str], None] = lambda sentence: None,
+    ) -> Session:
         """Open a session folder to take frames into it; it is held until it is closed, and `frames.csv` is made anew.
+
+        Parameters
+        ----------
+        folder
+            The session.
+        patience_s, announce
+            How another program is waited for that writes the journal; see `Journal.open_for_run`.
 
         Raises
         ------
@@ -141,11 +153,11 @@ class Session:
         StorageError
             The folder cannot be written.
         """
-        path = _journal_path(folder)
+        path = journal_path(folder)
         busy = f"{folder} is being taken by another program; wait for it, or look with acquire status"
         with ExitStack() as opened:
             opened.enter_context(held_folder(folder, busy))
-            journal = Journal.open_for_run(path)
+            journal = Journal.open_for_run(path, patience_s, announce)
             opened.callback(journal.close)
             session = cls(folder, journal, opened)
             session.write_frames_csv()
@@ -408,19 +420,33 @@ def session_exists(folder: Path) -> bool:
     InputError
         The folder holds something that is no session.
     """
-    if (folder / JOURNAL_FILE).is_file():
+    if _is_file(folder / JOURNAL_FILE):
         return True
     require_free(folder, "the session")
     return False
 
 
-def _journal_path(folder: Path) -> Path:
+def journal_path(folder: Path) -> Path:
+    """Return the path of a session's journal.
+
+    Raises
+    ------
+    FormatError
+        There is none, or it cannot be looked for.
+    """
     path = folder / JOURNAL_FILE
-    if not path.is_file():
+    if not _is_file(path):
         raise FormatError(
             f"{folder} is no session: it holds no {JOURNAL_FILE}; name a folder made by acquire run or import"
         )
     return path
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk") from error
 
 
 def _codes(colour: Colour) -> str:

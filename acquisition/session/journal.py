@@ -15,20 +15,19 @@ files are really there.
 from __future__ import annotations
 
 import sqlite3
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import astuple
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from acquisition.session.heartbeat import Heartbeat, Process, RunState
 from acquisition.session.journal_file import (
     JOURNAL_VERSION,
+    LockPatience,
     close_after_run,
     create_file,
-    is_busy,
     open_for_run,
     open_to_read,
     reading_error,
@@ -49,14 +48,12 @@ from acquisition.session.records import (
 from drivers.presenter import Colour
 from foundation.errors import FormatError, counted
 
-_T = TypeVar("_T")
-
 JOURNAL_FILE = "journal.sqlite"
 """Name of the journal in a session's folder."""
 
 PATIENCE_S = 600.0
-"""How long a write waits for another program's unless `Journal.be_patient` says otherwise: as long as a run waits for a
-device by default (`sequence.patience_s`)."""
+"""How long a write waits for another program's unless the caller says otherwise: as long as a run waits for a device by
+default (`sequence.patience_s`)."""
 
 
 class Journal:
@@ -70,17 +67,18 @@ class Journal:
         To the same file; the journal closes it.
     version
         Of the file.
-    writes
-        Whether it was opened for a run.
+    patience
+        With which other programs are waited for; None for a reader, for whom SQLite waits.
     """
 
-    def __init__(self, path: Path, connection: sqlite3.Connection, version: int, writes: bool) -> None:
+    def __init__(
+        self, path: Path, connection: sqlite3.Connection, version: int, patience: LockPatience | None = None
+    ) -> None:
         self._path = path
         self._connection = connection
         self._version = version
-        self._writes = writes
-        self._patience_s = PATIENCE_S
-        self._announce: Callable[[str], None] = lambda sentence: None
+        self._writes = patience is not None
+        self._patience = patience or LockPatience(path, 0, lambda sentence: None)
 
     @staticmethod
     def create(path: Path, steps: Sequence[SessionStep]) -> None:
@@ -91,7 +89,8 @@ class Journal:
         StorageError
             The disk is full, read-only or gone.
         """
-        with closing(Journal(path, create_file(path), JOURNAL_VERSION, writes=True)) as journal:
+        alone = LockPatience(path, 0, lambda sentence: None)
+        with closing(Journal(path, create_file(path), JOURNAL_VERSION, alone)) as journal:
             journal.add_steps(steps)
 
     @classmethod
@@ -103,11 +102,26 @@ class Journal:
         FormatError
             It cannot be read, is damaged, or of a version not known here.
         """
-        return cls(path, *open_to_read(path), writes=False)
+        return cls(path, *open_to_read(path))
 
     @classmethod
-    def open_for_run(cls, path: Path) -> Journal:
+    def open_for_run(
+        cls,
+        path: Path,
+        patience_s: float = PATIENCE_S,
+        announce: Callable[[str], None] = lambda sentence: None,
+    ) -> Journal:
         """Open a journal to write it; one of an older version gets what it lacks.
+
+        Parameters
+        ----------
+        path
+            The file.
+        patience_s
+            How long opening, and each write, waits for another program that writes, by the machine's own time;
+            infinite for ever.
+        announce
+            Called with a sentence once for each write that waits.
 
         Raises
         ------
@@ -116,7 +130,8 @@ class Journal:
         StorageError
             It can be read, but not written.
         """
-        return cls(path, open_for_run(path), JOURNAL_VERSION, writes=True)
+        patience = LockPatience(path, patience_s, announce)
+        return cls(path, open_for_run(path, patience), JOURNAL_VERSION, patience)
 
     def close(self) -> None:
         """Release the file; a second call does nothing."""
@@ -126,17 +141,8 @@ class Journal:
             self._connection.close()
 
     def be_patient(self, patience_s: float, announce: Callable[[str], None]) -> None:
-        """Say how long a write waits for another program's, by the machine's own time, and who is told of it.
-
-        Parameters
-        ----------
-        patience_s
-            Seconds; infinite for ever.
-        announce
-            Called with a sentence once for each write that waits.
-        """
-        self._patience_s = patience_s
-        self._announce = announce
+        """Change how long a write waits and who is told; see `open_for_run`."""
+        self._patience = LockPatience(self._path, patience_s, announce)
 
     def steps(self) -> tuple[SessionStep, ...]:
         """Return the plan, in taking order.
@@ -407,7 +413,7 @@ class Journal:
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[Any]:
         """Return all rows at once, so that nothing is held once they are read."""
         try:
-            return self._insist(lambda: self._connection.execute(query, values).fetchall())
+            return self._patience.insist(lambda: self._connection.execute(query, values).fetchall())
         except sqlite3.DatabaseError as error:
             raise reading_error(self._path, error) from error
 
@@ -415,28 +421,15 @@ class Journal:
     def _writing(self) -> Generator[None]:
         """Make what is written inside one transaction, which is on the disk when the block ends."""
         try:
-            self._insist(lambda: self._connection.execute("BEGIN IMMEDIATE"))
+            self._patience.insist(lambda: self._connection.execute("BEGIN IMMEDIATE"))
             yield
-            self._insist(lambda: self._connection.execute("COMMIT"))
+            self._patience.insist(lambda: self._connection.execute("COMMIT"))
         except sqlite3.DatabaseError as error:
             raise writing_error(self._path, error) from error
         finally:
             with suppress(sqlite3.Error):
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
-
-    def _insist(self, attempt: Callable[[], _T]) -> _T:
-        """Return what `attempt` returns, after trying again while another program holds the journal."""
-        begun, told = time.monotonic(), False
-        while True:
-            try:
-                return attempt()
-            except sqlite3.OperationalError as error:
-                if not is_busy(error) or not self._writes or time.monotonic() - begun >= self._patience_s:
-                    raise
-                if not told:
-                    self._announce(f"another program writes {self._path}; the run goes on when it has finished")
-                    told = True
 
 
 def time_text(at: datetime) -> str:

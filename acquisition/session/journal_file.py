@@ -13,15 +13,24 @@ Sources: sqlite.org/wal.html, in particular "Read-Only Databases" and "Disadvant
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import logging
 import shutil
 import sqlite3
 import tempfile
+import time
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from typing import TypeVar
 from urllib.parse import quote
 
 from foundation.errors import FormatError, StorageError
-from foundation.files import storage_error
+from foundation.files import partial_path, storage_error, sync_folder
+
+_T = TypeVar("_T")
+_log = logging.getLogger(__name__)
 
 JOURNAL_VERSION = 2
 """`PRAGMA user_version` of the journals that this software writes (docs/formats.md); version 1 is read."""
@@ -85,8 +94,43 @@ _TABLES[2] = _TABLES[1] | {"checks", "measurements", "timings", "heartbeat", "re
 _CANNOT_IN_PLACE = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
 """What SQLite answers where it would have to write in order to read."""
 
+_NO_LOCKS = {errno.ENOLCK, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EBADF}
+"""What a file system answers that has no locks (fcntl(2); Lustre, FUSE, NFS without its lock service)."""
+
 _NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "ceph", "fuse.glusterfs", "lustre"}
 """File systems on which several machines work and share no memory, as /proc/self/mounts names them."""
+
+
+class LockPatience:
+    """Waits while another program holds the journal.
+
+    Parameters
+    ----------
+    path
+        The journal, for the message.
+    seconds
+        How long one write waits, by the machine's own time; infinite for ever.
+    announce
+        Called with a sentence once for each write that waits.
+    """
+
+    def __init__(self, path: Path, seconds: float, announce: Callable[[str], None]) -> None:
+        self._path = path
+        self._seconds = seconds
+        self._announce = announce
+
+    def insist(self, attempt: Callable[[], _T]) -> _T:
+        """Return what `attempt` returns, after trying it again while another program holds the journal."""
+        begun, told = time.monotonic(), False
+        while True:
+            try:
+                return attempt()
+            except sqlite3.OperationalError as error:
+                if not is_busy(error) or time.monotonic() - begun >= self._seconds:
+                    raise
+                if not told:
+                    self._announce(f"another program holds {self._path}; the run goes on when it has finished")
+                    told = True
 
 
 def is_busy(error: sqlite3.DatabaseError) -> bool:
@@ -129,10 +173,10 @@ def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
         raise reading_error(path, error) from error
 
 
-def open_for_run(path: Path) -> sqlite3.Connection:
+def open_for_run(path: Path, patience: LockPatience) -> sqlite3.Connection:
     """Return a connection that writes, after bringing the journal up to this version and into write-ahead mode.
 
-    The caller holds the session's folder, so that no other run is at work.
+    The caller holds the session's folder, so that no other run is at work. Who else writes is waited for.
 
     Raises
     ------
@@ -142,15 +186,15 @@ def open_for_run(path: Path) -> sqlite3.Connection:
         It can be read, but not written.
     """
     try:
-        connection = _connect(path, "rw")
-        version = _checked(path, connection)
+        connection = patience.insist(lambda: _connect(path, "rw"))
+        version = patience.insist(lambda: _checked(path, connection))
     except (OSError, sqlite3.DatabaseError) as error:
         raise reading_error(path, error) from error
     try:
         if not _on_network(path):
-            connection = _in_write_ahead(path, connection)
+            connection = _in_write_ahead(path, connection, patience)
         if version < JOURNAL_VERSION:
-            _execute_all(connection, _VERSION_2, JOURNAL_VERSION)
+            patience.insist(lambda: _execute_all(connection, _VERSION_2, JOURNAL_VERSION))
     except OSError as error:
         connection.close()
         raise storage_error(path, error) from error
@@ -203,31 +247,54 @@ def _beside(path: Path, suffix: str) -> Path:
 
 
 def _connect(path: Path, mode: str) -> sqlite3.Connection:
+    """Return a connection; without locks where the file system has none."""
+    try:
+        return _connect_with(path, mode)
+    except sqlite3.OperationalError:
+        if not _is_lockless(path):
+            raise
+    _log.warning("%s: this file system has no locks; see to it that no other program writes it", path)
+    return _connect_with(path, f"{mode}&nolock=1")
+
+
+def _connect_with(path: Path, parameters: str) -> sqlite3.Connection:
     connection = sqlite3.connect(
-        f"file:{quote(str(path.absolute()))}?mode={mode}",
+        f"file:{quote(str(path.absolute()))}?mode={parameters}",
         uri=True,
-        timeout=READING_LIMIT_S if mode == "ro" else TRY_S,
+        timeout=READING_LIMIT_S if parameters.startswith("ro") else TRY_S,
         isolation_level=None,
     )
     try:
         # A committed row must survive a power cut: it is what makes a frame count.
         connection.execute("PRAGMA synchronous = FULL")
+        connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchall()
     except sqlite3.DatabaseError:
         connection.close()
         raise
     return connection
 
 
+def _is_lockless(path: Path) -> bool:
+    """Return whether the file system refuses locks altogether.
+
+    Only asked where no connection could be opened: closing a file gives up all locks that the process has on it.
+    """
+    try:
+        with path.open("rb") as stream:
+            fcntl.lockf(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno in _NO_LOCKS
+    return False
+
+
 def _opened_or_copied(path: Path) -> sqlite3.Connection:
     """Return a reader of the file in its place, or of a copy where SQLite would have to write in order to read."""
     try:
-        connection = _connect(path, "ro")
-        connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchall()
+        return _connect(path, "ro")
     except sqlite3.OperationalError as error:
         if _primary_code(error) not in _CANNOT_IN_PLACE:
             raise
         return _copied(path)
-    return connection
 
 
 def _copied(path: Path) -> sqlite3.Connection:
@@ -277,10 +344,19 @@ def _checked(path: Path, connection: sqlite3.Connection) -> int:
 
 def _execute_all(connection: sqlite3.Connection, statements: str, version: int) -> None:
     """Execute statements and set the version, all or nothing."""
-    connection.executescript(f"BEGIN IMMEDIATE; {statements} PRAGMA user_version = {version}; COMMIT;")
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        for statement in statements.split(";"):
+            connection.execute(statement)
+        connection.execute(f"PRAGMA user_version = {version}")
+        connection.execute("COMMIT")
+    except BaseException:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+        raise
 
 
-def _in_write_ahead(path: Path, connection: sqlite3.Connection) -> sqlite3.Connection:
+def _in_write_ahead(path: Path, connection: sqlite3.Connection, patience: LockPatience) -> sqlite3.Connection:
     """Return a connection in write-ahead mode, where the file system allows it.
 
     The mode cannot be changed while somebody reads. A reader who will not end keeps the file that he has, under no
@@ -291,16 +367,19 @@ def _in_write_ahead(path: Path, connection: sqlite3.Connection) -> sqlite3.Conne
     except sqlite3.OperationalError as error:
         if not is_busy(error):
             raise
-        copy = _beside(path, "-copy")
+        copy = partial_path(path)
         copy.unlink(missing_ok=True)
-        connection.execute("BEGIN IMMEDIATE")  # No other writer may be at work meanwhile.
-        with closing(_connect(copy, "rwc")) as target:
-            connection.backup(target)
+        # No other writer may be at work meanwhile.
+        patience.insist(lambda: connection.execute("BEGIN IMMEDIATE"))
+        with closing(_connect(path, "ro")) as source, closing(_connect(copy, "rwc")) as target:
+            source.backup(target)
         connection.execute("ROLLBACK")
         connection.close()
         copy.replace(path)
-        connection = _connect(path, "rw")
-        connection.execute("PRAGMA journal_mode = WAL").fetchall()
+        sync_folder(path.parent)
+        renewed = _connect(path, "rw")
+        renewed.execute("PRAGMA journal_mode = WAL").fetchall()
+        return renewed
     return connection
 
 

@@ -1,83 +1,36 @@
-"""How far a session is, derived from its journal: for the terminal, and for the web page."""
+"""Time as people want to know it: how long a session will still take, and durations in words."""
 
 from __future__ import annotations
 
 import statistics
-from dataclasses import asdict, dataclass
-from datetime import datetime
-
-from acquisition.session.folder import Session
-from acquisition.session.records import ACCEPTED, FAILED, REFUSED
+from collections.abc import Sequence
 
 
-@dataclass(frozen=True)
-class Progress:
-    """A session's state.
+def time_left(intervals: Sequence[float], attempts: int, gained: int, left: int) -> float | None:
+    """Return how long the frames that are left will take, seconds; None while that is unknown.
 
-    Attributes
+    Each frame costs as many attempts as frames have cost lately, retakes and references included; each attempt the
+    median interval, so that a pause does not count for ever.
+
+    Parameters
     ----------
-    total, done
-        Frames of the plan, and those taken and accepted.
-    lights_total, lights_done
-        The same of the lights alone.
-    refused, failed
-        Attempts whose frame was judged unfit, and attempts that gave no frame.
-    refusals
-        Of the steps still without an accepted frame: the last reason of each, oldest first.
-    seconds_per_frame
-        Median time of an accepted attempt by the lab's clock; None before the first.
-    last_frame_at
-        When the newest frame was released; None before the first.
+    intervals
+        Seconds from one attempt to the next, of the newest attempts.
+    attempts, gained
+        How many of the newest attempts there are, and how many of them gave a frame that was accepted.
+    left
+        Steps without an accepted frame.
+
+    Examples
+    --------
+    >>> time_left([5.0, 5.0, 300.0, 5.0], attempts=6, gained=4, left=10)
+    75.0
     """
-
-    total: int
-    done: int
-    lights_total: int
-    lights_done: int
-    refused: int
-    failed: int
-    refusals: tuple[str, ...]
-    seconds_per_frame: float | None
-    last_frame_at: datetime | None
-
-    @property
-    def remaining_s(self) -> float | None:
-        """Time left by the lab's clock, seconds; None while it is unknown."""
-        return None if self.seconds_per_frame is None else self.seconds_per_frame * (self.total - self.done)
-
-    def as_json(self) -> dict[str, object]:
-        """Return the values with their names, times as ISO 8601 text."""
-        last = self.last_frame_at.isoformat() if self.last_frame_at else None
-        return {**asdict(self), "last_frame_at": last, "remaining_s": self.remaining_s}
-
-
-def session_progress(session: Session) -> Progress:
-    """Return how far `session` is on its plan."""
-    steps = session.steps
-    done = session.done_steps()
-    attempts = session.journal.attempts()
-    durations = [
-        (attempt.ended_at - attempt.started_at).total_seconds()
-        for attempt in attempts
-        if attempt.ended_at is not None and attempt.verdict == ACCEPTED
-    ]
-    last_reason = {
-        attempt.step: f"{attempt.file}: {attempt.reason}"
-        for attempt in attempts
-        if attempt.reason and attempt.step not in done
-    }
-    frames = session.frames()
-    return Progress(
-        total=len(steps),
-        done=len(done & {step.number for step in steps}),
-        lights_total=sum(step.kind == "light" for step in steps),
-        lights_done=sum(step.kind == "light" and step.number in done for step in steps),
-        refused=sum(attempt.verdict == REFUSED for attempt in attempts),
-        failed=sum(attempt.verdict == FAILED for attempt in attempts),
-        refusals=tuple(last_reason.values()),
-        seconds_per_frame=statistics.median(durations) if durations else None,
-        last_frame_at=max((frame.taken_at for frame in frames), default=None),
-    )
+    if not left:
+        return 0.0
+    if not intervals or not gained:
+        return None
+    return statistics.median(intervals) * attempts / gained * left
 
 
 def duration_text(seconds: float | None) -> str:

@@ -78,7 +78,7 @@ def test_how_the_session_stands_is_told_to_scripts(opened: MonitorServer) -> Non
     assert (told["done"], told["total"]) == (2, 8)
     assert (told["lights_done"], told["lights_total"]) == (0, 4)
     assert told["refused"] == 1
-    assert told["remaining_s"] == pytest.approx(6 * 5, abs=1)
+    assert told["remaining_s"] == pytest.approx(6 * 5 * 3 / 2, abs=1), "two of three attempts gave a frame"
 
 
 def test_the_page_stands_alone_and_holds_no_markup_of_the_session(opened: MonitorServer) -> None:
@@ -100,8 +100,7 @@ def test_the_state_has_what_the_page_draws(opened: MonitorServer, run: MadeUpRun
     refused = state["frames"][2]
     assert refused["verdict"] == "refused"
     assert refused["reason"] == f"{SCRIPT} in the light"
-    assert refused["checks"]["light"] == [8.0, None, 1.0, f"{SCRIPT} in the light"]
-    assert state["units"]["light"] == "%"
+    assert ["light", "°", 8.0, None, 1.0, f"{SCRIPT} in the light"] in refused["checks"]
     # Red at full, green by its crosstalk: the camera sees the red light less red than its codes.
     assert refused["seen_at"][0] < 1
     assert b"<script" not in ask(opened, "/state.json")[2]

@@ -1,0 +1,130 @@
+"""What `acquire status` says of a session: whether it lives, how far it is, what was measured last, what went wrong.
+
+It says what the page of `acquire monitor` says, from the same look at the journal, in lines for a terminal and as
+values for programs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import datetime
+from typing import Any
+
+from acquisition.monitor.head import Head
+from acquisition.monitor.reading import SessionView
+from acquisition.monitor.rows import AttemptView
+from acquisition.session.judgement import Check
+from acquisition.session.progress import duration_text
+from acquisition.session.records import ACCEPTED
+
+LAST = 5
+"""Verdicts, and events, that are shown: chosen, a screen has room for them beside the rest."""
+
+
+def status_lines(view: SessionView, now: datetime) -> list[str]:
+    """Return a session's state for people, line by line.
+
+    Parameters
+    ----------
+    view
+        The session as read.
+    now
+        The machine's wall clock.
+    """
+    head = view.head(now)
+    lines = [
+        f"state   {_state(head)}",
+        f"frames  {head.done} of {head.total}",
+        f"lights  {head.lights_done} of {head.lights_total}",
+        f"left    {_left(head)}",
+        f"refused {head.refused}, failed {head.failed}, voided {head.voided}",
+    ]
+    if (drift := _white_drift(view)) is not None:
+        lines.append(f"white   {drift:+.2%} since the first white frame")
+    lines += [f"  {_check_text(check)}" for check in _newest_checks(view).values()]
+    judged = [attempt for attempt in view.attempts if attempt.verdict is not None]
+    lines += _block("last verdicts", [_verdict_text(attempt) for attempt in judged[-LAST:]])
+    lines += _block("without an accepted frame", list(_open_reasons(view).values()))
+    return lines + _block(
+        "last events", [f"{event.at:%Y-%m-%d %H:%M:%S} {event.what}: {event.detail}" for event in view.events[-LAST:]]
+    )
+
+
+def status_json(view: SessionView, now: datetime) -> dict[str, Any]:
+    """Return a session's state for programs: the fields of `Head`, and what was measured and refused; times as text."""
+    head = view.head(now)
+    values = {name: value.isoformat() if isinstance(value, datetime) else value for name, value in asdict(head).items()}
+    if not head.alive:
+        values["remaining_s"] = None
+    return values | {
+        "name": view.name,
+        "white_drift": _white_drift(view),
+        "checks": {name: asdict(check) for name, check in _newest_checks(view).items()},
+        "without_accepted_frame": _open_reasons(view),
+        "events": [{"at": event.at.isoformat(), "what": event.what, "detail": event.detail} for event in view.events],
+    }
+
+
+def _state(head: Head) -> str:
+    """Return what the run does, without saying it twice."""
+    if not head.sentence or head.sentence.startswith(head.state):
+        return head.sentence or head.state
+    return f"{head.state}: {head.sentence}"
+
+
+def _left(head: Head) -> str:
+    """Return the time left; none of a run that is not at work."""
+    if head.done == head.total:
+        return "nothing"
+    if not head.alive:
+        return f"{head.total - head.done} frames; no run is at work"
+    ready = f", ready at {head.eta.astimezone():%H:%M}" if head.eta is not None else ""
+    return f"{duration_text(head.remaining_s)}{ready}"
+
+
+def _white_drift(view: SessionView) -> float | None:
+    """Return how much brighter the newest accepted white frame is than the first, 0 for equal; None without two."""
+    white_steps = {step.number for step in view.steps if step.kind == "white"}
+    seen = [
+        attempt.seen
+        for attempt in view.attempts
+        if attempt.step in white_steps and attempt.verdict == ACCEPTED and attempt.seen is not None
+    ]
+    return sum(seen[-1]) / sum(seen[0]) - 1 if len(seen) > 1 and sum(seen[0]) > 0 else None
+
+
+def _newest_checks(view: SessionView) -> Mapping[str, Check]:
+    """Return the newest check of each name that has a number."""
+    return {check.name: check for attempt in view.attempts for check in attempt.checks if check.value is not None}
+
+
+def _open_reasons(view: SessionView) -> dict[int, str]:
+    """Return the last reason of each step that has no accepted frame, by step, oldest first."""
+    done = {attempt.step for attempt in view.attempts if attempt.verdict == ACCEPTED}
+    return {
+        attempt.step: f"{attempt.file}: {attempt.reason}"
+        for attempt in view.attempts
+        if attempt.reason and attempt.step not in done
+    }
+
+
+def _verdict_text(attempt: AttemptView) -> str:
+    return f"{attempt.file}: {attempt.verdict}{': ' if attempt.reason else ''}{attempt.reason}"
+
+
+def _check_text(check: Check) -> str:
+    """Return what was found and what is allowed."""
+    unit = f" {check.unit}" if check.unit else ""
+    limits = {
+        (False, False): "",
+        (False, True): f", at most {check.high}",
+        (True, False): f", at least {check.low}",
+        (True, True): f", {check.low} to {check.high}",
+    }[check.low is not None, check.high is not None]
+    return f"{check.name} {check.value:.4g}{unit}{limits}"
+
+
+def _block(title: str, lines: list[str]) -> list[str]:
+    """Return lines under a title; nothing where there are none."""
+    return [f"{title}:", *(f"  {line}" for line in lines)] if lines else []

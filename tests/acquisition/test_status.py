@@ -1,0 +1,90 @@
+"""What `acquire status` says: of a run at work, one that paused, one that was killed, one that is complete."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from acquisition.cli import main
+from acquisition.session.judgement import Check
+from tests.acquisition.monitor.made_up import MadeUpRun
+
+ENDED = """
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from acquisition.session.journal import Journal
+journal = Journal.open_for_run(Path(sys.argv[1]) / "journal.sqlite")
+journal.beat("running", "taking frames", datetime.now(UTC) + timedelta(hours=1))
+"""
+"""A run that gives a sign of life and is gone without a word; the next sign would be due in an hour."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a session of eight frames of 5 s, of which four are there and one was refused once, once for good."""
+    run = MadeUpRun.begin(tmp_path / "night")
+    try:
+        for number, step in enumerate(run.steps[:5]):
+            if number == 2:
+                run.take(step, "the light is 8.2 % off", value=8.2)
+            if number == 4:
+                run.take(step, "the chart has moved by 3.1 px, 0.5 px allowed", check="movement", value=3.1)
+            else:
+                run.take(step)
+    finally:
+        run.journal.close()
+    return tmp_path / "night"
+
+
+def say(folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(["status", str(folder)]) == 0
+    return capsys.readouterr().out
+
+
+def test_a_run_at_work(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = say(folder, capsys)
+    assert "state   running: taking 8 frames\n" in told
+    assert "frames  4 of 8\nlights  2 of 4\n" in told
+    # Six attempts, 5 s each, gave four frames, so that the four that are left take six more.
+    assert "left    30 s" in told
+    assert "refused 2, failed 0, voided 0\n" in told
+    assert "  movement 3.1 px, at most 0.5\n" in told
+    assert "frames/0004_light" in told.split("without an accepted frame:")[1].split("last events:")[0]
+    assert "refused: the light is 8.2 % off" in told.split("last verdicts:")[1]
+    assert "8.2 %" not in told.split("without an accepted frame:")[1], "that light was taken again"
+
+
+def test_a_killed_run_has_no_time_left(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    subprocess.run([sys.executable, "-c", ENDED, str(folder)], check=True)
+    told = say(folder, capsys)
+    assert "state   stopped at 20" in told
+    assert "killed or power lost: run the same command again\n" in told
+    assert "left    4 frames; no run is at work\n" in told
+    assert main(["status", "--json", str(folder)]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert (values["state"], values["alive"], values["remaining_s"]) == ("stopped", False, None)
+
+
+def test_values_for_programs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["status", "--json", str(folder)]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert (values["total"], values["done"], values["refused"], values["state"]) == (8, 4, 2, "running")
+    assert Check(**values["checks"]["movement"]).high == 0.5
+    assert list(values["without_accepted_frame"]) == ["4"]
+    assert values["events"][0]["what"] == "start"
+
+
+def test_status_changes_nothing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
+    say(folder, capsys)
+    assert {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()} == before
+
+
+def test_what_is_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["status", str(tmp_path)]) == 2
+    assert "is no session: it holds no journal.sqlite" in capsys.readouterr().err
