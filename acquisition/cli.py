@@ -227,15 +227,15 @@ def run(
     """
     from acquisition.config import load_lab
     from acquisition.run.run import run_session
-    from foundation.console import progress
+    from acquisition.run.terminal import Terminal
 
     settings = load_lab(lab)
     if dry_run:
         _print_plan(settings, session, retake)
         return
-    with orderly_end() as ending, progress("frames") as advance:
+    with orderly_end() as ending, Terminal() as shown:
         outcome = run_session(
-            settings, session, advance, lambda sentence: print(sentence, file=sys.stderr), retake, ending
+            settings, session, shown.progress, shown.announce, retake, ending, shown.taken, shown.state
         )
     if not outcome.complete:
         raise QualityError(

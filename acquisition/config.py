@@ -154,6 +154,9 @@ class JudgeSettings(_Settings):
 
     chart: bool = True
     """Whether the chart is looked for in the frames: false for a bare wall, of which only the light is judged."""
+    response: bool = True
+    """Whether a session begins with the projector's primaries and greys, by which the light of all codes is foretold:
+    false saves some twenty frames, and lights are then held against less."""
     moved_px: NotNegative = 0.2
     """Largest displacement of the chart since the first white frame, px: ten times the error of the measurement on a
     dark frame (0.02 at 66 counts), and below 0.3, about the margin that the 25 samples of a cell have."""

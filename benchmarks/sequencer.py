@@ -9,11 +9,11 @@
 
 ``python -m benchmarks.sequencer quick`` takes a tenth of the frames in simulated time.
 
-The unavoidable time of a frame is release, exposure and readout, and then the longer of settling and download: a body does
-not expose while it sends, and the light may change when it has announced the frame. What is flattered: files are
-prepared (two, a dark and a lit one), cable and body do their work without a processor of this machine,
-the latencies are constants, and no frame is refused. In simulated time work of this machine takes none; the figures in
-real time have it.
+The unavoidable time of a frame is release, exposure and readout, and then the longer of settling and download: a body
+does not expose while it sends, and the light may change when it has announced the frame. What is flattered: files are
+prepared (two, a dark and a lit one, with the slices of a 550D and without its previews), cable and body do their work
+without a processor of this machine, the latencies are constants, and no frame is refused. In simulated time work of
+this machine takes none; the figures in real time have it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -39,8 +39,8 @@ from acquisition.config import LabSettings, SequenceSettings
 from acquisition.judge.exposure import ExposureJudge
 from acquisition.lights.illuminations import Illumination, plan_illuminations
 from acquisition.run.devices import Devices
-from acquisition.run.taking.pipeline import Taken
 from acquisition.run.sequencer import take_session
+from acquisition.run.taking.pipeline import Taken
 from acquisition.session.folder import Session
 from acquisition.session.journal import Journal
 from acquisition.session.plan import plan_steps
@@ -292,19 +292,21 @@ def report_session(name: str, measured: Measured) -> None:
     frames = measured.frames
     report(f"{name}: frames", frames, "frames")
     report(f"{name}: seconds a frame", measured.taken_s / frames, "s")
-    report(f"{name}: unavoidable", measured.unavoidable_s / frames, "s", "exposure and the longer of settling, download")
+    report(
+        f"{name}: unavoidable", measured.unavoidable_s / frames, "s", "exposure and the longer of settling, download"
+    )
     report(f"{name}: efficiency", measured.efficiency, "ratio", "unavoidable time over time taken")
     for part, seconds in measured.timings.items():
         report(f"{name}: median of {part}", seconds, "s")
 
 
 @contextmanager
-def counted_writes() -> Iterator[list[float]]:
+def counted_writes() -> Generator[list[float]]:
     """Collect the seconds of each write to the journal."""
     spent: list[float] = []
     real = {name: getattr(Journal, name) for name in ("begin", "commit", "beat", "note")}
 
-    def timed(name: str):  # noqa: ANN202  # pyright: ignore
+    def timed(name: str):  # pyright: ignore
         def call(*given: object, **named: object) -> object:
             begun = time.perf_counter()
             try:

@@ -1,14 +1,14 @@
-"""Kills of a run at random operations and times: whatever they hit, the session ends in the frames of an undisturbed one.
+"""Kills of a run at random operations and times: the session ends in the frames of an undisturbed one.
 
-`python -m benchmarks.session_kills [KILLS [SEED]]` kills 10 000 runs and prints one JSON object a line. Each run is a process
-of its own that is killed by the system (SIGKILL): half of them at the n-th operation (a call that writes, flushes,
-renames, journals, shows, exposes or fetches; before or after it), half of them by a timer at any moment. After a few
-kills a session is taken to its end, and its frames, the accepted rows of its journal and `frames.csv` are compared with
-those of an undisturbed run: names, bytes, hashes, times.
+`python -m benchmarks.session_kills [KILLS [SEED]]` kills 10 000 runs and prints one JSON object a line. Each run is a
+process of its own that is killed by the system (SIGKILL): half of them at the n-th operation (a call that writes,
+flushes, renames, journals, shows, exposes or fetches; before or after it), half of them by a timer at any moment. After
+a few kills a session is taken to its end, and its frames, the accepted rows of its journal and `frames.csv` are
+compared with those of an undisturbed run: bytes, hashes, times. A table follows from these alone.
 
-Camera and screen are the simplest that keep the contracts; their files are the light, its number and the time of release,
-so that a frame that is lost, doubled or of another moment differs. What is flattered: a kill is no power cut (what was
-written and not flushed stays), and the files are small.
+Camera and screen are the simplest that keep the contracts; their files are the light, its number and the time of
+release, so that a frame that is lost, doubled or of another moment differs. What is flattered: a kill is no power cut
+(what was written and not flushed stays), and the files are small.
 """
 
 from __future__ import annotations
@@ -151,11 +151,11 @@ def counting(happens: Callable[[int], object]) -> None:
 
     def counted(real: Callable[..., Any]) -> Callable[..., Any]:
         def call(*given: Any, **named: Any) -> Any:
-            for part in (0, 1):
-                count[0] += 1
-                happens(count[0])
-                if part == 0:
-                    result = real(*given, **named)
+            count[0] += 1
+            happens(count[0])
+            result = real(*given, **named)
+            count[0] += 1
+            happens(count[0])
             return result
 
         return call
@@ -172,8 +172,8 @@ def in_child(work: Callable[[], object]) -> int:
         try:
             work()
             code = 0
-        except BaseException:
-            sys.excepthook(*sys.exc_info())
+        except BaseException as error:
+            sys.excepthook(type(error), error, error.__traceback__)
         finally:
             os._exit(code)
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])

@@ -8,11 +8,14 @@ from pathlib import Path
 
 from acquisition.chart.model import load_chart
 from acquisition.config import LabSettings
+from acquisition.judge.judge import LiveJudge
 from acquisition.lights.illuminations import load_illuminations
 from acquisition.run.planning.dry_run import checked_plan
 from acquisition.run.planning.work import planned_steps, require_same
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
+from acquisition.run.taking.pipeline import Taken
+from acquisition.run.taking.resuming import check_frames, require_same_devices, tie
 from acquisition.session.folder import Session, session_exists
 from foundation.console import Ending
 from foundation.errors import InputError
@@ -21,10 +24,12 @@ from foundation.errors import InputError
 def run_session(
     settings: LabSettings,
     folder: Path,
-    observe: Callable[[int, int], None],
-    announce: Callable[[str], None] = lambda sentence: None,
+    observe: Callable[[int, int], object],
+    announce: Callable[[str], object] = lambda sentence: None,
     retake: str | None = None,
     ending: Ending | None = None,
+    taken: Callable[[Taken], object] = lambda taken: None,
+    state: Callable[[str], object] = lambda sentence: None,
 ) -> RunOutcome:
     """Take the session `folder`, new or interrupted, with the rig that the settings name.
 
@@ -33,11 +38,15 @@ def run_session(
     observe
         Called with frames done and in all, once at the start and after each frame.
     announce
-        Called with a sentence when the run waits, tries again, pauses and goes on.
+        Called with a sentence when a frame is refused, and when the run waits, tries again, pauses and goes on.
     retake
         What to take again (`Session.retake`); nothing if None.
     ending
         By which the run learns that it is to end after the running frame.
+    taken
+        Called with each frame when its verdict is known.
+    state
+        Called now and then with what the run does that takes long; the newest holds.
 
     Raises
     ------
@@ -45,9 +54,15 @@ def run_session(
         The settings are not those that the session was begun with, or the folder holds something else.
     CropError
         The plan cannot be brought to its end (`RunPlan.require`): a disk that is too small, for one. Nothing has moved.
-    DeviceError, StorageError
+    DeviceRefused
+        Another camera or projector is connected than the session was begun with.
+    DeviceError, QualityError, StorageError
         See `acquisition.run.sequencer.take_session`; the session can be taken up again.
     """
+
+    def checking(done: int, total: int) -> None:
+        state(f"checking frame {done} of {total}")
+
     with ExitStack() as opened:
         session = opened.enter_context(_taken_up(settings, folder)) if session_exists(folder) else None
         if session is None and retake is not None:
@@ -55,6 +70,7 @@ def run_session(
         if session is not None:
             if retake is not None:
                 session.retake(retake)
+            check_frames(session, checking, announce)
             total = len(session.steps)
             if len(session.done_steps()) == total:
                 observe(total, total)
@@ -64,16 +80,19 @@ def run_session(
         checked_plan(settings, folder, session, devices)
         if session is None:
             session = opened.enter_context(_begun(settings, folder))
+        require_same_devices(session, devices, settings)
+        first = tie(session)
         total = len(session.steps)
         observe(len(session.done_steps()), total)
-        return take_session(
-            session,
-            devices,
-            settings,
-            observe=lambda taken: observe(total - taken.left, total),
-            announce=announce,
-            ending=ending,
-        )
+
+        def count(frame: Taken) -> None:
+            taken(frame)
+            # A reference may have been put behind the plan.
+            total = len(session.steps)
+            observe(total - frame.left, total)
+
+        judge = LiveJudge(settings, session.chart, session.illuminations)
+        return take_session(session, devices, settings, judge, count, announce, state, ending, first)
 
 
 def open_session(settings: LabSettings, folder: Path) -> Session:

@@ -13,21 +13,26 @@ from datetime import UTC, datetime, timedelta
 
 from acquisition.config import LabSettings
 from acquisition.judge.exposure import ExposureJudge
-from acquisition.run.taking.agenda import Agenda, unclosed_kinds
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import make_ready
+from acquisition.run.notices import Notices
 from acquisition.run.patience import Patience
+from acquisition.run.taking.agenda import Agenda, unclosed_kinds
 from acquisition.run.taking.pipeline import Pipeline, Taken
 from acquisition.run.taking.saving import Saver
 from acquisition.session.folder import Session
 from acquisition.session.heartbeat import RunState
 from acquisition.session.judgement import FrameJudge
-from acquisition.session.records import ACCEPTED, VOIDED
 from acquisition.session.plan import FrameKind, SessionStep
+from acquisition.session.records import ACCEPTED, VOIDED
 from drivers.camera import keep_awake
 from drivers.presenter import BLACK, WHITE
+from foundation.clock import Clock
 from foundation.console import Ending
 from foundation.errors import StorageError
+
+NOTIFIED = ("paused", "resumed")
+"""Words of a run's reports that are told to whoever is notified; its end is, in any case."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ def take_session(
     ending
         By which the run learns that it is to end after the running frame; None for a run that nobody asks.
     first
-        Numbers of steps that are taken before all others (`acquisition.run.resuming.tie`).
+        Numbers of steps that are taken before all others (`acquisition.run.taking.resuming.tie`).
 
     Raises
     ------
@@ -91,33 +96,96 @@ def take_session(
     KeyboardInterrupt
         The end was asked for by `ending`; the frames that were under way are in the journal.
     """
-    clock, journal = devices.clock, session.journal
-
-    def report(what: str, sentence: str, /) -> None:
-        announce(f"{what}: {sentence}")
-        if what != VOIDED:  # the journal notes that with the rows that it changes
-            journal.note(clock.now(), what, sentence)
-
-    def beat(what: str, sentence: str, within_s: float, /) -> None:
-        doing: RunState = "paused" if what == "paused" else "waiting" if what == "waiting" else "running"
-        journal.beat(doing, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
-        if doing != "running":
-            state(sentence)
-
-    patience = Patience(clock, settings.sequence.patience_s, report, lambda: keep_awake(devices.camera), beat)
+    notices = Notices(settings.sequence.notify, session.folder.name, announce)
+    telling = _Telling(session, devices.clock, announce, state, notices)
     asked = ending or Ending()
+    try:
+        outcome = _taken(session, devices, settings, judge, observe, telling, asked, first)
+        if asked.asked and not outcome.complete:
+            raise KeyboardInterrupt
+    except BaseException as error:
+        # It is derived, and made anew at the next opening: the fault that is there counts.
+        with suppress(StorageError):
+            session.write_frames_csv()
+        telling.ended(
+            "interrupted" if isinstance(error, KeyboardInterrupt) else "ended", str(error) or "by the operator"
+        )
+        raise
+    else:
+        session.write_frames_csv()
+        left = f"{outcome.left} of {outcome.total} frames left"
+        telling.ended("complete" if outcome.complete else "incomplete", "; ".join([left, *outcome.refused]))
+    finally:
+        notices.close()
+    return outcome
+
+
+class _Telling:
+    """Where words of a run go: terminal, journal, whoever is notified."""
+
+    def __init__(
+        self,
+        session: Session,
+        clock: Clock,
+        announce: Callable[[str], object],
+        state: Callable[[str], object],
+        notices: Notices,
+    ) -> None:
+        self._journal = session.journal
+        self._clock = clock
+        self._announce = announce
+        self._state = state
+        self._notices = notices
+
+    def report(self, what: str, sentence: str, /) -> None:
+        """Tell what happens."""
+        self._announce(f"{what}: {sentence}")
+        if what in NOTIFIED:
+            self._notices.tell(what, sentence, datetime.now(UTC))
+        if what != VOIDED:  # the journal notes that with the rows that it changes
+            self._journal.note(self._clock.now(), what, sentence)
+
+    def beat(self, what: str, sentence: str, within_s: float, /) -> None:
+        """Leave a sign of life."""
+        doing: RunState = "paused" if what == "paused" else "waiting" if what == "waiting" else "running"
+        if doing != "running":
+            self._state(sentence)
+        self._journal.beat(doing, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
+
+    def ended(self, how: str, sentence: str) -> None:
+        """Note why the run is over; a disk that cannot take that is told of already."""
+        self._notices.tell(how, sentence, datetime.now(UTC))
+        with suppress(StorageError):
+            self._journal.note(self._clock.now(), how, sentence)
+            self._journal.beat("ended", f"{how}: {sentence}", datetime.now(UTC))
+
+
+def _taken(
+    session: Session,
+    devices: Devices,
+    settings: LabSettings,
+    judge: FrameJudge | None,
+    observe: Callable[[Taken], object],
+    telling: _Telling,
+    ending: Ending,
+    first: Sequence[int],
+) -> RunOutcome:
+    """Make the devices ready, and take what is open."""
+    clock, journal = devices.clock, session.journal
+    patience = Patience(
+        clock, settings.sequence.patience_s, telling.report, lambda: keep_awake(devices.camera), telling.beat
+    )
     for stray in session.set_aside_strays():
-        report("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
-    taken = [attempt.kind for attempt in journal.attempts() if attempt.verdict == ACCEPTED]
+        telling.report("stray", f"{stray.name}: complete, but not in the journal; kept, not used")
 
     def append(kind: FrameKind) -> SessionStep:
         step = SessionStep(session.steps[-1].number + 1, kind, None, WHITE if kind == "white" else BLACK)
         session.add_steps([step])
         return step
 
-    agenda = Agenda(
-        session.steps, session.done_steps(), settings.sequence.attempts, first, unclosed_kinds(taken), append
-    )
+    taken = [attempt.kind for attempt in journal.attempts() if attempt.verdict == ACCEPTED]
+    attempts = settings.sequence.attempts
+    agenda = Agenda(session.steps, session.done_steps(), attempts, first, unclosed_kinds(taken), append)
     if not len(agenda):
         return RunOutcome(len(session.steps), 0, ())
     journal.note(clock.now(), "start", f"{len(agenda)} of {len(session.steps)} frames to take")
@@ -125,21 +193,11 @@ def take_session(
     used = judge or ExposureJudge(settings)
     for step, _, measurement, accepted in journal.measurements():
         used.recall(step, measurement, accepted)
-    try:
-        if devices.projector is not None:
-            make_ready(devices.projector, settings.sequence, patience)
-        with Saver(session, used) as saver:
-            Pipeline(session, devices, settings, agenda, saver, patience, observe, asked).run()
-    except BaseException:
-        # It is derived, and made anew at the next opening: the fault that is there counts.
-        with suppress(StorageError):
-            session.write_frames_csv()
-        raise
-    session.write_frames_csv()
+    if devices.projector is not None:
+        make_ready(devices.projector, settings.sequence, patience)
+    with Saver(session, used) as saver:
+        Pipeline(session, devices, settings, agenda, saver, patience, observe, ending).run()
     outcome = RunOutcome(len(session.steps), len(agenda), agenda.given_up)
     if outcome.complete and settings.sequence.switch_off and devices.projector is not None:
         devices.projector.switch_off()
-    journal.note(clock.now(), "complete" if outcome.complete else "incomplete", f"{outcome.left} frames left")
-    if asked.asked and not outcome.complete:
-        raise KeyboardInterrupt
     return outcome

@@ -1,7 +1,7 @@
 """A run on the terminal: how far it is, the last verdict, the drift, the true time left, and what it waits for.
 
-Lines that must stay (a refusal, a pause) are printed above a bar that is drawn anew; where the terminal is none, only the
-lines are printed.
+Lines that must stay (a refusal, a pause) are printed above a bar that is drawn anew; where the terminal is none, only
+the lines are printed.
 """
 
 from __future__ import annotations

@@ -24,6 +24,8 @@ LAB = """
 rig = "simulated"
 chart = "chart.json"
 illuminations = "illuminations.csv"
+[judge]
+response = false
 [sequence]
 reference_every = 2
 [simulated]

@@ -1,4 +1,4 @@
-"""A hundred sessions of twenty lights with several mishaps each, of every kind: most complete at once, all in the end."""
+"""A hundred sessions of twenty lights with mishaps of every kind: most complete at once, all of them in the end."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from acquisition.chart.model import Chart, load_chart
 from acquisition.config import LabSettings, parse_lab
 from acquisition.lights.illuminations import Illumination, load_illuminations
 from acquisition.session.folder import Session, session_exists
-from acquisition.session.plan import SessionStep, plan_steps
+from acquisition.session.plan import RESPONSE, SessionStep, plan_steps
 from drivers.presenter import BLACK
 from foundation.errors import ConfigurationError
 from foundation.hashing import file_sha256
@@ -73,7 +73,8 @@ class Work:
 def planned_steps(settings: LabSettings, lights: Sequence[Illumination]) -> tuple[SessionStep, ...]:
     """Return the frames of a new session, in the order that the settings ask for."""
     sequence = settings.sequence
-    return plan_steps(lights, sequence.reference_every, seed=sequence.seed if sequence.order == "shuffled" else None)
+    seed = sequence.seed if sequence.order == "shuffled" else None
+    return plan_steps(lights, sequence.reference_every, seed=seed, response=RESPONSE if settings.judge.response else ())
 
 
 def outline(settings: LabSettings, folder: Path) -> Work:

@@ -1,7 +1,7 @@
 """Which frame is taken next: the plan's open steps, what must be taken again, and what closes a run.
 
-A value that changes: no device, no clock, no file. The pipeline (`acquisition.run.taking.pipeline`) asks it for the next step
-and tells it how each ended.
+A value that changes: no device, no clock, no file. The pipeline (`acquisition.run.taking.pipeline`) asks it for the
+next step and tells it how each ended.
 
 Rules that hold inside:
 
@@ -65,7 +65,7 @@ class Agenda:
         self._unclosed: set[str] = set(unclosed)
         self._append = append
         planned = {step.kind for step in steps}
-        self._closing = [kind for kind in REFERENCES if kind in planned]
+        self._closing: list[FrameKind] = [kind for kind in REFERENCES if kind in planned]
 
     def __len__(self) -> int:
         """Return how many steps are without an accepted frame, given up or under way included."""

@@ -1,4 +1,4 @@
-"""A session in a lab in which several things go wrong once each, chosen by a seed: body, cable, screen, projector, disk.
+"""A session in a lab in which several things go wrong once each, by a seed: body, cable, screen, projector, disk.
 
 The camera's files say which colour was on the screen and how many exposures there were before, so that a frame that is
 lost, taken for another, or counted twice is seen.
@@ -204,8 +204,8 @@ def hangs(lab: TroubledLab) -> None:
 
 
 def falsifies(lab: TroubledLab) -> None:
-    change = lab.chance.choice((lambda data: data[:-1], lambda data: data + b"more", lambda data: b""))
-    lab.device = faults.Falsifying(lab.device, change, lab.occasion())
+    keep, more = lab.chance.choice(((slice(-1), b""), (slice(None), b"more"), (slice(0), b"")))
+    lab.device = faults.Falsifying(lab.device, lambda data: data[keep] + more, lab.occasion())
 
 
 def restarts(lab: TroubledLab) -> None:

@@ -13,8 +13,8 @@ import pytest
 
 from acquisition.lights.illuminations import Illumination
 from acquisition.run.patience import PAUSE_S
-from acquisition.run.taking.pipeline import Taken
 from acquisition.run.sequencer import RunOutcome, take_session
+from acquisition.run.taking.pipeline import Taken
 from acquisition.session.folder import Session
 from acquisition.session.judgement import Check, Judgement
 from acquisition.session.plan import SessionStep

@@ -340,7 +340,7 @@ def lab(tmp_path: Path) -> Path:
     path = tmp_path / "LAB.toml"
     path.write_text(
         'rig = "simulated"\nchart = "chart.json"\nilluminations = "lights.csv"\n[simulated]\nbody = "Test"\n'
-        '[sequence]\nnotify = "https://ntfy.example/s3cret"\n'
+        '[judge]\nresponse = false\n[sequence]\nnotify = "https://ntfy.example/s3cret"\n'
     )
     return path
 

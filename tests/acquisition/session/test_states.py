@@ -15,10 +15,10 @@ from acquisition.chart.layout import design_chart
 from acquisition.config import LabSettings
 from acquisition.judge.exposure import ExposureJudge
 from acquisition.lights.illuminations import Illumination
-from acquisition.run.taking.agenda import Agenda
 from acquisition.run.devices import Devices
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import take_session
+from acquisition.run.taking.agenda import Agenda
 from acquisition.session import records
 from acquisition.session.folder import Session
 from acquisition.session.incoming import IncomingFile, ReceivedFile

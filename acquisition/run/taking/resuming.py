@@ -21,7 +21,7 @@ from acquisition.session.records import ACCEPTED, Attempt
 from drivers.camera import CameraIdentity
 from drivers.projector import ProjectorIdentity
 from foundation.errors import DeviceRefused, first_of
-from foundation.version import software_version
+from foundation.version import software
 
 
 def check_frames(
@@ -66,15 +66,17 @@ def require_same_devices(session: Session, devices: Devices, settings: LabSettin
         names["projector"] = _projector_name(devices.projector.identity())
     if settings.rig == "lab":
         light = settings.lab.light
-        names["screen"] = " ".join(str(part) for part in (light.shown_by, light.display, light.host) if part is not None)
+        names["screen"] = " ".join(
+            str(part) for part in (light.shown_by, light.display, light.host) if part is not None
+        )
     for what, name in names.items():
         before = known.get(what, name)
         if before != name:
             raise DeviceRefused(
-                f"{session.folder} was begun with the {what} {before}, and now there is {name}: frames of both would not "
-                f"make one table; connect the {what} of before, or begin a new session"
+                f"{session.folder} was begun with the {what} {before}, and now there is {name}: frames of both would "
+                f"not make one table; connect the {what} of before, or begin a new session"
             )
-    for what, name in {**names, "software": software_version()}.items():
+    for what, name in {**names, "software": software()}.items():
         if known.get(what) != name:
             session.journal.record(what, name)
 

@@ -1,0 +1,154 @@
+"""A session that is taken up again: its files, its devices, and what ties it to what was taken before."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from acquisition.config import LabSettings
+from acquisition.lights.illuminations import Illumination
+from acquisition.run.sequencer import take_session
+from acquisition.run.taking.resuming import check_frames, require_same_devices, tie
+from acquisition.session.folder import Session
+from acquisition.session.journal import Journal
+from acquisition.session.plan import plan_steps, tie_steps
+from drivers.camera import CameraIdentity
+from drivers.presenter import Colour
+from drivers.projector import ProjectorIdentity
+from foundation.console import Ending
+from foundation.errors import DeviceRefused
+from tests.acquisition.run.scripted import LIGHTS, SETTINGS, Lab
+
+RESPONSE = (Colour(250, 0, 0), Colour(0, 250, 0))
+TIES = [step.colour for step in tie_steps(0)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "session"
+
+
+def lab_with_response(folder: Path) -> Lab:
+    """Return a lab whose session begins with white, dark, red, green."""
+    lab = Lab(folder)
+    lab.session.close()
+    (folder / "journal.sqlite").unlink()
+    Journal.create(folder / "journal.sqlite", plan_steps(LIGHTS, 25, response=RESPONSE))
+    lab.session = Session.open_for_run(folder)
+    return lab
+
+
+def interrupt_after(lab: Lab, frames: int, first: tuple[int, ...] = ()) -> None:
+    """Take some frames and end the run."""
+    ending = Ending(lambda sentence: None)
+    expose, before = lab.camera.expose, lab.camera.captures
+
+    def exposing() -> object:
+        released = expose()
+        if lab.camera.captures - before == frames:
+            ending.ask()
+        return released
+
+    lab.camera.expose = exposing  # type: ignore[method-assign, assignment]
+    with pytest.raises(KeyboardInterrupt):
+        take_session(lab.session, lab.devices, SETTINGS, ending=ending, first=first)
+    lab.camera.expose = expose  # type: ignore[method-assign]
+
+
+def test_a_damaged_frame_is_said_and_taken_again(folder: Path) -> None:
+    lab = Lab(folder)
+    interrupt_after(lab, 3)
+    victim = folder / lab.session.frames()[2].file
+    content = bytearray(victim.read_bytes())
+    content[1000] ^= 1
+    victim.write_bytes(content)
+    said: list[str] = []
+    looked: list[int] = []
+    check_frames(lab.session, lambda done, total: looked.append(done), said.append)
+    assert looked[-1] == 3
+    assert len(said) == 1
+    assert victim.name in said[0]
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    assert [step for step, _ in lab.taken()].count("l2") == 2
+
+
+def test_nothing_is_tied_to_nothing(folder: Path) -> None:
+    lab = lab_with_response(folder)
+    assert tie(lab.session) == ()
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+
+
+def test_a_session_that_does_not_know_its_projector_is_not_tied(folder: Path) -> None:
+    lab = Lab(folder)
+    interrupt_after(lab, 3)
+    assert tie(lab.session) == ()
+
+
+def test_a_run_that_is_taken_up_shows_the_ties_first(folder: Path) -> None:
+    lab = lab_with_response(folder)
+    interrupt_after(lab, 5)
+    first = tie(lab.session)
+    assert first == (8, 9, 10, 11)
+    lab.camera.exposed.clear()
+    assert take_session(lab.session, lab.devices, SETTINGS, first=first).complete
+    assert lab.camera.exposed[:4] == TIES
+    assert len(lab.session.steps) == 12
+
+
+def test_ties_that_were_interrupted_are_taken_anew(folder: Path) -> None:
+    lab = lab_with_response(folder)
+    interrupt_after(lab, 5)
+    interrupt_after(lab, 2, tie(lab.session))
+    again = tie(lab.session)
+    assert again == (8, 9, 10, 11), "no further steps"
+    lab.camera.exposed.clear()
+    interrupt_after(lab, 5, again)
+    assert lab.camera.exposed[:4] == TIES, "those that were taken are taken again: the chart may have moved since"
+    assert tie(lab.session) == (12, 13, 14, 15), "behind another light they are new"
+
+
+def test_another_camera_or_projector_is_refused(folder: Path) -> None:
+    lab = Lab(folder)
+    require_same_devices(lab.session, lab.devices, SETTINGS)
+    require_same_devices(lab.session, lab.devices, SETTINGS)
+    assert lab.session.journal.records()["camera"] == "Canon Test, serial number 1"
+    lab.projector.identity = lambda: ProjectorIdentity("Epson", "EB", "hall")  # type: ignore[method-assign]
+    with pytest.raises(DeviceRefused, match=r"begun with the projector .*, and now there is Epson EB"):
+        require_same_devices(lab.session, lab.devices, SETTINGS)
+    lab.projector = None  # type: ignore[assignment]
+    lab.camera.identity = lambda: CameraIdentity("Canon", "Test", "2")  # type: ignore[method-assign]
+    with pytest.raises(
+        DeviceRefused, match=r"serial number 1, and now there is Canon Test, serial number 2: .*new session"
+    ):
+        require_same_devices(lab.session, lab.devices, SETTINGS)
+
+
+def test_firmware_and_the_projectors_own_name_may_change(folder: Path) -> None:
+    lab = Lab(folder)
+    require_same_devices(lab.session, lab.devices, SETTINGS)
+    body, beamer = lab.camera.identity(), lab.projector.identity()
+    lab.camera.identity = lambda: replace(body, firmware="1.1.0")  # type: ignore[method-assign]
+    lab.projector.identity = lambda: replace(beamer, name="another")  # type: ignore[method-assign]
+    require_same_devices(lab.session, lab.devices, SETTINGS)
+
+
+def test_another_screen_of_a_real_lab_is_refused(folder: Path) -> None:
+    lab = Lab(folder)
+    one = LabSettings(rig="lab", chart=Path("c"), illuminations=Path("i"))
+    require_same_devices(lab.session, lab.devices, one)
+    light = one.lab.light.model_copy(update={"display": "HDMI-2"})
+    other = one.model_copy(update={"lab": one.lab.model_copy(update={"light": light})})
+    with pytest.raises(DeviceRefused, match="the screen display, and now there is display HDMI-2"):
+        require_same_devices(lab.session, lab.devices, other)
+
+
+def test_lights_taken_again_are_closed_by_a_pair_behind_the_plan(folder: Path) -> None:
+    lab = Lab(folder, lights=(*LIGHTS, Illumination(2, "uniform", None, Colour(9, 255, 3))))
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    lab.session.retake("1")
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    assert [step for step, _ in lab.taken()][-3:] == ["l3", "w7", "d8"]
+    assert take_session(lab.session, lab.devices, SETTINGS).complete
+    assert len(lab.taken()) == 10, "and only once"
