@@ -37,6 +37,7 @@ SLOW = (
     "calibration/pipeline/test_prefetching.py",
     "calibration/pipeline/test_print_and_sensor.py",
     "calibration/pipeline/test_refused_table.py",
+    "calibration/pipeline/test_retaking.py",
     "calibration/pipeline/test_small_charts.py",
     "calibration/radiometry/test_cell_field.py",
     "calibration/radiometry/test_dark_subtraction.py",
