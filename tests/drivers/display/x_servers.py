@@ -108,18 +108,41 @@ def two_outputs(folder: Path) -> Generator[str]:
 def screenshot(display: str, width: int, height: int) -> Picture:
     """Return the top left `width` × `height` pixels of a server's screen."""
     with socket.socket(socket.AF_UNIX) as server:
-        server.connect(f"/tmp/.X11-unix/X{display.removeprefix(':')}")
-        server.sendall(struct.pack("<BxHHHHxx", ord("l"), 11, 0, 0, 0))
-        accepted, length = struct.unpack("<B5xH", _exactly(server, 8))
-        assert accepted == 1
-        setup = _exactly(server, 4 * length)
-        (vendor,), formats = struct.unpack_from("<H", setup, 16), setup[21]
-        (root,) = struct.unpack_from("<I", setup, 32 + (vendor + 3) // 4 * 4 + 8 * formats)
+        root, _ = _greeted(server, display)
         server.sendall(struct.pack("<BBHIhhHHI", 73, 2, 5, root, 0, 0, width, height, 0xFFFFFFFF))
         kind, depth, length = struct.unpack("<BB2xI24x", _exactly(server, 32))
         assert (kind, depth) == (1, 24)
         pixels = np.frombuffer(_exactly(server, 4 * length), "<u4")
     return pixels.reshape(height, width) & np.uint32(0xFFFFFF)
+
+
+@contextlib.contextmanager
+def notification(display: str, place: tuple[int, int, int, int], code: int) -> Generator[None]:
+    """Show a window that no window manager touches, as notifications are: x, y, width, height; plain 0xRRGGBB.
+
+    X protocol: CreateWindow (1) with background-pixel and override-redirect, MapWindow (8), GetInputFocus (43), whose
+    reply tells that the server has done all before it.
+    """
+    with socket.socket(socket.AF_UNIX) as server:
+        root, own = _greeted(server, display)
+        window = struct.pack("<BBHIIhhHHHHIIII", 1, 0, 10, own, root, *place, 0, 1, 0, 0x0202, code, 1)
+        server.sendall(window + struct.pack("<BxHI", 8, 2, own) + struct.pack("<BxH", 43, 1))
+        while (kind := _exactly(server, 32)[0]) != 1:
+            assert kind != 0, "the X server refuses the window"
+        yield
+    # With its connection goes the window.
+
+
+def _greeted(server: socket.socket, display: str) -> tuple[int, int]:
+    """Connect, and return the root window and the first number for a window of one's own."""
+    server.connect(f"/tmp/.X11-unix/X{display.removeprefix(':')}")
+    server.sendall(struct.pack("<BxHHHHxx", ord("l"), 11, 0, 0, 0))
+    accepted, length = struct.unpack("<B5xH", _exactly(server, 8))
+    assert accepted == 1
+    setup = _exactly(server, 4 * length)
+    (own,), (vendor,), formats = struct.unpack_from("<I", setup, 4), struct.unpack_from("<H", setup, 16), setup[21]
+    (root,) = struct.unpack_from("<I", setup, 32 + (vendor + 3) // 4 * 4 + 8 * formats)
+    return root, own
 
 
 def _exactly(server: socket.socket, size: int) -> bytes:

@@ -1,0 +1,279 @@
+"""A lab is rehearsed with the shipped programs alone: `sim projector`, `sim camera` before a screen, `acquire`.
+
+Every program is a process of its own, and the commands are those of docs/how-to/rehearsal.md. The screen is an X server
+without a monitor, with a window manager on it. Nothing waits for a time: tests go on when a program has said something.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.session.folder import Session
+from drivers.links.tcp import TcpLink
+from drivers.pjlink.projector import PjLinkProjector
+from tests.drivers.display.x_servers import VirtualScreen, virtual_screen
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the screen is an X server's")
+
+HOW_TO = (Path(__file__).parents[2] / "docs" / "how-to" / "rehearsal.md").read_text(encoding="utf-8")
+SIZE = "320x240"
+PATIENCE_S = 120.0
+"""For what must come; nothing takes this long unless it fails."""
+
+PROGRAMS = {"acquire": "acquisition.cli", "build-lut": "calibration.cli", "sim": "synthesis.cli"}
+
+
+@dataclass
+class Running:
+    """A program under way: what it has said so far, on both its outputs."""
+
+    process: subprocess.Popen[str]
+    lines: list[str] = field(default_factory=list)
+    said: threading.Condition = field(default_factory=threading.Condition)
+
+    def read(self) -> None:
+        assert self.process.stdout is not None
+        with self.process.stdout:
+            for line in self.process.stdout:
+                with self.said:
+                    self.lines.append(line)
+                    self.said.notify_all()
+        with self.said:
+            self.lines.append(_END)
+            self.said.notify_all()
+
+    def hears(self, words: str) -> str:
+        """Return the first line that holds a pattern, when it has come; it must come while the program runs."""
+        with self.said:
+            assert self.said.wait_for(lambda: self._found(words) or _END in self.lines, PATIENCE_S), self.text
+            found = self._found(words)
+        assert found, f"{words!r} was never said:\n{self.text}"
+        return found
+
+    def ends(self) -> int:
+        """Return the exit code."""
+        code = self.process.wait(PATIENCE_S)
+        with self.said:
+            assert self.said.wait_for(lambda: _END in self.lines, PATIENCE_S)
+        return code
+
+    @property
+    def text(self) -> str:
+        return "".join(self.lines)
+
+    def _found(self, words: str) -> str:
+        return next((line for line in self.lines if re.search(words, line)), "")
+
+
+_END = "\0the end"
+
+
+@dataclass
+class Rehearsal:
+    """A folder, a screen, and the programs that were started."""
+
+    folder: Path
+    screen: VirtualScreen
+    replaced: dict[str, str]
+    opened: contextlib.ExitStack
+    programs: dict[str, Running] = field(default_factory=dict)
+
+    def start(self, command: str) -> Running:
+        """Start a command of the how-to; it is ended with the rehearsal."""
+        for written, used in self.replaced.items():
+            command = command.replace(written, used)
+        words = [word for word in _split(command) if word != "&"]
+        environment = dict(os.environ) | {"PYTHONUNBUFFERED": "1", "COLUMNS": "400"}
+        while "=" in words[0]:
+            name, _, value = words.pop(0).partition("=")
+            environment[name] = value
+        name = words[0]
+        if name in PROGRAMS:
+            words[:1] = [sys.executable, "-c", f"from {PROGRAMS[name]} import main; raise SystemExit(main())"]
+        process = subprocess.Popen(
+            words, cwd=self.folder, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        running = Running(process)
+        reader = threading.Thread(target=running.read, daemon=True)
+        reader.start()
+        self.opened.callback(reader.join, PATIENCE_S)
+        self.opened.callback(_end, process)
+        return running
+
+    def run(self, command: str) -> str:
+        """Run a command of the how-to to its end, which must be a good one, and return what it said."""
+        running = self.start(command)
+        code = running.ends()
+        assert code == 0, running.text
+        return running.text
+
+    def serve(self, projector: str = "", camera: str = "") -> None:
+        """Start projector and camera as the how-to does, with further options, on ports that are free."""
+        for name, port, options in (("projector", "4353", projector), ("camera", "15741", camera)):
+            command = next(line for line in commands("sim ") if line.startswith(f"sim {name}"))
+            running = self.start(command.replace(f" {port} ", " 0 ").removesuffix("&") + options)
+            address = running.hears(r" at 127\.0\.0\.1:\d+").split(":")[-1].strip()
+            self.replaced[port] = address
+            self.programs[name] = running
+        self.settings()
+
+    def settings(self, change: Callable[[str], str] = lambda text: text) -> None:
+        """Write the how-to's LAB.toml with the addresses that there are."""
+        (found,) = re.findall(r"^```toml\n(.*?)^```", HOW_TO, re.MULTILINE | re.DOTALL)
+        for written, used in self.replaced.items():
+            found = found.replace(written, used)
+        (self.folder / "LAB.toml").write_text(change(found))
+
+    @property
+    def camera(self) -> Running:
+        return self.programs["camera"]
+
+
+def commands(beginning: str = "") -> list[str]:
+    """Return the how-to's commands in their order, those that begin with some words."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", HOW_TO, re.MULTILINE | re.DOTALL)
+    return [line for block in blocks for line in block.splitlines() if line.startswith(beginning)]
+
+
+def _split(command: str) -> list[str]:
+    import shlex
+
+    return shlex.split(command)
+
+
+def _end(process: subprocess.Popen[Any]) -> None:
+    process.send_signal(signal.SIGCONT)
+    process.terminate()
+    process.wait(PATIENCE_S)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the how-to's chart and lights."""
+    folder = tmp_path_factory.mktemp("made")
+    with contextlib.ExitStack() as opened:
+        rehearsal = Rehearsal(folder, VirtualScreen("", folder, None), {}, opened)  # pyright: ignore[reportArgumentType]
+        for command in commands("acquire chart") + commands("acquire illuminations"):
+            rehearsal.run(command)
+    return folder
+
+
+@pytest.fixture
+def rehearsal(made: Path, tmp_path: Path) -> Iterator[Rehearsal]:
+    """Return a rehearsal on a screen with a window manager."""
+    for name in ("chart", "lights.csv"):
+        (tmp_path / name).symlink_to(made / name)
+    screens = tmp_path / "screen"
+    screens.mkdir()
+    with contextlib.ExitStack() as opened:
+        screen = opened.enter_context(virtual_screen(screens, SIZE))
+        rehearsal = Rehearsal(tmp_path, screen, {":77": screen.display}, opened)
+        with managed(rehearsal):
+            yield rehearsal
+
+
+@contextlib.contextmanager
+def managed(rehearsal: Rehearsal) -> Generator[None]:
+    """Run a window manager on the screen; skip where there is none."""
+    manager = next((name for name in ("openbox", "twm") if shutil.which(name)), None)
+    if manager is None:
+        pytest.skip("there is no window manager (Debian: openbox, or twm)")
+    rehearsal.start(f"DISPLAY=:77 {manager}")
+    yield
+
+
+def refusals(session: Path) -> list[str]:
+    with Session.open(session) as taken:
+        return [attempt.reason for attempt in taken.journal.attempts() if attempt.reason]
+
+
+def test_what_the_how_to_says_is_what_happens(rehearsal: Rehearsal) -> None:
+    if shutil.which("xmessage") is None:
+        pytest.skip("xmessage is not installed (Debian: x11-utils)")
+    rehearsal.serve()
+    check, run = commands("DISPLAY=:77 acquire")
+    (message,) = commands("DISPLAY=:77 xmessage")
+    assert "tags" in rehearsal.run(check)
+    session = rehearsal.start(run)
+    rehearsal.camera.hears(r"exposure \d+ ends: .* lamp 1\.00")
+    rehearsal.camera.hears(rf"exposure {_last(rehearsal.camera) + 3} half over")
+    pop_up = rehearsal.start(message)
+    assert "in front of it lies “xmessage”" in session.hears("refused: .*in front of it lies")
+    _end(pop_up.process)
+    assert session.ends() == 0, session.text
+    with Session.open(rehearsal.folder / "session") as taken:
+        assert len(taken.done_steps()) == len(taken.steps)
+    assert any("in front of it lies “xmessage”" in reason for reason in refusals(rehearsal.folder / "session"))
+    (build,) = commands("build-lut")
+    assert "accept" in rehearsal.run(build)
+
+
+def quick(text: str) -> str:
+    """Return the settings with a short exposure."""
+    return text + "\n[camera]\nshutter_s = 0.1\n"
+
+
+QUICK = " --room white_level_share=3.5"
+"""Of the room in which that exposure is a good one."""
+
+
+def test_a_night_of_trouble_ends_complete(rehearsal: Rehearsal) -> None:
+    """Each trouble is told by its cause, waited for, and leaves no frame behind that shows it."""
+    rehearsal.serve(camera=QUICK)
+    rehearsal.settings(quick)
+    port = int(rehearsal.replaced["4353"])
+    session = rehearsal.start("DISPLAY=:77 acquire run LAB.toml session")
+
+    def after_exposures(count: int) -> None:
+        rehearsal.camera.hears(r"exposure \d+ ends: plain picture, .* lamp 1\.00")
+        rehearsal.camera.hears(rf"exposure {_last(rehearsal.camera) + count} ends")
+
+    after_exposures(1)
+    projector = PjLinkProjector(lambda: TcpLink.connect("127.0.0.1", port, 10.0), timeout=10.0)
+    projector.set_frozen(True)
+    session.hears("paused: .*frozen")
+    projector.set_frozen(False)
+    after_exposures(1)
+    projector.set_muted(True)
+    session.hears("paused: .*muted")
+    projector.set_muted(False)
+    projector.close()
+    after_exposures(1)
+    if shutil.which("xset") is not None:
+        rehearsal.run("xset -display :77 s activate")
+        session.hears("(paused|retry|refused): .*the screen shows")
+        rehearsal.run("xset -display :77 s reset")
+        after_exposures(1)
+    _end(rehearsal.programs["projector"].process)
+    session.hears(f"paused: .*nothing listens at 127.0.0.1:{port}")
+    again = rehearsal.start(f"sim projector --pjlink {port} --lit")
+    again.hears("PJLink projector at")
+    assert session.ends() == 0, session.text
+    with Session.open(rehearsal.folder / "session") as taken:
+        assert len(taken.done_steps()) == len(taken.steps)
+        files = {frame.file for frame in taken.frames() if frame.accepted}
+    assert len(files) == len(taken.steps)
+
+
+def _last(camera: Running) -> int:
+    """Return the number of the exposure that began last."""
+    return int(re.findall(r"exposure (\d+) begins", camera.text)[-1])
+
+
+def test_the_how_to_shows_what_the_programs_say() -> None:
+    assert "in front of it lies “xmessage”" in HOW_TO
+    assert re.search(r"exposure \d+ ends: not plain picture, mean light [\d. ]+, lamp 1\.00", HOW_TO)
