@@ -26,10 +26,9 @@ from drivers.presenter import Colour
 STEPS = plan_steps((Illumination(0, "uniform", None, Colour(255, 0, 0)),), 2)
 BEGUN = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
 NUMBER = st.floats(allow_nan=False, allow_infinity=False)
-CHECK = st.builds(
-    Check, st.text(min_size=1, max_size=9), NUMBER | st.none(), NUMBER | st.none(), NUMBER | st.none(), st.text(max_size=3),
-    st.sampled_from(["", "too dark; light it", "moved"]),
-)  # fmt: skip
+LIMIT = NUMBER | st.none()
+REASON = st.sampled_from(["", "too dark; light it", "moved"])
+CHECK = st.builds(Check, st.text(min_size=1, max_size=9), LIMIT, LIMIT, LIMIT, st.text(max_size=3), REASON)
 JUDGEMENT = st.builds(
     Judgement,
     st.lists(CHECK, max_size=3).map(tuple),
@@ -76,8 +75,9 @@ def apply(what: str, value: Any, journal: Journal, model: Model, at: datetime) -
     """Do one thing to the journal and to the model."""
     open_rows = [number for number, row in enumerate(model.rows, 1) if row.verdict is None]
     if what == "begin":
-        assert journal.begin(model.steps[value], f"frames/{len(model.rows)}", at) == len(model.rows) + 1
-        model.rows.append(Row(model.steps[value]))
+        step = model.steps[int(value)]
+        assert journal.begin(step, f"frames/{len(model.rows)}", at) == len(model.rows) + 1
+        model.rows.append(Row(step))
     elif what == "commit" and open_rows:
         number = open_rows[-1]
         journal.commit(
