@@ -69,12 +69,14 @@ def run(tmp_path: Path) -> Iterator[MadeUpRun]:
 
 
 @contextmanager
-def shown(tab: Tab, folder: Path, *, width: int = 1280, dark: bool = False) -> Generator[MonitorServer]:
-    with open_monitor(folder, 0) as server:
+def shown(
+    tab: Tab, folder: Path, *, width: int = 1280, dark: bool = False, host: str = "127.0.0.1"
+) -> Generator[MonitorServer]:
+    with open_monitor(folder, 0, host) as server:
         thread = threading.Thread(target=lambda: server.serve_forever(0.01))
         thread.start()
         try:
-            tab.open(f"http://127.0.0.1:{server.port}/", width=width, dark=dark)
+            tab.open(f"http://127.0.0.1:{server.port}/{server.path}", width=width, dark=dark)
             tab.wait_for("document.readyState === 'complete' && typeof model !== 'undefined' && model.cursor !== ''")
             yield server
         finally:
@@ -245,6 +247,13 @@ def test_a_page_may_be_opened_before_the_session_is_there(tab: Tab, tmp_path: Pa
         made.take(made.steps[0])
         tab.wait_for("document.getElementById('frame-caption').innerText.includes('white frame 0')")
         made.journal.close()
+
+
+def test_a_phone_is_shown_the_same_behind_the_token(tab: Tab, run: MadeUpRun) -> None:
+    with shown(tab, run.folder, width=390, dark=True, host="0.0.0.0") as server:
+        assert len(server.path) > 20
+        assert marks(tab, "planned", "shown") == 1
+        tab.wait_for("document.getElementById('picture').naturalWidth === 360")
 
 
 def test_several_pages_look_at_once_and_a_frame_costs_little(tab: Tab, run: MadeUpRun) -> None:
