@@ -24,6 +24,7 @@ SLOW = (
     "acquisition/framing/test_finding.py",
     "acquisition/framing/test_tagless_field.py",
     "acquisition/framing/test_visibility.py",
+    "acquisition/monitor/test_page.py",
     "acquisition/session/test_states.py",
     "acquisition/test_chart_command.py",
     "calibration/checks/test_frame_consistency.py",
