@@ -7,13 +7,16 @@ from collections.abc import Sequence
 from contextlib import suppress
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from foundation import console
 from foundation.console import EXIT_CODES, orderly_end
 from foundation.errors import InputError, QualityError, first_of
+
+if TYPE_CHECKING:
+    from acquisition.config import LabSettings
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -207,18 +210,29 @@ def run(
             "beside SESSION. What was taken of them before is kept and not used.",
         ),
     ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run",
+            help="Open and ask every device, print what the run would take, need and find, and what would end it; "
+            "nothing is lit, released, shown or written.",
+        ),
+    ] = False,
 ) -> None:
     """Take the session, or take up one that was interrupted.
 
-    Reads LAB.toml, the chart and the lights it names. Writes SESSION: session.toml, chart.json, illuminations.csv,
-    frames/, journal.sqlite, frames.csv. Interrupt it as you like and run it again. Ends with 4 when some frames were
-    refused; the next run tries those again.
+    What a dry run prints is checked before anything moves. Reads LAB.toml, the chart and the lights it names. Writes
+    SESSION: session.toml, chart.json, illuminations.csv, frames/, journal.sqlite, frames.csv. Interrupt it as you like
+    and run it again. Ends with 4 when some frames were refused; the next run tries those again.
     """
     from acquisition.config import load_lab
     from acquisition.run.run import run_session
     from foundation.console import progress
 
     settings = load_lab(lab)
+    if dry_run:
+        _print_plan(settings, session, retake)
+        return
     with orderly_end() as ending, progress("frames") as advance:
         outcome = run_session(
             settings, session, advance, lambda sentence: print(sentence, file=sys.stderr), retake, ending
@@ -228,6 +242,19 @@ def run(
             f"{outcome.left} of {outcome.total} frames are without an accepted frame; " + "; ".join(outcome.refused)
         )
     print(f"{session}: complete, {outcome.total} frames; next: build-lut {session} LUT/")
+
+
+def _print_plan(settings: LabSettings, session: Path, retake: str | None) -> None:
+    from acquisition.run.planning.dry_run import dry_run
+    from acquisition.run.planning.text import plan_lines
+
+    if retake is not None:
+        raise InputError("a dry run voids nothing; leave --retake out")
+    with orderly_end():
+        plan = dry_run(settings, session)
+    for line in plan_lines(plan):
+        print(line)
+    plan.require()
 
 
 @app.command(epilog=EXIT_CODES)

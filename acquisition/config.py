@@ -26,41 +26,55 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _SECRETS = ("sequence.notify", "lab.projector.password")
 """Keys whose values are in no message, nor in `session.toml`: a session is copied, shown and published."""
 
-_MASK = "…"
+
+MASK = "…"
+"""What stands for a secret."""
 
 
-def notify_label(target: str) -> str:
-    """Return what may be shown of `sequence.notify`: a URL's scheme and host, or a command's first word.
+def is_webhook(target: str) -> bool:
+    """Return whether a target is a URL to post to, rather than a command."""
+    return target.lower().startswith(("http://", "https://"))
 
-    The rest of it may be a secret: a webhook's path is one, and so are user names, queries and most arguments.
+
+def target_label(target: str) -> str:
+    """Return what may be shown of a target: a URL's scheme and host, or a command's first word.
+
+    The rest may be a secret: a webhook's path is one, and so are user names, queries and most arguments.
 
     Examples
     --------
-    >>> notify_label("https://user:word@ntfy.example/lab?auth=tk_1"), notify_label("curl -H 'Authorization: x' y")
+    >>> target_label("https://user:word@ntfy.example/lab?auth=tk_1"), target_label("curl -H 'Authorization: x' y")
     ('https://ntfy.example/…', 'curl …')
     """
     if is_webhook(target):
         parts = urlsplit(target)
-        host = parts.netloc.rpartition("@")[2]
-        return f"{parts.scheme}://{host}/{_MASK}"
+        return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}/{MASK}"
     words = shlex.split(target)
-    return " ".join([*words[:1], *([_MASK] if words[1:] else [])])
+    return " ".join([*words[:1], *([MASK] if words[1:] else [])])
 
 
-def is_webhook(target: str) -> bool:
-    """Return whether `sequence.notify` is a URL to post to, rather than a command."""
-    return target.lower().startswith(("http://", "https://"))
+def _require_target(target: str) -> None:
+    """Require that a target is a URL with a host, or a command line; empty is nobody.
 
-
-def _notify_checked(target: str) -> str:
-    """Return the target of notices as it is; refuse one that is neither a URL nor a command line."""
-    if is_webhook(target):
-        parts = urlsplit(target)
-        if not parts.hostname or parts.port == 0:
-            raise ValueError("a URL names a host, as in https://ntfy.sh/my-lab")
-    else:
-        # A quotation that does not end.
+    Raises
+    ------
+    ValueError
+        It is neither; the message does not hold it.
+    """
+    if not is_webhook(target):
+        # A quotation that does not end is refused here.
         shlex.split(target)
+        return
+    parts = urlsplit(target)
+    if not parts.hostname or parts.port == 0:
+        raise ValueError("a URL names a host, as in https://ntfy.sh/my-lab")
+    if not target.removesuffix(f"/{MASK}").isascii() or any(character.isspace() for character in target):
+        raise ValueError("a URL has no spaces and no letters but ASCII's; write them as %20 and the like")
+
+
+def _target_checked(target: str) -> str:
+    """Return the target of notices as it is; refuse one that is neither a URL nor a command line."""
+    _require_target(target)
     return target
 
 
@@ -114,7 +128,7 @@ class SequenceSettings(_Settings):
     lamp_if_unfinished: Literal["off", "on"] = "off"
     """What the lamp does when a run ends by itself before the session is complete: it goes out, for nobody may be
     there, or burns on, so that the next run needs no warm-up. After Ctrl-C it burns on."""
-    notify: Annotated[str, AfterValidator(_notify_checked), Field(repr=False)] = ""
+    notify: Annotated[str, AfterValidator(_target_checked), Field(repr=False)] = ""
     """Who is told when a run pauses, goes on and ends: a URL that gets JSON by POST, or a command that gets the same on
     its standard input; empty: nobody. Kept out of messages and `session.toml`, but for the host or the program's
     name."""
@@ -149,8 +163,9 @@ class JudgeSettings(_Settings):
     drift_percent: NotNegative = 1.0
     """Largest change of paper white from one white frame to the next, per cent: usual for a warm lamp; `build-lut`
     warns at as much."""
-    dark_percent: NotNegative = 0.5
-    """Largest light in a dark frame, of white, per cent: `build-lut` warns at as much."""
+    dark_percent: NotNegative = 5.0
+    """Largest light in a dark frame, of white, per cent: half of what `build-lut` refuses. It warns from 0.5 on, and so
+    does `acquire check`: light that is always there harms deep colours, and no frame gets better by being retaken."""
     ambient_percent: NotNegative = 0.2
     """Largest change of that light since the first dark frame, of white, per cent: `build-lut` warns at as much."""
     light_deg: NotNegative = 0.5
@@ -276,7 +291,7 @@ class LabSettings(_Settings):
     def to_toml(self) -> str:
         """Return the settings, defaults included, as the text of `session.toml`; secrets are masked."""
         values = self.model_dump(mode="json", exclude_none=True)
-        values["sequence"]["notify"] = notify_label(self.sequence.notify)
+        values["sequence"]["notify"] = target_label(self.sequence.notify)
         # A password is needed to take frames, and whoever does that has LAB.toml.
         values["lab"]["projector"].pop("password", None)
         return tomli_w.dumps(values)
@@ -336,7 +351,7 @@ def parse_lab(text: str, where: str) -> LabSettings:
             raise unknown_key(key, _known_keys(first["loc"][:-1]), where) from error
         if first["type"] == "missing":
             raise ConfigurationError(f"{where}: {key} is missing; add it") from error
-        given = _MASK if key in _SECRETS else repr(first["input"])
+        given = MASK if key in _SECRETS else repr(first["input"])
         # The cause has the value, too.
         reason = first["msg"].removeprefix("Value error, ")
         raise ConfigurationError(f"{where}: {key} = {given}: {reason}") from (None if key in _SECRETS else error)

@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.finding import Framing
-from acquisition.framing.planes import Plane
+from acquisition.framing.planes import Channel, Plane, channel_offset_px, phases
 from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.tags import FoundTag
+from drivers.raw.rawfile import Mosaic
 from foundation.robust import huber_weights, sigma_of
 
 MAX_SHIFT_PX = 3.0
@@ -100,6 +101,21 @@ def gauge_boxes(framing: Framing) -> list[tuple[int, int, int, int]]:
     low = [np.maximum(np.floor(outline.min(axis=0)).astype(int) - around, 0) for outline in outlines]
     high = [np.ceil(outline.max(axis=0)).astype(int) + around for outline in outlines]
     return [(int(a[0]), int(a[1]), int(b[0]), int(b[1])) for a, b in zip(low, high, strict=True)]
+
+
+def gauges_of(mosaic: Mosaic, channel: Channel, black: npt.NDArray[np.float64], framing: Framing) -> Plane:
+    """Return one channel of a frame, float32 counts above black, around its gauges, and 0 elsewhere.
+
+    Movements are measured in nothing else. `black` (2, 2) float64 counts.
+    """
+    places = phases(mosaic)[channel]
+    blocks = mosaic.block_planes()
+    level = np.float32(np.mean([black[place] for place in places]))
+    values = np.zeros(blocks.shape[2:], dtype=np.float32)
+    for left, top, right, bottom in gauge_boxes(framing):
+        part = np.s_[top:bottom, left:right]
+        values[part] = sum(blocks[place][part].astype(np.float32) for place in places) / np.float32(len(places)) - level
+    return Plane(channel, values, channel_offset_px(places))
 
 
 def shift_between(reference: Plane, framing: Framing, plane: Plane) -> Shift:

@@ -18,6 +18,7 @@ import numpy as np
 from acquisition.lights.illuminations import Illumination
 from acquisition.monitor.head import Head
 from acquisition.monitor.rows import AttemptView, EventView
+from acquisition.session.judgement import Check
 from acquisition.session.plan import SessionStep
 from foundation.srgb import decode_srgb
 
@@ -85,12 +86,12 @@ def attempt_json(view: AttemptView, white: tuple[float, float, float] | None, pr
         "reason": view.reason,
         "seen": [_rounded(value) for value in seen] if seen else None,
         "seen_at": place,
-        "checks": {check.name: _check(check.value, check.low, check.high, check.reason) for check in view.checks},
+        "checks": [_check(check) for check in view.checks],
         "timings": {name: _rounded(seconds) for name, seconds in view.timings.items()},
         "seconds": None if view.seconds is None else _rounded(view.seconds),
         "preview": preview if view.has_frame else None,
     }
-    return {key: value for key, value in told.items() if value not in (None, "", {})}
+    return {key: value for key, value in told.items() if value not in (None, "", {}, [])}
 
 
 def event_json(event: EventView) -> list[Any]:
@@ -120,9 +121,10 @@ def _codes(step: SessionStep) -> tuple[int, int, int]:
     return step.colour.red, step.colour.green, step.colour.blue
 
 
-def _check(value: float | None, low: float | None, high: float | None, reason: str) -> list[Any]:
-    told = [None if number is None else _rounded(number) for number in (value, low, high)]
-    return [*told, reason] if reason else told
+def _check(check: Check) -> list[Any]:
+    """Return a check: [name, unit, value, low, high], and the reason where there is one."""
+    numbers = [None if number is None else _rounded(number) for number in (check.value, check.low, check.high)]
+    return [check.name, check.unit, *numbers, *([check.reason] if check.reason else [])]
 
 
 def _rounded(value: float) -> float | None:

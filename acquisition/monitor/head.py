@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import statistics
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -137,7 +138,7 @@ def _state_of(
 ) -> tuple[str, str]:
     over = heartbeat is None or heartbeat.state == "ended" or heartbeat.is_dead(now, process_alive)
     if over and total and not left:
-        return "complete", f"complete, {total} frames; next: build-lut {name} LUT/"
+        return "complete", f"complete, {total} frames; next: build-lut {shlex.quote(name)} LUT/"
     if heartbeat is None:
         return "unknown", f"{left} of {total} frames are left, and the journal has no sign of life of a run"
     if heartbeat.is_dead(now, process_alive):

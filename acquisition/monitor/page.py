@@ -71,7 +71,7 @@ def _part(name: str) -> str:
 
 
 def _script() -> str:
-    return _part("plots.js") + _part("page.js")
+    return _part("plots.js") + _part("head.js") + _part("page.js")
 
 
 def _style() -> str:

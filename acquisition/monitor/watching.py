@@ -123,7 +123,6 @@ class SessionWatch:
         recent = {one.id for one in view.attempts[-RECENT:]}
         news = [one for one in view.attempts if known.attempts[one.id] > seen or one.id in recent]
         told: Json = {
-            "units": {check.name: check.unit for one in news for check in one.checks if check.unit},
             "frames": [attempt_json(one, known.whites[one.id], preview_version(self.folder, one.file)) for one in news],
             "events": [event_json(one) for one in view.events if known.events[one.id] > seen],
         }

@@ -22,9 +22,18 @@ TOP = 250
 PRIMARIES = (Colour(TOP, 0, 0), Colour(0, TOP, 0), Colour(0, 0, TOP))
 """The projector's red, green and blue, each alone."""
 
-RESPONSE = (*PRIMARIES, *(Colour(code, code, code) for code in (16, 32, 48, 64, 88, 112, 136, 160, 184, 208, 232, TOP)))
-"""What a session shows first so that the light of any codes can be foretold: the primaries, and greys that give the
-curve from codes to light. The steps are chosen: even in code, and closer where the curve is steep in proportion."""
+MIDDLE = 136
+"""Code of a quarter of the light, at which each primary's own curve is compared with that of grey."""
+
+RESPONSE = (
+    *PRIMARIES,
+    *(Colour(code, code, code) for code in (TOP, 232, 208, 184, 160, 136, 112, 88, 64, 48, 32, 16)),
+    *(Colour(TOP, TOP, 0), Colour(TOP, 0, TOP), Colour(0, TOP, TOP)),
+    *(Colour(MIDDLE, 0, 0), Colour(0, MIDDLE, 0), Colour(0, 0, MIDDLE)),
+)
+"""What a session shows first so that the light of any codes can be foretold: the primaries; greys that give the curve
+from codes to light; pairs of primaries, for what light is added where they overlap; and each primary at half code, for
+what its curve has of its own. The steps are chosen: even in code, and closer where the curve is steep in proportion."""
 
 
 @dataclass(frozen=True)

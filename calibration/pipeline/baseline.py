@@ -13,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
-from acquisition.framing.movement import Shift, shift_between
+from acquisition.framing.movement import Shift, gauges_of, shift_between
 from acquisition.framing.planes import CLIPPING_SHARE, Channel
 from acquisition.measures.paper import MAX_ORDER, MAX_ORDER_AROUND, PaperReader
 from calibration.checks.frame_consistency import ConsistencyCheck
 from calibration.pipeline.frames import DecodedFrame
 from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
-from calibration.pipeline.registered_frame import ChartPoints, RegisteredFrame, gauges_of, register_frame
+from calibration.pipeline.registered_frame import ChartPoints, RegisteredFrame, register_frame
 from calibration.radiometry.cell_field import field_of_cells
 from calibration.radiometry.dark_subtraction import DarkLightEstimator, reflectances
 from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transfer

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from acquisition.framing.movement import REREGISTER_PX, STILL_PX, Shift, shift_between
+from acquisition.framing.movement import REREGISTER_PX, STILL_PX, Shift, gauges_of, shift_between
 from acquisition.measures.paper import Paper
 from calibration.figures.frame_figures import FrameFigures
 from calibration.pipeline.baseline import Baseline, usable_means
 from calibration.pipeline.frames import DecodedFrame
-from calibration.pipeline.registered_frame import RegisteredFrame, gauges_of, sites_of
+from calibration.pipeline.registered_frame import RegisteredFrame, sites_of
 from calibration.radiometry.dark_frames import DarkFrameFigures, measure_dark_frame
 from calibration.radiometry.dark_subtraction import DarkLight, winsorised_means
 from calibration.radiometry.primaries import Primaries

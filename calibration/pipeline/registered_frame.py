@@ -16,16 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
-from acquisition.framing.finding import Framing
-from acquisition.framing.movement import gauge_boxes
-from acquisition.framing.planes import CHANNELS, Channel, Plane, channel_offset_px, phases
+from acquisition.framing.movement import gauges_of
+from acquisition.framing.planes import CHANNELS, Channel, Plane
 from calibration.pipeline.frames import DecodedFrame
 from calibration.pipeline.options import BuildOptions
 from calibration.radiometry.greys import GreyLevels
 from calibration.registration.register import register
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites, sites_at
-from drivers.raw.rawfile import Mosaic
 
 _Array = npt.NDArray[np.float64]
 
@@ -132,18 +130,3 @@ def sites_of(
         for places in (points.cells_mm, points.references_mm)
     )
     return cells, references
-
-
-def gauges_of(mosaic: Mosaic, channel: Channel, black: _Array, framing: Framing) -> Plane:
-    """Return one channel of a frame, float32 counts above black, around its gauges, and 0 elsewhere.
-
-    Movements are measured in nothing else. `black` (2, 2) float64 counts.
-    """
-    places = phases(mosaic)[channel]
-    blocks = mosaic.block_planes()
-    level = np.float32(np.mean([black[place] for place in places]))
-    values = np.zeros(blocks.shape[2:], dtype=np.float32)
-    for left, top, right, bottom in gauge_boxes(framing):
-        part = np.s_[top:bottom, left:right]
-        values[part] = sum(blocks[place][part].astype(np.float32) for place in places) / np.float32(len(places)) - level
-    return Plane(channel, values, channel_offset_px(places))

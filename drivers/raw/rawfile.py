@@ -78,6 +78,8 @@ class Mosaic:
         Optically black areas in sensor coordinates; empty if none is known.
     iso, aperture, shutter_s
         The exposure as the file states it: ISO speed, f-number, seconds; None where it does not.
+    serial
+        Serial number of the body as Exif 2.3 or DNG state it; empty where the file does not.
     """
 
     counts: NDArray[np.uint16]
@@ -91,6 +93,7 @@ class Mosaic:
     iso: int | None = None
     aperture: float | None = None
     shutter_s: float | None = None
+    serial: str = ""
 
     def masked_black(self) -> NDArray[np.float64] | None:
         """Return the black level measured in the masked areas.
@@ -224,6 +227,7 @@ def _plain_mosaic(data: bytes | memoryview, directories: list[Directory], plain:
         iso=plain.iso,
         aperture=plain.aperture,
         shutter_s=plain.shutter_s,
+        serial=_camera_serial(directories),
     )
 
 
@@ -276,6 +280,7 @@ def _mosaic(path: Path, raw: RawPy, data: bytes | memoryview, directories: list[
         iso=round(exposure.iso_speed) if stated_exposure else None,
         aperture=(round(exposure.aperture, 4) or None) if stated_exposure else None,
         shutter_s=(exposure.shutter_speed or None) if stated_exposure else None,
+        serial=_camera_serial(directories),
     )
 
 
@@ -322,6 +327,14 @@ def _camera_name(data: bytes | memoryview, directories: list[Directory]) -> str:
         if directory.text(TiffTag.UNIQUE_CAMERA_MODEL):
             return directory.text(TiffTag.UNIQUE_CAMERA_MODEL)
     return _joined(*_ciff_camera(data))
+
+
+def _camera_serial(directories: list[Directory]) -> str:
+    for tag in (TiffTag.BODY_SERIAL_NUMBER, TiffTag.CAMERA_SERIAL_NUMBER):
+        for directory in directories:
+            if directory.text(tag):
+                return directory.text(tag)
+    return ""
 
 
 def _joined(maker: str, model: str) -> str:

@@ -70,6 +70,8 @@ _DECODED: Final = frozenset(
         TiffTag.F_NUMBER,
         TiffTag.EXIF_IFD_POINTER,
         TiffTag.PHOTOGRAPHIC_SENSITIVITY,
+        TiffTag.BODY_SERIAL_NUMBER,
+        TiffTag.CAMERA_SERIAL_NUMBER,
         TiffTag.DNG_VERSION,
         TiffTag.UNIQUE_CAMERA_MODEL,
         TiffTag.CFA_PLANE_COLOR,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from acquisition.config import LabSettings, load_lab, notify_label, parse_lab
+from acquisition.config import LabSettings, load_lab, parse_lab, target_label
 from acquisition.run.shutter import require_whole_turns
 from foundation.errors import ConfigurationError
 
@@ -135,7 +135,7 @@ def test_no_secret_gets_into_the_session(target: str, label: str) -> None:
             "lab": {"projector": {"control": "pjlink", "host": "h", "password": "s3cret"}},
         }
     )
-    assert notify_label(target) == label
+    assert target_label(target) == label
     assert "s3cret" not in settings.to_toml()
     assert "s3cret" not in repr(settings)
     assert parse_lab(settings.to_toml(), "session.toml").sequence.notify == label
@@ -147,6 +147,7 @@ def test_no_secret_gets_into_the_session(target: str, label: str) -> None:
         ('notify = "curl \'s3cret"', "sequence.notify = …: No closing quotation"),
         ('notify = "https:///s3cret"', "a URL names a host"),
         ('notify = "https://s3cret:99999/"', "sequence.notify = …: Port out of range"),
+        ('notify = "https://x/s3cret word"', "a URL has no spaces"),
         ('notify = ["s3cret"]', "sequence.notify = …: Input should be a valid string"),
     ],
 )

@@ -94,7 +94,7 @@ class CameraContract:
             names.append(captured.name)
         assert len(bench.frames()) == 4
         assert len(set(names)) == 4
-        assert all(name.lower().endswith(".cr2") for name in names)
+        assert all(name.lower().endswith(bench.film.suffix) for name in names)
         if bench.keeps_names:
             assert names == ["IMG_0001.CR2", "IMG_0002.CR2", "IMG_0003.CR2", "IMG_0004.CR2"]
 

@@ -11,15 +11,15 @@ const STATES = {
   unknown: ["?", "no sign of life known"],
 };
 const LOUD = new Set(["paused", "incomplete", "stopped", "complete"]);
-const WHITE = "white since the first: red ─ green ╌ blue ┈";
-const BLACK = "black: red ─ green ╌ blue ┈";
+const WHITE = "white, red ─ green ╌ blue ┈";
+const BLACK = "black, red ─ green ╌ blue ┈";
 const PACE = "seconds a frame";
 // Plots in the order in which an operator asks; what is not named here follows in the order of the journal.
-const PLOT_ORDER = [WHITE, "white drift", BLACK, "dark", "ambient", "movement", "blur", PACE];
+const PLOT_ORDER = [WHITE, "white drift", BLACK, "dark", "ambient", "movement", "blur", PACE, "light", "lamp", "uniformity", "repeated"];
 
 const $ = (id) => document.getElementById(id);
 const embedded = $("embedded");
-const model = { cursor: "", head: { state: "unknown", sentence: "" }, session: null, frames: new Map(), events: [], units: {} };
+const model = { cursor: "", head: { state: "unknown", sentence: "" }, session: null, frames: new Map(), events: [], begun: 0 };
 let chosen = null;
 let allRefused = false;
 let clockOffset = 0;
@@ -44,7 +44,7 @@ function durationText(seconds) {
 // State: what came is put into the model ---------------------------------------------------------------------------
 
 function take(state) {
-  const before = model.head.state;
+  const before = model.head;
   const whole = state.session !== undefined;
   model.cursor = state.cursor;
   model.head = state.head;
@@ -53,43 +53,28 @@ function take(state) {
     model.session = state.session;
     model.frames = new Map();
     model.events = [];
-    model.units = {};
+    model.begun = 0;
     if (!same) chosen = null;
   }
-  Object.assign(model.units, state.units);
   for (const frame of state.frames ?? []) model.frames.set(frame.id, frame);
   model.events = model.events.concat(state.events ?? []).slice(-EVENTS_SHOWN);
-  if (before !== model.head.state && answeredOnce) announceState();
+  for (const [at, what] of state.events ?? []) if (what === "start") model.begun = at;
+  if (before.state !== model.head.state && answeredOnce) announceState();
   answeredOnce = true;
   if (whole) drawSession();
-  if (whole || (state.frames ?? []).length) drawFrames(whole, state.frames ?? []);
+  const lives = before.alive !== model.head.alive;
+  if (model.session && (whole || lives || (state.frames ?? []).length)) drawFrames(whole || lives, state.frames ?? []);
   if (whole || (state.events ?? []).length) drawEvents();
   drawHead();
 }
 let answeredOnce = false;
 
-function announceState() {
-  const [, word] = STATES[model.head.state] ?? STATES.unknown;
-  $("said").textContent = `The run is now: ${word}. ${model.head.sentence}`;
-  if (sound && LOUD.has(model.head.state)) beep(model.head.state === "complete" ? 1 : 3);
-}
-
-function beep(times) {
-  for (let index = 0; index < times; index += 1) {
-    const tone = sound.createOscillator();
-    const gain = sound.createGain();
-    gain.gain.value = 0.2;
-    tone.frequency.value = 660;
-    tone.connect(gain).connect(sound.destination);
-    tone.start(sound.currentTime + 0.4 * index);
-    tone.stop(sound.currentTime + 0.4 * index + 0.22);
-  }
-}
-
 // Frames -----------------------------------------------------------------------------------------------------------
 
 const inOrder = () => [...model.frames.values()].sort((one, other) => one.id - other.id);
 const stepOf = (frame) => model.session.steps.get(frame.step);
+/** Return whether an attempt is under way: one without a verdict from before the newest start was cut off. */
+const isOpen = (frame) => !frame.verdict && model.head.alive && frame.at >= model.begun;
 const codesText = (codes) => codes.join(" ");
 const fillOf = (codes) => `rgb(${codes.join(",")})`;
 
@@ -100,21 +85,27 @@ function nameOf(step) {
   return `light ${step.light}${light && light.cct ? ` (${short(light.cct)} K)` : ""}`;
 }
 
-/** Return the frame that the page shows: the chosen one, else the newest that has a verdict. */
+/**
+ * Return the frame that the page shows: the chosen one, else the newest that has a verdict.
+ *
+ * When nothing is taken any more that is not the dark frame with which a session ends: there is nothing to be seen on it.
+ */
 function frameShown(frames) {
   if (chosen !== null && model.frames.has(chosen)) return model.frames.get(chosen);
-  return frames.findLast((frame) => frame.verdict) ?? null;
+  const judged = frames.filter((frame) => frame.verdict);
+  const lit = model.head.alive ? undefined : judged.findLast((frame) => stepOf(frame)?.kind !== "dark");
+  return lit ?? judged[judged.length - 1] ?? null;
 }
 
 function drawSession() {
   const { session } = model;
   session.steps = new Map(session.steps.map(([number, kind, light, ...codes]) => [number, { number, kind, light, codes }]));
   session.lights = new Map(session.lights.map(([index, kind, cct, at, ...codes]) => [index, { index, kind, cct, at, codes }]));
-  $("name").textContent = session.name;
+  if (!embedded) $("name").textContent = session.name;
   drawn.planned.clear();
   drawn.seen.clear();
   $("records").replaceChildren(
-    ...session.records.flatMap(([key, text]) => [element("dt", {}, key), element("dd", {}, text)]),
+    ...(session.records.length ? session.records : [["", "Nothing is recorded."]]).flatMap(([key, text]) => [element("dt", {}, key), element("dd", {}, text)]),
   );
 }
 
@@ -127,6 +118,7 @@ function drawFrames(whole, changed) {
   }
   const touched = whole ? model.session.lights.keys() : new Set(changed.map((frame) => stepOf(frame)?.light).filter((light) => light !== null && light !== undefined));
   for (const light of touched) drawLight(light, byLight.get(light) ?? []);
+  $("seen-note").hidden = frames.some((frame) => frame.seen_at);
   drawReach(frames);
   drawWall(frames);
   drawSeries(frames);
@@ -139,8 +131,7 @@ function drawLight(index, frames) {
   if (!light) return;
   const accepted = frames.findLast((frame) => frame.verdict === "accepted");
   const last = frames[frames.length - 1];
-  const open = last && !last.verdict && model.head.alive;
-  const state = open ? "shown" : accepted ? "accepted" : frames.some((frame) => ["refused", "voided"].includes(frame.verdict)) ? "refused" : "planned";
+  const state = last && isOpen(last) ? "shown" : accepted ? "accepted" : frames.some((frame) => ["refused", "voided"].includes(frame.verdict)) ? "refused" : "planned";
   const form = light.kind === "blackbody" ? "diamond" : "circle";
   const title = `light ${index}, ${codesText(light.codes)}${light.cct ? `, ${short(light.cct)} K` : ""}: ${state}`;
   drawn.planned.plane.mark(index, light.at, { form, state, fill: fillOf(light.codes), title });
@@ -161,7 +152,7 @@ function drawReach(frames) {
 
 function drawWall(frames) {
   const last = frames[frames.length - 1];
-  const open = last && !last.verdict && model.head.alive ? stepOf(last) : null;
+  const open = last && isOpen(last) ? stepOf(last) : null;
   const swatch = $("swatch");
   if (!open) {
     swatch.style.background = "";
@@ -171,7 +162,7 @@ function drawWall(frames) {
   }
   swatch.style.background = fillOf(open.codes);
   swatch.setAttribute("aria-label", `sRGB ${codesText(open.codes)}`);
-  $("wall").replaceChildren(element("b", {}, codesText(open.codes)), element("br"), `${nameOf(open)}, frame ${open.number} of the plan, since ${timeText(last.at)}`);
+  $("wall").replaceChildren(element("b", {}, codesText(open.codes)), element("br"), `${nameOf(open)}, step ${open.number} of the plan, shown at ${timeText(last.at)}`);
 }
 
 function choose(id, frames = inOrder()) {
@@ -191,7 +182,8 @@ function drawChoice(frames) {
   const frame = frameShown(frames);
   const index = frames.indexOf(frame);
   const light = frame ? stepOf(frame)?.light ?? null : null;
-  $("frame-title").textContent = chosen === null ? "Last frame" : "Chosen frame";
+  const newest = frame && stepOf(frame) && !model.head.alive ? `Last ${stepOf(frame).kind} frame` : "Last frame";
+  $("frame-title").textContent = chosen === null ? newest : "Chosen frame";
   $("latest").disabled = chosen === null;
   $("previous").disabled = index <= 0;
   $("next").disabled = index < 0 || index >= frames.length - 1;
@@ -206,17 +198,22 @@ function drawChoice(frames) {
   drawPicture(frame);
   if (!frame) return;
   const step = stepOf(frame);
-  const verdict = frame.verdict || "under way";
+  const verdict = frame.verdict || (isOpen(frame) ? "under way" : "cut off");
   $("frame-caption").replaceChildren(
     `${nameOf(step)}, shown as ${step ? codesText(step.codes) : "?"}, at ${dayText(frame.taken ?? frame.at)}: `,
     element("b", frame.verdict === "accepted" ? {} : { class: "bad" }, verdict),
     frame.reason ? `: ${frame.reason}` : "",
   );
   $("checks").tBodies[0].replaceChildren(
-    ...Object.entries(frame.checks ?? {}).map(([name, [value, low, high, reason]]) => {
-      const unit = model.units[name] ?? "";
-      const row = [element("th", { scope: "row" }, `${reason ? "✕ " : ""}${name}`), element("td", { class: "number" }, withUnit(value, unit)), element("td", { class: "number note" }, limitText(low, high, unit))];
-      return element("tr", reason ? { class: "bad" } : {}, ...row);
+    ...(frame.checks ?? []).map(([name, unit, value, low, high, reason]) => {
+      const found = value !== null ? withUnit(value, unit) : reason ? "refused" : "no fault";
+      return element(
+        "tr",
+        reason ? { class: "bad" } : {},
+        element("th", { scope: "row" }, `${reason ? "✕ " : ""}${name}`),
+        element("td", { class: "number" }, found),
+        element("td", { class: "number note" }, limitText(low, high, unit)),
+      );
     }),
   );
   const timings = Object.entries(frame.timings ?? {}).map(([what, seconds]) => `${what} ${short(seconds)} s`);
@@ -234,7 +231,7 @@ function drawPicture(frame) {
   const without = $("no-picture");
   picture.hidden = source === null;
   without.hidden = source !== null;
-  without.textContent = !frame ? "No frame yet" : embedded ? "Not among this report's pictures" : "No picture of this frame";
+  without.textContent = !frame ? "No frame yet" : frame.preview ? "Not among this report's pictures" : "No picture of this frame";
   if (source === null) {
     picture.removeAttribute("src");
     return;
@@ -249,34 +246,39 @@ function seriesOf(frames) {
   const series = new Map();
   const add = (name, unit, point, least = 0) => {
     if (point.value === null || point.value === undefined) return;
-    if (!series.has(name)) series.set(name, { name, unit, least, points: [] });
-    series.get(name).points.push({ low: null, high: null, good: true, curve: 0, ...point });
+    // One name may stand for two quantities: that of a light, in degrees, and that of a primary, in percent.
+    const key = `${name} ${unit}`;
+    if (!series.has(key)) series.set(key, { name, unit, least, points: [] });
+    series.get(key).points.push({ low: null, high: null, good: true, curve: 0, ...point });
   };
   let white = null;
   frames.forEach((frame, index) => {
     const kind = stepOf(frame)?.kind;
     if (kind === "white" && frame.seen && frame.verdict === "accepted") {
       white ??= frame.seen;
-      frame.seen.forEach((value, curve) => add(WHITE, "%", { index, value: (100 * value) / white[curve], curve }, 1));
+      frame.seen.forEach((value, curve) => add(WHITE, "% of first", { index, value: (100 * value) / white[curve], curve }, 1));
     }
     if (kind === "dark" && frame.seen) frame.seen.forEach((value, curve) => add(BLACK, "DN", { index, value, curve }, 2));
-    for (const [name, [value, low, high, reason]] of Object.entries(frame.checks ?? {})) {
-      add(name, model.units[name], { index, value, low, high, good: !reason });
+    for (const [name, unit, value, low, high, reason] of frame.checks ?? []) {
+      add(name, unit, { index, value, low, high, good: !reason });
     }
     add(PACE, "s", { index, value: frame.seconds }, 0.5);
   });
   const rank = (name) => (PLOT_ORDER.includes(name) ? PLOT_ORDER.indexOf(name) : PLOT_ORDER.length);
+  const names = [...series.values()].map((one) => one.name);
+  const isDouble = (name) => names.indexOf(name) !== names.lastIndexOf(name);
+  for (const one of series.values()) one.label = isDouble(one.name) ? `${one.name}, ${one.unit || "number"}` : one.name;
   return [...series.values()].sort((one, other) => rank(one.name) - rank(other.name));
 }
 
 function drawSeries(frames) {
   const count = frames.length;
   const refusals = frames.filter((frame) => frame.verdict && frame.verdict !== "accepted").length;
-  $("series-note").textContent = `${count} attempts in the order in which they were made, ${refusals} without an accepted frame; dashed lines are limits, crosses lie beyond.`;
+  $("series-note").textContent = `${count} attempts in the order in which they were made, ${refusals} without an accepted frame; dashed lines are limits, crosses were refused for that.`;
   drawn.strip = stripOf(frames);
   drawn.strip.svg.setAttribute("aria-label", `Verdicts of ${count} attempts`);
   $("verdicts").replaceChildren(drawn.strip.svg);
-  drawn.plots = seriesOf(frames).map((one) => plotOf({ ...one, count }));
+  drawn.plots = seriesOf(frames).map((one) => plotOf({ ...one, name: one.label, count }));
   $("series").replaceChildren(...drawn.plots.map((plot) => plot.box));
 }
 
@@ -296,6 +298,9 @@ function drawRefused(frames) {
   const bad = frames.filter((frame) => ["refused", "voided", "failed"].includes(frame.verdict)).reverse();
   const shown = allRefused ? bad : bad.slice(0, REFUSED_SHOWN);
   const again = new Set(frames.filter((frame) => frame.verdict === "accepted").map((frame) => frame.step));
+  const key = JSON.stringify([allRefused, bad.map((frame) => [frame.id, frame.verdict, frame.preview, again.has(frame.step)])]);
+  if (drawn.refused === key) return; // What a reader looks at, or has the focus on, stays as it is.
+  drawn.refused = key;
   $("refused-title").textContent = bad.length ? `Refused frames (${bad.length})` : "Refused frames";
   $("more").hidden = bad.length <= REFUSED_SHOWN;
   $("more").textContent = allRefused ? "Show the newest" : `Show all ${bad.length}`;
@@ -315,7 +320,9 @@ function refusalOf(frame, mended) {
   });
   const parts = [button];
   const source = pictureOf(frame);
-  if (source) parts.push(element("img", { src: source, alt: `${name}, ${frame.verdict}`, loading: "lazy" }));
+  // A report is printed and photographed whole; a live page fetches what comes into sight.
+  const loading = embedded ? "eager" : "lazy";
+  if (source) parts.push(element("img", { src: source, alt: `${name}, ${frame.verdict}`, loading }));
   parts.push(element("p", {}, frame.reason || "no reason recorded"));
   parts.push(element("p", { class: "note" }, `${dayText(frame.taken ?? frame.at)}; ${mended ? "taken again since and accepted" : "not yet taken again"}`));
   return element("article", { class: "refusal" }, ...parts);
@@ -325,78 +332,6 @@ function drawEvents() {
   $("events").replaceChildren(
     ...[...model.events].reverse().map(([at, what, detail]) => element("tr", {}, element("td", { class: "number" }, dayText(at)), element("th", { scope: "row" }, what), element("td", {}, detail))),
   );
-}
-
-// Head: what is asked at three in the morning ----------------------------------------------------------------------
-
-function fact(name, value, bad = false) {
-  return element("div", {}, element("dt", {}, name), element("dd", bad ? { class: "bad" } : {}, value));
-}
-
-function drawHead() {
-  const { head } = model;
-  const [glyph, word] = STATES[head.state] ?? STATES.unknown;
-  $("top").dataset.state = head.state;
-  $("state").textContent = `${glyph} ${word}`;
-  const share = head.total ? head.done / head.total : 0;
-  $("bar").style.width = `${(100 * share).toFixed(2)}%`;
-  const bar = $("progress");
-  bar.setAttribute("aria-valuemax", head.total || 1);
-  bar.setAttribute("aria-valuenow", head.done ?? 0);
-  bar.setAttribute("aria-valuetext", `${head.done ?? 0} of ${head.total ?? 0} frames`);
-  document.title = `${glyph} ${head.done ?? 0}/${head.total ?? 0} ${model.session?.name ?? ""}`;
-  drawIcon(share);
-  const facts = [];
-  if (head.total) {
-    facts.push(fact("lights", `${head.lights_done} of ${head.lights_total}`), fact("frames", `${head.done} of ${head.total}`));
-    if (head.done < head.total) facts.push(fact("time left", head.alive ? durationText(head.remaining_s) : "stands still", !head.alive));
-    if (head.eta && head.alive) facts.push(fact("done at about", timeText(head.eta)));
-    if (head.seconds_per_frame) facts.push(fact("a frame", `${short(head.seconds_per_frame)} s`));
-    facts.push(fact("refused", String(head.refused), head.refused > 0), fact("failed", String(head.failed), head.failed > 0));
-    if (head.voided) facts.push(fact("voided", String(head.voided), true));
-  }
-  if (head.last) facts.push(fact("last frame", timeText(head.last)));
-  if (!embedded && head.beat) facts.push(element("div", { id: "beat" }));
-  $("facts").replaceChildren(...facts);
-  drawBanner();
-  drawClock();
-}
-
-function drawBanner() {
-  const { head } = model;
-  const banner = $("banner");
-  const quiet = head.state === "running" || !head.sentence;
-  banner.hidden = quiet;
-  banner.className = ["stopped", "incomplete", "gone"].includes(head.state) ? "bad" : head.state === "complete" ? "good" : "";
-  // The house's sentences name the fault, then, after a semicolon, the remedy.
-  const [fault, ...remedy] = (head.sentence ?? "").split("; ");
-  const text = quiet ? "" : `${fault}\u0000${remedy.join("; ")}`;
-  if ($("banner-text").dataset.text !== text) {
-    $("banner-text").dataset.text = text;
-    $("banner-text").replaceChildren(...(quiet ? [] : [element("strong", {}, fault), remedy.join("; ")]));
-  }
-}
-
-/** Draw what changes with time alone: the countdown, the age of the last sign of life, and whether we are answered. */
-function drawClock() {
-  if (embedded) return;
-  const { head } = model;
-  const left = head.until && head.alive && head.state !== "running" ? (head.until - now()) / 1000 : null;
-  $("countdown").textContent = left === null ? "" : left > 0 ? `Next sign of life within ${durationText(left)} (by ${timeText(head.until)})` : "Late: looking whether it still lives";
-  const beat = $("beat");
-  if (beat) beat.replaceChildren(element("dt", {}, "sign of life"), element("dd", {}, head.alive ? `${durationText((now() - head.beat) / 1000)} ago` : dayText(head.beat)));
-  const silent = Date.now() - answeredAt > 2 * ANSWER_LIMIT_MS;
-  $("offline").hidden = !silent;
-  if (silent) $("offline").textContent = `acquire monitor has not answered since ${timeText(answeredAt)}: what stands here is old. The run itself may well go on; look at its terminal, or start acquire monitor again.`;
-}
-
-/** Draw the tab's icon: a ring that fills, in the colour of the state. */
-function drawIcon(share) {
-  const colours = { running: "#2f8fd0", complete: "#2f8fd0", waiting: "#e0a000", paused: "#e0a000" };
-  const colour = colours[model.head.state] ?? "#d9541e";
-  const round = 2 * Math.PI * 11;
-  const svg = `<svg xmlns="${SVG}" viewBox="0 0 32 32"><circle cx="16" cy="16" r="11" fill="none" stroke="#8888" stroke-width="8"/><circle cx="16" cy="16" r="11" fill="none" stroke="${colour}" stroke-width="8" stroke-dasharray="${round * share} ${round}" transform="rotate(-90 16 16)"/></svg>`;
-  document.querySelector("link[rel=icon]").href = `data:image/svg+xml,${encodeURIComponent(svg)}`;
 }
 
 // Asking -----------------------------------------------------------------------------------------------------------
@@ -468,6 +403,7 @@ function begin() {
   });
   if (embedded) {
     $("sound").hidden = true;
+    document.body.classList.add("report");
     const state = JSON.parse(embedded.textContent);
     model.pictures = state.pictures;
     take(state);

@@ -25,7 +25,8 @@ function short(value) {
   if (value === 0) return "0";
   const size = Math.abs(value);
   if (size >= 100) return value.toFixed(0);
-  return size >= 10 ? value.toFixed(1) : size >= 0.01 ? String(Number(value.toPrecision(3))) : value.toExponential(1);
+  if (size >= 10) return value.toFixed(1);
+  return size >= 0.0005 ? String(Number(value.toPrecision(size >= 0.01 ? 3 : 2))) : value.toExponential(1);
 }
 
 /** Return a number with as many decimals as a range of `span` wants. */
@@ -160,18 +161,21 @@ function pathThrough(points) {
   return path;
 }
 
+/** Return the value below which a share of sorted values lies. */
+const quantile = (sorted, share) => sorted[Math.round(share * (sorted.length - 1))];
+
 /**
  * Return the range of values that a plot shows, at least `least` wide.
  *
- * Limits are always within it, so that what drifts towards one is seen to; a value far beyond them, or far from nearly all
- * others, is drawn at the edge, so that one bad frame does not flatten the rest.
+ * Limits are within it, so that what drifts towards one is seen to; what is far beyond them, or far from nearly all others
+ * (dim lights have wide limits), is drawn at the edge, so that a few frames do not flatten the rest.
  */
 function rangeOf(values, limits, least) {
-  const sorted = [...values].sort((one, other) => one - other);
-  const at = (share) => sorted[Math.round(share * (sorted.length - 1))];
+  const [sorted, bounds] = [values, limits].map((numbers) => [...numbers].sort((one, other) => one - other));
   const [first, last] = [sorted[0], sorted[sorted.length - 1]];
-  let low = Math.min(at(0.05), ...limits);
-  let high = Math.max(at(0.95), ...limits);
+  const within = bounds.length ? [quantile(bounds, 0.1), quantile(bounds, 0.9)] : [];
+  let low = Math.min(quantile(sorted, 0.05), ...within);
+  let high = Math.max(quantile(sorted, 0.95), ...within);
   const reach = Math.max((high - low) * (limits.length ? 0.6 : 2), Math.abs(high) * 0.02);
   [low, high] = [Math.min(low, Math.max(first, low - reach)), Math.max(high, Math.min(last, high + reach))];
   const margin = Math.max((high - low) * 0.08, (least - (high - low)) / 2) || Math.abs(high) * 0.05 || 1;
@@ -189,7 +193,8 @@ function plotOf({ name, unit, points, count, least }) {
   const [low, high] = rangeOf(points.map((point) => point.value), limits, least);
   const bottom = PLOT.height - PLOT.bottom;
   const y = (value) => bottom - ((value - low) / (high - low)) * (bottom - PLOT.top);
-  const at = (point) => [across(point.index, count), Math.max(PLOT.top, Math.min(bottom, y(point.value)))];
+  const held = (value) => Math.max(PLOT.top, Math.min(bottom, y(value)));
+  const at = (point) => [across(point.index, count), held(point.value)];
   const bad = points.filter((point) => !point.good);
   const latest = [0, 1, 2].map((curve) => points.findLast((point) => point.curve === curve)).filter(Boolean);
   const said = `${latest.map((point) => within(point.value, high - low)).join(", ")} ${unit ?? ""}`.trim();
@@ -202,7 +207,7 @@ function plotOf({ name, unit, points, count, least }) {
     shape("text", { x: PLOT.left - 5, y: bottom, "text-anchor": "end" }, short(low)),
   );
   for (const side of ["low", "high"]) {
-    const line = points.map((point) => (point[side] === null ? null : [across(point.index, count), y(point[side])]));
+    const line = points.map((point) => (point[side] === null ? null : [across(point.index, count), held(point[side])]));
     const alone = line.length === 1 && line[0];
     const path = alone ? `M${PLOT.left} ${alone[1]}H${PLOT.width - PLOT.right}` : pathThrough(line);
     if (path) svg.append(shape("path", { class: "limit", d: path }));

@@ -14,7 +14,7 @@ from drivers.display.fullscreen import FullScreen
 from drivers.display.jvc import PORT as JVC_PORT
 from drivers.display.jvc import JvcFlatField
 from drivers.display.lightcrafter import LightCrafter, find_lightcrafter
-from drivers.gphoto2_camera import Gphoto2Camera
+from drivers.gphoto2_camera.camera import Gphoto2Camera
 from drivers.links.pipes import UsbPipes
 from drivers.links.serial import SerialLink
 from drivers.links.tcp import TcpLink

@@ -54,3 +54,12 @@ def open_rig(
             from acquisition.run.rig.simulated import open_simulated
 
             yield open_simulated(settings, chart, session, opened)
+
+
+def known_frame_bytes(settings: LabSettings) -> int | None:
+    """Return the size of the raw files of a simulated rig, bytes; None where a real camera decides it."""
+    if settings.rig not in ("simulated", "replay"):
+        return None
+    from acquisition.run.rig.simulated import simulated_frame_bytes
+
+    return simulated_frame_bytes(settings)

@@ -115,6 +115,22 @@ def simulated_body(settings: LabSettings) -> Body:
     return find_body(name, changes, settings.file, "simulated.camera")
 
 
+def simulated_frame_bytes(settings: LabSettings) -> int:
+    """Return the size of a raw file that the simulated camera writes: 16 bits a photosite, or the largest recorded.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such body.
+    FormatError
+        The recorded session holds no frames.
+    """
+    if settings.replay is not None and settings.rig == "replay":
+        return max(frame.path.stat().st_size for frame in _recording(settings.replay.session))
+    rows, columns = simulated_body(settings).sensor
+    return 2 * rows * columns
+
+
 def simulated_room(settings: LabSettings) -> Room:
     """Return the default room with the seed and the changes of the settings.
 

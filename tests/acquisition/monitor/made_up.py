@@ -119,7 +119,8 @@ class MadeUpRun:
             checks.append(Check("dark", 4.5 + 0.1 * float(drawn[3]), None, 80.0, "DN"))
             checks.append(Check("ambient", 0.04 + 0.004 * float(drawn[4]), None, 0.5, "%"))
         else:
-            checks.append(Check("light", abs(0.3 + 0.1 * float(drawn[5])), None, 1.0, "%"))
+            checks.append(Check("light", abs(0.3 + 0.1 * float(drawn[5])), None, 1.0, "°"))
+        checks.append(Check("screen"))
         return tuple(checks)
 
 
@@ -130,7 +131,7 @@ def whole_night(folder: Path, share: float = 0.6, *, grid: int = 35, previews: b
     last = int(share * len(run.steps))
     for step in run.steps[:last]:
         if step.number == last // 3:
-            reason = "the light is 8.2 % from the one ordered, 1 % allowed; close what covers the picture"
+            reason = "the light is 8.2° from the one ordered, 1° allowed; close what covers the picture"
             run.take(step, reason, value=8.2)
         if step.number == last // 2:
             reason = "the chart has moved by 3.1 px, 0.5 px allowed; find what moved it"

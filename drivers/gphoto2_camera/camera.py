@@ -5,7 +5,8 @@ Rules that hold inside:
 - python-gphoto2 is an optional extra and is imported only when a camera is opened.
 - libgphoto2's errors become ours in `_speaking`. After a fault the connection is dropped, and the next call opens a
   new one; a frame that was being transferred is lost and may be retaken.
-- Settings are chosen from the lists that libgphoto2 shows for the body, and read back.
+- Settings are chosen from what libgphoto2 shows for the body (`drivers.gphoto2_camera.settings`), and read back.
+- A file that is no raw file is refused, whatever the body was asked for.
 
 libgphoto2 may focus before it releases, so that a body that does not focus by hand is refused.
 """
@@ -18,21 +19,32 @@ from contextlib import contextmanager
 from datetime import datetime
 from typing import TYPE_CHECKING, BinaryIO
 
-from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings
+from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
+from drivers.gphoto2_camera.settings import (
+    HOST_TARGETS,
+    SHUTTER,
+    TARGET,
+    Setting,
+    battery_level,
+    first_of,
+    is_no_raw_file,
+    is_same,
+    number_of,
+    plan,
+)
 from foundation.clock import Clock, SystemClock
 from foundation.errors import ConfigurationError, DeviceError, DeviceRefused, LinkClosed, LinkTimeout
 
 if TYPE_CHECKING:
     import gphoto2
 
-TOLERANCE = 0.06
-"""Relative difference allowed between a label and the value wanted: libgphoto2 lists 6.3 s where the dial shows 6."""
+SETTLE_LIMIT_S = 5.0
+"""How long a body may take to report a value that it was given: a Sony turns its dials step by step."""
+
+_LOOK_AGAIN_S = 0.1
+"""Between two looks at a value that is to settle; each costs an exchange with the body."""
 
 _SYSTEM_CLOCK = SystemClock()
-_MANUAL = ("Manual", "M")
-_SINGLE = ("Single", "Single silent", "Single Shot")
-_RAW_FORMATS = ("RAW", "NEF (Raw)", "Raw")
-_HOST_TARGETS = ("Internal RAM", "sdram")
 _IDENTITY = {
     "maker": ("manufacturer",),
     "model": ("cameramodel",),
@@ -91,8 +103,27 @@ class Gphoto2Camera:
             The body cannot be reached.
         """
         with self._speaking() as camera:
-            numbers = (_number(label) for label in _choices(camera, "shutterspeed"))
+            setting = first_of(lambda name: _setting(camera, name), SHUTTER)
+            numbers = (number_of(label) for label in (setting.choices if setting is not None else ()))
             return tuple(sorted({number for number in numbers if number is not None}))
+
+    def supplies(self) -> Supplies:
+        """Return what is left of battery and card, as far as libgphoto2 shows it; see `drivers.camera.ReportsSupplies`.
+
+        Raises
+        ------
+        DeviceError
+            The body cannot be reached.
+        """
+        with self._speaking() as camera:
+            power = _text(camera, ("acpower",))
+            target = _text(camera, TARGET)
+            return Supplies(
+                battery_level(_text(camera, ("batterylevel",))),
+                {"On": True, "Off": False}.get(power),
+                _card_free_bytes(camera),
+                not target or target in HOST_TARGETS,
+            )
 
     def expose(self) -> datetime:
         """Release the shutter; return when it was released, UTC, once libgphoto2 names the file.
@@ -116,7 +147,13 @@ class Gphoto2Camera:
             if fresh:
                 self._apply(camera, settings)
             released_at = self._clock.now()
-            self._exposed = camera.capture(gp.GP_CAPTURE_IMAGE), released_at
+            path = camera.capture(gp.GP_CAPTURE_IMAGE)
+            self._exposed = path, released_at
+            if is_no_raw_file(path.name):
+                self._forget(camera)
+                raise DeviceRefused(
+                    f"the camera made {path.name}, no raw file, though it was asked for one; set raw alone by hand"
+                )
         return released_at
 
     def download(self, into: BinaryIO) -> CapturedFrame:
@@ -190,38 +227,25 @@ class Gphoto2Camera:
         return camera
 
     def _apply(self, camera: gphoto2.Camera, settings: ExposureSettings) -> None:
-        refused: list[str] = []
-        for name, allowed, remedy in (
-            ("autoexposuremode", _MANUAL, "turn the mode dial to M"),
-            ("focusmode", _MANUAL, "set the lens to MF and focus by hand"),
-            ("drivemode", _SINGLE, "set single shooting"),
-        ):
-            value = _text(camera, (name,))
-            if value and value not in allowed:
-                refused.append(f"{name} is {value}: {remedy}")
-        wanted: dict[str, str] = {}
-        for name, labels in (("capturetarget", _HOST_TARGETS), ("imageformat", _RAW_FORMATS)):
-            choices = _choices(camera, name)
-            found = next((label for label in labels if label in choices), None)
-            if found is not None:
-                wanted[name] = found
-            elif choices:
-                refused.append(f"{name} offers {', '.join(choices)}, none of {', '.join(labels)}")
-        for name, value in (
-            ("iso", float(settings.iso)),
-            ("aperture", settings.aperture),
-            ("shutterspeed", settings.shutter_s),
-        ):
-            choices = _choices(camera, name)
-            found = _nearest(choices, value)
-            if found is not None:
-                wanted[name] = found
-            else:
-                refused.append(f"{name} {value:g} is not offered; offered are {', '.join(choices) or 'none'}")
-        if refused:
-            raise DeviceRefused(f"the camera cannot take the series: {'; '.join(refused)}")
-        for name, label in wanted.items():
-            _set(camera, name, label)
+        for name, label in plan(lambda name: _setting(camera, name), settings).items():
+            self._set(camera, name, label)
+
+    def _set(self, camera: gphoto2.Camera, name: str, label: str) -> None:
+        """Set a setting, and see that the body reports it."""
+        gp = library()
+        widget = camera.get_single_config(name)
+        if is_same(_shown(widget.get_value()), label):
+            return
+        widget.set_value(float(label) if widget.get_type() == gp.GP_WIDGET_RANGE else label)
+        camera.set_single_config(name, widget)
+        end = self._clock.monotonic() + SETTLE_LIMIT_S
+        while True:
+            came = _shown(camera.get_single_config(name).get_value())
+            if is_same(came, label):
+                return
+            if self._clock.monotonic() >= end:
+                raise DeviceRefused(f"{name} was set to {label}, and the camera reports {came}; set it by hand")
+            self._clock.sleep(_LOOK_AGAIN_S)
 
 
 def library():
@@ -295,41 +319,41 @@ def _text(camera: gphoto2.Camera, names: Iterable[str]) -> str:
     return ""
 
 
-def _choices(camera: gphoto2.Camera, name: str) -> list[str]:
-    """Return what a widget can be set to, empty where the body has no such widget or no list for it."""
+def _setting(camera: gphoto2.Camera, name: str) -> Setting | None:
+    """Return a setting as the body shows it, None where it has none of that name."""
     gp = library()
     try:
         widget = camera.get_single_config(name)
     except gp.GPhoto2Error as error:
         if error.code != gp.GP_ERROR_BAD_PARAMETERS:
             raise
-        return []
-    if widget.get_type() not in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU):
-        return []
-    return [widget.get_choice(index) for index in range(widget.count_choices())]
-
-
-def _set(camera: gphoto2.Camera, name: str, label: str) -> None:
-    widget = camera.get_single_config(name)
-    if widget.get_value() != label:
-        widget.set_value(label)
-        camera.set_single_config(name, widget)
-        came = camera.get_single_config(name).get_value()
-        if came != label:
-            raise DeviceRefused(f"{name} was set to {label}, and the camera reports {came}; set it by hand")
-
-
-def _nearest(choices: Iterable[str], wanted: float) -> str | None:
-    """Return the label of the choice nearest to `wanted`, None where none is near enough."""
-    numbers = {label: number for label in choices if (number := _number(label)) is not None}
-    near = [label for label, number in numbers.items() if abs(number / wanted - 1) <= TOLERANCE]
-    return min(near, key=lambda label: abs(numbers[label] / wanted - 1), default=None)
-
-
-def _number(label: str) -> float | None:
-    over, _, under = label.lower().removeprefix("f/").removesuffix("s").partition("/")
-    try:
-        number = float(over) / float(under or 1)
-    except (ValueError, ZeroDivisionError):
         return None
-    return number if number > 0 else None
+    kind = widget.get_type()
+    choices: tuple[str, ...] = ()
+    bounds: tuple[float, float] | None = None
+    if kind in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU):
+        choices = tuple(widget.get_choice(index) for index in range(widget.count_choices()))
+    elif kind == gp.GP_WIDGET_RANGE:
+        least, greatest, _ = widget.get_range()
+        bounds = least, greatest
+    return Setting(name, _shown(widget.get_value()), choices, bounds, bool(widget.get_readonly()))
+
+
+def _shown(value: object) -> str:
+    """Return a value as text; a number as short as it is true."""
+    if value is None:
+        return ""
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def _card_free_bytes(camera: gphoto2.Camera) -> int | None:
+    """Return the room on all cards together; None where none tells it."""
+    gp = library()
+    try:
+        stores = camera.get_storageinfo()
+    except gp.GPhoto2Error as error:
+        if error.code != gp.GP_ERROR_NOT_SUPPORTED:
+            raise
+        return None
+    free = [1024 * store.freekbytes for store in stores if store.fields & gp.GP_STORAGEINFO_FREESPACEKBYTES]
+    return sum(free) if free else None

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from drivers.camera import CameraIdentity, ExposureSettings, capture
-from drivers.gphoto2_camera import Gphoto2Camera
+from drivers.gphoto2_camera.camera import Gphoto2Camera
 from foundation.clock import SystemClock
 from foundation.errors import ConfigurationError, DeviceError, DeviceRefused, LinkError
 from tests.contracts.camera import SETTINGS, Bench, CameraContract, SeededFilm
@@ -48,7 +48,7 @@ def served(port: int = 0, mode: str = "prepared") -> Generator[tuple[str, FarFil
     """Serve a simulated EOS; give libgphoto2's name of its port, and its film."""
     with subprocess.Popen(
         [sys.executable, "-m", "tests.drivers.gphoto2_server", str(port), mode],
-        cwd=Path(__file__).parents[2],
+        cwd=Path(__file__).parents[3],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     ) as process:

@@ -1,0 +1,220 @@
+"""What the judge knows of a session so far, as one frozen value, and what a frame adds to it.
+
+Rules that hold inside:
+
+- `after` is the only way on, for a frame just judged and for one of an earlier run, so that a run that is taken up
+  again knows what an uninterrupted one would.
+- Only accepted frames teach. A refused one is kept as the frame before, and as what may be lasting.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.judge.anchor import Anchor
+from acquisition.judge.basis import Basis, Light
+from acquisition.judge.frame import Frame
+from acquisition.judge.measuring import Measured
+from acquisition.judge.response import FULL, Codes, ProjectorModel
+from acquisition.session.plan import SessionStep
+
+RECENT = 6
+"""Frames whose noise is compared with the next one's: a camera's memory card hands out none older."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A frame that was taken: its codes, what was measured, the amounts of light if they are known."""
+
+    codes: Codes
+    measured: Measured
+    amounts: _Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What was found of a frame, and said of it.
+
+    Attributes
+    ----------
+    frame
+        What was measured.
+    light
+        Its light, where a basis is known.
+    accepted
+        Whether it may be used.
+    cause
+        Name of the check that refused it; empty if none did.
+    brightness
+        Level of the lamp over the one expected (logarithm); NaN where that is not known.
+    stepped
+        Whether it was accepted at another level of the lamp than expected.
+    """
+
+    frame: Frame
+    light: Light | None
+    accepted: bool
+    cause: str = ""
+    brightness: float = float("nan")
+    stepped: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """All that is known.
+
+    Attributes
+    ----------
+    anchor
+        The chart's place.
+    first
+        The session's first accepted frame: camera, size, serial number.
+    first_white, white, first_dark, dark
+        Accepted references.
+    primaries
+        Frames of the three primaries at `FULL`.
+    basis, model
+        How a frame is a sum of primaries, and which amounts codes give.
+    moved_px
+        (2,) where the chart lay last, from its place in the anchor; NaN if not known.
+    recent
+        The last frames, the newest last.
+    digests
+        Of all frames.
+    untold
+        Names of checks that some accepted frame since the last good reference was too dark for.
+    refused
+        Cause, and number, of the refusals in a row.
+    candidate
+        Level of the lamp (logarithm) and place of the chart (px) of the frame refused last; NaN where it was not that.
+    rested
+        Whether the run was taken up again and no lit frame has been accepted since.
+    moved_on
+        Whether the chart lies elsewhere than in the white frame that is known.
+    """
+
+    anchor: Anchor | None = None
+    first: Measured | None = None
+    first_white: Frame | None = None
+    white: Measured | None = None
+    first_dark: Measured | None = None
+    dark: Measured | None = None
+    primaries: tuple[Measured | None, Measured | None, Measured | None] = (None, None, None)
+    basis: Basis | None = None
+    model: ProjectorModel = field(default_factory=ProjectorModel.unknown)
+    moved_px: _Array | None = None
+    recent: tuple[Seen, ...] = ()
+    digests: frozenset[bytes] = frozenset()
+    untold: frozenset[str] = frozenset()
+    refused: tuple[str, int] = ("", 0)
+    candidate: tuple[float, float, float] = (float("nan"), float("nan"), float("nan"))
+    rested: bool = False
+    moved_on: bool = False
+
+    @property
+    def modelled(self) -> bool:
+        """Whether amounts are those of the projector's primaries, so that codes foretell them."""
+        return self.basis is not None and self.basis.of_primaries
+
+    def paused(self) -> Knowledge:
+        """Return what is known after a pause of the run: the lamp may be at another level, the chart elsewhere."""
+        if self.rested or not self.digests:
+            return self
+        return replace(self, model=self.model.rested(), rested=True, recent=(), refused=("", 0))
+
+    def after(self, step: SessionStep, found: Found) -> Knowledge:
+        """Return what is known after a frame of a step."""
+        frame, codes = found.frame, codes_of(step)
+        seen = Seen(codes, frame.measured, None if found.light is None else found.light.amounts)
+        known = replace(
+            self,
+            recent=(*self.recent, seen)[-RECENT:],
+            digests=self.digests | {frame.measured.digest},
+        )
+        if not found.accepted:
+            count = self.refused[1] + 1 if found.cause == self.refused[0] else 1
+            lamp = found.brightness if found.cause == "lamp" else float("nan")
+            x, y = frame.moved_px.tolist() if found.cause == "movement" else (float("nan"), float("nan"))
+            return replace(known, refused=(found.cause, count), candidate=(lamp, x, y))
+        known = replace(known, refused=("", 0), candidate=(float("nan"),) * 3, first=self.first or frame.measured)
+        if step.kind != "dark":
+            known = replace(known, rested=False)
+        if not np.isnan(frame.moved_px).any():
+            known = replace(known, moved_px=frame.moved_px)
+        if frame.anchor is not None:
+            known = known._anchored(frame.anchor)
+        known = known._referenced(step, frame)
+        # A frame that makes the basis has been learnt from with it.
+        if found.light is not None and self.modelled and known.modelled and step.kind != "dark":
+            model = known.model.stepped() if found.stepped else known.model
+            known = replace(known, model=model.learn(found.light.amounts, codes))
+        return known
+
+    def _anchored(self, anchor: Anchor) -> Knowledge:
+        """Return what is known where the chart lies elsewhere: pictures of another place are no basis any more."""
+        again = self.anchor is not None
+        return replace(
+            self,
+            anchor=anchor,
+            moved_px=np.zeros(2),
+            moved_on=again,
+            basis=None if again else self.basis,
+            primaries=(None, None, None) if again else self.primaries,
+        )
+
+    def _referenced(self, step: SessionStep, frame: Frame) -> Knowledge:
+        """Return what is known with a frame that later ones are compared with."""
+        measured = frame.measured
+        known = self
+        if step.kind in ("white", "dark"):
+            known = replace(known, untold=frozenset())
+        if step.kind == "white":
+            known = replace(known, white=measured, first_white=self.first_white or frame, moved_on=False)
+        if step.kind == "dark":
+            known = replace(known, dark=measured, first_dark=self.first_dark or measured)
+            if known.basis is not None and known.basis.of_primaries:
+                known = replace(known, basis=known.basis.with_dark(measured))
+        primary = primary_of(codes_of(step))
+        if step.kind == "response" and primary is not None and len(measured.strips):
+            of: list[Measured | None] = list(known.primaries)
+            of[primary] = measured
+            known = replace(known, primaries=(of[0], of[1], of[2]))
+        return known._based(step)
+
+    def _based(self, step: SessionStep) -> Knowledge:
+        """Return what is known with the best basis that the frames so far give."""
+        red, green, blue = self.primaries
+        if self.dark is None:
+            return self
+        if self.basis is None or not self.basis.of_primaries:
+            if red is not None and green is not None and blue is not None:
+                basis = Basis.between((red, green, blue), self.dark)
+                model = self.model
+                for number, frame in enumerate((red, green, blue)):
+                    model = model.learn(basis.light(frame).amounts, primary_codes(number))
+                if self.white is not None and not self.moved_on:
+                    model = model.learn(basis.light(self.white).amounts, (255, 255, 255))
+                return replace(self, basis=basis, model=model)
+            if self.white is not None and step.kind in ("white", "dark"):
+                return replace(self, basis=Basis.of_white(self.white, self.dark))
+        return self
+
+
+def codes_of(step: SessionStep) -> Codes:
+    """Return the codes of red, green and blue that a step shows."""
+    return step.colour.red, step.colour.green, step.colour.blue
+
+
+def primary_codes(primary: int) -> Codes:
+    """Return the codes that show primary 0, 1 or 2 alone at `FULL`."""
+    return (FULL if primary == 0 else 0, FULL if primary == 1 else 0, FULL if primary == 2 else 0)
+
+
+def primary_of(codes: Codes) -> int | None:
+    """Return which primary codes show alone at `FULL`; None if they show anything else."""
+    return next((number for number in range(3) if codes == primary_codes(number)), None)

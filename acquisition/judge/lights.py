@@ -1,0 +1,229 @@
+"""Whether a frame shows the light that was ordered, and which other one it shows if not.
+
+The amounts of the three primaries in a frame are compared with those that the codes foretell. The lamp's level is left
+free for the colour, and judged by itself. A light that is not the one ordered is held against everything else that it
+could be: the light of the frame before, another one of the plan, the ordered one and light from elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.judge import limits
+from acquisition.judge.basis import Light
+from acquisition.judge.knowledge import Knowledge, Seen, codes_of
+from acquisition.judge.response import Codes, Fit, ProjectorModel
+from acquisition.session.judgement import Check
+from acquisition.session.plan import SessionStep
+from foundation.angles import angles_deg
+from foundation.srgb import decode_srgb
+
+_SAME_SD = 0.0015
+"""Scatter of amounts between two frames of one light that is reckoned with at least, relative."""
+
+_SAME_FLOOR = 4e-4
+"""The same of amounts without light, of a full primary."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LightVerdict:
+    """What is said of a light: the checks, the lamp's level over the one expected, whether it is a step lived with."""
+
+    checks: tuple[Check, ...]
+    brightness: float = float("nan")
+    stepped: bool = False
+
+
+def judge_light(
+    known: Knowledge, step: SessionStep, light: Light, plan: Sequence[Codes], angle_deg: float, drift_percent: float
+) -> LightVerdict:
+    """Return whether a lit frame shows what its step asks for.
+
+    Parameters
+    ----------
+    known
+        Before this frame, with a basis.
+    light
+        The frame's.
+    plan
+        Codes of all lights of the plan, among which another one is looked for.
+    angle_deg
+        Angle that the light may always be off by (`[judge] light_deg`).
+    drift_percent
+        Change of brightness that is always allowed (`[judge] drift_percent`).
+    """
+    codes = codes_of(step)
+    before = known.recent[-1] if known.recent else None
+    if not known.modelled:
+        return LightVerdict((_without_model(light, codes, before),))
+    model = known.model
+    fit = model.compare(light.amounts, codes, light.covariance)
+    limit = max(angle_deg, fit.angle_limit(limits.LIGHT_SIGMAS))
+    wrong = fit.angle_deg > limit
+    room = max(drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
+    reason, added = "", 0.0
+    if wrong or fit.distance > limits.STALE_SIGMAS or abs(fit.brightness) > room:
+        reason, added = _cause(model, light, codes, before, plan, fit, wrong, room)
+    stepped = False
+    lamp = ""
+    if not reason and abs(fit.brightness) > room:
+        level = known.candidate[0]
+        # Shown twice alike, and small: the lamp has another level now, and each light has a ground truth of its own.
+        stepped = abs(fit.brightness) <= limits.LAMP_FOLLOWED and abs(fit.brightness - level) <= room / 2
+        lamp = "" if stepped else _brightness_reason(fit.brightness, light.amounts)
+    percent = 100 * float(np.expm1(fit.brightness))
+    ambient = (Check("ambient", round(100 * added, 2), None, None, "%", reason),) if added else ()
+    # Where another cause changes the light, its brightness is none of the lamp's.
+    checks = (
+        *ambient,
+        Check("light", round(fit.angle_deg, 3), None, round(limit, 3), "°", "" if added else reason),
+        Check("lamp", round(percent, 2), round(-100 * room, 2), round(100 * room, 2), "%", lamp),
+    )
+    return LightVerdict(checks, fit.brightness, stepped)
+
+
+def same_light(one: _Array, other: _Array, scatter: float) -> float:
+    """Return how many standard deviations two frames' amounts (3,) differ by; `scatter` relative, of colours."""
+    sd = max(scatter, _SAME_SD)
+    variance = 2 * ((sd * np.maximum(one, other)) ** 2 + _SAME_FLOOR**2)
+    return float(np.sqrt(((one - other) ** 2 / variance).sum()))
+
+
+def _cause(
+    model: ProjectorModel,
+    light: Light,
+    codes: Codes,
+    before: Seen | None,
+    plan: Sequence[Codes],
+    fit: Fit,
+    wrong: bool,
+    room: float,
+) -> tuple[str, float]:
+    """Return why a light is not the one ordered, empty where it is but its lamp, and how much light is added to it."""
+    squared = fit.distance**2 + (fit.brightness / fit.brightness_sd) ** 2
+    if before is not None and before.amounts is not None and before.codes != codes:
+        same = same_light(light.amounts, before.amounts, model.chroma_sd)
+        if same < limits.LIGHT_SIGMAS and squared - same**2 > limits.STALE_ADVANTAGE:
+            return (
+                f"the light of the frame before, {_named(before.codes)}, is still seen, {_named(codes)} was ordered; "
+                "does the screen stand still, or is sequence.settle_s too short?",
+                0.0,
+            )
+    ambient = _ambient(model, light, codes)
+    if wrong:
+        if ambient is not None and ambient[1] < limits.LIGHT_SIGMAS**2:
+            return _ambient_reason(ambient[0]), ambient[0]
+        other = _other(model, light, codes, plan, squared)
+        return other or _wrong_reason(model, light, codes), 0.0
+    if fit.brightness > room and ambient is not None and ambient[1] + 9 < fit.distance**2:
+        return _ambient_reason(ambient[0]), ambient[0]
+    if fit.distance > limits.STALE_SIGMAS:
+        return _other(model, light, codes, plan, squared), 0.0
+    return "", 0.0
+
+
+def _wrong_reason(model: ProjectorModel, light: Light, codes: Codes) -> str:
+    expected = model.predict(codes).amounts
+    parts = ", ".join(
+        f"{name} {100 * seen:.1f} % instead of {100 * wanted:.1f} %"
+        for name, seen, wanted in zip(("red", "green", "blue"), light.amounts, expected, strict=True)
+    )
+    return (
+        f"the light is not the one ordered, {_named(codes)}: {parts} of the primaries; look for what covers the "
+        "picture or changes its colours, a pop-up, a screen saver, a picture mode"
+    )
+
+
+def _other(model: ProjectorModel, light: Light, codes: Codes, plan: Sequence[Codes], squared: float) -> str:
+    """Return the sentence that names the light of the plan, or black or white, that is seen instead; empty if none."""
+    # Only what is about as bright and of that colour is compared in full.
+    found: tuple[float, Codes] | None = None
+    for other in _near(model, light.amounts, [*plan, (0, 0, 0), (255, 255, 255)]):
+        if other == codes:
+            continue
+        if not any(other):
+            left = float(((light.amounts / (3 * _SAME_FLOOR)) ** 2).sum())
+        else:
+            fit = model.compare(light.amounts, other, light.covariance)
+            left = fit.distance**2 + (fit.brightness / (fit.brightness_sd + 0.01)) ** 2
+        if found is None or left < found[0]:
+            found = left, other
+    if found is None or squared - found[0] < limits.OTHER_ADVANTAGE or found[0] > limits.LIGHT_SIGMAS**2:
+        return ""
+    return (
+        f"another light is seen, {_named(found[1])}, {_named(codes)} was ordered; "
+        "does something else draw on the screen, or is the picture late?"
+    )
+
+
+def _near(model: ProjectorModel, amounts: _Array, plan: Sequence[Codes], most: int = 12) -> list[Codes]:
+    """Return the codes whose amounts, by the tone curves alone, are nearest."""
+    curves = model.curves()
+    table = np.array(plan)
+    foretold = np.stack([curves[primary, table[:, primary]] for primary in range(3)], axis=-1)
+    off = np.linalg.norm(foretold - amounts, axis=1)
+    return [plan[k] for k in np.argsort(off, kind="stable")[:most].tolist()]
+
+
+def _ambient(model: ProjectorModel, light: Light, codes: Codes) -> tuple[float, float] | None:
+    """Return how much neutral light, of white, added to the one ordered explains it, and the squared distance left."""
+    expected = model.predict(codes)
+    h, neutral = expected.amounts, np.ones(3)
+    covariance = expected.covariance + light.covariance
+    # The lamp is where it was, within its scatter: what is added is asked for.
+    covariance = covariance + (model.brightness_sd**2 + 1e-6) * np.outer(h, h)
+    weight = np.linalg.inv(covariance)
+    power = float(neutral @ weight @ neutral)
+    added = float(neutral @ weight @ (light.amounts - h)) / power
+    off = light.amounts - h - added * neutral
+    if added <= 4 * power**-0.5 or added < 0.002:
+        return None
+    return added, float(off @ weight @ off)
+
+
+def _ambient_reason(added: float) -> str:
+    return (
+        f"light from elsewhere, {100 * added:.1f} % of white, falls on the chart besides the projector's; "
+        "darken the room, close the door, cover lamps and displays"
+    )
+
+
+def _brightness_reason(brightness: float, amounts: _Array) -> str:
+    percent = 100 * float(np.expm1(brightness))
+    if percent < 0:
+        return (
+            f"the light is {-percent:.1f} % weaker than expected, its colour is right; does the lamp fail, or did its "
+            "power mode, the shutter or the aperture change?"
+        )
+    elsewhere = ", or does other light fall on the chart" if amounts.min() > 0.2 * amounts.max() else ""
+    return (
+        f"the light is {percent:.1f} % stronger than expected, its colour is right; did the lamp's power mode, the "
+        f"shutter or the aperture change{elsewhere}?"
+    )
+
+
+def _without_model(light: Light, codes: Codes, before: Seen | None) -> Check:
+    """Return what can be said without frames of the primaries: whether nothing has changed since the frame before."""
+    if before is None or before.amounts is None or before.codes == codes or not any(codes) or not any(before.codes):
+        return Check("light")
+    wanted = np.array([decode_srgb(np.array(c) / 255) for c in (codes, before.codes)])
+    away = float(angles_deg(wanted[:1], wanted[1:])[0])
+    brighter = abs(float(np.log(wanted[0].sum() / wanted[1].sum())))
+    same = same_light(light.amounts, before.amounts, 0.005)
+    reason = ""
+    if same < 2 * limits.STALE_SIGMAS and (away > limits.NOMINAL_DEG or brighter > 0.2):
+        reason = (
+            f"the light of the frame before, {_named(before.codes)}, is still seen, {_named(codes)} was ordered; does "
+            "the screen stand still, or is sequence.settle_s too short?"
+        )
+    return Check("light", reason=reason)
+
+
+def _named(codes: Codes) -> str:
+    return "black" if not any(codes) else "({}, {}, {})".format(*codes)

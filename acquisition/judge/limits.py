@@ -1,0 +1,86 @@
+"""By which limits frames are judged, beside those that LAB.toml sets in `[judge]` and `[limits]`, each with its reason.
+
+What scatters (colour wheel, shutter, lamp) has limits in standard deviations of the scatter that was seen; the numbers
+here are how many, and the least that makes sense.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+LIGHT_SIGMAS: Final = 5.5
+"""Standard deviations of two degrees of freedom: exceeded by chance once in four million frames."""
+
+BRIGHTNESS_SIGMAS: Final = 6.0
+"""Standard deviations of the lamp's level: exceeded once in 500 million frames; tails of a flickering lamp are
+longer."""
+
+STALE_SIGMAS: Final = 3.5
+"""Standard deviations off from which on the light of the frame before is asked for: few lights are so near to the one
+before, so that one frame in 500 may be asked."""
+
+STALE_ADVANTAGE: Final = 13.8
+"""By how much squared standard deviations the light before must fit better: a likelihood a thousand times larger."""
+
+OTHER_ADVANTAGE: Final = 20.0
+"""The same for any other light of the plan: a likelihood 22 000 times larger, as there are 706 of them."""
+
+UNEVEN: Final = 0.02
+"""Deviation of a tile from the light of the whole frame, relative: an LCD's unevenness changes by as much between
+codes; a lamp's arc that wanders shifts the field by less."""
+
+UNEVEN_WHITE: Final = 0.25
+"""The same where the primaries are not known and the camera's own colours stand for them."""
+
+UNEVEN_TILES: Final = 0.05
+"""Share of the tiles that must deviate by so much there."""
+
+UNEVEN_SIGMAS: Final = 7.0
+"""Standard deviations of a tile's noise: of 384 tiles in 767 frames of 100 sessions none exceeds them by chance."""
+
+ROW_DEVIATION: Final = 0.15
+"""Deviation of a strip of a row from the light of the frame, relative, that counts it as another row's: rows of other
+cells differ by 6 to 8 % on an EOS 550D, 20 % where strips have few cells, rows that lack data by 100 %."""
+
+ROW_SIGMAS: Final = 8.0
+"""Standard deviations of a strip, of those usual in the frame and of noise, beyond which it counts so, too."""
+
+ROWS: Final = 3
+"""Strips of rows that may deviate: a fly covers as many."""
+
+EMPTY_SHARE: Final = 1e-5
+"""Share of photosites without any count: a body's dead photosites are fewer, one lost row is 3e-4."""
+
+SAME_NOISE: Final = 0.3
+"""Noise of the difference of two frames over that of two independent ones: 1 if independent, rather more where
+photosites' own differences are large; 0.3 is a correlation of 0.9, 0 the same frame."""
+
+LEAST_NOISE: Final = 0.4
+"""Standard deviation of a photosite, counts, below which noise cannot tell a repeated frame: rounding remains."""
+
+LAMP_FOLLOWED: Final = 0.055
+"""Largest step of the lamp that is lived with when the frame is repeated and shows it again (logarithm, 5 %): each
+light has its own ground truth, so that brightness harms none; a larger step is a lamp that fails."""
+
+LAMP_TOTAL: Final = 15.0
+"""Largest change of paper white since the session's first white frame, per cent: beyond, build-lut makes no table."""
+
+MOVED_FOLLOWED_PX: Final = 1.0
+"""Largest displacement that is lived with when the frame is repeated and shows the chart at rest there: build-lut moves
+its grid; beyond, it remarks on it."""
+
+STEADY_PX: Final = 0.1
+"""How near a repeated frame must have the chart for it to be at rest."""
+
+DIM_DN: Final = 40.0
+"""Counts of paper above black below which a frame is too dark to tell movement (0.02 px at 66) and blur."""
+
+BLUR_DIM_DN: Final = 250.0
+"""The same for blur alone, which is a second derivative of the picture."""
+
+LASTING_FRAMES: Final = 3
+"""Frames refused in a row for one cause that make it a lasting one: as many as a step has attempts by default."""
+
+NOMINAL_DEG: Final = 8.0
+"""Angle between two lights' codes in linear light from which on they cannot look alike, where no primaries are
+known."""

@@ -1,0 +1,110 @@
+"""Whether a dark frame is dark and as dark as before, and how far white has drifted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from acquisition.judge import limits
+from acquisition.judge.frame import Frame
+from acquisition.judge.knowledge import Knowledge
+from acquisition.judge.lights import same_light
+from acquisition.judge.measuring import Measured
+from acquisition.session.judgement import Check
+
+_SIGMAS = 6.0
+"""Standard deviations of a mean's noise that no change is made of."""
+
+_STALE_LEAST = 0.02
+"""Amount of light in a dark frame, of a primary, from which on the frame before may be what is seen."""
+
+
+def judge_dark(known: Knowledge, frame: Measured, dark_percent: float, ambient_percent: float) -> tuple[Check, ...]:
+    """Return whether a dark frame is dark, and changed by no more than `ambient_percent` of white since the first.
+
+    Both limits are per cent of what white gives in the same channel; the larger of the frame's mean and its brightest
+    sixteenth counts, so that a lamp in a corner shows.
+    """
+    if known.white is None:
+        return (Check("dark"),)
+    white = known.white.tiles - (0 if known.dark is None else known.dark.tiles)
+    # Of a tile that white hardly lights, such as a black backdrop, against a third of the mean.
+    scale = np.maximum(white, np.maximum(white.mean(axis=0) / 3, 1.0))
+    level = 100 * frame.tiles / scale
+    value = float(max(level.mean(axis=0).max(), np.percentile(level, 94)))
+    stale = ""
+    before = known.recent[-1] if known.recent else None
+    if value > dark_percent and known.basis is not None and before is not None and before.amounts is not None:
+        amounts = known.basis.light(frame).amounts
+        if amounts.max() > _STALE_LEAST and same_light(amounts, before.amounts, 0.003) < 2 * limits.STALE_SIGMAS:
+            stale = (
+                "the dark frame shows the light of the frame before; does the screen stand still, or is "
+                "sequence.settle_s too short?"
+            )
+    reason = ""
+    if value > dark_percent:
+        reason = stale or (
+            f"the dark frame has {value:.1f} % of white, {dark_percent:g} % allowed; is another light on, or the "
+            "projector's picture not black?"
+        )
+    checks = [Check("light" if stale else "dark", round(value, 3), None, dark_percent, "%", reason)]
+    first = known.first_dark
+    if first is not None and not reason:
+        changed = 100 * (frame.tiles - first.tiles) / scale
+        noise = 100 * float(np.sqrt(frame.noise.variance(frame.level).max() / frame.places.tile_blocks.mean()))
+        noise /= float(scale.min())
+        by_mean, local = np.abs(changed.mean(axis=0)), np.abs(changed)
+        drift = float(max(by_mean.max(), np.percentile(local, 94)))
+        limit = max(ambient_percent, _SIGMAS * noise)
+        # Without a masked border the black level is a constant of the file's, and its drift looks like light.
+        if not frame.black_measured:
+            limit = max(limit, 100 * 8.0 / float(scale.min()))
+        reason = ""
+        if drift > limit:
+            more = "more" if changed.mean() > 0 else "less"
+            reason = (
+                f"the room is not as dark as in the first dark frame: {drift:.2f} % of white {more}, {limit:.2g} % "
+                "allowed; was a lamp or a display switched, or does daylight come in?"
+            )
+        checks.append(Check("ambient", round(drift, 3), None, round(limit, 3), "%", reason))
+    return tuple(checks)
+
+
+def judge_white(known: Knowledge, frame: Frame) -> Check:
+    """Return how far paper white is from that of the session's first white frame."""
+    first = known.first_white
+    if first is None or np.isnan(frame.paper).any() or np.isnan(first.paper).any():
+        return Check("white drift")
+    drift = float(100 * (frame.paper.sum() / max(first.paper.sum(), 1.0) - 1))
+    reason = ""
+    if abs(drift) > limits.LAMP_TOTAL:
+        reason = (
+            f"paper white is {drift:+.0f} % from the session's first white frame, {limits.LAMP_TOTAL:g} % allowed; let "
+            "the lamp warm up, or begin a new session"
+        )
+    return Check("white drift", round(drift, 2), -limits.LAMP_TOTAL, limits.LAMP_TOTAL, "%", reason)
+
+
+def judge_first_primary(known: Knowledge, frame: Measured, primary: int) -> Check:
+    """Return whether the first frame of a primary shows it: against white, its own channel is the brightest.
+
+    Of a frame's three channels none sees another's primary better than its own, whatever the camera.
+    """
+    if known.white is None:
+        return Check("light")
+    dark = np.zeros(3) if known.dark is None else known.dark.level
+    share = (frame.level - dark) / np.maximum(known.white.level - dark, 1.0)
+    name = ("red", "green", "blue")[primary]
+    reason = ""
+    if int(share.argmax()) != primary or share[primary] < 0.1:
+        seen = (
+            "nearly black" if share.max() < 0.1 else f"more {('red', 'green', 'blue')[int(share.argmax())]} than that"
+        )
+        reason = (
+            f"{name} alone was ordered, and the frame is {seen}; does the screen stand still, or are the colours of "
+            "the cable or of the picture mode exchanged?"
+        )
+    elif share.min() > 0.9:
+        reason = (
+            f"{name} alone was ordered, and the frame is as bright as white everywhere; does the screen stand still?"
+        )
+    return Check("light", round(100 * float(share[primary]), 1), 10.0, None, "%", reason)

@@ -1,0 +1,313 @@
+"""What a projector makes of its codes: learnt from response frames, refined by every light that was accepted.
+
+The light of a frame is described by the amounts of the three primaries, each 1 at its code of `FULL`. The logarithm of
+an amount is a power law of its code, plus a smooth deviation (the tone curve), plus what light is added where primaries
+overlap (a wheel with white, yellow, cyan or magenta segments, "brilliant colour"), plus the lamp's level. All of it is
+one linear Gaussian state, known with a covariance, which every accepted frame improves; a prediction therefore has an
+uncertainty, which is large before the response frames, and honest where light does not add.
+
+Sources: C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, eq. 2.22 to 2.26 (tone
+curves are Gaussian processes on nodes); Kalman's filter in Joseph's form with a linearised overlap (extended). Overlap
+as in `calibration.checks.light_codes`: functions of the least of two and of three codes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+
+FULL = 250
+"""Code at which the primaries are shown: near the top, and never taken for a planned light or a reference."""
+
+_NODES = np.array([4, 8, 16, 24, 32, 44, 56, 72, 88, 104, 120, 136, 152, 168, 184, 200, 216, 232, 255.0])
+"""Codes at which tone curves are known; between them a curve bends by less than a thousandth."""
+
+_POWER = 2.2
+"""Exponent about which tone curves are described: displays have 1.8 to 2.6."""
+
+_SLOPE, _BEND, _LENGTH = 0.4, 0.12, 0.7
+"""Prior standard deviations of a tone curve's exponent and bends (logarithm), and the bends' length in the logarithm of
+the code: sRGB, S-shaped curves and any exponent from 1.4 to 3 lie within two."""
+
+_OWN = 0.15
+"""How much of that a primary may have for itself: the three curves of a projector are much alike, LCDs least."""
+
+_LEVEL = 0.01
+"""Prior standard deviation of a primary's frame at `FULL` about its true level: a colour wheel's ½ %, and the
+lamp's."""
+
+_OVERLAP = 0.25
+"""Prior standard deviation of the light added where primaries overlap: white segments add up to half."""
+
+_OVERLAP_SHAPE = 0.15
+"""Share of that added light by which it may differ from the form assumed: unlike white it need not follow the least
+code. It widens the limits of mixed lights by as much where light does not add, and by nothing where it does."""
+
+LAMP_STEP = 3e-4
+"""Standard deviation of the lamp's drift from frame to frame (logarithm): 1 % in a thousand frames, with room."""
+
+RESTED = 0.05
+"""Standard deviation of the lamp's level after a pause of the run: it is cold, older, or another one."""
+
+RESTED_COLOUR = 0.01
+"""Standard deviation of each primary's level after such a pause."""
+
+_ABSOLUTE = 3e-4
+"""Standard deviation of an amount without any light, of a full primary: drift of black and of stray light."""
+
+_CHROMA, _BRIGHTNESS = 0.004, 0.002
+"""Scatter of an amount against the others, and of all together, from frame to frame, before it is known: a colour wheel
+with a shutter's jitter of 0.5 ms gives 0.24 % of R/G at half a second, 0.47 % at a quarter."""
+
+_TRUST = 12.0
+"""Amounts that this first guess of the scatter weighs as much as."""
+
+_LEAST_CHROMA, _LEAST_BRIGHTNESS = 0.0006, 0.0006
+"""Scatter that is reckoned with however steady the lights were: tiles and tone curves are not known better."""
+
+_SUBSETS: tuple[tuple[int, ...], ...] = ((0, 1), (0, 2), (1, 2), (0, 1, 2))
+"""Primaries that overlap: each pair, and all three."""
+
+_TERMS = [(primary, subset) for primary in range(3) for subset in _SUBSETS if primary in subset]
+"""What each overlap adds to each of its primaries."""
+
+_N = len(_NODES)
+"""Nodes of a curve; the state holds three curves, three levels, the overlaps, and the lamp's level, in this order."""
+
+_CURVES = 3 * _N
+"""Entries of the state that are curves."""
+
+_OVERLAPS = slice(_CURVES + 3, _CURVES + 3 + len(_TERMS))
+_LAMP = _CURVES + 3 + len(_TERMS)
+"""Entry of the state that is the lamp's level, the last one."""
+
+_SIZE = _LAMP + 1
+"""Entries of the state."""
+
+_Array = npt.NDArray[np.float64]
+Codes = tuple[int, int, int]
+
+
+def _x(codes: npt.ArrayLike) -> _Array:
+    return np.log(np.maximum(np.asarray(codes, dtype=np.float64), 0.5) / FULL)
+
+
+def _kernel(a: _Array, b: _Array, slope: float, bend: float) -> _Array:
+    far = (a[:, None] - b[None]) / _LENGTH
+    near_full = np.exp(-0.5 * (a / _LENGTH) ** 2)[:, None] * np.exp(-0.5 * (b / _LENGTH) ** 2)[None]
+    # Bends are conditioned on none at `FULL`, where an amount is 1 by definition.
+    return slope**2 * a[:, None] * b[None] + bend**2 * (np.exp(-0.5 * far**2) - near_full)
+
+
+@cache
+def _node_weights() -> tuple[_Array, _Array]:
+    """Return (N, N) the prior covariance of a curve at the nodes, shared and own, and its inverse."""
+    x = _x(_NODES)
+    prior = _kernel(x, x, _SLOPE, _BEND) + 1e-8 * np.eye(_N)
+    return prior, np.asarray(np.linalg.inv(prior), dtype=np.float64)
+
+
+@cache
+def _table() -> _Array:
+    """Return (256, N): weights of the nodes in a curve's value at each code."""
+    _, inverse = _node_weights()
+    return _kernel(_x(np.arange(256)), _x(_NODES), _SLOPE, _BEND) @ inverse
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """The amounts (3,) expected of codes, their covariance (3, 3) without the lamp's, and with it, all float64."""
+
+    amounts: _Array
+    covariance: _Array
+    with_lamp: _Array
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """How well amounts agree with codes.
+
+    Attributes
+    ----------
+    distance
+        Of the amounts from the prediction, the lamp's level free, in standard deviations (Mahalanobis, two degrees of
+        freedom).
+    angle_deg
+        Between the two.
+    brightness
+        Level of the lamp over the one expected (logarithm).
+    brightness_sd
+        Standard deviation expected of it.
+    """
+
+    distance: float
+    angle_deg: float
+    brightness: float
+    brightness_sd: float
+
+    def angle_limit(self, sigmas: float) -> float:
+        """Return the angle, degrees, at which this deviation would be as many standard deviations off."""
+        return self.angle_deg * sigmas / max(self.distance, 1e-3)
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectorModel:
+    """Tone curves, overlaps and lamp of a projector as known so far.
+
+    Attributes
+    ----------
+    state, covariance
+        (K,) and (K, K) float64: deviations of the curves at the nodes, one primary after another; logarithms of the
+        primaries' levels; overlaps; logarithm of the lamp's level.
+    chroma, brightness
+        Sum of squares, and number, of the scatter seen of amounts against each other, and of all together.
+    """
+
+    state: _Array
+    covariance: _Array
+    chroma: tuple[float, float] = (_TRUST * _CHROMA**2, _TRUST)
+    brightness: tuple[float, float] = (_TRUST * _BRIGHTNESS**2, _TRUST)
+
+    @classmethod
+    def unknown(cls) -> ProjectorModel:
+        """Return what is known of any projector."""
+        prior, _ = _node_weights()
+        covariance = np.zeros((_SIZE, _SIZE))
+        shared = np.kron(np.full((3, 3), 1 - _OWN**2) + _OWN**2 * np.eye(3), prior)
+        covariance[:_CURVES, :_CURVES] = shared
+        own = [_LEVEL**2] * 3 + [_OVERLAP**2] * len(_TERMS) + [LAMP_STEP**2]
+        covariance[_CURVES:, _CURVES:] = np.diag(own)
+        return cls(np.zeros(_SIZE), covariance)
+
+    @property
+    def chroma_sd(self) -> float:
+        """Scatter of an amount against the others from frame to frame, relative."""
+        return max((self.chroma[0] / self.chroma[1]) ** 0.5, _LEAST_CHROMA)
+
+    @property
+    def brightness_sd(self) -> float:
+        """Scatter of all amounts together from frame to frame, relative."""
+        return max((self.brightness[0] / self.brightness[1]) ** 0.5, _LEAST_BRIGHTNESS)
+
+    @property
+    def overlap(self) -> float:
+        """The light by which white differs from the sum of the primaries, the largest of the three, relative."""
+        terms = self.state[_OVERLAPS]
+        totals = [sum(terms[k] for k, (p, _) in enumerate(_TERMS) if p == primary) for primary in range(3)]
+        return float(max(totals, key=abs))
+
+    def predict(self, codes: Codes) -> Prediction:
+        """Return the amounts that codes should give now."""
+        logs, slopes, extra = self._logs(codes)
+        lit = np.array(codes) > 0
+        amounts = np.where(lit, np.exp(np.minimum(logs, 5)), 0.0)
+        fixed = slopes.copy()
+        fixed[:, _LAMP] = 0
+        # A frame that is far from anything known could be anything between nothing and full.
+        scale, own = np.outer(amounts, amounts), np.diag(self.chroma_sd**2 + extra**2)
+        without, total = (np.clip(part @ self.covariance @ part.T, -4, 4) + own for part in (fixed, slopes))
+        floor = _ABSOLUTE**2 * np.eye(3)
+        return Prediction(amounts, without * scale + floor, total * scale + floor)
+
+    def curves(self) -> _Array:
+        """Return (3, 256) float64: the amount of each primary alone at each code, the lamp as it is."""
+        curves = self.state[:_CURVES].reshape(3, _N) @ _table().T
+        levels = self.state[_CURVES : _CURVES + 3, None] + self.state[_LAMP]
+        amounts = np.exp(np.minimum(_POWER * _x(np.arange(256)) + curves + levels, 5))
+        amounts[:, 0] = 0
+        return np.asarray(amounts, dtype=np.float64)
+
+    def compare(self, amounts: _Array, codes: Codes, added: _Array | None = None) -> Fit:
+        """Return how well amounts (3,) float64 agree with codes; `added` (3, 3) is their own covariance."""
+        expected = self.predict(codes)
+        weight = np.linalg.inv(expected.covariance + (0 if added is None else added))
+        h = expected.amounts
+        power = max(float(h @ weight @ h), 1e-12)
+        level = float(h @ weight @ amounts) / power
+        off = amounts - level * h
+        distance = float(np.sqrt(max(off @ weight @ off, 0)))
+        sine = np.linalg.norm(np.cross(amounts, h))
+        angle = float(np.degrees(np.arctan2(sine, amounts @ h))) if h.any() else 180.0
+        brightness = float(np.log(max(level, 1e-6)))
+        share = weight @ h / power
+        sd = (float(share @ expected.with_lamp @ share) + self.brightness_sd**2 + LAMP_STEP**2) ** 0.5
+        return Fit(distance, angle, brightness, sd)
+
+    def learn(self, amounts: _Array, codes: Codes) -> ProjectorModel:
+        """Return what is known after a frame of `codes` that showed `amounts` (3,) float64."""
+        covariance = self.covariance.copy()
+        covariance[_LAMP, _LAMP] += LAMP_STEP**2
+        used = (np.array(codes) > 0) & (amounts > 5 * _ABSOLUTE)
+        if not used.any():
+            return replace(self, covariance=covariance)
+        logs, slopes, extra = self._logs(codes)
+        slopes, off = slopes[used], np.log(amounts[used]) - logs[used]
+        count = int(used.sum())
+        own = np.diag(self.chroma_sd**2 + extra[used] ** 2 + (_ABSOLUTE / amounts[used]) ** 2)
+        together = np.full((count, count), self.brightness_sd**2)
+        innovation = slopes @ covariance @ slopes.T + own + together
+        gain = covariance @ slopes.T @ np.linalg.inv(innovation)
+        state = self.state + gain @ off
+        kept = np.eye(_SIZE) - gain @ slopes
+        covariance = kept @ covariance @ kept.T + gain @ (own + together) @ gain.T
+        chroma, brightness = self._scatter(off, innovation, count)
+        return ProjectorModel(state, (covariance + covariance.T) / 2, chroma, brightness)
+
+    def rested(self) -> ProjectorModel:
+        """Return what is known after a pause of the run: lamp and primaries may be at other levels."""
+        covariance = self.covariance.copy()
+        covariance[_LAMP, _LAMP] += RESTED**2
+        levels = np.arange(_CURVES, _CURVES + 3)
+        covariance[levels, levels] += RESTED_COLOUR**2
+        return replace(self, covariance=covariance)
+
+    def stepped(self) -> ProjectorModel:
+        """Return what is known after the lamp has jumped to another level."""
+        covariance = self.covariance.copy()
+        covariance[_LAMP, _LAMP] += RESTED**2
+        return replace(self, covariance=covariance)
+
+    def _scatter(self, off: _Array, innovation: _Array, count: int) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return the sums of squares and numbers of scatter after a frame whose logarithms are `off` (count,)."""
+        mean = float(off.mean())
+        # What the model does not know yet is no scatter: each frame weighs by how much of its deviation that is.
+        own = self.chroma_sd**2 * (1 - 1 / count) if count > 1 else 0.0
+        spread = float(np.mean(np.diag(innovation)) - np.mean(innovation))
+        weight = min(1.0, own / max(spread, 1e-12)) * (count - 1)
+        chroma = (
+            self.chroma[0]
+            + weight * min(float(((off - mean) ** 2).sum()) / max(count - 1, 1), (8 * self.chroma_sd) ** 2),
+            self.chroma[1] + weight,
+        )
+        together = min(1.0, self.brightness_sd**2 / max(float(np.mean(innovation)), 1e-12))
+        brightness = (
+            self.brightness[0] + together * min(mean**2, (8 * self.brightness_sd) ** 2),
+            self.brightness[1] + together,
+        )
+        return chroma, brightness
+
+    def _logs(self, codes: Codes) -> tuple[_Array, _Array, _Array]:
+        """Return the logarithms (3,) of the amounts, their slopes (3, K) by the state, and what the form lacks (3,)."""
+        curves = self.state[:_CURVES].reshape(3, _N)
+        table = _table()
+        base = np.array([_POWER * float(_x(code)) + float(table[code] @ curves[p]) for p, code in enumerate(codes)])
+        slopes = np.zeros((3, _SIZE))
+        shares = np.zeros((3, len(_TERMS)))
+        for p, code in enumerate(codes):
+            slopes[p, p * _N : (p + 1) * _N] = table[code]
+            slopes[p, _CURVES + p] = 1
+        for k, (p, subset) in enumerate(_TERMS):
+            least = min(codes[other] for other in subset)
+            if least > 0:
+                own = _POWER * float(_x(least)) + float(table[least] @ curves[p]) - base[p]
+                shares[p, k] = np.exp(min(own, 0.0))
+        terms = self.state[_OVERLAPS]
+        total = np.maximum(1 + shares @ terms, 0.2)
+        slopes[:, _OVERLAPS] = shares / total[:, None]
+        slopes[:, _LAMP] = 1
+        extra = _OVERLAP_SHAPE * np.sqrt((4 * (shares * (1 - shares) * terms) ** 2).sum(axis=1)) / total
+        levels = self.state[_CURVES : _CURVES + 3]
+        return base + levels + np.log(total) + self.state[_LAMP], slopes, extra

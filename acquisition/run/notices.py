@@ -1,0 +1,186 @@
+"""Somebody is told what happens: by a command that is run, or a URL to which JSON is posted; nothing ever waits for it.
+
+Rules that hold inside:
+
+- Telling takes no time: a thread of its own delivers, one notice after another, each within `LIMIT_S`.
+- A notice that cannot be delivered hurts nobody: what failed is said once, by the thread that tells.
+- Of the target nothing is said but a URL's scheme and host, or a program's name: the rest may be a secret. Errors of
+  libraries, whose text may hold it, are told by their number or kind.
+
+What a receiver gets, on its standard input or as the body of a POST (`application/json`)::
+
+    {"event": "paused", "message": "the screen: covered by a window …", "text": "night: paused: the screen …",
+     "content": "night: paused: the screen …", "session": "night", "host": "lab", "at": "2026-01-01T03:12:45+00:00"}
+
+``text`` is what Slack, Mattermost and their likes show, ``content`` what Discord does. A command finds event, message
+and session in its environment, too: ``CROP_EVENT``, ``CROP_MESSAGE``, ``CROP_SESSION``.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import queue
+import shlex
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from datetime import datetime
+from typing import Final
+from urllib.parse import unquote, urlsplit, urlunsplit
+
+from acquisition.config import is_webhook, target_label
+
+LIMIT_S: Final = 20.0
+"""How long a receiver may take; a message to a telephone takes seconds."""
+ENDING_S: Final = 2.0
+"""How much longer the end waits for the last one, so that a receiver that is too slow is named."""
+QUEUED: Final = 100
+"""Notices that may wait for a slow receiver; more are dropped."""
+
+
+class Notices:
+    """Tells a target what happens; close it at the end, which waits for what was told, for `LIMIT_S` at most.
+
+    Parameters
+    ----------
+    target
+        A URL or a command line; empty: nobody is told.
+    session
+        Name of what it is about.
+    warn
+        Called with a sentence by `tell` and `close` when an earlier notice could not be delivered.
+    """
+
+    def __init__(self, target: str, session: str, warn: Callable[[str], object] = lambda sentence: None) -> None:
+        self._target = target
+        self._session = session
+        self._warn = warn
+        self._waiting: queue.Queue[tuple[str, str, bytes] | None] = queue.Queue(QUEUED)
+        self._failed: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._said: set[str] = set()
+        self._closed = False
+        self._thread = threading.Thread(target=self._deliver_all, name="notices", daemon=True)
+        if target:
+            self._thread.start()
+
+    def tell(self, event: str, message: str, at: datetime) -> None:
+        """Tell what happens; returns at once.
+
+        Parameters
+        ----------
+        event
+            A word or two: ``paused``, ``resumed``, ``complete``.
+        message
+            A sentence.
+        at
+            When, timezone-aware.
+        """
+        if not self._target:
+            return
+        text = f"{self._session}: {event}: {message}"
+        body = {
+            "event": event,
+            "message": message,
+            "text": text,
+            "content": text,
+            "session": self._session,
+            "host": socket.gethostname(),
+            "at": at.isoformat(timespec="seconds"),
+        }
+        with suppress(queue.Full):
+            self._waiting.put_nowait((event, message, json.dumps(body, ensure_ascii=False).encode()))
+        self._say_failures()
+
+    def close(self) -> None:
+        """Wait until all was delivered, or for `LIMIT_S` and a little; a second call does nothing."""
+        if self._thread.is_alive() and not self._closed:
+            until = time.monotonic() + LIMIT_S + ENDING_S
+            with suppress(queue.Full):
+                self._waiting.put(None, timeout=LIMIT_S)
+            self._thread.join(max(until - time.monotonic(), 0))
+            if self._thread.is_alive():
+                self._failed.put(f"{target_label(self._target)} was not told all before the end")
+        self._closed = True
+        self._say_failures()
+
+    def _say_failures(self) -> None:
+        while not self._failed.empty():
+            sentence = self._failed.get()
+            # A receiver that is gone stays gone for the night: once is enough.
+            if sentence not in self._said:
+                self._said.add(sentence)
+                self._warn(sentence)
+
+    def _deliver_all(self) -> None:
+        while (notice := self._waiting.get()) is not None:
+            why = self._posted(*notice) if is_webhook(self._target) else self._run(*notice)
+            if why:
+                self._failed.put(f"{target_label(self._target)} could not be told: {why}; the run goes on without")
+
+    def _run(self, event: str, message: str, body: bytes) -> str:
+        """Run the command; return why it failed, empty if it did not."""
+        variables = {"CROP_EVENT": event, "CROP_MESSAGE": message, "CROP_SESSION": self._session}
+        try:
+            # In a group of its own: Ctrl-C is not for it, and what it starts ends with it.
+            process = subprocess.Popen(
+                shlex.split(self._target),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, **variables},
+                start_new_session=True,
+            )
+        except (OSError, ValueError) as error:
+            return getattr(error, "strerror", None) or type(error).__name__
+        with process:
+            try:
+                process.communicate(body, LIMIT_S)
+            except subprocess.TimeoutExpired:
+                with suppress(OSError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                return f"it did not end within {LIMIT_S:g} s"
+        return f"it ended with {process.returncode}, 0 expected" if process.returncode else ""
+
+    def _posted(self, event: str, message: str, body: bytes) -> str:
+        """Post to the URL; return why it failed, empty if it did not."""
+        parts = urlsplit(self._target)
+        headers = {"Content-Type": "application/json; charset=utf-8", "User-Agent": "CroP"}
+        if event.isascii():
+            headers["Title"] = f"CroP: {event}"
+        if parts.username is not None:
+            word = f"{unquote(parts.username)}:{unquote(parts.password or '')}".encode()
+            headers["Authorization"] = f"Basic {base64.b64encode(word).decode()}"
+        bare = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2], fragment=""))
+        return _post(bare, body, headers)
+
+
+def _post(url: str, body: bytes, headers: Mapping[str, str]) -> str:
+    """Post to a URL without user name; return why it failed, empty if it did not."""
+    # They cost a thirtieth of a second, which every command would pay.
+    import http.client
+    import urllib.error
+    import urllib.request
+
+    class Unredirected(urllib.request.HTTPRedirectHandler):
+        """Follows no redirection: the body would be lost on the way, and the answer be a success."""
+
+        def redirect_request(self, req: object, fp: object, code: int, msg: str, headers: object, newurl: str) -> None:
+            return None
+
+    request = urllib.request.Request(url, body, dict(headers))
+    try:
+        with urllib.request.build_opener(Unredirected).open(request, timeout=LIMIT_S):
+            return ""
+    except urllib.error.HTTPError as error:
+        error.close()
+        return f"it answered {error.code}"
+    except urllib.error.URLError as error:
+        return getattr(error.reason, "strerror", None) or type(error.reason).__name__
+    except (OSError, ValueError, http.client.HTTPException) as error:
+        return getattr(error, "strerror", None) or type(error).__name__

@@ -1,0 +1,1 @@
+"""Any tethered camera that libgphoto2 supports."""

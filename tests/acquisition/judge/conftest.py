@@ -1,0 +1,108 @@
+"""A small room whose frames are judged: a chart of 3 bits before the Test body, and everything that can go wrong."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from acquisition.chart.layout import design_chart
+from acquisition.chart.model import Chart
+from acquisition.config import LabSettings, parse_lab
+from acquisition.judge.judge import LiveJudge
+from acquisition.lights.illuminations import Illumination, plan_illuminations
+from acquisition.run.rig.simulated import sheet
+from acquisition.session.judgement import Judgement
+from acquisition.session.plan import RESPONSE, SessionStep, plan_steps
+from drivers.camera import ExposureSettings
+from drivers.presenter import BLACK, Colour
+from sim.camera.dng import write_dng
+from sim.world.disturbances import AnyDisturbance, Disturbances, Moment
+from sim.world.room import Room
+from sim.world.sensors import BODIES, Body
+from sim.world.world import World
+
+LAB = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "illuminations.csv"\n'
+
+Counts = npt.NDArray[np.uint16]
+_frames = itertools.count()
+
+
+@dataclass
+class Bench:
+    """A judge, the room before it, and the frames of a plan."""
+
+    world: World
+    chart: Chart
+    lights: tuple[Illumination, ...]
+    steps: tuple[SessionStep, ...]
+    settings: LabSettings
+    folder: Path
+    judge: LiveJudge
+    body: Body = BODIES["Test"]
+
+    def counts(self, step: SessionStep, *events: AnyDisturbance, before: Colour = BLACK) -> Counts:
+        """Return the counts of a new frame, after one of a colour: no two have the same noise."""
+        moment = Moment(0, 0.0, step.colour, ((-1.0, before),))
+        gone_wrong = Disturbances(events)
+        counts = self.world.expose(
+            gone_wrong.shown(moment),
+            self.settings.camera.exposure,
+            key=(next(_frames),),
+            situation=gone_wrong.situation(moment),
+        )
+        return gone_wrong.counted(counts, moment)
+
+    def show(self, counts: Counts, step: SessionStep, **writing: Any) -> Judgement:
+        """Return what is said of counts."""
+        path = self.folder / "frame.dng"
+        given: dict[str, Any] = {
+            "settings": self.settings.camera.exposure,
+            "taken_at": datetime(2026, 1, 1, tzinfo=UTC),
+            **writing,
+        }
+        body = given.pop("body", self.body)
+        with path.open("wb") as stream:
+            write_dng(stream, counts, body, **given)
+        return self.judge.judge(path, step)
+
+    def take(self, step: SessionStep, *events: AnyDisturbance, before: Colour = BLACK) -> Judgement:
+        return self.show(self.counts(step, *events, before=before), step)
+
+    def fork(self) -> Bench:
+        """Return the bench with a judge of its own that knows what this one does."""
+        return replace(self, judge=copy.copy(self.judge))
+
+    def light(self, red: int, green: int, blue: int, number: int = 900) -> SessionStep:
+        return SessionStep(number, "light", 0, Colour(red, green, blue))
+
+
+def bench(folder: Path, room: Room, count: int = 12, every: int = 6, lab: str = LAB, response: bool = True) -> Bench:
+    chart = design_chart(3, "A7")
+    plan = plan_illuminations()
+    order: list[int] = np.random.default_rng(room.seed).permutation(len(plan)).tolist()
+    some = tuple(replace(plan[k], index=n) for n, k in enumerate(order[:count]))
+    settings = parse_lab(lab, "LAB.toml")
+    steps = plan_steps(some, every, seed=1, response=RESPONSE if response else ())
+    world = World(sheet(chart), BODIES["Test"], room)
+    return Bench(world, chart, plan, steps, settings, folder, LiveJudge(settings, chart, plan))
+
+
+@pytest.fixture(scope="session")
+def taught(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """Make a bench whose judge has seen a whole small session under a colour wheel, all of it accepted."""
+    made = bench(tmp_path_factory.mktemp("judge"), Room(seed=3, wheel_hz=60, transfer=2.2), count=24, every=12)
+    for step in made.steps:
+        judgement = made.take(step)
+        assert judgement.accepted, f"{step}: {judgement.reason}"
+    return made
+
+
+EXPOSURE = ExposureSettings(100, 8.0, 0.5)

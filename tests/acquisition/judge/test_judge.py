@@ -1,0 +1,273 @@
+"""Each disturbance is refused at its frame and named; what is no disturbance is accepted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquisition.judge.judge import LiveJudge
+from acquisition.session.judgement import Check, Judgement
+from acquisition.session.plan import SessionStep, tie_steps
+from drivers.camera import ExposureSettings
+from drivers.presenter import BLACK, WHITE, Colour
+from sim.world.disturbances import (
+    AmbientStep,
+    Bump,
+    Defocus,
+    HalfChanged,
+    LampStep,
+    Person,
+    PopUp,
+    ScrambledRows,
+    ZeroedStrip,
+)
+from sim.world.room import Room
+from sim.world.sensors import BODIES
+from tests.acquisition.judge.conftest import EXPOSURE, LAB, Bench, bench
+
+ORANGE, SKY, DEEP_BLUE = (255, 197, 126), (113, 188, 255), (0, 0, 255)
+WHITE_STEP = SessionStep(901, "white", None, WHITE)
+DARK_STEP = SessionStep(902, "dark", None, BLACK)
+
+
+def cause(judgement: Judgement) -> str:
+    return next((check.name for check in judgement.checks if check.reason), "")
+
+
+def check(judgement: Judgement, name: str) -> Check:
+    return next(found for found in judgement.checks if found.name == name)
+
+
+@pytest.mark.parametrize("codes", [ORANGE, SKY, DEEP_BLUE, (255, 0, 0), (48, 255, 188)])
+def test_a_light_that_was_ordered_is_accepted(taught: Bench, codes: tuple[int, int, int]) -> None:
+    lab = taught.fork()
+    said = [lab.take(lab.light(*codes)) for _ in range(3)]
+    assert [judgement.reason for judgement in said] == ["", "", ""]
+    assert said[0].seen is not None
+    assert said[0].preview[:2] == b"\xff\xd8"
+
+
+@pytest.mark.parametrize(("shown", "ordered"), [(ORANGE, SKY), (SKY, ORANGE), ((255, 249, 255), (255, 245, 246))])
+def test_the_light_of_the_frame_before_is_told(
+    taught: Bench, shown: tuple[int, int, int], ordered: tuple[int, int, int]
+) -> None:
+    lab = taught.fork()
+    assert lab.take(lab.light(*shown)).accepted
+    stale = lab.take(lab.light(*shown))
+    assert stale.accepted  # the same light ordered again is no fault
+    frozen = lab.show(lab.counts(lab.light(*shown)), lab.light(*ordered))
+    assert cause(frozen) == "light"
+    assert "of the frame before" in frozen.reason
+    assert str(shown) in frozen.reason
+
+
+def test_a_frozen_screen_lasts_at_the_third_frame(taught: Bench) -> None:
+    lab = taught.fork()
+    assert lab.take(lab.light(*ORANGE)).accepted
+    said = [lab.show(lab.counts(lab.light(*ORANGE)), lab.light(*SKY)) for _ in range(3)]
+    assert [judgement.lasting for judgement in said] == [False, False, True]
+
+
+def test_another_light_of_the_plan_is_named(taught: Bench) -> None:
+    lab = taught.fork()
+    assert lab.take(lab.light(*DEEP_BLUE)).accepted
+    other = lab.lights[300].codes
+    seen = lab.show(lab.counts(lab.light(*other)), lab.light(*ORANGE))
+    assert cause(seen) == "light"
+    assert str(other) in seen.reason
+
+
+@pytest.mark.parametrize("pixels", [0.3, 1.0, 3.0, 8.0])
+@pytest.mark.parametrize("codes", [ORANGE, DEEP_BLUE])
+def test_a_bump_is_movement(taught: Bench, pixels: float, codes: tuple[int, int, int]) -> None:
+    lab = taught.fork()
+    judgement = lab.take(lab.light(*codes), Bump(px=pixels))
+    assert cause(judgement) == "movement"
+    assert check(judgement, "movement").value == pytest.approx(pixels, rel=0.25)
+
+
+def test_a_small_bump_that_stays_is_followed_and_a_large_one_lasts(taught: Bench) -> None:
+    lab = taught.fork()
+    small = Bump(px=0.45)
+    assert cause(lab.take(lab.light(*ORANGE), small)) == "movement"
+    followed = lab.take(lab.light(*ORANGE), small)
+    assert followed.accepted, followed.reason
+    assert lab.take(lab.light(*SKY), small).accepted
+    large = Bump(px=2)
+    assert [lab.take(lab.light(*ORANGE), large).lasting for _ in range(3)] == [False, False, True]
+
+
+@pytest.mark.parametrize("sigma", [1.0, 3.0])
+def test_defocus_is_refused(taught: Bench, sigma: float) -> None:
+    lab = taught.fork()
+    judgement = lab.take(lab.light(*ORANGE), Defocus(px=sigma))
+    assert cause(judgement) in ("blur", "movement")
+    if sigma == 1.0:
+        assert cause(judgement) == "blur"
+
+
+@pytest.mark.parametrize("percent", [-2.0, -10.0, -50.0])
+def test_a_step_of_the_lamp_is_told_from_another_light(taught: Bench, percent: float) -> None:
+    lab = taught.fork()
+    judgement = lab.take(lab.light(*SKY), LampStep(percent=percent))
+    assert cause(judgement) == "lamp"
+    assert check(judgement, "lamp").value == pytest.approx(percent, abs=1.0)
+    again = lab.take(lab.light(*SKY), LampStep(percent=percent))
+    assert again.accepted == (percent == -2)
+    if percent == -2:
+        assert lab.take(lab.light(*ORANGE), LampStep(percent=percent)).accepted
+
+
+@pytest.mark.parametrize("percent", [1.0, 3.0])
+def test_light_in_the_room_is_told(taught: Bench, percent: float) -> None:
+    lit = AmbientStep(percent=percent)
+    lab = taught.fork()
+    blue = lab.take(lab.light(*DEEP_BLUE), lit)
+    assert cause(blue) == "ambient", blue.reason
+    assert check(blue, "ambient").value == pytest.approx(percent, rel=0.2)
+    lab = taught.fork()
+    dark = lab.take(DARK_STEP, lit)
+    assert cause(dark) == "ambient"
+    assert dark.voids
+    lab = taught.fork()
+    neutral = [lab.take(lab.light(*codes), lit) for codes in ((255, 245, 246), SKY)]
+    assert not all(judgement.accepted for judgement in neutral)
+
+
+def test_a_covered_part_is_told_and_where(taught: Bench) -> None:
+    lab = taught.fork()
+    person = lab.take(lab.light(*ORANGE), Person(place=(-0.1, -0.1, 0.55, 0.55)))
+    assert cause(person) == "uniformity"
+    assert "top left" in person.reason
+    lab = taught.fork()
+    hand = lab.take(lab.light(*DEEP_BLUE), Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3))
+    assert cause(hand) == "uniformity"
+    assert "bottom right" in hand.reason
+
+
+@pytest.mark.parametrize("part", [HalfChanged(), HalfChanged(place=(-9, -9, 0.2, 0.2)), HalfChanged(share=0.3)])
+def test_a_picture_changed_in_part_is_told(taught: Bench, part: HalfChanged) -> None:
+    lab = taught.fork()
+    assert lab.take(lab.light(*SKY)).accepted
+    assert cause(lab.take(lab.light(*ORANGE), part, before=Colour(*SKY))) == "uniformity"
+
+
+def test_a_window_over_the_picture_is_told(taught: Bench) -> None:
+    lab = taught.fork()
+    judgement = lab.take(WHITE_STEP, PopUp())
+    assert cause(judgement) == "uniformity"
+    assert not judgement.voids  # every light since was judged by itself
+    assert cause(lab.take(WHITE_STEP, PopUp(share=0.1))) == "uniformity"
+    assert cause(lab.take(WHITE_STEP, PopUp(place=(-9, -9, 9, 9)))) == "light"
+
+
+def test_a_frame_given_twice_is_told_by_its_noise(taught: Bench) -> None:
+    lab = taught.fork()
+    step = lab.light(*ORANGE)
+    counts = lab.counts(step)
+    assert lab.show(counts, step).accepted
+    assert cause(lab.show(counts, step)) == "repeated"
+    assert cause(lab.show(counts, lab.light(*SKY))) == "repeated"
+    # Passed on through something that changes a few counts: it is not the same file, but the same noise.
+    changed = counts + (np.random.default_rng(1).random(counts.shape) < 0.2).astype(np.uint16)
+    assert cause(lab.show(changed, step)) == "repeated"
+    assert lab.take(step).accepted
+
+
+def test_missing_and_misplaced_rows_are_told(taught: Bench) -> None:
+    lab = taught.fork()
+    assert cause(lab.take(lab.light(*ORANGE), ZeroedStrip(top=0.5, bottom=0.51))) == "data"
+    assert cause(lab.take(lab.light(*ORANGE), ScrambledRows())) == "rows"
+    assert cause(lab.take(lab.light(*ORANGE), ScrambledRows(top=0.5, bottom=0.55))) == "rows"
+
+
+def test_another_camera_exposure_or_file_is_told(taught: Bench, tmp_path: Path) -> None:
+    lab = taught.fork()
+    step = lab.light(*ORANGE)
+    other = lab.show(lab.counts(step), step, serial="7")
+    assert cause(other) == "camera"
+    assert other.lasting
+    body = replace(BODIES["Test"], model="CroP Other")
+    assert cause(lab.show(lab.counts(step), step, body=body)) == "camera"
+    assert cause(lab.show(lab.counts(step), step, settings=ExposureSettings(200, 8.0, 0.5))) == "settings"
+    broken = tmp_path / "frame.dng"
+    broken.write_bytes(b"II*\0 and no more")
+    assert cause(lab.judge.judge(broken, step)) == "file"
+
+
+def test_dark_and_clipped_frames_are_told(taught: Bench) -> None:
+    lab = taught.fork()
+    assert cause(lab.show(lab.counts(DARK_STEP), lab.light(*ORANGE))) == "exposure"
+    assert cause(lab.show(lab.counts(lab.light(*ORANGE)), DARK_STEP)) == "dark"
+    bright = lab.world.expose(WHITE, replace(EXPOSURE, shutter_s=1.2), key=(5,))
+    assert cause(lab.show(bright, WHITE_STEP)) == "clipping"
+
+
+def test_a_screen_that_stays_lit_is_told_in_the_dark_frame(taught: Bench) -> None:
+    lab = taught.fork()
+    assert lab.take(lab.light(*ORANGE)).accepted
+    assert "of the frame before" in lab.show(lab.counts(lab.light(*ORANGE)), DARK_STEP).reason
+
+
+def test_a_run_taken_up_again_knows_what_was_seen(taught: Bench, tmp_path: Path) -> None:
+    first = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
+    first.world = taught.world
+    kept: list[tuple[SessionStep, bytes]] = []
+    for step in first.steps[:-2]:
+        judgement = first.take(step)
+        assert judgement.accepted
+        kept.append((step, judgement.measurement))
+    resumed = replace(first, judge=LiveJudge(first.settings, first.chart, first.lights))
+    for step, measurement in kept:
+        resumed.judge.recall(step, measurement, True)
+    assert resumed.judge.knowledge.modelled
+    # A day later the lamp is 3 % weaker: drift, no other light.
+    weaker = LampStep(percent=-3)
+    ties = [resumed.take(step, weaker) for step in tie_steps(500)]
+    assert [tie.reason for tie in ties] == [""] * 4
+    assert check(ties[0], "lamp").value == pytest.approx(-3, abs=0.8)
+    assert resumed.take(resumed.light(*SKY), weaker).accepted
+    assert cause(resumed.show(resumed.counts(resumed.light(*SKY), weaker), resumed.light(*ORANGE))) == "light"
+    assert cause(resumed.take(resumed.light(*SKY), LampStep(percent=-6))) == "lamp"
+
+
+def test_a_chart_that_moved_between_runs_is_told_and_followed(taught: Bench, tmp_path: Path) -> None:
+    first = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
+    first.world = taught.world
+    resumed = replace(first, judge=LiveJudge(first.settings, first.chart, first.lights))
+    for step in first.steps[:-2]:
+        resumed.judge.recall(step, first.take(step).measurement, True)
+    elsewhere = Bump(px=6.7, direction_deg=-27)
+    said = [resumed.take(step, elsewhere) for step in tie_steps(500)]
+    assert all(judgement.accepted for judgement in said), [judgement.reason for judgement in said]
+    assert check(said[0], "movement").value == pytest.approx(6.7, abs=0.3)
+    later = resumed.take(resumed.light(*SKY), elsewhere)
+    assert later.accepted, later.reason
+    assert cause(resumed.take(resumed.light(*SKY))) == "movement"
+
+
+def test_without_response_frames_a_stale_light_is_told_and_others_are_not_refused(
+    tmp_path: Path, taught: Bench
+) -> None:
+    lab = bench(tmp_path, Room(seed=3), count=12, every=6, response=False)
+    lab.world = taught.world
+    for step in lab.steps:
+        assert (judgement := lab.take(step)).accepted, judgement.reason
+    assert lab.take(lab.light(*SKY)).accepted
+    assert cause(lab.show(lab.counts(lab.light(*SKY)), lab.light(*ORANGE))) == "light"
+    person = lab.take(lab.light(*ORANGE), Person(place=(-0.1, -0.1, 0.55, 0.55)))
+    assert cause(person) == "uniformity"
+
+
+def test_a_chart_that_is_not_there_is_said_in_the_first_frame(tmp_path: Path, taught: Bench) -> None:
+    wall = taught.world.expose(Colour(0, 0, 0), EXPOSURE, key=(1,))
+    wall[60:, 60:] += np.uint16(3000)
+    lab = bench(tmp_path, Room(seed=3))
+    judgement = lab.show(wall, WHITE_STEP)
+    assert cause(judgement) == "chart"
+    assert judgement.lasting
+    bare = bench(tmp_path, Room(seed=3), lab=LAB + "[judge]\nchart = false\n")
+    assert bare.show(wall, WHITE_STEP).accepted

@@ -1,0 +1,253 @@
+"""The page in a browser: what a person sees of a run that goes on, pauses, is killed, and of its report."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from acquisition.lights.illuminations import plan_illuminations
+from acquisition.monitor.report import save_report
+from acquisition.monitor.server import MonitorServer, open_monitor
+from tests.acquisition.monitor.browser import Tab, browser_tab, needs_chromium
+from tests.acquisition.monitor.made_up import MadeUpRun
+from tests.acquisition.monitor.page_checks import NAMELESS, OUTSIDE, POOR_CONTRAST, TOO_WIDE
+
+pytestmark = needs_chromium
+ROOT = Path(__file__).parents[3]
+WEB = ROOT / "acquisition" / "monitor" / "web"
+HOSTILE = '<img src=x onerror="window.hacked=1"><script>window.hacked=1</script>\'"&{data}'
+
+KILLED_RUN = """
+import sys, time
+from pathlib import Path
+from tests.acquisition.monitor.made_up import MadeUpRun
+from tests.acquisition.monitor.page_checks import NAMELESS, OUTSIDE, POOR_CONTRAST, TOO_WIDE
+run = MadeUpRun.begin(Path(sys.argv[1]))
+for step in run.steps[:4]:
+    run.take(step)
+run.expose(run.steps[4])
+print("taken", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    with browser_tab(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.fixture(autouse=True)
+def _no_errors(tab: Tab) -> Iterator[None]:  # pyright: ignore[reportUnusedFunction]
+    tab.errors.clear()
+    yield
+    tab.value("1")
+    assert tab.errors == []
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[MadeUpRun]:
+    """Return a run of 27 lights and black bodies with a third of its frames, one refused, and one under way."""
+    name = f"night {HOSTILE}".replace("/", "|")
+    made = MadeUpRun.begin(tmp_path / name, plan_illuminations(5, (3000, 6500)), response=True)
+    made.journal.record(f"camera {HOSTILE}", HOSTILE)
+    made.journal.note(made.clock, "warning", HOSTILE)
+    for step in made.steps[:28]:
+        if step.number == 20:
+            made.take(step, f"the light is another one {HOSTILE}; close what covers it", value=9.0)
+        made.take(step)
+    made.expose(made.steps[28])
+    yield made
+    made.journal.close()
+
+
+@contextmanager
+def shown(tab: Tab, folder: Path, *, width: int = 1280, dark: bool = False) -> Generator[MonitorServer]:
+    with open_monitor(folder, 0) as server:
+        thread = threading.Thread(target=lambda: server.serve_forever(0.01))
+        thread.start()
+        try:
+            tab.open(f"http://127.0.0.1:{server.port}/", width=width, dark=dark)
+            tab.wait_for("document.readyState === 'complete' && typeof model !== 'undefined' && model.cursor !== ''")
+            yield server
+        finally:
+            tab.open("about:blank")
+            server.shutdown()
+            thread.join()
+
+
+def marks(tab: Tab, plane: str, state: str) -> int:
+    return tab.value(f"document.querySelectorAll('#{plane} .mark.{state}').length")
+
+
+def test_a_run_is_followed_frame_by_frame(tab: Tab, run: MadeUpRun) -> None:
+    with shown(tab, run.folder):
+        assert tab.value("document.getElementById('state').textContent") == "▶ running"
+        lights = sum(step.kind == "light" for step in run.steps[:28])
+        assert marks(tab, "planned", "accepted") == lights
+        assert marks(tab, "planned", "shown") == 1
+        assert marks(tab, "planned", "planned") == 23 - lights - 1
+        assert marks(tab, "seen", "accepted") == lights
+        run.take(run.steps[29])
+        tab.wait_for(f"document.querySelectorAll('#planned .mark.accepted').length === {lights + 1}")
+        assert f"lights {lights + 1} of 23" in " ".join(tab.text().split())
+        assert tab.value("document.querySelectorAll('.plot').length") >= 8
+        assert tab.value("document.getElementById('wall').textContent") == "Between two frames"
+        following = run.steps[30].colour
+        run.expose(run.steps[30])
+        codes = f"{following.red} {following.green} {following.blue}"
+        tab.wait_for(f"document.querySelector('#wall b')?.textContent === '{codes}'")
+        swatch = tab.value("getComputedStyle(document.getElementById('swatch')).backgroundColor")
+        assert swatch == f"rgb({codes.replace(' ', ', ')})"
+        tab.wait_for("document.getElementById('picture').naturalWidth === 360")
+        assert tab.value(OUTSIDE) == []
+
+
+def test_what_a_session_says_is_text_and_never_code(tab: Tab, run: MadeUpRun) -> None:
+    run.beat("paused", f"the camera: {HOSTILE}; mend it {HOSTILE}")
+    with shown(tab, run.folder):
+        tab.wait_for("document.getElementById('state').textContent === '‖ paused'")
+        tab.value("choose(21)")
+        assert tab.value("window.hacked") is None
+        text = tab.text()
+        assert text.count("<script>window.hacked=1</script>") >= 6
+        assert tab.value("document.querySelectorAll('img[src=x]').length") == 0
+    script = "".join((WEB / name).read_text() for name in ("plots.js", "head.js", "page.js"))
+    for way in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "new Function"):
+        assert way not in script
+
+
+def test_a_pause_is_a_banner_with_remedy_and_countdown(tab: Tab, run: MadeUpRun) -> None:
+    fault = "the camera: it does not answer"
+    run.beat("paused", f"{fault}; see to its cable (paused for 20 s; goes on by itself, ends in 9 min 40 s)")
+    with shown(tab, run.folder):
+        tab.wait_for("!document.getElementById('banner').hidden")
+        assert tab.value("document.querySelector('#banner-text strong').textContent") == fault
+        assert tab.value("document.getElementById('banner-text').lastChild.textContent") == "see to its cable"
+        assert "ends in 9 min 40 s" in tab.value("document.getElementById('countdown').textContent")
+        assert tab.value("document.title").startswith("‖")
+        run.beat("running", "goes on")
+        tab.wait_for("document.getElementById('banner').hidden")
+
+
+def test_after_a_kill_it_says_that_the_run_was_killed(tab: Tab, tmp_path: Path) -> None:
+    folder = tmp_path / "night"
+    child = subprocess.Popen([sys.executable, "-c", KILLED_RUN, str(folder)], stdout=subprocess.PIPE, cwd=ROOT)
+    try:
+        assert child.stdout is not None
+        assert child.stdout.readline() == b"taken\n"
+        with shown(tab, folder):
+            assert tab.value("document.getElementById('state').textContent") == "▶ running"
+            assert marks(tab, "planned", "shown") == 1
+            child.send_signal(signal.SIGKILL)
+            child.wait(30)
+            tab.wait_for("document.getElementById('state').textContent === '✕ stopped'")
+            banner = tab.value("document.getElementById('banner').innerText")
+            assert "killed or power lost" in banner
+            assert "run the same command again" in banner
+            assert tab.value("document.getElementById('wall').textContent") == "Not known: nothing is being taken"
+            assert "stands still" in tab.text()
+            assert marks(tab, "planned", "shown") == 0
+    finally:
+        child.kill()
+        child.wait(30)
+        assert child.stdout is not None
+        child.stdout.close()
+
+
+def test_refused_frames_stand_with_picture_and_reason(tab: Tab, run: MadeUpRun) -> None:
+    with shown(tab, run.folder):
+        card = "document.querySelector('.refusal')"
+        assert "the light is another one" in tab.value(f"{card}.innerText")
+        assert "taken again since and accepted" in tab.value(f"{card}.innerText")
+        tab.value(f"{card}.querySelector('button').click()")
+        assert tab.value("document.getElementById('frame-title').textContent") == "Chosen frame"
+        assert tab.value("document.querySelector('#checks tr.bad th').textContent") == "✕ light"
+
+
+def test_keys_go_from_frame_to_frame_and_back_to_the_newest(tab: Tab, run: MadeUpRun) -> None:
+    def number() -> int:
+        return tab.value("frameShown(inOrder()).id")
+
+    with shown(tab, run.folder):
+        newest = number()
+        tab.press("ArrowLeft")
+        assert number() == newest - 1
+        tab.press("Home")
+        assert number() == 1
+        tab.press("ArrowRight")
+        assert number() == 2
+        tab.press("Escape")
+        assert number() == newest
+        # A click on a plot chooses the frame under it, in all plots and planes.
+        tab.value(
+            "(() => { const svg = document.querySelector('#series svg'); const box = svg.getBoundingClientRect();"
+            " svg.dispatchEvent(new MouseEvent('click', { bubbles: true, clientX: box.left + box.width * 0.6,"
+            " clientY: box.top + 20 })); })()"
+        )
+        assert 2 < number() < newest
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [320, 390, 1280])
+def test_nothing_is_wider_than_the_window(tab: Tab, run: MadeUpRun, width: int, dark: bool) -> None:
+    with shown(tab, run.folder, width=width, dark=dark):
+        assert tab.value("document.documentElement.scrollWidth <= window.innerWidth")
+        assert tab.value(TOO_WIDE) == []
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("state", ["running", "paused"])
+def test_all_text_has_contrast(tab: Tab, run: MadeUpRun, dark: bool, state: str) -> None:
+    run.beat(state, "the camera: it does not answer; see to its cable (paused for 20 s)")
+    with shown(tab, run.folder, dark=dark):
+        assert tab.value(POOR_CONTRAST) == []
+
+
+def test_it_can_be_used_without_seeing_it(tab: Tab, run: MadeUpRun) -> None:
+    with shown(tab, run.folder):
+        assert tab.value(NAMELESS) == []
+        assert tab.value("document.documentElement.lang") == "en"
+        assert tab.value("document.getElementById('progress').getAttribute('aria-valuetext')") == (
+            f"28 of {len(run.steps)} frames"
+        )
+        run.beat("paused", "the camera is gone; find it")
+        tab.wait_for("document.getElementById('said').textContent.includes('paused')")
+
+
+def test_a_page_that_gets_no_answer_says_that_it_is_old(tab: Tab, run: MadeUpRun) -> None:
+    with shown(tab, run.folder):
+        assert tab.value("document.getElementById('offline').hidden")
+        tab.value("answeredAt -= 60000; drawClock()")
+        assert "has not answered since" in tab.value("document.getElementById('offline').innerText")
+
+
+def test_several_pages_look_at_once_and_a_frame_costs_little(tab: Tab, run: MadeUpRun) -> None:
+    with shown(tab, run.folder) as server:
+        size = tab.value(f"fetch('state.json?since={'x'}').then((one) => one.text()).then((text) => text.length)")
+        cursor = tab.value("model.cursor")
+        run.take(run.steps[30])
+        news = tab.value(f"fetch('state.json?since={cursor}').then((one) => one.text()).then((text) => text.length)")
+        assert news < size / 4
+        assert server.watch.head().done == 29
+
+
+def test_the_report_shows_the_same_from_a_file(tab: Tab, run: MadeUpRun, tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    save_report(run.folder, path)
+    tab.open(path.as_uri())
+    tab.wait_for("document.readyState === 'complete' && document.querySelectorAll('#planned .mark').length > 0")
+    assert tab.value("window.hacked") is None
+    assert marks(tab, "planned", "accepted") == sum(step.kind == "light" for step in run.steps[:28])
+    tab.wait_for("document.getElementById('picture').naturalWidth === 360")
+    assert tab.value("document.querySelector('.refusal img').src").startswith("data:image/jpeg")
+    assert tab.value(OUTSIDE) == []
+    assert tab.value("document.getElementById('sound').hidden")
+    tab.open("about:blank")

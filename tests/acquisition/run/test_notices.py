@@ -1,0 +1,211 @@
+"""Notices reach a command or a URL; receivers that fail, hang or refuse hurt nobody, and no secret is said."""
+
+from __future__ import annotations
+
+import base64
+import http.server
+import json
+import os
+import shlex
+import socket
+import sys
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.run import notices
+from acquisition.run.notices import Notices
+
+AT = datetime(2026, 1, 1, 3, 12, 45, tzinfo=UTC)
+
+
+@dataclass
+class Receiver:
+    """What a server on this machine got, and how it answers."""
+
+    code: int = 200
+    headers: dict[str, str] = field(default_factory=dict[str, str])
+    hangs: threading.Event | None = None
+    port: int = 0
+    got: list[tuple[str, dict[str, str], dict[str, Any]]] = field(
+        default_factory=list[tuple[str, dict[str, str], dict[str, Any]]]
+    )
+
+
+@contextmanager
+def served(receiver: Receiver) -> Generator[Receiver]:
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            receiver.got.append((self.path, dict(self.headers), json.loads(body)))
+            if receiver.hangs is not None:
+                receiver.hangs.wait(10)
+            self.send_response(receiver.code)
+            for name, value in receiver.headers.items():
+                self.send_header(name, value)
+            self.end_headers()
+
+        do_GET = do_POST  # noqa: N815
+
+        def log_message(self, format: str, *args: object) -> None: ...
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        receiver.port = server.server_address[1]
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield receiver
+        finally:
+            if receiver.hangs is not None:
+                receiver.hangs.set()
+            server.shutdown()
+            thread.join()
+
+
+@pytest.fixture(autouse=True)
+def no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+
+
+def told(target: str, *events: str) -> list[str]:
+    """Tell a target some events; return the warnings."""
+    warnings: list[str] = []
+    told_by = Notices(target, "night", warnings.append)
+    for event in events or ("paused",):
+        told_by.tell(event, "the screen is covered – 3 °C", AT)
+    told_by.close()
+    told_by.close()
+    return warnings
+
+
+def test_nobody_is_told_where_nobody_is_named() -> None:
+    before = threading.active_count()
+    assert told("") == []
+    assert threading.active_count() == before
+
+
+class TestWebhook:
+    def test_it_gets_json(self) -> None:
+        with served(Receiver()) as receiver:
+            assert told(f"http://127.0.0.1:{receiver.port}/lab?token=t", "paused", "resumed") == []
+        (path, headers, body), (_, _, second) = receiver.got
+        assert path == "/lab?token=t"
+        assert headers["Content-Type"] == "application/json; charset=utf-8"
+        assert headers["Title"] == "CroP: paused"
+        assert body == {
+            "event": "paused",
+            "message": "the screen is covered – 3 °C",
+            "text": "night: paused: the screen is covered – 3 °C",
+            "content": "night: paused: the screen is covered – 3 °C",
+            "session": "night",
+            "host": socket.gethostname(),
+            "at": "2026-01-01T03:12:45+00:00",
+        }
+        assert second["event"] == "resumed"
+
+    def test_a_user_and_a_password_become_a_header(self) -> None:
+        with served(Receiver()) as receiver:
+            assert told(f"http://u%40x:p%3Aw@127.0.0.1:{receiver.port}/lab") == []
+        ((path, headers, _),) = receiver.got
+        assert path == "/lab"
+        assert "u%40x" not in headers["Host"]
+        assert base64.b64decode(headers["Authorization"].removeprefix("Basic ")) == b"u@x:p:w"
+
+    @pytest.mark.parametrize(
+        ("receiver", "why"),
+        [
+            (Receiver(403), "it answered 403"),
+            (Receiver(500), "it answered 500"),
+            (Receiver(302, {"Location": "/elsewhere"}), "it answered 302"),
+        ],
+    )
+    def test_a_refusal_is_said_once_and_without_the_secret(self, receiver: Receiver, why: str) -> None:
+        with served(receiver):
+            warnings = told(f"http://u:s3cret@127.0.0.1:{receiver.port}/s3cret?s3cret", "paused", "resumed")
+        assert warnings == [f"http://127.0.0.1:{receiver.port}/… could not be told: {why}; the run goes on without"]
+        assert len(receiver.got) == 2
+
+    def test_a_server_that_is_not_there(self) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as unused:
+            port = unused.getsockname()[1]
+        (warning,) = told(f"http://127.0.0.1:{port}/s3cret")
+        assert "Connection refused" in warning
+        assert "s3cret" not in warning
+
+    def test_a_name_that_does_not_exist(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def unknown(*_: object, **__: object) -> object:
+            raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+        monkeypatch.setattr(socket, "getaddrinfo", unknown)
+        (warning,) = told("https://lab.invalid/s3cret")
+        assert "Name or service not known" in warning
+        assert "s3cret" not in warning
+
+    def test_a_server_that_hangs_is_not_waited_for(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(notices, "LIMIT_S", 0.1)
+        monkeypatch.setattr(notices, "ENDING_S", 0.1)
+        with served(Receiver(hangs=threading.Event())) as receiver:
+            warnings = told(f"http://127.0.0.1:{receiver.port}/s3cret", "paused", "resumed", "complete")
+        assert warnings
+        assert all("s3cret" not in warning for warning in warnings)
+
+
+class TestCommand:
+    def test_it_gets_json_and_variables(self, tmp_path: Path) -> None:
+        out = tmp_path / "got"
+        program = (
+            "import json, os, sys; body = json.load(sys.stdin);"
+            "open(sys.argv[1], 'a').write(repr((body['message'], os.environ['CROP_EVENT'], os.environ['CROP_MESSAGE'],"
+            "os.environ['CROP_SESSION'])) + '\\n')"
+        )
+        assert told(shlex.join([sys.executable, "-c", program, str(out)]), "paused", "resumed") == []
+        said = "the screen is covered – 3 °C"
+        lines = [repr((said, event, said, "night")) for event in ("paused", "resumed")]
+        assert out.read_text().splitlines() == lines
+
+    @pytest.mark.parametrize(
+        ("target", "label", "why"),
+        [
+            ("false s3cret", "false …", "it ended with 1, 0 expected"),
+            ("/nowhere/notify s3cret", "/nowhere/notify …", "No such file or directory"),
+            ("true s3cret", "", ""),
+        ],
+    )
+    def test_how_it_ends_is_said(self, target: str, label: str, why: str) -> None:
+        expected = [f"{label} could not be told: {why}; the run goes on without"] if why else []
+        assert told(target, "paused", "resumed") == expected
+
+    def test_one_that_hangs_is_ended_with_what_it_started(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(notices, "LIMIT_S", 0.5)
+        numbers = tmp_path / "pids"
+        (warning,) = told(f"sh -c 'sleep 600 & echo $$ $! > {numbers}; wait'")
+        assert "within 0.5 s" in warning
+        for number in numbers.read_text().split():
+            # It is gone, or what is left of it waits to be read by init.
+            stat = Path(f"/proc/{number}/stat")
+            assert not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] in "ZX"
+
+
+def test_telling_takes_no_time_and_loses_what_nobody_takes() -> None:
+    with served(Receiver(hangs=threading.Event())) as receiver:
+        told_by = Notices(f"http://127.0.0.1:{receiver.port}/", "night")
+        for number in range(3 * notices.QUEUED):
+            told_by.tell(f"event {number}", "", AT)
+        assert len(receiver.got) <= 1
+        assert receiver.hangs is not None
+        receiver.hangs.set()
+        told_by.close()
+        assert len(receiver.got) <= notices.QUEUED + 2
+
+
+def test_the_environment_stays_as_it_was() -> None:
+    told("true")
+    assert "CROP_EVENT" not in os.environ

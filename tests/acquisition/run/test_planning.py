@@ -1,0 +1,454 @@
+"""The plan before action: what is printed holds, what would end a run is refused with its remedy, and nothing moves."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.chart.layout import design_chart
+from acquisition.cli import main
+from acquisition.config import LabSettings, load_lab
+from acquisition.lights.illuminations import Illumination, save_illuminations
+from acquisition.run.devices import Devices
+from acquisition.run.planning.answers import Answers, ask
+from acquisition.run.planning.dry_run import dry_run
+from acquisition.run.planning.plan import RunPlan, make_plan
+from acquisition.run.planning.sizes import MEGAPIXELS, SPARE_BYTES, free_bytes_at, needed_bytes
+from acquisition.run.planning.text import plan_lines
+from acquisition.run.planning.work import Work, order_of, outline
+from acquisition.session.folder import Session
+from acquisition.session.plan import plan_steps
+from drivers.camera import CameraIdentity, ExposureSettings, Supplies
+from drivers.presenter import Colour
+from drivers.projector import Power, Severity
+from foundation.errors import ConfigurationError, CropError, DeviceError, DeviceFault, DeviceRefused, StorageError
+from sim.clock import SimulatedClock
+from sim.projectors.projector import SimulatedProjector
+
+GB = 10**9
+LIGHTS = tuple(Illumination(index, "uniform", None, Colour(255, index, 0)) for index in range(100))
+EOS = CameraIdentity("Canon Inc.", "Canon EOS 550D", "123")
+SPEEDS = (0.25, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
+
+
+def settings_with(**tables: dict[str, Any]) -> LabSettings:
+    document = {"rig": "lab", "chart": "chart.json", "illuminations": "lights.csv", **tables}
+    return LabSettings.model_validate(document)
+
+
+SETTINGS = settings_with()
+
+
+def work_of(settings: LabSettings = SETTINGS, done: int = 0, **changes: Any) -> Work:
+    steps = plan_steps(LIGHTS, 25, seed=1)
+    work = Work(
+        Path("night"), not done, steps, frozenset(range(done)), order_of(steps, settings), CHART, LIGHTS, "0" * 64
+    )
+    return replace(work, **changes)
+
+
+CHART = design_chart(1)
+
+
+def planned(
+    free: float = 1000 * GB, answers: Answers | None = None, settings: LabSettings = SETTINGS, work: Work | None = None
+) -> RunPlan:
+    given = answers or Answers(camera=EOS, offered_s=SPEEDS, projector="Epson, in standby: it will be lit", lit=False)
+    return make_plan(settings, work or work_of(), given, int(free))
+
+
+class TestDisk:
+    def test_a_disk_that_is_too_small_names_what_is_missing(self) -> None:
+        enough = planned().needed_bytes
+        assert planned(enough).faults == ()
+        (fault,) = planned(enough - 3.25 * GB).faults
+        assert isinstance(fault, StorageError)
+        assert "3.3 GB are missing; free them, or name a session folder on another disk" in str(fault)
+        with pytest.raises(StorageError, match=r"3\.3 GB are missing"):
+            planned(enough - 3.25 * GB).require()
+
+    def test_there_is_room_for_what_is_taken_again_and_a_reserve(self) -> None:
+        plan = planned()
+        assert plan.work.left == 110
+        assert plan.needed_bytes - SPARE_BYTES >= 1.1 * 110 * plan.frame_bytes.value
+        assert needed_bytes(0, 1e6) == 0
+
+    def test_a_little_too_small_is_never_nothing(self) -> None:
+        (fault,) = planned(planned().needed_bytes - 1).faults
+        assert "0.1 MB are missing" in str(fault)
+
+    def test_frames_of_the_session_tell_their_size(self) -> None:
+        plan = planned(work=work_of(done=50, frame_bytes=25_000_000))
+        assert plan.frame_bytes.value == 25_000_000
+        assert plan.needed_bytes == needed_bytes(60, 25e6)
+
+    @pytest.mark.parametrize(("model", "bytes_per_frame"), [("EOS 550D", 25e6), ("EOS 6D Mark II", 36e6)])
+    def test_what_a_body_writes_is_not_underestimated(self, model: str, bytes_per_frame: float) -> None:
+        answers = Answers(camera=replace(EOS, model=f"Canon {model}"))
+        assert bytes_per_frame <= planned(answers=answers).frame_bytes.value <= 1.2 * bytes_per_frame
+        assert f"{MEGAPIXELS[model]:.1f} million photosites" in planned(answers=answers).frame_bytes.basis
+
+    def test_a_guess_is_a_doubt_and_no_fault(self) -> None:
+        plan = planned(1 * GB, Answers(camera=CameraIdentity("Acme", "Unknown 9", "")))
+        assert plan.faults == ()
+        assert any("are missing" in doubt and "the size of Unknown 9 is not known" in doubt for doubt in plan.doubts)
+
+    def test_free_space_is_that_of_the_nearest_folder_that_is_there(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        asked: list[Path] = []
+        usage = shutil.disk_usage(tmp_path)
+
+        def disk_usage(path: Path) -> object:
+            asked.append(Path(path))
+            return usage._replace(free=1)
+
+        monkeypatch.setattr(shutil, "disk_usage", disk_usage)
+        assert free_bytes_at(tmp_path / "in" / "night") == 1
+        assert asked == [tmp_path]
+
+    def test_a_disk_that_can_only_be_read(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def read_only(path: Path) -> os.statvfs_result:
+            return os.statvfs_result((0,) * 8 + (os.ST_RDONLY, 255))
+
+        monkeypatch.setattr(os, "statvfs", read_only)
+        with pytest.raises(StorageError, match=r"night: Read-only file system; .* mount it for writing"):
+            free_bytes_at(tmp_path / "night")
+
+    def test_a_disk_that_fails(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def dead(path: object) -> object:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+        monkeypatch.setattr(os, "statvfs", dead)
+        with pytest.raises(StorageError, match="the disk fails"):
+            free_bytes_at(tmp_path)
+
+
+class TestExposure:
+    def test_a_time_that_is_not_offered_names_the_nearest(self) -> None:
+        settings = settings_with(camera={"shutter_s": 0.45})
+        (fault,) = planned(settings=settings).faults
+        assert isinstance(fault, DeviceRefused)
+        assert str(fault).startswith("camera.shutter_s = 0.45: the body does not offer it; ")
+        assert "0.4, 0.5, 0.6 s" in str(fault)
+
+    def test_a_body_that_lists_nothing_is_not_known(self) -> None:
+        plan = planned(answers=Answers(camera=EOS))
+        assert plan.faults == ()
+        assert any("whether the body offers this time is not known" in line for line in plan_lines(plan))
+
+    @pytest.mark.parametrize(
+        ("shutter_s", "projector", "text"),
+        [
+            (0.5, {}, "0.5 s = 30 turns of the colour wheel"),
+            (0.5, {"colour_wheel_hz": 120.0}, "0.5 s = 60 turns of the colour wheel"),
+            (0.5, {"colour_wheel_hz": 0.0, "refresh_hz": 50.0}, "0.5 s = 25 pictures"),
+            (0.25, {"colour_wheel_hz": 50.0}, "0.25 s = 12.50 turns of the colour wheel, which are not whole"),
+        ],
+    )
+    def test_turns_of_the_wheel_are_counted(self, shutter_s: float, projector: dict[str, float], text: str) -> None:
+        settings = settings_with(camera={"shutter_s": shutter_s}, lab={"projector": projector})
+        assert any(text in line for line in plan_lines(planned(settings=settings)))
+
+
+class TestTime:
+    def test_a_new_session_says_what_is_assumed(self) -> None:
+        plan = planned()
+        assert plan.warm_up_s >= SETTINGS.sequence.warm_up_s
+        assert "assumed" in plan.frame_s.basis
+        assert plan.time_s == pytest.approx(110 * plan.frame_s.value + plan.warm_up_s)
+
+    def test_a_lamp_that_burns_needs_no_warm_up(self) -> None:
+        assert planned(answers=Answers(camera=EOS, lit=True)).warm_up_s == 0
+
+    def test_frames_of_the_session_tell_their_time(self) -> None:
+        plan = planned(work=work_of(done=50, frame_s=3.0), answers=Answers(camera=EOS, lit=True))
+        assert plan.time_s == pytest.approx(60 * 3.0)
+        assert any(
+            "3 min 00 s: 60 frames, 3.00 s each (median of the session so far)" in line for line in plan_lines(plan)
+        )
+
+    def test_nothing_is_left(self) -> None:
+        plan = planned(0, work=work_of(done=110))
+        assert (plan.time_s, plan.needed_bytes, plan.faults) == (0, 0, ())
+        assert any("nothing is left to take" in line for line in plan_lines(plan))
+
+
+class TestSupplies:
+    @pytest.mark.parametrize(
+        ("supplies", "fault"),
+        [
+            (Supplies(battery=0.25), True),
+            (Supplies(battery=0.25, mains=False), True),
+            (Supplies(battery=0.25, mains=True), False),
+            (Supplies(battery=0.5), False),
+            (Supplies(), False),
+        ],
+    )
+    def test_a_low_battery_ends_a_night(self, supplies: Supplies, fault: bool) -> None:
+        faults = planned(answers=Answers(camera=EOS, supplies=supplies)).faults
+        assert [type(found) for found in faults] == [DeviceFault] * fault
+        assert all("at 25%, and 110 frames are to be taken; connect a mains adapter" in str(found) for found in faults)
+
+    def test_a_low_battery_is_enough_for_a_few_frames(self) -> None:
+        assert planned(answers=Answers(camera=EOS, supplies=Supplies(0.25)), work=work_of(done=90)).faults == ()
+
+    def test_a_half_battery_is_a_doubt(self) -> None:
+        (doubt,) = planned(answers=Answers(camera=EOS, supplies=Supplies(0.5))).doubts
+        assert "a charge lasts for some hundred" in doubt
+
+    @pytest.mark.parametrize(
+        ("supplies", "fault"),
+        [
+            (Supplies(card_free_bytes=GB, saves_to_host=False), True),
+            (Supplies(card_free_bytes=GB, saves_to_host=True), False),
+            (Supplies(card_free_bytes=100 * GB, saves_to_host=False), False),
+            (Supplies(card_free_bytes=None, saves_to_host=False), False),
+        ],
+    )
+    def test_a_card_that_is_too_small_matters_where_frames_stay_on_it(self, supplies: Supplies, fault: bool) -> None:
+        faults = planned(answers=Answers(camera=EOS, supplies=supplies)).faults
+        assert [type(found) for found in faults] == [DeviceFault] * fault
+        assert all("are missing; put in an empty card of" in str(found) for found in faults)
+
+
+class TestOrder:
+    def test_each_order_is_named(self) -> None:
+        listed = plan_steps(LIGHTS, 25)
+        assert order_of(listed, settings_with(sequence={"order": "listed"})) == "as listed"
+        assert order_of(plan_steps(LIGHTS, 25, seed=7), settings_with(sequence={"seed": 7})) == "shuffled by seed 7"
+
+    def test_a_session_keeps_the_order_that_it_was_begun_with(self) -> None:
+        assert (
+            order_of(plan_steps(LIGHTS, 25), SETTINGS) == "as listed, as the session was begun; LAB.toml says shuffled"
+        )
+        shuffled = plan_steps(LIGHTS, 25, seed=1)
+        assert (
+            order_of(shuffled, settings_with(sequence={"seed": 2}))
+            == "shuffled by another seed, as the session was begun"
+        )
+        wanted = settings_with(sequence={"order": "listed"})
+        assert order_of(shuffled, wanted) == "shuffled by seed 1, as the session was begun; LAB.toml says listed"
+
+    def test_one_light_has_no_order(self) -> None:
+        assert order_of(plan_steps(LIGHTS[:1], 25, seed=1), SETTINGS) == "shuffled by seed 1"
+        assert order_of(plan_steps(LIGHTS[:1], 25), settings_with(sequence={"order": "listed"})) == "as listed"
+
+
+@dataclass
+class Silent:
+    """Devices that note what is asked of them, and must do nothing else."""
+
+    log: list[str] = field(default_factory=list[str])
+    fault: DeviceError | None = None
+
+    def _noted(self, what: str, answer: Any) -> Any:
+        self.log.append(what)
+        if self.fault is not None:
+            raise self.fault
+        return answer
+
+    def identity(self) -> CameraIdentity:
+        return self._noted("identity", EOS)
+
+    def shutter_speeds(self) -> tuple[float, ...]:
+        return self._noted("shutter_speeds", SPEEDS)
+
+    def supplies(self) -> Supplies:
+        return self._noted("supplies", Supplies(0.75))
+
+    def configure(self, settings: ExposureSettings) -> None:
+        raise AssertionError(settings)
+
+    def expose(self) -> datetime:
+        raise AssertionError
+
+    def download(self, into: object) -> Any:
+        raise AssertionError(into)
+
+    def show(self, colour: Colour) -> None:
+        raise AssertionError(colour)
+
+    def warnings(self) -> tuple[str, ...]:
+        return ("night light is on: switch it off",)
+
+    def close(self) -> None: ...
+
+
+class Unmoved(SimulatedProjector):
+    """A projector that may be asked, and nothing else."""
+
+    def switch_on(self) -> None:
+        raise AssertionError
+
+    def set_muted(self, muted: bool) -> None:
+        raise AssertionError(muted)
+
+
+class TestAsking:
+    def test_devices_are_asked_and_nothing_moves(self) -> None:
+        clock = SimulatedClock()
+        answers = ask(Devices(Silent(), Silent(), Unmoved(clock), clock))
+        assert answers.camera == EOS
+        assert answers.supplies == Supplies(0.75)
+        assert (answers.lit, answers.faults) == (False, ())
+        assert "in standby: it will be lit" in answers.projector
+        assert answers.warnings == ("night light is on: switch it off",)
+        assert clock.monotonic() == 0
+
+    def test_a_camera_that_is_gone_is_asked_once_and_the_rest_all_the_same(self) -> None:
+        clock, camera = SimulatedClock(), Silent(fault=DeviceError("no camera on USB"))
+        answers = ask(Devices(camera, Silent(), Unmoved(clock, power=Power.ON), clock))
+        assert camera.log == ["identity"]
+        assert [str(fault) for fault in answers.faults] == ["no camera on USB"]
+        assert answers.lit
+
+    def test_a_broken_lamp_is_a_fault(self) -> None:
+        clock = SimulatedClock()
+        projector = Unmoved(clock, power=Power.ON)
+        projector.break_part("fan", Severity.ERROR)
+        (fault,) = ask(Devices(Silent(), Silent(), projector, clock)).faults
+        assert isinstance(fault, DeviceFault)
+        assert "fan" in str(fault)
+
+    def test_what_cannot_be_asked_is_named(self) -> None:
+        class Mute:
+            def __init__(self) -> None:
+                self.identity = Silent().identity
+                self.shutter_speeds = tuple
+                self.configure, self.expose, self.download = Silent().configure, Silent().expose, Silent().download
+                self.close = Silent().close
+
+        answers = ask(Devices(Mute(), Silent(), None, SimulatedClock()))
+        assert [sentence.split(":")[0] for sentence in answers.unasked] == [
+            "shutter times", "battery", "ISO speed and aperture", "lamp",
+        ]  # fmt: skip
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    design_chart(1).save(tmp_path / "chart.json")
+    save_illuminations(LIGHTS[:4], tmp_path / "lights.csv")
+    path = tmp_path / "LAB.toml"
+    path.write_text(
+        'rig = "simulated"\nchart = "chart.json"\nilluminations = "lights.csv"\n[simulated]\nbody = "Test"\n'
+        '[sequence]\nnotify = "https://ntfy.example/s3cret"\n'
+    )
+    return path
+
+
+def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
+    return {
+        path.relative_to(folder).as_posix(): (path.stat().st_mtime_ns, path.read_bytes() if path.is_file() else b"")
+        for path in folder.rglob("*")
+    }
+
+
+class TestDryRun:
+    def test_a_new_session_is_printed_and_not_made(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        before = contents(lab.parent)
+        assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 0
+        assert contents(lab.parent) == before
+        text = capsys.readouterr().out
+        assert "night: new, 8 frames to take (4 light, 2 white, 2 dark); 0 frames of 8 done" in text
+        assert "shuffled by seed 1" in text
+        assert "in standby: it will be lit" in text
+        assert "notices     to https://ntfy.example/…" in text
+        assert "s3cret" not in text
+
+    def test_a_session_is_looked_at_and_not_changed(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        night = lab.parent / "night"
+        assert main(["run", str(lab), str(night)]) == 0
+        with Session.open_for_run(night) as session:
+            session.retake("2")
+        before = contents(lab.parent)
+        capsys.readouterr()
+        assert main(["run", str(lab), str(night), "--dry-run"]) == 0
+        assert contents(lab.parent) == before
+        text = capsys.readouterr().out
+        assert "night: taken up again, 1 frame to take (1 light); 7 frames of 8 done" in text
+        assert "the largest of the session so far" in text
+        assert "median of the session so far" in text
+
+    def test_a_full_disk_is_printed_and_is_the_exit_code(
+        self, lab: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        usage = shutil.disk_usage(lab.parent)._replace(free=10**8)
+
+        def small(path: Path) -> object:
+            return usage
+
+        monkeypatch.setattr(shutil, "disk_usage", small)
+        assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run"]) == 5
+        said = capsys.readouterr()
+        assert "fault       the disk of" in said.out
+        assert "are missing; free them" in said.err
+
+    def test_a_session_that_was_begun_otherwise_is_refused(self, lab: Path) -> None:
+        night = lab.parent / "night"
+        settings = load_lab(lab)
+        Session.create(night, settings.to_toml(), CHART, LIGHTS[:4], plan_steps(LIGHTS[:4], 25)).close()
+        lab.write_text(lab.read_text() + "[camera]\niso = 400\n")
+        with pytest.raises(ConfigurationError, match="was begun with camera"):
+            outline(load_lab(lab), night)
+
+    def test_a_rig_that_cannot_be_opened_is_a_fault_of_the_plan(self, lab: Path) -> None:
+        lab.write_text(lab.read_text().replace('"Test"', '"Box"'))
+        plan = dry_run(load_lab(lab), lab.parent / "night")
+        assert plan.work.left == 8
+        with pytest.raises(ConfigurationError, match="known are"):
+            plan.require()
+
+    def test_it_takes_nothing_again(self, lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["run", str(lab), str(lab.parent / "night"), "--dry-run", "--retake", "1"]) == 2
+        assert "leave --retake out" in capsys.readouterr().err
+
+
+def test_the_first_fault_is_raised_and_the_others_named() -> None:
+    faults: tuple[CropError, ...] = (DeviceFault("the lamp is broken"), StorageError("the disk is full"))
+    plan = replace(planned(), faults=faults)
+    with pytest.raises(DeviceFault, match="the lamp is broken; moreover, the disk is full"):
+        plan.require()
+    replace(planned(), faults=()).require()
+
+
+def test_the_times_of_a_session_are_those_between_its_frames(tmp_path: Path, lab: Path) -> None:
+    """Frames overlap: the time of an attempt is not that from one frame to the next."""
+    night = lab.parent / "night"
+    assert main(["run", str(lab), str(night)]) == 0
+    settings = load_lab(lab)
+    with Session.open(night) as session:
+        taken = sorted(frame.taken_at for frame in session.frames())
+    gaps = sorted(after - before for before, after in pairwise(taken))
+    frame_s = outline(settings, night).frame_s
+    assert frame_s is not None
+    assert timedelta(seconds=frame_s) == gaps[len(gaps) // 2]
+
+
+def test_a_run_checks_its_plan_before_anything_moves(
+    lab: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(lab.parent)._replace(free=10**8)
+
+    def small(path: Path) -> object:
+        return usage
+
+    monkeypatch.setattr(shutil, "disk_usage", small)
+    before = contents(lab.parent)
+    assert main(["run", str(lab), str(lab.parent / "night")]) == 5
+    assert "are missing; free them" in capsys.readouterr().err
+    assert contents(lab.parent) == before
+
+
+def test_nothing_is_taken_again_of_a_session_that_was_not_begun(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", str(lab), str(lab.parent / "night"), "--retake", "1"]) == 2
+    assert "leave --retake out" in capsys.readouterr().err
+    assert not (lab.parent / "night").exists()

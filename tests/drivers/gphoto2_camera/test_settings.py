@@ -1,0 +1,318 @@
+"""What a series wants of bodies of several makers, as libgphoto2 shows them, and how they are used with it."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.camera import CameraIdentity, ExposureSettings, ReportsSupplies, Supplies, capture
+from drivers.gphoto2_camera import camera as gphoto2_camera
+from drivers.gphoto2_camera.camera import Gphoto2Camera
+from drivers.gphoto2_camera.settings import Setting, battery_level, is_same, label_of, number_of, plan
+from foundation.errors import DeviceError, DeviceRefused
+from sim.clock import SimulatedClock
+from tests.contracts.camera import SETTINGS, Bench, CameraContract, SeededFilm
+from tests.drivers.gphoto2_camera.bodies import (
+    BODIES,
+    NIKON_D7100,
+    NIKON_Z7,
+    SONY_A7M4,
+    SONY_A6000,
+    SONY_A6400,
+    FakeBody,
+    fake_module,
+)
+
+
+class NoisyFilm(SeededFilm):
+    """A film in bodies that make another raw file than Canon's."""
+
+    suffix = ".nef"
+
+    def accept(self, settings: ExposureSettings) -> None:
+        """Take every exposure that the body is set to."""
+
+
+class Fake:
+    """A camera of ours with a fake libgphoto2 below it."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, name: str, **given: object) -> None:
+        self.clock = SimulatedClock()
+        self.film = NoisyFilm()
+        self.body = FakeBody(dict(BODIES[name]), self.film, self.clock, **given)  # pyright: ignore[reportArgumentType]
+        module = fake_module(self.body)
+        patch.setattr(gphoto2_camera, "library", lambda: module)
+        self.camera = Gphoto2Camera(clock=self.clock)
+
+
+@pytest.fixture(params=list(BODIES))
+def fake(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Fake:
+    return Fake(monkeypatch, request.param)
+
+
+class TestContract(CameraContract):
+    @pytest.fixture
+    def bench(self, fake: Fake) -> Bench:
+        tree = fake.body.tree
+        if not tree["iso"].choices:
+            tree["iso"] = replace(tree["iso"], choices=("Auto ISO", "100", "200"))
+        identity = CameraIdentity(
+            *(tree[name].value for name in ("manufacturer", "cameramodel", "serialnumber", "deviceversion"))
+        )
+        return Bench(fake.camera, fake.film, identity, fake.clock.now, keeps_names=False)
+
+
+def test_what_a_nikon_is_given() -> None:
+    assert plan(NIKON_Z7.get, SETTINGS) == {
+        "isoauto": "Off",
+        "capturetarget": "Internal RAM",
+        "imagequality": "NEF (Raw)",
+        "iso": "100",
+        "f-number": "f/8",
+        "shutterspeed2": "1/60",
+    }
+    assert plan(NIKON_D7100.get, replace(SETTINGS, shutter_s=0.5))["shutterspeed2"] == "1/2"
+    # Its other list rounds short times away: 1/6400 s is "0.0001s" there, as 1/8000 s is.
+    assert plan(NIKON_D7100.get, replace(SETTINGS, shutter_s=1 / 6400))["shutterspeed2"] == "1/6400"
+
+
+def test_what_a_sony_is_given() -> None:
+    assert plan(SONY_A7M4.get, replace(SETTINGS, shutter_s=0.5)) == {
+        "capturetarget": "sdram",
+        "imagequality": "RAW",
+        "iso": "100",
+        "f-number": "f/8",
+        "shutterspeed": "5/10",
+    }
+    older = plan(SONY_A6400.get, replace(SETTINGS, aperture=5.6, shutter_s=3.2))
+    assert (older["f-number"], older["shutterspeed"], older["iso"]) == ("5.6", "32/10", "100")
+    assert "capturetarget" not in plan(SONY_A6000.get, SETTINGS)
+
+
+SPOILED: list[tuple[dict[str, Setting], Setting | str, str]] = [
+    (NIKON_Z7, Setting("expprogram", "A", ("M", "A")), "expprogram is A: turn the mode dial to M"),
+    (NIKON_Z7, Setting("focusmode", "AF-S", ("Manual", "AF-S")), "focusmode is AF-S: set the lens"),
+    (NIKON_Z7, Setting("capturemode", "Timer", ("Single Shot", "Timer")), "capturemode is Timer: set single shooting"),
+    (NIKON_Z7, Setting("capturemode", "Mirror Up", ("Single Shot",)), "capturemode is Mirror Up: set single shooting"),
+    (NIKON_Z7, Setting("bracketing", "On", ("On", "Off"), fixed=True), "bracketing is On, so that every frame would"),
+    (NIKON_Z7, Setting("isoauto", "On", ("On", "Off"), fixed=True), "isoauto is On, so that the body would choose"),
+    (NIKON_Z7, Setting("rawcompression", "Lossy", ("Lossy",)), "rawcompression is Lossy, so that raw values"),
+    (
+        NIKON_Z7,
+        Setting("imagequality", "JPEG Fine", ("JPEG Basic", "JPEG Fine", "NEF+Fine")),
+        r"imagequality offers JPEG Basic, JPEG Fine, NEF\+Fine, none of RAW, NEF \(Raw\)",
+    ),
+    (
+        NIKON_Z7,
+        Setting("imagequality", "JPEG Fine", ("JPEG Fine", "NEF (Raw)"), fixed=True),
+        r"imagequality offers JPEG Fine, NEF \(Raw\), none of RAW, .* that can be set",
+    ),
+    (NIKON_Z7, "imagequality", "a raw format cannot be asked for: the body shows neither imageformat nor imagequality"),
+    (NIKON_Z7, "f-number", "aperture or f-number 8 cannot be asked for: the body does not show it"),
+    (NIKON_Z7, "iso", "iso 100 cannot be asked for"),
+    (NIKON_Z7, Setting("f-number", "f/1.8", ("f/1.8", "f/2")), "f-number 8 is not offered; offered are f/1.8, f/2"),
+    (NIKON_Z7, Setting("capturetarget", "Memory card", ("Memory card",)), "capturetarget offers Memory card, none of"),
+    (SONY_A7M4, Setting("expprogram", "Unknown value 8000", ("M", "P")), "expprogram is Unknown value 8000"),
+    (SONY_A7M4, Setting("focusmode", "DMF", ("Manual", "DMF")), "focusmode is DMF"),
+    (SONY_A7M4, Setting("capturemode", "Bracketing WB Hi", ("Single Shot",)), "capturemode is Bracketing WB Hi"),
+    (SONY_A6400, Setting("f-number", "4.5", bounds=(3.5, 5.6)), "f-number 8 is not offered; offered are 3.5 to 5.6"),
+]
+
+
+@pytest.mark.parametrize(("tree", "spoiled", "says"), SPOILED)
+def test_what_would_spoil_a_series_is_refused(tree: dict[str, Setting], spoiled: Setting | str, says: str) -> None:
+    plan(tree.get, SETTINGS)
+    changed = dict(tree)
+    if isinstance(spoiled, str):
+        del changed[spoiled]
+    else:
+        changed[spoiled.name] = spoiled
+    with pytest.raises(DeviceRefused, match=says):
+        plan(changed.get, SETTINGS)
+
+
+def test_everything_that_is_wrong_is_told_at_once() -> None:
+    with pytest.raises(
+        DeviceRefused, match=r"raw format cannot.*; iso 100 cannot.*; aperture or f-number 8.*shutterspeed"
+    ):
+        plan(lambda name: None, SETTINGS)
+
+
+def test_a_body_that_stands_at_raw_and_cannot_be_set_is_good() -> None:
+    tree = NIKON_Z7 | {"imagequality": Setting("imagequality", "NEF (Raw)", fixed=True)}
+    assert "imagequality" not in plan(tree.get, SETTINGS)
+
+
+def test_an_aperture_ring_that_stands_right_is_good() -> None:
+    ring = Setting("f-number", "f/8", ("f/8", "f/11"), fixed=True)
+    assert plan((NIKON_Z7 | {"f-number": ring}).get, SETTINGS)["f-number"] == "f/8"
+    with pytest.raises(DeviceRefused, match="f-number 11 is not offered"):
+        plan((NIKON_Z7 | {"f-number": ring}).get, replace(SETTINGS, aperture=11))
+
+
+@pytest.mark.parametrize(
+    ("label", "number"),
+    [
+        ("1/2", 0.5), ("0.5000s", 0.5), ("0,5000s", 0.5), ("5/10", 0.5), ("f/5.6", 5.6), ("f/3,5", 3.5), ("100", 100),
+        ("Bulb", None), ("Time", None), ("x 200", None), ("Auto ISO", None), ("100 Multi Frame Noise Reduction", None),
+        ("1/0", None), ("0", None), ("-1", None), ("", None), ("inf", None), ("nan", None),
+        ("Unknown value 8000", None),
+    ],
+)  # fmt: skip
+def test_numbers_in_labels(label: str, number: float | None) -> None:
+    assert number_of(label) == number
+
+
+def test_labels_that_mean_the_same() -> None:
+    assert is_same("5/10", "1/2")
+    assert is_same("0.0166s", "1/60")
+    assert is_same("RAW", "RAW")
+    assert not is_same("RAW", "RAW+JPEG")
+    assert not is_same("1/60", "1/50")
+    assert not is_same("Bulb", "30")
+
+
+@given(st.text(max_size=30))
+def test_any_label_is_a_number_or_none(label: str) -> None:
+    number = number_of(label)
+    assert number is None or 0 < number < float("inf")
+    assert battery_level(label) is None or 0 <= (battery_level(label) or 0) <= 1
+    setting = Setting("iso", label, (label, "100"))
+    assert label_of(setting, 100.0) is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "level"),
+    [("80%", 0.8), ("100%", 1.0), ("Low", 0.0), ("", None), ("Unknown value 0003", None), ("250%", 1.0)],
+)
+def test_charges(text: str, level: float | None) -> None:
+    assert battery_level(text) == level
+
+
+def test_a_dial_that_turns_step_by_step_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = Fake(monkeypatch, "Sony A6400", settles_after=8)
+    fake.camera.configure(SETTINGS)
+    assert fake.body.exposure() == ExposureSettings(100, 8.0, 1 / 60)
+    assert 0.5 < fake.clock.monotonic() < 10
+
+
+def test_a_setting_that_the_body_does_not_take_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = Fake(monkeypatch, "Nikon Z 7", stubborn=frozenset({"imagequality"}))
+    with pytest.raises(DeviceRefused, match=r"imagequality was set to NEF \(Raw\), and the camera reports NEF\+Fine"):
+        fake.camera.configure(SETTINGS)
+
+
+def test_what_stands_right_is_not_set_again(fake: Fake) -> None:
+    fake.camera.configure(SETTINGS)
+    first = len(fake.body.set_to)
+    fake.camera.configure(SETTINGS)
+    assert len(fake.body.set_to) == first
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "JPG", "hif"])
+def test_a_picture_in_place_of_a_raw_file_is_refused(monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    fake = Fake(monkeypatch, "Sony A7 IV", suffix=suffix)
+    fake.camera.configure(SETTINGS)
+    with pytest.raises(DeviceRefused, match=r"capt0000\..* no raw file, though it was asked for one"):
+        fake.camera.expose()
+    assert fake.body.files == {}, "it does not stay in the camera's memory"
+    with pytest.raises(DeviceError, match="no exposed frame waits"):
+        fake.camera.download(io.BytesIO())
+
+
+@pytest.mark.parametrize("code", [-7, -10, -34, -110, -1])
+def test_a_fault_of_any_kind_is_a_device_error_and_the_next_frame_is_taken(fake: Fake, code: int) -> None:
+    fake.camera.configure(SETTINGS)
+    for _ in range(3):
+        fake.body.fails.append(code)
+        with pytest.raises(DeviceError):
+            fake.camera.expose()
+        into = io.BytesIO()
+        capture(fake.camera, into)
+        assert into.getvalue() == fake.film.frames[-1]
+    assert fake.body.openings == 4
+
+
+def test_a_fault_of_the_download_says_that_the_frame_is_lost(fake: Fake) -> None:
+    fake.camera.configure(SETTINGS)
+    fake.camera.expose()
+    fake.body.fails.append(-34)
+    with pytest.raises(DeviceError, match="check the cable"):
+        fake.camera.download(io.BytesIO())
+    with pytest.raises(DeviceError, match="no exposed frame waits in the camera to be downloaded; expose it again"):
+        fake.camera.download(io.BytesIO())
+
+
+def test_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    nikon = Fake(monkeypatch, "Nikon D7100")
+    assert isinstance(nikon.camera, ReportsSupplies)
+    assert nikon.camera.supplies() == Supplies(0.8, False, 3_072_000_000, saves_to_host=False)
+    nikon.camera.configure(SETTINGS)
+    assert nikon.camera.supplies() == Supplies(0.8, False, 3_072_000_000, saves_to_host=True)
+    assert Fake(monkeypatch, "Sony A6000").camera.supplies() == Supplies(None, None, None, saves_to_host=True)
+
+
+VIRTUAL = """
+import io, json, sys
+from drivers.camera import ExposureSettings
+from drivers.gphoto2_camera.camera import Gphoto2Camera
+from foundation.errors import DeviceError
+
+camera = Gphoto2Camera()
+said = {"identity": vars(camera.identity()), "speeds": camera.shutter_speeds(), "supplies": vars(camera.supplies())}
+settings = ExposureSettings(100, 8, 0.1)
+try:
+    camera.configure(settings)
+except DeviceError as error:
+    said["refused"] = str(error)
+# As if it had been taken for good: what it makes is a JPEG.
+camera._settings = settings
+camera._apply = lambda *_: None
+try:
+    camera.expose()
+except DeviceError as error:
+    said["made"] = str(error)
+for name, label in (("f-number", "f/8"), ("shutterspeed", "1.0000s")):
+    with camera._speaking() as body:
+        camera._set(body, name, label)
+        said[name] = body.get_single_config(name).get_value()
+camera.close()
+print(json.dumps(said))
+"""
+
+
+def test_libgphoto2s_virtual_camera(tmp_path: Path) -> None:
+    pytest.importorskip("gphoto2", reason="the extra `gphoto2` is not installed")
+    (tmp_path / "IMG_0001.JPG").write_bytes(b"\xff\xd8\xff\xd9")
+    # python-gphoto2 takes its virtual USB for the real one where this is set.
+    done = subprocess.run(
+        [sys.executable, "-c", VIRTUAL],
+        cwd=Path(__file__).parents[3],
+        env=os.environ | {"VCAMERADIR": str(tmp_path), "HOME": str(tmp_path)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if "found: no camera at all" in done.stderr:
+        pytest.skip("this build of libgphoto2 has no virtual camera")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout.splitlines()[-1])
+    assert said["identity"]["model"] == "VC"
+    assert said["speeds"] == [0.0001, 0.0012, 0.0025, 0.005, 0.01, 0.02, 0.05, 0.1, 1.0]
+    assert said["supplies"]["battery"] == 0.5
+    assert said["supplies"]["card_free_bytes"] > 1 << 20
+    assert said["refused"].startswith(
+        "the camera cannot take the series: a raw format cannot be asked for: the body shows neither imageformat nor "
+        "imagequality"
+    )
+    assert "iso 100 cannot be asked for" in said["refused"]
+    assert "f-number" not in said["refused"], "that it can"
+    assert "no raw file, though it was asked for one" in said["made"]
+    assert (said["f-number"], said["shutterspeed"]) == ("f/8", "1.0000s")
