@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the screen is a
 
 HOW_TO = (Path(__file__).parents[2] / "docs" / "how-to" / "rehearsal.md").read_text(encoding="utf-8")
 SIZE = "320x240"
-PATIENCE_S = 25.0
+PATIENCE_S = 60.0
 """For what must come; nothing takes this long unless it fails."""
 
 PROGRAMS = {"acquire": "acquisition.cli", "build-lut": "calibration.cli", "sim": "synthesis.cli"}
@@ -292,19 +292,24 @@ def test_an_output_that_is_switched_off_or_over_is_waited_for(made: Path, tmp_pa
             assert len(taken.done_steps()) == len(taken.steps)
 
 
-def test_a_window_that_is_gone_before_the_exposure_ends_is_found_in_the_frame(rehearsal: Rehearsal) -> None:
-    """No read-back can see it: neither before nor after the exposure is it there."""
+@pytest.mark.parametrize("compositor", [None])
+def test_a_window_that_is_gone_before_the_exposure_ends_is_found(rehearsal: Rehearsal, compositor: str | None) -> None:
+    """It leaves its pixels on a screen that no compositor repairs; where one does, they are in the frame alone."""
+    if compositor is not None:
+        if shutil.which(compositor) is None:
+            pytest.skip(f"{compositor} is not installed (Debian: {compositor})")
+        rehearsal.start(f"DISPLAY=:77 {compositor}")
     rehearsal.serve()
     session = rehearsal.start("DISPLAY=:77 acquire run LAB.toml session")
     rehearsal.camera.hears(r"exposure \d+ ends: .* lamp 1\.00")
     covered = _last(rehearsal.camera) + 4
     rehearsal.camera.hears(f"exposure {covered} begins")
-    with notification(rehearsal.screen.display, (160, 20, 120, 90), 0xFF8800):
+    with notification(rehearsal.replaced[":77"], (160, 20, 120, 90), 0xFF8800):
         rehearsal.camera.hears(f"exposure {covered} half over")
     assert "not plain" in rehearsal.camera.hears(f"exposure {covered} ends")
     assert session.ends() == 0, session.text
     (reason,) = refusals(rehearsal.folder / "session")
-    assert not reason.startswith("the screen shows"), "the judge's own words"
+    assert reason.startswith("the screen shows") == (compositor is None), reason
     with Session.open(rehearsal.folder / "session") as taken:
         assert len(taken.done_steps()) == len(taken.steps)
 
