@@ -334,15 +334,15 @@ class Session:
         """
         at = at or datetime.now(UTC)
         accepted = self.journal.accepted_files()
-        known = {step.number: step.illumination for step in self.steps if step.illumination is not None}
+        known = range(len(self.illuminations))
         if selection.strip() == BAD:
             refused = newest_report(self.folder, {frame.sha256 for frame in self.frames()})
             chosen = [frame.attempt for frame in accepted if frame.sha256 in refused.sha256]
             self.journal.void(chosen, at, f"refused by build-lut, as {refused.report} says")
-            return parse_lights(refused.lights, set(known.values())) if refused.lights else ()
-        lights = parse_lights(selection, set(known.values()))
-        chosen = [frame.attempt for frame in accepted if known.get(frame.step) in lights]
-        done = {known.get(frame.step) for frame in accepted}
+            return parse_lights(refused.lights, known) if refused.lights else ()
+        lights = parse_lights(selection, known)
+        chosen = [frame.attempt for frame in accepted if frame.illumination in lights]
+        done = {frame.illumination for frame in accepted}
         asked = lights_text(lights)
         if self.journal.records().get("retake") != asked or done.issuperset(lights):
             self.journal.record("retake", asked)

@@ -110,6 +110,8 @@ def test_a_run_is_followed_frame_by_frame(tab: Tab, run: MadeUpRun) -> None:
         assert swatch == f"rgb({codes.replace(' ', ', ')})"
         tab.wait_for("document.getElementById('picture').naturalWidth === 360")
         assert tab.value(OUTSIDE) == []
+        assert "NaN" not in tab.value("document.body.innerHTML")
+        assert "undefined" not in tab.value("document.querySelector('main').innerHTML")
 
 
 def test_what_a_session_says_is_text_and_never_code(tab: Tab, run: MadeUpRun) -> None:
@@ -121,7 +123,7 @@ def test_what_a_session_says_is_text_and_never_code(tab: Tab, run: MadeUpRun) ->
         text = tab.text()
         assert text.count("<script>window.hacked=1</script>") >= 6
         assert tab.value("document.querySelectorAll('img[src=x]').length") == 0
-    script = "".join((WEB / name).read_text() for name in ("plots.js", "head.js", "page.js"))
+    script = "".join(path.read_text() for path in WEB.glob("*.js"))
     for way in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "new Function"):
         assert way not in script
 
@@ -232,6 +234,29 @@ def test_a_page_that_gets_no_answer_says_that_it_is_old(tab: Tab, run: MadeUpRun
         assert tab.value("document.getElementById('offline').hidden")
         tab.value("answeredAt -= 60000; drawClock()")
         assert "has not answered since" in tab.value("document.getElementById('offline').innerText")
+
+
+@pytest.mark.parametrize(
+    ("values", "limits", "low", "high"),
+    [
+        # One frame in a hundred that is far off does not flatten the others, nor does one limit in a hundred.
+        ("[...Array(99).fill(1), ...Array(99).fill(2), 500]", "[]", (0, 1), (2, 5)),
+        ("[...Array(99).fill(1), 1.5]", "[...Array(99).fill(3), 800]", (0, 1), (3, 4)),
+        # A limit is in sight however small the values are; what is refused close to it is, too.
+        ("[0.01, 0.02, 0.7]", "[0.5, 0.5, 0.5]", (-0.01, 0.01), (0.7, 0.9)),
+        # A single value, equal ones, and zeros alone have a range, too.
+        ("[7]", "[]", (6, 7), (7, 8)),
+        ("[0, 0, 0]", "[]", (-1, 0), (0.5, 1)),
+        ("[-3, -3]", "[-5, 5]", (-7, -5), (5, 7)),
+    ],
+)
+def test_a_plot_shows_nearly_all_values_and_the_limits(
+    tab: Tab, run: MadeUpRun, values: str, limits: str, low: tuple[float, float], high: tuple[float, float]
+) -> None:
+    with shown(tab, run.folder):
+        shows = tab.value(f"rangeOf({values}, {limits}, 0)")
+        assert low[0] <= shows[0] <= low[1]
+        assert high[0] <= shows[1] <= high[1]
 
 
 def test_a_page_may_be_opened_before_the_session_is_there(tab: Tab, tmp_path: Path) -> None:

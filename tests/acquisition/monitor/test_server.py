@@ -210,7 +210,7 @@ def test_the_page_goes_where_the_package_goes() -> None:
     named = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
     package = root / "acquisition" / "monitor"
     parts = [path.relative_to(package) for path in package.rglob("*") if path.suffix in (".html", ".css", ".js")]
-    assert len(parts) == 5
+    assert len(parts) == 6
     assert all(any(part.match(pattern) for pattern in named["acquisition.monitor"]) for part in parts)
 
 
