@@ -26,6 +26,8 @@ SLOW = (
     "acquisition/framing/test_tagless_field.py",
     "acquisition/framing/test_visibility.py",
     "acquisition/monitor/test_page.py",
+    "acquisition/run/test_planning.py",
+    "acquisition/session/test_disk_faults.py",
     "acquisition/session/test_journal_file.py",
     "acquisition/session/test_journal_model.py",
     "acquisition/session/test_states.py",
