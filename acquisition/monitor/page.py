@@ -16,6 +16,9 @@ from importlib import resources
 
 from acquisition.monitor.encoding import Json, to_bytes
 
+SCRIPTS = ("plots.js", "head.js", "series.js", "page.js")
+"""Files that make up the page's script, in the order in which they stand in it; the last one begins."""
+
 _PLACE = re.compile(r"\{(title|plain|policy|data|style|script)\}")
 
 
@@ -71,7 +74,7 @@ def _part(name: str) -> str:
 
 
 def _script() -> str:
-    return _part("plots.js") + _part("head.js") + _part("page.js")
+    return "".join(map(_part, SCRIPTS))
 
 
 def _style() -> str:

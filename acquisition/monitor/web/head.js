@@ -19,11 +19,18 @@ function drawHead() {
   drawIcon(share);
   const facts = [];
   if (head.total) {
-    facts.push(fact("lights", `${head.lights_done} of ${head.lights_total}`), fact("frames", `${head.done} of ${head.total}`));
-    if (head.done < head.total) facts.push(fact("time left", head.alive ? durationText(head.remaining_s) : "stands still", !head.alive));
+    facts.push(
+      fact("lights", `${head.lights_done} of ${head.lights_total}`),
+      fact("frames", `${head.done} of ${head.total}`),
+    );
+    if (head.done < head.total)
+      facts.push(fact("time left", head.alive ? durationText(head.remaining_s) : "stands still", !head.alive));
     if (head.eta && head.alive) facts.push(fact("done at about", timeText(head.eta)));
     if (head.seconds_per_frame) facts.push(fact("a frame", `${short(head.seconds_per_frame)} s`));
-    facts.push(fact("refused", String(head.refused), head.refused > 0), fact("failed", String(head.failed), head.failed > 0));
+    facts.push(
+      fact("refused", String(head.refused), head.refused > 0),
+      fact("failed", String(head.failed), head.failed > 0),
+    );
     if (head.voided) facts.push(fact("voided", String(head.voided), true));
   }
   if (head.last) facts.push(fact("last frame", timeText(head.last)));
@@ -38,7 +45,11 @@ function drawBanner() {
   const banner = $("banner");
   const quiet = head.state === "running" || !head.sentence;
   banner.hidden = quiet;
-  banner.className = ["stopped", "incomplete", "gone", "unreadable"].includes(head.state) ? "bad" : head.state === "complete" ? "good" : "";
+  banner.className = ["stopped", "incomplete", "gone", "unreadable"].includes(head.state)
+    ? "bad"
+    : head.state === "complete"
+      ? "good"
+      : "";
   // The house's sentences name the fault, behind a semicolon the remedy, and in brackets at the end how long it lasts;
   // only fault and remedy are read out, since the last changes all the time.
   const [, text, lasts] = (quiet ? "" : head.sentence).match(/^(.*?)(?: \(([^()]*)\))?$/s);
@@ -56,10 +67,21 @@ function drawClock() {
   const { head } = model;
   const late = head.alive && head.until && now() > head.until;
   const beat = $("beat");
-  if (beat) beat.replaceChildren(element("dt", {}, "sign of life"), element("dd", {}, head.alive ? `${durationText((now() - head.beat) / 1000)} ago${late ? ", late" : ""}` : dayText(head.beat)));
+  if (beat)
+    beat.replaceChildren(
+      element("dt", {}, "sign of life"),
+      element(
+        "dd",
+        {},
+        head.alive ? `${durationText((now() - head.beat) / 1000)} ago${late ? ", late" : ""}` : dayText(head.beat),
+      ),
+    );
   const silent = Date.now() - answeredAt > 2 * ANSWER_LIMIT_MS;
   $("offline").hidden = !silent;
-  if (silent) $("offline").textContent = `acquire monitor has not answered since ${timeText(answeredAt)}: what stands here is old. The run itself may well go on; look at its terminal, or start acquire monitor again.`;
+  if (silent)
+    $("offline").textContent =
+      `acquire monitor has not answered since ${timeText(answeredAt)}: what stands here is old. ` +
+      "The run itself may well go on; look at its terminal, or start acquire monitor again.";
 }
 
 /** Draw the tab's icon: a ring that fills, in the colour of the state. */
@@ -67,7 +89,10 @@ function drawIcon(share) {
   const colours = { running: "#2f8fd0", complete: "#2f8fd0", waiting: "#e0a000", paused: "#e0a000" };
   const colour = colours[model.head.state] ?? "#d9541e";
   const round = 2 * Math.PI * 11;
-  const svg = `<svg xmlns="${SVG}" viewBox="0 0 32 32"><circle cx="16" cy="16" r="11" fill="none" stroke="#8888" stroke-width="8"/><circle cx="16" cy="16" r="11" fill="none" stroke="${colour}" stroke-width="8" stroke-dasharray="${round * share} ${round}" transform="rotate(-90 16 16)"/></svg>`;
+  const circle = (stroke, more) =>
+    `<circle cx="16" cy="16" r="11" fill="none" stroke="${stroke}" stroke-width="8" ${more}/>`;
+  const filling = `stroke-dasharray="${round * share} ${round}" transform="rotate(-90 16 16)"`;
+  const svg = `<svg xmlns="${SVG}" viewBox="0 0 32 32">${circle("#8888", "")}${circle(colour, filling)}</svg>`;
   document.querySelector("link[rel=icon]").href = `data:image/svg+xml,${encodeURIComponent(svg)}`;
 }
 

@@ -1,13 +1,24 @@
-// The page of a session. The state comes from state.json, or stands in the page itself (a report): then nothing is asked.
+// The page of a session. The state comes from state.json, or stands in the page itself (a report): nothing is asked
+// then.
 
+// A frame takes two seconds and more; a page that nobody sees may be later.
 const POLL_MS = 2000;
 const POLL_HIDDEN_MS = 10000;
+// A disk may stall for seconds before the journal can be read.
 const ANSWER_LIMIT_MS = 10000;
+// More is looked up in the journal.
 const EVENTS_SHOWN = 100;
 const REFUSED_SHOWN = 12;
 const STATES = {
-  running: ["▶", "running"], waiting: ["…", "waiting"], paused: ["‖", "paused"], complete: ["■", "complete"],
-  incomplete: ["■", "ended, incomplete"], stopped: ["✕", "stopped"], gone: ["✕", "no session"], absent: ["…", "not begun"],
+  running: ["▶", "running"],
+  waiting: ["…", "waiting"],
+  paused: ["‖", "paused"],
+  complete: ["■", "complete"],
+  incomplete: ["■", "ended, incomplete"],
+  stopped: ["✕", "stopped"],
+  gone: ["✕", "no session"],
+  unreadable: ["✕", "cannot be read"],
+  absent: ["…", "not begun"],
   unknown: ["?", "no sign of life known"],
 };
 const LOUD = new Set(["paused", "incomplete", "stopped", "complete"]);
@@ -15,11 +26,31 @@ const WHITE = "white, red ─ green ╌ blue ┈";
 const BLACK = "black, red ─ green ╌ blue ┈";
 const PACE = "seconds a frame";
 // Plots in the order in which an operator asks; what is not named here follows in the order of the journal.
-const PLOT_ORDER = [WHITE, "white drift", BLACK, "dark", "ambient", "movement", "blur", PACE, "light", "lamp", "uniformity", "repeated"];
+const PLOT_ORDER = [
+  WHITE,
+  "white drift",
+  BLACK,
+  "dark",
+  "ambient",
+  "movement",
+  "blur",
+  PACE,
+  "light",
+  "lamp",
+  "uniformity",
+  "repeated",
+];
 
 const $ = (id) => document.getElementById(id);
 const embedded = $("embedded");
-const model = { cursor: "", head: { state: "unknown", sentence: "" }, session: null, frames: new Map(), events: [], begun: 0 };
+const model = {
+  cursor: "",
+  head: { state: "unknown", sentence: "" },
+  session: null,
+  frames: new Map(),
+  events: [],
+  begun: 0,
+};
 let chosen = null;
 let allRefused = false;
 let clockOffset = 0;
@@ -88,7 +119,7 @@ function nameOf(step) {
 /**
  * Return the frame that the page shows: the chosen one, else the newest that has a verdict.
  *
- * When nothing is taken any more that is not the dark frame with which a session ends: there is nothing to be seen on it.
+ * When nothing is taken any more that is not the dark frame with which a session ends, on which there is nothing to see.
  */
 function frameShown(frames) {
   if (chosen !== null && model.frames.has(chosen)) return model.frames.get(chosen);
@@ -99,13 +130,20 @@ function frameShown(frames) {
 
 function drawSession() {
   const { session } = model;
-  session.steps = new Map(session.steps.map(([number, kind, light, ...codes]) => [number, { number, kind, light, codes }]));
-  session.lights = new Map(session.lights.map(([index, kind, cct, at, ...codes]) => [index, { index, kind, cct, at, codes }]));
+  session.steps = new Map(
+    session.steps.map(([number, kind, light, ...codes]) => [number, { number, kind, light, codes }]),
+  );
+  session.lights = new Map(
+    session.lights.map(([index, kind, cct, at, ...codes]) => [index, { index, kind, cct, at, codes }]),
+  );
   if (!embedded) $("name").textContent = session.name;
   drawn.planned.clear();
   drawn.seen.clear();
   $("records").replaceChildren(
-    ...(session.records.length ? session.records : [["", "Nothing is recorded."]]).flatMap(([key, text]) => [element("dt", {}, key), element("dd", {}, text)]),
+    ...(session.records.length ? session.records : [["", "Nothing is recorded."]]).flatMap(([key, text]) => [
+      element("dt", {}, key),
+      element("dd", {}, text),
+    ]),
   );
 }
 
@@ -116,7 +154,9 @@ function drawFrames(whole, changed) {
     const step = stepOf(frame);
     if (step && step.kind === "light") byLight.set(step.light, [...(byLight.get(step.light) ?? []), frame]);
   }
-  const touched = whole ? model.session.lights.keys() : new Set(changed.map((frame) => stepOf(frame)?.light).filter((light) => light !== null && light !== undefined));
+  const touched = whole
+    ? model.session.lights.keys()
+    : new Set(changed.map((frame) => stepOf(frame)?.light).filter((light) => light !== null && light !== undefined));
   for (const light of touched) drawLight(light, byLight.get(light) ?? []);
   $("seen-note").hidden = frames.some((frame) => frame.seen_at);
   drawReach(frames);
@@ -131,12 +171,24 @@ function drawLight(index, frames) {
   if (!light) return;
   const accepted = frames.findLast((frame) => frame.verdict === "accepted");
   const last = frames[frames.length - 1];
-  const state = last && isOpen(last) ? "shown" : accepted ? "accepted" : frames.some((frame) => ["refused", "voided"].includes(frame.verdict)) ? "refused" : "planned";
+  const state =
+    last && isOpen(last)
+      ? "shown"
+      : accepted
+        ? "accepted"
+        : frames.some((frame) => ["refused", "voided"].includes(frame.verdict))
+          ? "refused"
+          : "planned";
   const form = light.kind === "blackbody" ? "diamond" : "circle";
   const title = `light ${index}, ${codesText(light.codes)}${light.cct ? `, ${short(light.cct)} K` : ""}: ${state}`;
   drawn.planned.plane.mark(index, light.at, { form, state, fill: fillOf(light.codes), title });
   const seen = accepted ?? frames.findLast((frame) => frame.seen_at);
-  drawn.seen.plane.mark(index, seen?.seen_at ?? null, { form, state: accepted ? "accepted" : "refused", fill: fillOf(light.codes), title });
+  drawn.seen.plane.mark(index, seen?.seen_at ?? null, {
+    form,
+    state: accepted ? "accepted" : "refused",
+    fill: fillOf(light.codes),
+    title,
+  });
 }
 
 /** Draw what the projector's primaries, as they were seen, can make: straight lines, since light adds up. */
@@ -144,7 +196,9 @@ function drawReach(frames) {
   const primaries = [0, 1, 2].map((channel) =>
     frames.findLast((frame) => {
       const step = stepOf(frame);
-      return frame.seen_at && step?.kind === "response" && step.codes.every((code, at) => (code > 0) === (at === channel));
+      return (
+        frame.seen_at && step?.kind === "response" && step.codes.every((code, at) => code > 0 === (at === channel))
+      );
     }),
   );
   if (primaries.every(Boolean)) drawn.seen.plane.drawReach(primaries.map((frame) => frame.seen_at));
@@ -162,7 +216,11 @@ function drawWall(frames) {
   }
   swatch.style.background = fillOf(open.codes);
   swatch.setAttribute("aria-label", `sRGB ${codesText(open.codes)}`);
-  $("wall").replaceChildren(element("b", {}, codesText(open.codes)), element("br"), `${nameOf(open)}, step ${open.number} of the plan, shown at ${timeText(last.at)}`);
+  $("wall").replaceChildren(
+    element("b", {}, codesText(open.codes)),
+    element("br"),
+    `${nameOf(open)}, step ${open.number} of the plan, shown at ${timeText(last.at)}`,
+  );
 }
 
 function choose(id, frames = inOrder()) {
@@ -181,7 +239,7 @@ function stride(by) {
 function drawChoice(frames) {
   const frame = frameShown(frames);
   const index = frames.indexOf(frame);
-  const light = frame ? stepOf(frame)?.light ?? null : null;
+  const light = frame ? (stepOf(frame)?.light ?? null) : null;
   const newest = frame && stepOf(frame) && !model.head.alive ? `Last ${stepOf(frame).kind} frame` : "Last frame";
   $("frame-title").textContent = chosen === null ? newest : "Chosen frame";
   $("latest").disabled = chosen === null;
@@ -231,7 +289,11 @@ function drawPicture(frame) {
   const without = $("no-picture");
   picture.hidden = source === null;
   without.hidden = source !== null;
-  without.textContent = !frame ? "No frame yet" : frame.preview ? "Not among this report's pictures" : "No picture of this frame";
+  without.textContent = !frame
+    ? "No frame yet"
+    : frame.preview
+      ? "Not among this report's pictures"
+      : "No picture of this frame";
   if (source === null) {
     picture.removeAttribute("src");
     return;
@@ -240,112 +302,25 @@ function drawPicture(frame) {
   picture.alt = `${nameOf(stepOf(frame))}: ${frame.verdict || "under way"}${frame.reason ? `, ${frame.reason}` : ""}`;
 }
 
-// Series -----------------------------------------------------------------------------------------------------------
-
-function seriesOf(frames) {
-  const series = new Map();
-  const add = (name, unit, point, least = 0) => {
-    if (point.value === null || point.value === undefined) return;
-    // One name may stand for two quantities: that of a light, in degrees, and that of a primary, in percent.
-    const key = `${name} ${unit}`;
-    if (!series.has(key)) series.set(key, { name, unit, least, points: [] });
-    series.get(key).points.push({ low: null, high: null, good: true, curve: 0, ...point });
-  };
-  let white = null;
-  frames.forEach((frame, index) => {
-    const kind = stepOf(frame)?.kind;
-    if (kind === "white" && frame.seen && frame.verdict === "accepted") {
-      white ??= frame.seen;
-      frame.seen.forEach((value, curve) => add(WHITE, "% of first", { index, value: (100 * value) / white[curve], curve }, 1));
-    }
-    if (kind === "dark" && frame.seen) frame.seen.forEach((value, curve) => add(BLACK, "DN", { index, value, curve }, 2));
-    for (const [name, unit, value, low, high, reason] of frame.checks ?? []) {
-      add(name, unit, { index, value, low, high, good: !reason });
-    }
-    add(PACE, "s", { index, value: frame.seconds }, 0.5);
-  });
-  const rank = (name) => (PLOT_ORDER.includes(name) ? PLOT_ORDER.indexOf(name) : PLOT_ORDER.length);
-  const names = [...series.values()].map((one) => one.name);
-  const isDouble = (name) => names.indexOf(name) !== names.lastIndexOf(name);
-  for (const one of series.values()) one.label = isDouble(one.name) ? `${one.name}, ${one.unit || "number"}` : one.name;
-  return [...series.values()].sort((one, other) => rank(one.name) - rank(other.name));
-}
-
-function drawSeries(frames) {
-  const count = frames.length;
-  const refusals = frames.filter((frame) => frame.verdict && frame.verdict !== "accepted").length;
-  $("series-note").textContent = `${count} attempts in the order in which they were made, ${refusals} without an accepted frame; dashed lines are limits, crosses were refused for that.`;
-  drawn.strip = stripOf(frames);
-  drawn.strip.svg.setAttribute("aria-label", `Verdicts of ${count} attempts`);
-  $("verdicts").replaceChildren(drawn.strip.svg);
-  drawn.plots = seriesOf(frames).map((one) => plotOf({ ...one, name: one.label, count }));
-  $("series").replaceChildren(...drawn.plots.map((plot) => plot.box));
-}
-
-function chooseAt(event, plot) {
-  const svg = event.target.closest("svg");
-  const frames = inOrder();
-  if (!svg || !frames.length) return;
-  const x = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse()).x;
-  const share = (x - plot.left) / (plot.width - plot.left - plot.right);
-  const index = Math.max(0, Math.min(frames.length - 1, Math.round(share * (frames.length - 1))));
-  choose(frames[index].id, frames);
-}
-
-// Refusals and events ----------------------------------------------------------------------------------------------
-
-function drawRefused(frames) {
-  const bad = frames.filter((frame) => ["refused", "voided", "failed"].includes(frame.verdict)).reverse();
-  const shown = allRefused ? bad : bad.slice(0, REFUSED_SHOWN);
-  const again = new Set(frames.filter((frame) => frame.verdict === "accepted").map((frame) => frame.step));
-  const key = JSON.stringify([allRefused, bad.map((frame) => [frame.id, frame.verdict, frame.preview, again.has(frame.step)])]);
-  if (drawn.refused === key) return; // What a reader looks at, or has the focus on, stays as it is.
-  drawn.refused = key;
-  $("refused-title").textContent = bad.length ? `Refused frames (${bad.length})` : "Refused frames";
-  $("more").hidden = bad.length <= REFUSED_SHOWN;
-  $("more").textContent = allRefused ? "Show the newest" : `Show all ${bad.length}`;
-  if (!bad.length) {
-    $("refused").replaceChildren(element("p", { class: "note" }, "None."));
-    return;
-  }
-  $("refused").replaceChildren(...shown.map((frame) => refusalOf(frame, again.has(frame.step))));
-}
-
-function refusalOf(frame, mended) {
-  const name = nameOf(stepOf(frame));
-  const button = element("button", { type: "button", class: "name" }, `${name}: ${frame.verdict}`);
-  button.addEventListener("click", () => {
-    choose(frame.id);
-    $("frame-title").focus();
-  });
-  const parts = [button];
-  const source = pictureOf(frame);
-  // A report is printed and photographed whole; a live page fetches what comes into sight.
-  const loading = embedded ? "eager" : "lazy";
-  if (source) parts.push(element("img", { src: source, alt: `${name}, ${frame.verdict}`, loading }));
-  parts.push(element("p", {}, frame.reason || "no reason recorded"));
-  parts.push(element("p", { class: "note" }, `${dayText(frame.taken ?? frame.at)}; ${mended ? "taken again since and accepted" : "not yet taken again"}`));
-  return element("article", { class: "refusal" }, ...parts);
-}
-
-function drawEvents() {
-  $("events").replaceChildren(
-    ...[...model.events].reverse().map(([at, what, detail]) => element("tr", {}, element("td", { class: "number" }, dayText(at)), element("th", { scope: "row" }, what), element("td", {}, detail))),
-  );
-}
-
 // Asking -----------------------------------------------------------------------------------------------------------
 
 async function poll() {
   try {
-    const answer = await fetch(`state.json?since=${encodeURIComponent(model.cursor)}`, { cache: "no-store", signal: AbortSignal.timeout(ANSWER_LIMIT_MS) });
+    const limit = new AbortController();
+    const timer = setTimeout(() => limit.abort(), ANSWER_LIMIT_MS);
+    const asked = fetch(`state.json?since=${encodeURIComponent(model.cursor)}`, {
+      cache: "no-store",
+      signal: limit.signal,
+    });
+    const answer = await asked.finally(() => clearTimeout(timer));
     if (!answer.ok) throw new Error(`answered ${answer.status}`);
     answeredAt = Date.now();
     clockOffset = Date.parse(answer.headers.get("Date")) + 500 - answeredAt;
     if (answer.status !== 204) take(await answer.json());
   } catch (error) {
     // Said by the page once it has lasted (drawClock); a fault of the page itself belongs in the console.
-    if (!["TypeError", "TimeoutError", "AbortError"].includes(error.name) && !String(error.message).startsWith("answered")) console.error(error);
+    if (!["TypeError", "AbortError"].includes(error.name) && !String(error.message).startsWith("answered"))
+      console.error(error);
   }
   drawClock();
   waiting = setTimeout(poll, document.hidden ? POLL_HIDDEN_MS : POLL_MS);
@@ -358,16 +333,25 @@ function legend() {
     if (state === "accepted" || state === "shown") path.setAttribute("fill", "#c9a227");
     return element("li", {}, shape("svg", { viewBox: "0 0 16 16", "aria-hidden": "true" }, path), text);
   };
-  $("legend").replaceChildren(mark("planned", "circle", "planned"), mark("accepted", "circle", "taken"), mark("accepted", "diamond", "taken, black body"), mark("shown", "circle", "on the wall"), mark("refused", "cross", "refused"));
-  $("lights-note").textContent = "Each light at r = R/(R+G+B), b = B/(R+G+B), in its own colour. A mark out of its place in the plane of what was seen was lit by another light than ordered.";
+  $("legend").replaceChildren(
+    mark("planned", "circle", "planned"),
+    mark("accepted", "circle", "taken"),
+    mark("accepted", "diamond", "taken, black body"),
+    mark("shown", "circle", "on the wall"),
+    mark("refused", "cross", "refused"),
+  );
+  $("lights-note").textContent =
+    "Each light at r = R/(R+G+B), b = B/(R+G+B), in its own colour. " +
+    "A mark out of its place in the plane of what was seen was lit by another light than ordered.";
 }
 
 function planeIn(id, label) {
   const box = $(id);
-  const plane = () => new Plane(box, label, (light) => {
-    const frame = inOrder().findLast((one) => stepOf(one)?.kind === "light" && stepOf(one).light === light);
-    if (frame) choose(frame.id);
-  });
+  const plane = () =>
+    new Plane(box, label, (light) => {
+      const frame = inOrder().findLast((one) => stepOf(one)?.kind === "light" && stepOf(one).light === light);
+      if (frame) choose(frame.id);
+    });
   const made = { plane: plane() };
   made.clear = () => {
     box.replaceChildren();
@@ -396,7 +380,15 @@ function begin() {
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.altKey || event.metaKey) return;
     const frames = inOrder();
-    const acts = { ArrowLeft: () => stride(-1), ArrowRight: () => stride(1), Home: () => frames.length && choose(frames[0].id, frames), End: () => choose(null), Escape: () => choose(null) };
+    // Home and End scroll, but where the focus is on plots or planes.
+    if (["Home", "End"].includes(event.key) && !document.activeElement.closest("#planned, #seen, #series")) return;
+    const acts = {
+      ArrowLeft: () => stride(-1),
+      ArrowRight: () => stride(1),
+      Home: () => frames.length && choose(frames[0].id, frames),
+      End: () => choose(null),
+      Escape: () => choose(null),
+    };
     if (!acts[event.key]) return;
     acts[event.key]();
     event.preventDefault();

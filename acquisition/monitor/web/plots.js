@@ -47,7 +47,8 @@ function limitText(low, high, unit) {
 
 /** Return the path of a mark of radius `size` around x, y: form and not colour alone tells how a frame stands. */
 function markPath(kind, x, y, size) {
-  if (kind === "cross") return `M${x - size} ${y - size}L${x + size} ${y + size}M${x - size} ${y + size}L${x + size} ${y - size}`;
+  if (kind === "cross")
+    return `M${x - size} ${y - size}L${x + size} ${y + size}M${x - size} ${y + size}L${x + size} ${y - size}`;
   if (kind === "diamond") return `M${x} ${y - size}L${x + size} ${y}L${x} ${y + size}L${x - size} ${y}Z`;
   return `M${x - size} ${y}a${size} ${size} 0 1 0 ${2 * size} 0a${size} ${size} 0 1 0 ${-2 * size} 0Z`;
 }
@@ -167,8 +168,8 @@ const quantile = (sorted, share) => sorted[Math.round(share * (sorted.length - 1
 /**
  * Return the range of values that a plot shows, at least `least` wide.
  *
- * Limits are within it, so that what drifts towards one is seen to; what is far beyond them, or far from nearly all others
- * (dim lights have wide limits), is drawn at the edge, so that a few frames do not flatten the rest.
+ * Limits are within it, so that what drifts towards one is seen to; what is far beyond them, or far from nearly all
+ * others (dim lights have wide limits), is drawn at the edge, so that a few frames do not flatten the rest.
  */
 function rangeOf(values, limits, least) {
   const [sorted, bounds] = [values, limits].map((numbers) => [...numbers].sort((one, other) => one - other));
@@ -185,12 +186,16 @@ function rangeOf(values, limits, least) {
 /**
  * Return a plot of one quantity, attempt after attempt.
  *
- * Points are {index, value, good, low, high, curve}: `low` and `high` are limits or null, `curve` the number of the line
- * that joins them, 0 … 2.
+ * Points are {index, value, good, low, high, curve}: `low` and `high` are limits or null, `curve` the number of the
+ * line that joins them, 0 … 2.
  */
 function plotOf({ name, unit, points, count, least }) {
   const limits = points.flatMap((point) => [point.low, point.high].filter((limit) => limit !== null));
-  const [low, high] = rangeOf(points.map((point) => point.value), limits, least);
+  const [low, high] = rangeOf(
+    points.map((point) => point.value),
+    limits,
+    least,
+  );
   const bottom = PLOT.height - PLOT.bottom;
   const y = (value) => bottom - ((value - low) / (high - low)) * (bottom - PLOT.top);
   const held = (value) => Math.max(PLOT.top, Math.min(bottom, y(value)));
@@ -216,16 +221,28 @@ function plotOf({ name, unit, points, count, least }) {
     const places = points.filter((point) => point.good && point.curve === curve).map(at);
     if (!places.length) continue;
     svg.append(shape("path", { class: `curve curve-${curve}`, d: pathThrough(places) }));
-    if (places.length < 90) svg.append(shape("path", { class: "dots", d: places.map(([px, py]) => `M${px} ${py}h0`).join("") }));
+    if (places.length < 90)
+      svg.append(shape("path", { class: "dots", d: places.map(([px, py]) => `M${px} ${py}h0`).join("") }));
   }
   const beyond = points.filter((point) => point.good && (point.value > high || point.value < low)).map(at);
   svg.append(
     shape("path", { class: "beyond", d: beyond.map(([px, py]) => markPath("diamond", px, py, 3)).join("") }),
-    shape("path", { class: "out", d: bad.map(at).map(([px, py]) => markPath("cross", px, py, 3)).join("") }),
+    shape("path", {
+      class: "out",
+      d: bad
+        .map(at)
+        .map(([px, py]) => markPath("cross", px, py, 3))
+        .join(""),
+    }),
   );
   const cursor = shape("line", { class: "cursor", y1: PLOT.top, y2: bottom, visibility: "hidden" });
   svg.append(cursor);
-  const head = element("div", { class: "plot-head" }, element("b", {}, name), element("span", {}, [said, allowed].filter(Boolean).join(", ")));
+  const head = element(
+    "div",
+    { class: "plot-head" },
+    element("b", {}, name),
+    element("span", {}, [said, allowed].filter(Boolean).join(", ")),
+  );
   return { box: element("div", { class: "plot" }, head, svg), cursor };
 }
 
@@ -241,7 +258,8 @@ function stripOf(frames) {
     paths[kind] = `${paths[kind] ?? ""}M${across(index, frames.length, STRIP).toFixed(1)} 34V${tops[kind] ?? 0}`;
   });
   const width = Math.max(1, Math.min(8, (STRIP.width / Math.max(1, frames.length)) * 0.7));
-  for (const [kind, path] of Object.entries(paths)) svg.append(shape("path", { class: `tick-${kind}`, d: path, "stroke-width": width }));
+  for (const [kind, path] of Object.entries(paths))
+    svg.append(shape("path", { class: `tick-${kind}`, d: path, "stroke-width": width }));
   const cursor = shape("line", { class: "cursor", y1: 0, y2: STRIP.height, visibility: "hidden" });
   svg.append(cursor);
   return { svg, cursor };
