@@ -15,6 +15,7 @@ from acquisition.config import LabSettings
 from acquisition.judge.exposure import ExposureJudge
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import make_ready
+from acquisition.run.leaving import RunEnd, end_of, leave_lab
 from acquisition.run.notices import Notices
 from acquisition.run.patience import Patience
 from acquisition.run.taking.agenda import Agenda, unclosed_kinds
@@ -103,7 +104,10 @@ def take_session(
         outcome = _taken(session, devices, settings, judge, observe, telling, asked, first)
         if asked.asked and not outcome.complete:
             raise KeyboardInterrupt
+        end = RunEnd.COMPLETE if outcome.complete else RunEnd.UNFINISHED
+        leave_lab(devices, end, settings.sequence, telling.report)
     except BaseException as error:
+        leave_lab(devices, end_of(error), settings.sequence, telling.report)
         # It is derived, and made anew at the next opening: the fault that is there counts.
         with suppress(StorageError):
             session.write_frames_csv()
@@ -197,7 +201,4 @@ def _taken(
         make_ready(devices.projector, settings.sequence, patience)
     with Saver(session, used) as saver:
         Pipeline(session, devices, settings, agenda, saver, patience, observe, ending).run()
-    outcome = RunOutcome(len(session.steps), len(agenda), agenda.given_up)
-    if outcome.complete and settings.sequence.switch_off and devices.projector is not None:
-        devices.projector.switch_off()
-    return outcome
+    return RunOutcome(len(session.steps), len(agenda), agenda.given_up)

@@ -65,8 +65,8 @@ class TestTime:
     def test_every_light_is_shown_once_and_its_frame_kept(self, folder: Path) -> None:
         lab = Lab(folder)
         assert run(lab).complete
-        assert lab.screen.shown == [WHITE, BLACK, LIGHTS[0].colour, LIGHTS[1].colour, WHITE, BLACK]
-        assert lab.camera.exposed == lab.screen.shown
+        assert lab.camera.exposed == [WHITE, BLACK, LIGHTS[0].colour, LIGHTS[1].colour, WHITE, BLACK]
+        assert lab.screen.shown == [*lab.camera.exposed, BLACK], "and black in the end"
         assert lab.projector.power() is Power.COOLING, "a complete session switches the lamp off"
         assert lab.verdicts() == ["accepted"] * 6
 
@@ -136,7 +136,7 @@ class TestRefusals:
         assert run(lab, ScriptedJudge({2: refused("another light")}), announce=said.append).complete
         assert [step for step, _ in lab.taken()] == ["w0", "d1", "l2", "l3", "l2", "w4", "d5"]
         assert lab.verdicts()[2] == "refused"
-        assert said == ["refused: light 0: another light (it is taken again)"]
+        assert said == ["refused: light 0: another light (it is taken again)", "lamp: it was switched off"]
 
     def test_a_light_that_is_taken_again_behind_the_last_white_is_closed_by_another(self, folder: Path) -> None:
         lab = Lab(folder)
@@ -150,7 +150,7 @@ class TestRefusals:
         assert not outcome.complete
         assert outcome.refused == ("light 0: c",)
         assert outcome.left == 1
-        assert lab.projector.power() is Power.ON
+        assert lab.projector.power() is Power.COOLING, "nobody may be there: `sequence.lamp_if_unfinished`"
         assert run(lab, ScriptedJudge()).complete
 
     def test_what_was_measured_of_earlier_frames_is_recalled(self, folder: Path) -> None:
@@ -194,7 +194,7 @@ class TestRefusals:
         said: list[str] = []
         assert run(lab, judge, announce=said.append).complete
         words = [sentence.split(":")[0] for sentence in said]
-        assert words == ["refused", "retry", "refused", "paused", "resumed"]
+        assert words == ["refused", "retry", "refused", "paused", "resumed", "lamp"]
         assert "the chart has moved by 3.1 px" in said[3]
         assert lab.verdicts().count("refused") == 2
 
@@ -275,7 +275,7 @@ class TestFaults:
         lab.screen.fails = dict.fromkeys(range(2, 6), DeviceError("a screen saver covers the picture"))
         said: list[str] = []
         assert run(lab, announce=said.append).complete
-        assert [sentence.split(":")[0] for sentence in said] == ["retry", "paused", "resumed"]
+        assert [sentence.split(":")[0] for sentence in said] == ["retry", "paused", "resumed", "lamp"]
         assert lab.verdicts() == ["accepted"] * 6
 
     @pytest.mark.parametrize("place", ["download", "save", "commit", "begin", "fail"])

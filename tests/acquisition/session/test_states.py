@@ -93,7 +93,9 @@ class WatchedPresenter:
         self.presenter.show(BLACK if black else colour)
         if self.watch.state.get(self.watch.lit) in (StepState.LIT, StepState.SETTLED):
             self.watch.enter(self.watch.lit, StepState.PLANNED)
-        self.watch.lit = self.watch.wanted
+        if self.watch.wanted < 0:
+            return  # the end of the run leaves the screen black
+        self.watch.lit, self.watch.wanted = self.watch.wanted, -1
         self.watch.enter(self.watch.lit, StepState.LIT)
 
     def close(self) -> None:
