@@ -124,3 +124,13 @@ def test_a_journal_that_is_damaged_is_called_so(night: Night) -> None:
     path.write_bytes(data)
     with pytest.raises(FormatError, match=r"journal\.sqlite is damaged: .*; restore it from a copy"):
         night.run()
+
+
+def test_a_disk_that_was_unmounted_is_not_written_below(night: Night) -> None:
+    shutil.copytree(night._pristine, night.folder)  # pyright: ignore[reportPrivateUsage]  # noqa: SLF001
+    with Session.open_for_run(night.folder) as session:
+        # What an unmounted disk leaves: the open journal, and nothing under the name.
+        shutil.rmtree(session.frames_folder)
+        with pytest.raises(StorageError, match="its folder is gone: connect and mount the disk it was on"):
+            session.receive("0001_dark", capture(FRAMES[1]))
+        assert not session.frames_folder.exists()
