@@ -50,8 +50,8 @@ PAUSE_S: Final = 5.0
 SLOW_S: Final = 10.0
 """A try that failed after so long has been tried often enough by its driver: the pause is told at once."""
 TRY_S: Final = 300.0
-"""How long a try may go without a sign of life: a camera's driver renews its connection three times for a minute each,
-and waits 90 s for a frame."""
+"""How long a try may go without a sign of life: a camera's driver waits 90 s for a frame of 30 s, then
+looks for it for 70 s more over a new connection, and a question may go without an answer for 20 s."""
 _INSTANT_S: Final = 1e-6
 """Resolution of simulated time: nothing shorter can be waited for."""
 

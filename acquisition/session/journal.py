@@ -367,7 +367,9 @@ class Journal:
 
     def accepted_files(self) -> list[AcceptedFile]:
         """Return every frame that was accepted, oldest first."""
-        rows = self._rows("SELECT id, step, file, size, sha256 FROM attempts WHERE verdict=? ORDER BY id", (ACCEPTED,))
+        rows = self._rows(
+            "SELECT id, step, illumination, file, size, sha256 FROM attempts WHERE verdict=? ORDER BY id", (ACCEPTED,)
+        )
         return [AcceptedFile(*row) for row in rows]
 
     def kept_files(self, step: SessionStep) -> int:

@@ -44,10 +44,11 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class AcceptedFile:
-    """The raw file of a frame that was accepted: of which attempt and step, its name in the session, its bytes."""
+    """The raw file of an accepted frame: of which attempt, step and light, its name in the session, its bytes."""
 
     attempt: int
     step: int
+    illumination: int | None
     file: str
     size: int
     sha256: str

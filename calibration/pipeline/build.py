@@ -14,6 +14,7 @@ by the time a frame is taken in, it is measured again. The memory is that of a f
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +32,7 @@ from calibration.pipeline.baseline import baseline_of
 from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
 from calibration.pipeline.collecting import check_figures, table_figures
 from calibration.pipeline.frames import (
+    ChangedFrame,
     ReportProgress,
     SelectedFrames,
     decode_frame,
@@ -50,10 +52,11 @@ from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
 from calibration.pipeline.prefetching import prefetched
 from calibration.radiometry.corrections import corrections
 from calibration.radiometry.greys import references_csv
-from calibration.table.file_names import REFERENCES, REPORT_JSON, REPORT_PAGE, SAMPLES
+from calibration.table.file_names import REFERENCES, REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION, SAMPLES
 from calibration.table.provenance import Provenance
 from calibration.table.writer import LutWriter
 from calibration.verdict.result import BuildResult
+from calibration.verdict.retaking import COMMAND, retake_json
 from calibration.verdict.thresholds import THRESHOLDS, Threshold
 from calibration.verdict.values import judged_values
 from calibration.verdict.verdict import judge
@@ -149,7 +152,7 @@ def build(
         )
     _require_dark_frames(session, options)
     with unfinished_table(out) as unfinished:
-        job = _Job(session, selected, options, linearity, unfinished, progress or _no_progress)
+        job = _Job(session, selected, options, linearity, out, unfinished, progress or _no_progress)
         return _finish(job, _take_in_all(job, job.checkpoint()), out, report, thresholds)
 
 
@@ -172,7 +175,7 @@ def append(
     complete = not selected.lights_without and {step.number for step in session.steps} <= session.done_steps()
     _require_dark_frames(session, options)
     with unfinished_table(out) as unfinished:
-        job = _Job(session, selected, options, linearity, unfinished, progress or _no_progress)
+        job = _Job(session, selected, options, linearity, out, unfinished, progress or _no_progress)
         checkpoint = job.checkpoint()
         if complete:
             return _finish(job, _take_in_all(job, checkpoint), out, report, thresholds)
@@ -243,6 +246,7 @@ class _Job:
     selected: SelectedFrames
     options: BuildOptions
     linearity: Path | None
+    out: Path
     unfinished: UnfinishedTable
     progress: ReportProgress
 
@@ -314,14 +318,27 @@ def _take_in_all(job: _Job, checkpoint: Checkpoint | None) -> _BuildState:
         # In a thread, with the state as it is at that moment.
         return intake.measure(record, taken)
 
-    for record, early in prefetched(measure_early, records[before:], intake.others_wait_for):
-        taken, measured = intake.take_in(record, early, taken)
-        if isinstance(measured, MeasuredFrame) and record.kind == "light" and record.illumination is not None:
-            writer.put(record.illumination, measured.values)
-        if (len(taken.figures) - before) % CHECKPOINT_EVERY == 0:
-            job.save(replace(work, taken=taken))
-        job.progress(len(taken.figures), len(records), record.file)
+    try:
+        for record, early in prefetched(measure_early, records[before:], intake.others_wait_for):
+            taken, measured = intake.take_in(record, early, taken)
+            if isinstance(measured, MeasuredFrame) and record.kind == "light" and record.illumination is not None:
+                writer.put(record.illumination, measured.values)
+            if (len(taken.figures) - before) % CHECKPOINT_EVERY == 0:
+                job.save(replace(work, taken=taken))
+            job.progress(len(taken.figures), len(records), record.file)
+    except ChangedFrame:
+        raise
+    except (FormatError, QualityError) as error:
+        raise _stopped_by(error, records[len(taken.figures)], job) from error
     return replace(work, taken=taken)
+
+
+def _stopped_by(error: FormatError | QualityError, record: FrameRecord, job: _Job) -> FormatError | QualityError:
+    """Return why the build ends at a frame, after naming it in a report that `acquire run --retake bad` reads."""
+    says = {"format": REPORT_FORMAT, "version": REPORT_VERSION, "verdict": "refuse", "reason": str(error)}
+    says |= {"session": job.session.folder.name, **retake_json((record,), record.sha256)}
+    write_whole(refused_folder(job.out) / REPORT_JSON, json.dumps(says, indent=2) + "\n")
+    return type(error)(f"{error}; or take {record.file} again: {COMMAND}")
 
 
 def _begin(job: _Job, checkpoint: Checkpoint | None, writer: LutWriter) -> _BuildState:
@@ -410,7 +427,9 @@ def _refused(result: BuildResult, out: Path, folder: Path) -> QualityError:
         write_whole(refused / name, (folder / name).read_bytes())
     where = f"; see {refused / kept[0]}" if kept else ""
     figures = result.figures
-    return QualityError(f"{figures.session.folder}: no table is made. {refusal(result.verdict, figures)}{where}")
+    return QualityError(
+        f"{figures.session.folder}: no table is made. {refusal(result.verdict, figures, reported=bool(kept))}{where}"
+    )
 
 
 def refused_folder(out: Path) -> Path:

@@ -30,8 +30,14 @@ from foundation.files import read_whole
 from foundation.hashing import file_sha256
 
 _Array = npt.NDArray[np.float64]
+_TAKEN_AGAIN = "or take it again: acquire run LAB.toml SESSION finds such frames by itself"
+
 ReportProgress = Callable[[int, int, str], None]
 """Called with frames done, frames in all, and what is being done."""
+
+
+class ChangedFrame(FormatError):
+    """A frame's file is gone, or is not what was taken; the next run of the session takes it again by itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,17 +161,16 @@ def decode_frame(session: Session, record: FrameRecord) -> DecodedFrame:
     try:
         data = read_whole(path)
     except FileNotFoundError as error:
-        raise FormatError(
-            f"{path} is missing, but the session's journal counts it; restore the file from a copy, "
-            "or take the light again with acquire run"
+        raise ChangedFrame(
+            f"{path} is missing, but the session's journal counts it; restore the file from a copy, {_TAKEN_AGAIN}"
         ) from error
     except OSError as error:
         raise FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk") from error
     found = hashlib.sha256(data).hexdigest()
     if found != record.sha256:
-        raise FormatError(
+        raise ChangedFrame(
             f"{path} is not the file that was taken: its SHA-256 is {found[:16]}…, the journal says "
-            f"{record.sha256[:16]}…; restore the file from a copy, or take the light again with acquire run"
+            f"{record.sha256[:16]}…; restore the file from a copy, {_TAKEN_AGAIN}"
         )
     mosaic = decode_raw(data, path)
     black = frame_black(mosaic)

@@ -11,7 +11,9 @@ from calibration.report.plots import INK
 from calibration.report.summary import summary
 from calibration.table.provenance import Unfit
 from calibration.verdict.result import BuildResult
+from calibration.verdict.retaking import COMMAND, is_mended_by_retaking, retaken_frames
 from calibration.verdict.verdict import JudgedValue, Outcome, Verdict, format_value
+from foundation.errors import counted, first_of
 
 MOST_UNFIT = 200
 """Unfit cells that are listed; all of them are in lut.json, and a page of thousands is read by nobody."""
@@ -53,7 +55,7 @@ def page(result: BuildResult, pictures: Sequence[Picture]) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>\n"
         f'<h1>{html.escape(title)}</h1><p class="note">Session {html.escape(session.folder.name)}</p>\n'
-        f"{_verdict(result.verdict)}<h2>Figures</h2>{_summary(result)}"
+        f"{_verdict(result.verdict)}{_retaking(result)}<h2>Figures</h2>{_summary(result)}"
         f"{''.join(map(_picture, pictures))}{_unfit(result.figures.cells.unfit)}</body></html>\n"
     )
 
@@ -71,6 +73,18 @@ def _verdict(verdict: Verdict) -> str:
         f"<p class='verdict {_CLASSES[verdict.outcome]}'>{sentence}</p><table><tr><th></th><th>figure</th>"
         f"<th>measured</th><th>accepted</th><th>refused beyond</th><th>what goes wrong beyond</th></tr>{rows}</table>"
     )
+
+
+def _retaking(result: BuildResult) -> str:
+    """Return which frames are to be taken again and how; nothing where taking frames again does not help."""
+    records = retaken_frames(result.verdict, result.figures)
+    if not records:
+        return ""
+    also = " What else is refused may follow from these; if not, take the session anew."
+    if is_mended_by_retaking(result.verdict, result.figures):
+        also = ""
+    names = html.escape(first_of([record.file for record in records]))
+    return f"<p>To be taken again ({counted(len(records), 'frame')}): {names}; <code>{COMMAND}</code>.{also}</p>"
 
 
 def _judged(row: JudgedValue) -> str:

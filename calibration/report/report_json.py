@@ -10,12 +10,10 @@ import numpy.typing as npt
 
 from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import largest_window
+from calibration.table.file_names import REPORT_FORMAT, REPORT_VERSION
 from calibration.verdict.result import BuildResult
+from calibration.verdict.retaking import retake_json, retaken_frames
 from calibration.verdict.values import judged_values
-
-FORMAT = "crop.report"
-VERSION = 1
-"""`format` and `version` of `report.json` (docs/formats.md)."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -25,8 +23,8 @@ def report_json(result: BuildResult) -> dict[str, Any]:
     figures, verdict = result.figures, result.verdict
     off_codes_deg, primaries = figures.lights.off_codes_deg, figures.primaries
     return {
-        "format": FORMAT,
-        "version": VERSION,
+        "format": REPORT_FORMAT,
+        "version": REPORT_VERSION,
         "verdict": verdict.outcome,
         "session": figures.session.folder.name,
         "camera": figures.session.camera,
@@ -35,8 +33,15 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "off_codes_deg": None if off_codes_deg is None else [float(f"{angle:.3g}") for angle in off_codes_deg.tolist()],
         "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
         "figures": {name: _rounded(value) for name, value in judged_values(figures).items()},
+        **retake_json(retaken_frames(verdict, figures), _registered_sha256(figures)),
         "limits": [asdict(row.threshold) | {"outcome": row.outcome} for row in verdict.rows],
     }
+
+
+def _registered_sha256(figures: TableFigures) -> str:
+    """Return the hash of the frame that was registered first; of another where that one is not among those measured."""
+    named = [frame for frame in figures.frames if frame.record.file == figures.session.registered_file]
+    return (named or figures.frames)[0].record.sha256
 
 
 def _channels(figures: TableFigures) -> dict[str, Any]:

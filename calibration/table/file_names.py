@@ -24,3 +24,7 @@ REPORT_PAGE: Final = "report.html"
 
 REPORT_JSON: Final = "report.json"
 """The report for programs."""
+
+REPORT_FORMAT: Final = "crop.report"
+REPORT_VERSION: Final = 1
+"""`format` and `version` of `report.json` (docs/formats.md)."""

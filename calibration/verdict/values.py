@@ -6,8 +6,8 @@ import numpy as np
 
 from calibration.checks.frame_consistency import has_enough_cells
 from calibration.figures.table_figures import TableFigures
-from calibration.registration.registration import Registration
 from calibration.sampling.windows import bleed
+from calibration.verdict.retaking import added_bleed
 from foundation.angles import angles_deg
 
 
@@ -60,7 +60,7 @@ def _frame_values(figures: TableFigures) -> dict[str, float]:
     used = min((frame.paper.references for frame in frames), default=0)
     values = {
         "softer_bleed": max(
-            (_added_bleed(registration, frame.blur_px, figures.cells.window) for frame in frames), default=0.0
+            (added_bleed(registration, frame.blur_px, figures.cells.window) for frame in frames), default=0.0
         ),
         "black_drift_counts": figures.black_drift,
         "references_used": used / max(figures.session.white_references, 1),
@@ -125,8 +125,3 @@ def _sensor_values(figures: TableFigures) -> dict[str, float]:
 
 def _cell_count(figures: TableFigures) -> int:
     return len(figures.registration.mismatched_cells)
-
-
-def _added_bleed(registration: Registration, blur_px: float, window: int) -> float:
-    """Return how much more light a frame's worst sample has from beyond its cell than that of the registered frame."""
-    return bleed(registration.cell_px, blur_px, window) - bleed(registration.cell_px, registration.blur_px, window)

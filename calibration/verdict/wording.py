@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections import Counter
 
 from calibration.figures.table_figures import TableFigures
+from calibration.verdict.retaking import COMMAND, is_mended_by_retaking, retaken_frames
 from calibration.verdict.verdict import JudgedValue, Verdict
-from foundation.errors import first_of
+from foundation.errors import counted, first_of
+
+_THEN = "what else is refused may follow from these, else take the session anew"
 
 _REMEDIES = {
     "outside": "bring all of the chart into the picture",
@@ -20,8 +23,16 @@ _REMEDIES = {
 """What helps against each cause of unfit cells (`calibration.pipeline.cell_statistics`)."""
 
 
-def refusal(verdict: Verdict, figures: TableFigures) -> str:
-    """Return why there is no table and what helps, in a line; of the first of the verdict's refused rows."""
+def refusal(verdict: Verdict, figures: TableFigures, *, reported: bool = False) -> str:
+    """Return why there is no table and what helps, in a line; of the first of the verdict's refused rows.
+
+    Parameters
+    ----------
+    verdict, figures
+        Of the table.
+    reported
+        Whether a report was written, so that the frames it names can be taken again by it.
+    """
     worst = verdict.refused[0]
     remedy = worst.threshold.remedy
     more = f" (and {len(verdict.refused) - 1} more)" if len(verdict.refused) > 1 else ""
@@ -29,7 +40,13 @@ def refusal(verdict: Verdict, figures: TableFigures) -> str:
     if worst.threshold.name == "unfit_share":
         cause, count = Counter(cell.cause.split(":")[0] for cell in figures.cells.unfit).most_common(1)[0]
         detail, remedy = f", {count} of them {cause}", _REMEDIES.get(cause, "look at the report")
-    return f"{_with_place(worst, figures)}{detail}{more}; {remedy}, and take the session anew"
+    what, frames = "take the session anew", retaken_frames(verdict, figures)
+    if reported and frames:
+        again = f"take {counted(len(frames), 'frame')} again"
+        what = (
+            f"{again}: {COMMAND}" if is_mended_by_retaking(verdict, figures) else f"{again} first ({COMMAND}); {_THEN}"
+        )
+    return f"{_with_place(worst, figures)}{detail}{more}; {remedy}, and {what}"
 
 
 def remark(row: JudgedValue, figures: TableFigures) -> str:

@@ -214,11 +214,15 @@ class FullScreen:
             self._present(BLACK)
 
     def _open_window(self) -> Any:
-        glfw = self._glfw
+        glfw, display = self._glfw, self.display
+        on_x = glfw.get_platform() == glfw.PLATFORM_X11
         glfw.default_window_hints()
+        if on_x:
+            glfw.window_hint(glfw.POSITION_X, display.x)
+            glfw.window_hint(glfw.POSITION_Y, display.y)
         for hint, value in (
+            (glfw.VISIBLE, not on_x),
             (glfw.DECORATED, False),
-            (glfw.FLOATING, True),
             (glfw.AUTO_ICONIFY, False),  # or it goes away when the operator clicks on another display
             (glfw.CENTER_CURSOR, False),
             (glfw.RED_BITS, 8),
@@ -229,18 +233,30 @@ class FullScreen:
             (glfw.STENCIL_BITS, 0),
             (glfw.SAMPLES, 0),
             (glfw.SRGB_CAPABLE, False),
-            (glfw.REFRESH_RATE, self.display.refresh_hz),
+            (glfw.REFRESH_RATE, display.refresh_hz),
         ):
             glfw.window_hint(hint, value)
         try:
-            window = glfw.create_window(self.display.width, self.display.height, "CroP", self._monitor, None)
+            window = glfw.create_window(display.width, display.height, "CroP", None if on_x else self._monitor, None)
+            if on_x:
+                self._place(window)
         except glfw.GLFWError as error:
             raise DeviceError(
-                f"no picture on display {self.display}: {error}; check that OpenGL works (Debian: libgl1-mesa-dri)"
+                f"no picture on display {display}: {error}; check that OpenGL works (Debian: libgl1-mesa-dri)"
             ) from error
         glfw.set_input_mode(window, glfw.CURSOR, glfw.CURSOR_HIDDEN)
         glfw.make_context_current(window)
         return window
+
+    def _place(self, window: Any) -> None:
+        """Let a window that lies on the display fill it.
+
+        A window manager that knows no ``_NET_WM_FULLSCREEN_MONITORS``, such as Openbox, fills the display on which the
+        window lies: one that is made full from the start would come out on the first.
+        """
+        display = self.display
+        refresh_hz = display.refresh_hz or self._glfw.DONT_CARE
+        self._glfw.set_window_monitor(window, self._monitor, 0, 0, display.width, display.height, refresh_hz)
 
     def _wait_until_full(self) -> None:
         deadline = self._clock.monotonic() + OPENING_S
@@ -265,9 +281,9 @@ class FullScreen:
                 self.display.height,
             ):
                 self.display, self._monitor = found, monitor
-                glfw.set_window_monitor(
-                    self._window, monitor, 0, 0, found.width, found.height, found.refresh_hz or glfw.DONT_CARE
-                )
+                # As a window it goes where it is put; see `_place`.
+                glfw.set_window_monitor(self._window, None, found.x, found.y, found.width, found.height, glfw.DONT_CARE)
+                self._place(self._window)
                 with contextlib.suppress(DeviceError):
                     self._wait_until_full()
                 break

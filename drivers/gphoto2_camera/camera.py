@@ -41,6 +41,11 @@ if TYPE_CHECKING:
 SETTLE_LIMIT_S = 5.0
 """How long a body may take to report a value that it was given: a Sony turns its dials step by step."""
 
+BUSY_TRIES = 5
+"""Requests of a file in all from a body that says that it is busy: a second each, for it may still be writing. Any
+other fault loses the connection, and the frame with it."""
+BUSY_PAUSE_S = 1.0
+"""Between two of them."""
 _LOOK_AGAIN_S = 0.1
 """Between two looks at a value that is to settle; each costs an exchange with the body."""
 
@@ -169,10 +174,9 @@ class Gphoto2Camera:
         if self._exposed is None:
             raise DeviceError("no exposed frame waits in the camera to be downloaded; expose it again")
         path, released_at = self._exposed
-        gp = library()
         with self._speaking() as camera:
             # The bytes belong to `file` and go with it.
-            file = camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)
+            file = self._file(camera, path)
             size = into.write(file.get_data_and_size())
             self._forget(camera)
         return CapturedFrame(path.name, size, released_at)
@@ -181,6 +185,18 @@ class Gphoto2Camera:
         """Give the camera back to its user; a second call does nothing."""
         self._closed = True
         self._drop()
+
+    def _file(self, camera: gphoto2.Camera, path: gphoto2.CameraFilePath) -> gphoto2.CameraFile:
+        """Return a file that waits in the camera; one that is busy is asked again."""
+        gp = library()
+        for _ in range(BUSY_TRIES - 1):
+            try:
+                return camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)
+            except gp.GPhoto2Error as error:
+                if error.code != gp.GP_ERROR_CAMERA_BUSY:
+                    raise
+            self._clock.sleep(BUSY_PAUSE_S)
+        return camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)
 
     def _forget(self, camera: gphoto2.Camera) -> None:
         """Delete the exposed frame, if any: what waits in the camera's memory would fill it."""

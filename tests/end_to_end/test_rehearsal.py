@@ -24,13 +24,13 @@ import pytest
 from acquisition.session.folder import Session
 from drivers.links.tcp import TcpLink
 from drivers.pjlink.projector import PjLinkProjector
-from tests.drivers.display.x_servers import VirtualScreen, virtual_screen
+from tests.drivers.display.x_servers import notification, two_outputs, virtual_screen
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the screen is an X server's")
 
 HOW_TO = (Path(__file__).parents[2] / "docs" / "how-to" / "rehearsal.md").read_text(encoding="utf-8")
 SIZE = "320x240"
-PATIENCE_S = 120.0
+PATIENCE_S = 60.0
 """For what must come; nothing takes this long unless it fails."""
 
 PROGRAMS = {"acquire": "acquisition.cli", "build-lut": "calibration.cli", "sim": "synthesis.cli"}
@@ -86,7 +86,6 @@ class Rehearsal:
     """A folder, a screen, and the programs that were started."""
 
     folder: Path
-    screen: VirtualScreen
     replaced: dict[str, str]
     opened: contextlib.ExitStack
     programs: dict[str, Running] = field(default_factory=dict)
@@ -166,7 +165,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the how-to's chart and lights."""
     folder = tmp_path_factory.mktemp("made")
     with contextlib.ExitStack() as opened:
-        rehearsal = Rehearsal(folder, VirtualScreen("", folder, None), {}, opened)  # pyright: ignore[reportArgumentType]
+        rehearsal = Rehearsal(folder, {}, opened)
         for command in commands("acquire chart") + commands("acquire illuminations"):
             rehearsal.run(command)
     return folder
@@ -181,7 +180,7 @@ def rehearsal(made: Path, tmp_path: Path) -> Iterator[Rehearsal]:
     screens.mkdir()
     with contextlib.ExitStack() as opened:
         screen = opened.enter_context(virtual_screen(screens, SIZE))
-        rehearsal = Rehearsal(tmp_path, screen, {":77": screen.display}, opened)
+        rehearsal = Rehearsal(tmp_path, {":77": screen.display}, opened)
         with managed(rehearsal):
             yield rehearsal
 
@@ -267,6 +266,52 @@ def test_a_night_of_trouble_ends_complete(rehearsal: Rehearsal) -> None:
         assert len(taken.done_steps()) == len(taken.steps)
         files = {frame.file for frame in taken.frames() if frame.accepted}
     assert len(files) == len(taken.steps)
+
+
+def test_an_output_that_is_switched_off_or_over_is_waited_for(made: Path, tmp_path: Path) -> None:
+    """The projector is the second output of a desk: it goes dark, comes back in another mode, then as it was."""
+    if shutil.which("xrandr") is None:
+        pytest.skip("xrandr is not installed (Debian: x11-xserver-utils)")
+    for name in ("chart", "lights.csv"):
+        (tmp_path / name).symlink_to(made / name)
+    with contextlib.ExitStack() as opened:
+        display = opened.enter_context(two_outputs(tmp_path))
+        rehearsal = Rehearsal(tmp_path, {":77": display}, opened)
+        with managed(rehearsal):
+            rehearsal.serve(" --lit", QUICK.replace("--", "--watch-screen :77,480x270+640+0 --", 1))
+            rehearsal.settings(lambda text: quick(text) + '[lab.light]\ndisplay = "right"\n')
+            session = rehearsal.start("DISPLAY=:77 acquire run LAB.toml session")
+            rehearsal.camera.hears(r"exposure 2 ends: plain picture")
+            rehearsal.run("DISPLAY=:77 xrandr --output DUMMY1 --off")
+            session.hears("(paused|retry): .*no longer fills display")
+            rehearsal.run("DISPLAY=:77 xrandr --output DUMMY1 --mode 640x480 --right-of DUMMY0")
+            session.hears("no longer fills .*640×480 at \\+640")
+            rehearsal.run("DISPLAY=:77 xrandr --output DUMMY1 --mode 480x270 --right-of DUMMY0")
+            assert session.ends() == 0, session.text
+        with Session.open(tmp_path / "session") as taken:
+            assert len(taken.done_steps()) == len(taken.steps)
+
+
+@pytest.mark.parametrize("compositor", [None])
+def test_a_window_that_is_gone_before_the_exposure_ends_is_found(rehearsal: Rehearsal, compositor: str | None) -> None:
+    """It leaves its pixels on a screen that no compositor repairs; where one does, they are in the frame alone."""
+    if compositor is not None:
+        if shutil.which(compositor) is None:
+            pytest.skip(f"{compositor} is not installed (Debian: {compositor})")
+        rehearsal.start(f"DISPLAY=:77 {compositor}")
+    rehearsal.serve()
+    session = rehearsal.start("DISPLAY=:77 acquire run LAB.toml session")
+    rehearsal.camera.hears(r"exposure \d+ ends: .* lamp 1\.00")
+    covered = _last(rehearsal.camera) + 4
+    rehearsal.camera.hears(f"exposure {covered} begins")
+    with notification(rehearsal.replaced[":77"], (160, 20, 120, 90), 0xFF8800):
+        rehearsal.camera.hears(f"exposure {covered} half over")
+    assert "not plain" in rehearsal.camera.hears(f"exposure {covered} ends")
+    assert session.ends() == 0, session.text
+    (reason,) = refusals(rehearsal.folder / "session")
+    assert reason.startswith("the screen shows") == (compositor is None), reason
+    with Session.open(rehearsal.folder / "session") as taken:
+        assert len(taken.done_steps()) == len(taken.steps)
 
 
 def _last(camera: Running) -> int:

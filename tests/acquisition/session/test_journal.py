@@ -57,7 +57,7 @@ def test_what_is_written_is_read_again(path: Path) -> None:
         ]
         assert attempts[0].ended_at == NOW + timedelta(seconds=2)
         assert attempts[1].reason == "the cable came off"
-        assert journal.accepted_files() == [AcceptedFile(1, 0, "frames/1.cr2", 10, "00")]
+        assert journal.accepted_files() == [AcceptedFile(1, 0, None, "frames/1.cr2", 10, "00")]
         assert journal.events() == [SessionEvent(NOW, "start", "4 of 4 frames to take")]
 
 

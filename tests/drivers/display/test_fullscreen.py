@@ -143,6 +143,25 @@ def test_a_pop_up_in_a_window_managers_frame_is_named(tmp_path: Path, monkeypatc
                 presenter.verify(colour)
 
 
+def test_under_a_window_manager_it_fills_the_display_that_was_chosen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    openbox = shutil.which("openbox")
+    if openbox is None:
+        pytest.skip("openbox is not installed (Debian: openbox)")
+    colour = Colour(3, 99, 7)
+    with two_outputs(tmp_path) as server:
+        monkeypatch.setenv("DISPLAY", server)
+        with running([openbox, "--sm-disable"]):
+            until(lambda: "_NET_SUPPORTING_WM_CHECK" in properties())
+            for place in ("right", "left"):
+                with contextlib.closing(FullScreen(place)) as presenter:
+                    presenter.show(colour)
+                    seen = screenshot(server, 1120, 360)
+                    assert plain(seen[:270, 640:] if place == "right" else seen[:, :640]) == colour
+                    assert np.count_nonzero(seen == seen[0, 640 if place == "right" else 0]) <= 640 * 360
+
+
 def test_a_picture_that_changed_in_one_corner_is_noticed(screen: FullScreen, virtual: VirtualScreen) -> None:
     colour = Colour(10, 20, 30)
     screen.show(colour)

@@ -264,6 +264,19 @@ def test_a_fault_of_any_kind_is_a_device_error_and_the_next_frame_is_taken(fake:
     assert fake.body.openings == 4
 
 
+def test_a_busy_body_is_asked_for_its_file_again(fake: Fake) -> None:
+    fake.camera.configure(SETTINGS)
+    fake.camera.expose()
+    fake.body.fails.extend([-110] * 4)
+    into = io.BytesIO()
+    fake.camera.download(into)
+    assert [into.getvalue()] == fake.film.frames
+    fake.camera.expose()
+    fake.body.fails.extend([-110] * 5)
+    with pytest.raises(DeviceError, match="retaken when it is idle"):
+        fake.camera.download(io.BytesIO())
+
+
 def test_a_fault_of_the_download_says_that_the_frame_is_lost(fake: Fake) -> None:
     fake.camera.configure(SETTINGS)
     fake.camera.expose()
