@@ -161,7 +161,10 @@ def devices(
 @app.command(epilog=EXIT_CODES)
 def check(
     lab: Annotated[Path, typer.Argument(help="LAB.toml: the settings.")],
-    picture: Annotated[Path | None, typer.Option(help="Save the frame with what was found on it as PNG.")] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(help="Save as PNG the frame with what was found on it, maps of light, blur and print, verdicts."),
+    ] = None,
     identify: Annotated[bool, typer.Option(help="First show on every display its number for ten seconds.")] = False,
     corners: Annotated[
         tuple[str, str, str, str] | None,
@@ -171,14 +174,22 @@ def check(
             show_default=False,
         ),
     ] = None,
+    linearity: Annotated[
+        bool, typer.Option("--linearity", help="Take a series of exposures too: linearity, electrons a count, noise.")
+    ] = False,
+    session: Annotated[
+        Path | None, typer.Option(help="Where the session will be, for the disk's space; else beside LAB.toml.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the verdicts as JSON.")] = False,
 ) -> None:
-    """Talk to every device, find the chart, judge focus, framing and exposure; record nothing.
+    """Say whether the lab is ready: a verdict on exposure, light, sharpness, print, sensor, supplies; record nothing.
 
-    Reads LAB.toml, the chart and the lights it names. Writes nothing unless asked with --picture. Ends with 4 when the
-    frame is not good enough.
+    Reads LAB.toml, the chart and the lights it names. Takes 10 to 20 frames and keeps none; tries shutter times until
+    one suits. Each verdict is good, a remark, a fault, or not checked, with its number, limit, reason and remedy.
+    Writes nothing unless asked with --picture. Ends with 4 when there is a fault.
     """
+    from acquisition.check.check import CheckOptions, check_lab
     from acquisition.config import load_lab
-    from acquisition.run.checking import check_lab
 
     settings = load_lab(lab)
     given = None
@@ -190,10 +201,16 @@ def check(
         from acquisition.run.rig.attached import identify_displays
 
         identify_displays(10.0)
+    options = CheckOptions(picture, given, linearity, session)
     with orderly_end():
-        report = check_lab(settings, picture, lambda sentence: print(sentence, file=sys.stderr), given)
-    for line in report.lines:
-        print(line)
+        report = check_lab(settings, options, lambda sentence: print(sentence, file=sys.stderr))
+    if as_json:
+        print(report.to_json())
+    else:
+        for line in report.lines():
+            print(line)
+        if picture is not None:
+            print(f"picture     {picture}")
     if report.faults:
         raise QualityError("; ".join(report.faults))
 

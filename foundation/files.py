@@ -17,7 +17,7 @@ from io import BufferedRandom
 from pathlib import Path
 from typing import TypeGuard
 
-from foundation.errors import InputError, StorageError
+from foundation.errors import FormatError, InputError, StorageError
 
 _PARTIAL = ".partial"
 _PART_IS_A_FILE = "a part of that path is a file, not a folder; name another"
@@ -96,6 +96,21 @@ def storage_error(path: Path, error: OSError, what: str = "write") -> InputError
     return (InputError if by_name else StorageError)(
         f"cannot {what} {path}: {error.strerror or error}; "
         f"{remedy or disk_remedy_of(error) or f'see to the disk, or choose another, {_AGAIN}'}"
+    )
+
+
+def reading_error(path: Path, error: OSError, remedy: str, what: str = "") -> FormatError | StorageError:
+    """Return why `path` cannot be read: the disk's fault with its own remedy, else the file's with `remedy`.
+
+    Parameters
+    ----------
+    what
+        What it is, before its name in the message: "chart".
+    """
+    of_disk = disk_remedy_of(error) if error.errno != errno.ENOENT else None
+    named = f"{what} {path}" if what else str(path)
+    return (StorageError if of_disk else FormatError)(
+        f"cannot read {named}: {error.strerror or error}; {of_disk or remedy}"
     )
 
 

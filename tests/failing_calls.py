@@ -30,8 +30,8 @@ from typing import Any
 DISK_FAULTS = (errno.EIO, errno.ENOSPC, errno.EROFS, errno.EDQUOT, errno.ENODEV, errno.ESTALE)
 """What a disk answers that breaks, is full, read-only, used up, pulled out, or on a server that was started anew."""
 
-# What asks a disk (lseek does not), by number on x86-64 and on ARM64, and by what names the file: a file descriptor, a
-# path, or a folder's descriptor with a path ("at").
+# What asks a disk (lseek does not, nor the locks of fcntl that SQLite takes), by number on x86-64 and on ARM64, and by
+# what names the file: a file descriptor, a path, or a folder's descriptor with a path ("at").
 _CALLS: dict[str, tuple[int | None, int | None, str]] = {
     "read": (0, 63, "fd"),
     "write": (1, 64, "fd"),
@@ -42,7 +42,6 @@ _CALLS: dict[str, tuple[int | None, int | None, str]] = {
     "pread64": (17, 67, "fd"),
     "pwrite64": (18, 68, "fd"),
     "access": (21, None, "path"),
-    "fcntl": (72, 25, "fd"),
     "flock": (73, 32, "fd"),
     "fsync": (74, 82, "fd"),
     "fdatasync": (75, 83, "fd"),

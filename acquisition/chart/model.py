@@ -19,7 +19,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from foundation.errors import FormatError
-from foundation.files import write_whole
+from foundation.files import reading_error, write_whole
 
 FORMAT = "crop.chart"
 VERSION = 1
@@ -226,7 +226,7 @@ def load_chart(path: Path) -> Chart:
     try:
         document = _Document.model_validate_json(path.read_bytes())
     except OSError as error:
-        raise FormatError(f"cannot read chart {path}: {error.strerror}; name the chart.json of the print") from error
+        raise reading_error(path, error, "name the chart.json of the print", "chart") from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"

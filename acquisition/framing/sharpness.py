@@ -42,10 +42,22 @@ def blur_px(framing: Framing) -> float:
     read up to a tenth high, as the corners themselves are less sure.
     """
     if framing.field is not None:
-        found = _outline_blurs(framing.plane, framing.field)
+        found = _outline_blurs(framing.plane, framing.field)[1]
     else:
         found = np.concatenate([_edge_blurs(framing.plane, tag) for tag in framing.tags])
     return float(np.median(found)) if len(found) else float("nan")
+
+
+def edge_blurs(framing: Framing) -> tuple[_Points, npt.NDArray[np.float64]]:
+    """Return where blur was measured, (N, 2) half-size px, and its σ there, (N,) px, as in `blur_px`.
+
+    One place a tag, with the median of its four edges; of a chart without tags, places along its field's outline.
+    """
+    if framing.field is not None:
+        return _outline_blurs(framing.plane, framing.field)
+    seen = [(tag.centre_px, edges) for tag in framing.tags if len(edges := _edge_blurs(framing.plane, tag))]
+    places = np.array([place for place, _ in seen], dtype=np.float64).reshape(-1, 2)
+    return places, np.array([float(np.median(edges)) for _, edges in seen])
 
 
 def _edge_blurs(plane: Plane, tag: FoundTag) -> npt.NDArray[np.float64]:
@@ -74,11 +86,12 @@ def _edge_blurs(plane: Plane, tag: FoundTag) -> npt.NDArray[np.float64]:
     return found
 
 
-def _outline_blurs(plane: Plane, field: FoundField) -> npt.NDArray[np.float64]:
-    """Return the σ of the field's edge at places all round; none where the picture ends."""
+def _outline_blurs(plane: Plane, field: FoundField) -> tuple[_Points, npt.NDArray[np.float64]]:
+    """Return places all round the field's edge, (N, 2) px, and the edge's σ there; none where the picture ends."""
     height, width = plane.values.shape
     reach = int(np.ceil(_INWARDS_PX + _ALONG_PX))
     found: list[float] = []
+    places: list[_Points] = []
     for number in range(0, len(field.outline_px), max(1, len(field.outline_px) // _OUTLINE_PLACES)):
         place, normal = field.outline_px[number] - plane.offset_px, field.normals[number]
         left, top = np.floor(place).astype(int) - reach
@@ -91,7 +104,8 @@ def _outline_blurs(plane: Plane, field: FoundField) -> npt.NDArray[np.float64]:
         near = (np.abs(along) < _ALONG_PX) & (across > -_INWARDS_PX) & (across < _OUTWARDS_PX)
         seen = plane.values[top : top + 2 * reach + 2, left : left + 2 * reach + 2].ravel()[near].astype(np.float64)
         found.append(_sigma(seen, across[near], (0.0,)))
-    return np.array(found)
+        places.append(field.outline_px[number])
+    return np.array(places, dtype=np.float64).reshape(-1, 2), np.array(found)
 
 
 def _sigma(seen: _Points, aside: _Points, steps_at: Sequence[float]) -> float:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from drivers.presenter import Colour
 from foundation.errors import FormatError, InputError
-from foundation.files import write_whole
+from foundation.files import reading_error, write_whole
 from foundation.srgb import encode_srgb
 
 Kind = Literal["uniform", "blackbody", "spectrum"]
@@ -144,11 +144,10 @@ def load_illuminations(path: Path, *, computed: bool = False) -> tuple[Illuminat
     try:
         text = path.read_text(encoding="utf-8-sig")
         rows = list(csv.DictReader(io.StringIO(text)))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise FormatError(
-            f"cannot read illuminations {path}: {reason}; make one with: acquire illuminations"
-        ) from error
+    except OSError as error:
+        raise reading_error(path, error, "make one with: acquire illuminations", "illuminations") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FormatError(f"cannot read illuminations {path}: {error}; make one with: acquire illuminations") from error
     if not rows or any(column not in rows[0] for column in COLUMNS):
         raise FormatError(f"{path}: expected lights under the columns {','.join(COLUMNS)}")
     lights: list[Illumination] = []

@@ -31,7 +31,7 @@ from acquisition.session.records import FrameRecord
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
 from foundation.errors import FormatError, StorageError
-from foundation.files import is_partial, require_free, whole_folder, write_whole
+from foundation.files import is_partial, reading_error, require_free, storage_error, whole_folder, write_whole
 from foundation.held_folders import held_folder
 
 FRAME_COLUMNS = ("kind", "illumination", "file", "sha256", "taken_at", "exposure_s", "verdict")
@@ -193,10 +193,11 @@ class Session:
         path = self.folder / "session.toml"
         try:
             return path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else error
+        except OSError as error:
+            raise reading_error(path, error, "restore it from a copy", "the session's settings") from error
+        except UnicodeDecodeError as error:
             raise FormatError(
-                f"cannot read {path}, the settings of the session: {reason}; restore it from a copy"
+                f"cannot read {path}, the settings of the session: {error}; restore it from a copy"
             ) from error
 
     def receive(self, stem: str, capture: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
@@ -390,7 +391,15 @@ class Session:
         ------
         FormatError
             The folder of the frames is missing.
+        StorageError
+            The disk fails.
         """
+        try:
+            return self._set_aside_strays()
+        except OSError as error:
+            raise storage_error(self.frames_folder, error, "clear") from error
+
+    def _set_aside_strays(self) -> list[Path]:
         if not self.frames_folder.is_dir():
             raise FormatError(
                 f"{self.frames_folder} is missing, where the session's raw files are; restore it from a copy, or begin "
@@ -446,7 +455,7 @@ def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
     except OSError as error:
-        raise FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk") from error
+        raise reading_error(path, error, "check its permissions") from error
 
 
 def _codes(colour: Colour) -> str:

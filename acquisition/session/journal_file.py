@@ -16,6 +16,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import logging
+import os
 import shutil
 import sqlite3
 import tempfile
@@ -26,8 +27,9 @@ from pathlib import Path
 from typing import TypeVar
 from urllib.parse import quote
 
-from foundation.errors import FormatError, StorageError
+from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import partial_path, storage_error, sync_folder
+from foundation.files import reading_error as file_reading_error
 
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
@@ -96,6 +98,12 @@ _CANNOT_IN_PLACE = {sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY}
 
 _NO_LOCKS = {errno.ENOLCK, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EBADF}
 """What a file system answers that has no locks (fcntl(2); Lustre, FUSE, NFS without its lock service)."""
+
+_READABLE_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
+"""Faults of a disk that can be read all the same."""
+
+_PROBE_BYTES = 65536
+"""As much as a commit writes, with the pages of its log."""
 
 _NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "ceph", "fuse.glusterfs", "lustre"}
 """File systems on which several machines work and share no memory, as /proc/self/mounts names them."""
@@ -214,28 +222,71 @@ def close_after_run(connection: sqlite3.Connection) -> None:
         connection.close()
 
 
-def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError:
-    """Return why a journal cannot be read, and what helps."""
+def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatError | StorageError:
+    """Return why a journal cannot be read, and what helps.
+
+    SQLite calls a file damaged whose disk does not read it, and a copy must not take the place of a sound journal: so
+    the disk is tried, and the file checked again.
+    """
     if isinstance(error, OSError):
-        return FormatError(f"cannot read {path}: {error.strerror}; check its permissions and the disk")
+        return file_reading_error(path, error, "check its permissions")
     if is_busy(error):
         return FormatError(f"cannot read {path}: {error}; see that no other program holds it")
-    if isinstance(error, sqlite3.OperationalError):
+    code = _primary_code(error)
+    failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and os.access(path, os.R_OK))
+    fault = _disk_fault(path)
+    if fault is not None and (failed or fault.errno not in _READABLE_FAULTS):
+        return file_reading_error(path, fault, "check the permissions of its folder")
+    if failed or (_is_damage(error) and _is_sound(path)):
+        return StorageError(
+            f"cannot read {path}: {error}, and its disk did not say why; check the disk and its cable, then run the "
+            "same command again"
+        )
+    if not _is_damage(error):
         return FormatError(f"cannot read {path}: {error}; check its permissions and the disk")
     return FormatError(f"{path} is damaged: {error}; restore it from a copy")
 
 
-def writing_error(path: Path, error: sqlite3.DatabaseError) -> StorageError:
-    """Return why a journal cannot be written, and what helps."""
+def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | InputError | StorageError:
+    """Return why a journal cannot be written, and what helps; the disk itself is asked what ails it."""
     if is_busy(error):
         remedy = "end the other program that holds the session"
+    elif (fault := _disk_fault(path)) is not None:
+        return storage_error(path, fault)
     elif _primary_code(error) == sqlite3.SQLITE_FULL:
         remedy = "free space"
     elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
         remedy = "see that the folder may be written and the disk is there"
+    elif _is_damage(error) and not _is_sound(path):
+        return FormatError(f"{path} is damaged: {error}; restore it from a copy")
     else:
         remedy = "check the disk and its cable"
     return StorageError(f"cannot write {path}: {error}; {remedy}, then run the same command again")
+
+
+def _disk_fault(path: Path) -> OSError | None:
+    """Return what the disk answers when something is written beside the journal; None if it does not mind."""
+    try:
+        # Without a name, so that nothing is left behind.
+        with tempfile.TemporaryFile(dir=path.parent, buffering=0) as stream:
+            stream.write(bytes(_PROBE_BYTES))
+            os.fsync(stream.fileno())
+    except OSError as error:
+        return error
+    return None
+
+
+def _is_damage(error: sqlite3.DatabaseError) -> bool:
+    return _primary_code(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+
+def _is_sound(path: Path) -> bool:
+    """Return whether a journal that was called damaged is whole, read once more."""
+    try:
+        with closing(_connect(path, "ro")) as connection:
+            return connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]
+    except sqlite3.DatabaseError:
+        return False
 
 
 def _primary_code(error: sqlite3.DatabaseError) -> int:

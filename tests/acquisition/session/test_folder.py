@@ -105,7 +105,7 @@ def test_lights_edited_since_are_refused(session: Session, lights: tuple[Illumin
 
 def test_a_session_without_its_settings(session: Session) -> None:
     (session.folder / "session.toml").unlink()
-    with pytest.raises(FormatError, match=r"session\.toml, the settings of the session: No such file .*; restore it"):
+    with pytest.raises(FormatError, match=r"the session.s settings .*session\.toml: No such file .*; restore it"):
         session.settings_text()
 
 

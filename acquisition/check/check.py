@@ -1,0 +1,279 @@
+"""Check a rig before the session: every device asked, frames taken and thrown away, a verdict on each thing.
+
+Takes 10 to 20 frames; records nothing. The lamp is switched on if it was off, and stays on, which is said; a muted
+picture is shown.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.chart.model import Chart, load_chart
+from acquisition.check.exposure import judge_exposure
+from acquisition.check.findings import CheckReport, Finding, not_checked
+from acquisition.check.light import (
+    judge_evenness,
+    judge_flicker,
+    judge_primaries,
+    judge_room_light,
+)
+from acquisition.check.looking import ChartFigures, CheckFrames, look, mean_levels, measure_chart, points_of
+from acquisition.check.optics import (
+    judge_chart,
+    judge_sharpness,
+    judge_size,
+    judge_tilt,
+    judge_turn,
+)
+from acquisition.check.print_state import judge_print
+from acquisition.check.sensor import judge_clipping, judge_hot, judge_linearity, judge_noise_reduction
+from acquisition.check.supplies import judge_disk, judge_supplies
+from acquisition.check.taking import Photographer
+from acquisition.config import LabSettings
+from acquisition.framing.corners import Corners
+from acquisition.judge.exposure import disagreement
+from acquisition.lights.illuminations import load_illuminations
+from acquisition.run.devices import Devices
+from acquisition.run.lamp import make_ready
+from acquisition.run.patience import Patience
+from acquisition.run.planning.work import planned_steps
+from acquisition.run.rig.opening import open_rig
+from acquisition.run.shutter import light_period_s
+from drivers.camera import keep_awake
+from drivers.presenter import ReportsWarnings
+from drivers.projector import Power, Projector, Severity
+from foundation.errors import DeviceError, counted
+from foundation.files import write_whole
+
+CLIPPED = "white is clipped at every shutter time that was tried"
+"""Why nothing can be said of the light."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """What is asked of a check.
+
+    Attributes
+    ----------
+    picture
+        Where to draw what was found, PNG; None for nowhere.
+    corners
+        Of the field of a chart without tags, as given by hand, half-size px; `acquisition.framing.corners`.
+    linearity
+        Whether to take a series of exposures that shows the sensor's linearity and noise.
+    session
+        Where the session is to lie, for the disk's free space; the settings' folder if not given.
+    """
+
+    picture: Path | None = None
+    corners: Corners | None = None
+    linearity: bool = False
+    session: Path | None = None
+
+
+def check_lab(
+    settings: LabSettings,
+    options: CheckOptions | None = None,
+    announce: Callable[[str], None] = lambda sentence: None,
+) -> CheckReport:
+    """Check the rig that the settings name; record nothing.
+
+    Parameters
+    ----------
+    settings
+        As `acquisition.config.load_lab` returns them.
+    options
+        What is asked; nothing beyond the usual if not given.
+    announce
+        Called with a sentence when a long wait begins.
+
+    Raises
+    ------
+    InputError, DeviceError
+        The settings or a device make a check impossible.
+    """
+    options = options or CheckOptions()
+    chart = load_chart(settings.chart)
+    lights = load_illuminations(settings.illuminations)
+    frames = len(planned_steps(settings, lights))
+    lines = [f"lights      {len(lights)} in {settings.illuminations.name}, {counted(frames, 'frame')} of a session"]
+    with open_rig(settings, chart) as devices, tempfile.TemporaryDirectory() as scratch:
+        told, screen = _make_devices_ready(devices, settings, announce)
+        lines += told
+        camera = Photographer(devices, settings, Path(scratch))
+        seen = look(
+            camera, settings, chart, devices.camera.shutter_speeds(), period_s(settings), options.corners,
+            options.linearity, announce,
+        )  # fmt: skip
+        supplies = judge_supplies(devices.camera, frames, seen.first.size)
+    figures = None if seen.chart is None else measure_chart(seen, seen.chart, chart)
+    recorded = settings.rig == "replay"
+    findings = [
+        *_exposure_findings(seen, settings, recorded),
+        *_chart_findings(seen, figures, chart, options),
+        *_light_findings(seen, figures, chart, bool(lights)),
+        *_sensor_findings(seen, camera.timings, figures, chart, options),
+        *screen,
+        judge_disk(options.session or Path(settings.file).parent, frames, seen.first.size),
+        *supplies,
+    ]
+    if seen.used_s != seen.first.shutter_s:
+        lines.append(f"frames      all but exposure and clipping judged at {seen.used_s:.4g} s")
+    report = CheckReport(tuple(lines), tuple(findings))
+    if options.picture is not None:
+        from acquisition.check.picture import check_png
+
+        write_whole(options.picture, check_png(seen, figures, chart, report))
+    return report
+
+
+def period_s(settings: LabSettings) -> float:
+    """Return the seconds after which the light repeats: that of the simulated room's wheel where it has one."""
+    wheel_hz = float(settings.simulated.room.get("wheel_hz", 0)) if settings.rig == "simulated" else 0.0
+    return 1 / wheel_hz if wheel_hz else light_period_s(settings.lab.projector)
+
+
+def _exposure_findings(seen: CheckFrames, settings: LabSettings, recorded: bool) -> list[Finding]:
+    findings = [
+        judge_exposure(seen.trials, seen.saturation, seen.times_s, period_s(settings), recorded),
+        judge_clipping(
+            seen.first, seen.saturation.counts, settings.limits.clipped_percent, seen.chart and seen.chart.place
+        ),
+    ]
+    differs = None if recorded else disagreement(seen.first.mosaic, settings.camera.exposure)
+    if differs is not None:
+        findings.append(Finding("settings", "fault", differs, remedy="set the mode dial to M and touch no other"))
+    return findings
+
+
+def _chart_findings(
+    seen: CheckFrames, figures: ChartFigures | None, chart: Chart, options: CheckOptions
+) -> list[Finding]:
+    if figures is None:
+        look_at = "" if options.picture is None else f"see {options.picture}"
+        names = ("evenness", "colour evenness", "sharpness", "turn", "tilt", "size", "stains")
+        why = "the chart was not found"
+        return [Finding("chart", "fault", seen.trouble or why, remedy=look_at), *(not_checked(n, why) for n in names)]
+    framing, place = figures.placed.framing, figures.placed.place
+    lit = [judge_print(figures.state, chart, place.matched), *judge_evenness(figures.light, chart)]
+    if not seen.usable:
+        lit = [not_checked(name, CLIPPED) for name in ("stains", "evenness", "colour evenness")]
+    return [
+        judge_chart(framing, chart),
+        *lit,
+        judge_sharpness(figures.blur, chart, framing.module_px),
+        judge_turn(framing),
+        judge_tilt(framing, chart, seen.focal_px),
+        judge_size(framing, chart, place),
+    ]
+
+
+def _light_findings(seen: CheckFrames, figures: ChartFigures | None, chart: Chart, plan_has: bool) -> list[Finding]:
+    if not seen.usable:
+        names = ("room light", "brightest light", "additivity", "flicker", "brightness")
+        return [not_checked(name, CLIPPED) for name in names]
+    if figures is None:
+        findings = [not_checked("room light", "the chart was not found")]
+    else:
+        points, white = points_of(chart), np.concatenate([figures.cells.mean, figures.references.mean])
+        clipped = np.concatenate([figures.cells.clipped, figures.references.clipped])
+        white = np.where(clipped[:, None], np.nan, white)
+        dark, muted = (
+            None if shot is None else mean_levels((shot,), figures.placed, points, seen.saturation.counts).mean
+            for shot in (seen.dark, seen.muted)
+        )
+        assert dark is not None
+        findings = [judge_room_light(chart, points, white, dark, muted, seen.why_not_muted)]
+    recorded = "a recording cannot be exposed anew"
+    if seen.primaries is None:
+        names = ("brightest light", "additivity", "flicker", "brightness")
+        return [*findings, *(not_checked(name, recorded) for name in names)]
+    if float(seen.primaries["white"].min()) < 100.0:
+        names = ("brightest light", "additivity", "flicker", "brightness")
+        return [*findings, *(not_checked(name, "white is too dim") for name in names)]
+    whites = [_paper_level(shot_levels) for shot_levels in _whites(seen, figures, chart)]
+    return [*findings, *judge_primaries(seen.primaries, plan_has), *judge_flicker(whites, seen.used_s)]
+
+
+def _whites(seen: CheckFrames, figures: ChartFigures | None, chart: Chart) -> list[_Array]:
+    if figures is None:
+        return [shot.brightest(99.0)[None] for shot in seen.whites]
+    points = points_of(chart)
+    return [mean_levels((shot,), figures.placed, points, seen.saturation.counts).mean for shot in seen.whites]
+
+
+def _paper_level(levels: _Array) -> _Array:
+    return np.nanmean(levels, axis=0)
+
+
+def _sensor_findings(
+    seen: CheckFrames,
+    timings: list[tuple[float, float]],
+    figures: ChartFigures | None,
+    chart: Chart,
+    options: CheckOptions,
+) -> list[Finding]:
+    share = 0.0
+    if figures is not None:
+        dark = mean_levels((seen.dark,), figures.placed, chart.centres_mm, seen.saturation.counts).mean
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = dark / np.where(figures.cells.mean > 300, figures.cells.mean, np.nan)
+        share = float(np.nanmedian(ratio)) if np.isfinite(ratio).any() else 0.0
+    hot = judge_hot(seen.dark.mosaic, share, seen.whites[0].mosaic)
+    findings = [
+        hot if seen.usable and figures is not None else not_checked("hot photosites", "white does not show the print"),
+        judge_noise_reduction(timings),
+    ]
+    if not options.linearity:
+        return findings
+    if seen.series is None:
+        why = "the chart was not found" if seen.chart is None else "a recording cannot be exposed anew"
+        return [*findings, not_checked("linearity", why), not_checked("photon transfer", why)]
+    series = seen.series
+    return [*findings, *judge_linearity(series.seen, series.times_s, series.transfer)]
+
+
+def _make_devices_ready(
+    devices: Devices, settings: LabSettings, announce: Callable[[str], None]
+) -> tuple[list[str], list[Finding]]:
+    """Make every device ready for a frame; return a line about each, and what screen and projector report."""
+    body = devices.camera.identity()
+    name = body.model if body.model.startswith(body.maker.split()[0]) else f"{body.maker} {body.model}"
+    lines = [f"camera      {name}, serial {body.serial}"]
+    warnings = devices.presenter.warnings() if isinstance(devices.presenter, ReportsWarnings) else ()
+    findings = [Finding("screen", "remark", warning) for warning in warnings]
+    devices.camera.configure(settings.camera.exposure)
+    if devices.projector is None:
+        lines.append("projector   not under control: see to its lamp yourself")
+        return lines, findings
+    before = _state(devices.projector)
+    patience = Patience(
+        devices.clock, 0, lambda what, sentence: announce(f"{what}: {sentence}"), lambda: keep_awake(devices.camera)
+    )
+    make_ready(devices.projector, settings.sequence, patience)
+    identity = devices.projector.identity()
+    hours = ", ".join(f"{lamp.hours} h" for lamp in devices.projector.lamps()) or "no lamp"
+    lines.append(f"projector   {identity.maker} {identity.model} {identity.name}, {hours}; {before}")
+    parts = [fault.part for fault in devices.projector.faults() if fault.severity is Severity.WARNING]
+    if parts:
+        said = f"the projector warns of its {', '.join(parts)}"
+        findings.append(Finding("projector", "remark", said, remedy="look at its display before the session"))
+    return lines, findings
+
+
+def _state(projector: Projector) -> str:
+    """Return in which state the projector was found, and in which it is left."""
+    try:
+        if projector.power() is not Power.ON:
+            return "its lamp was off; it is switched on, and stays on when the check is over"
+        return "it was muted, and shows its picture now" if projector.muted() else "its lamp was on, and stays on"
+    except DeviceError:
+        return "it is switched on, and stays on"

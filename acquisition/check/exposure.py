@@ -1,0 +1,275 @@
+"""The exposure: where the sensor saturates, how bright white is, and which of the body's shutter times suits it.
+
+Saturation is measured, not looked up: exposed longer, a photosite that is not saturated counts in proportion more, one
+that is does not. LibRaw states 15 831 for an EOS 550D that saturates at 13 584.
+
+The search goes by measurement as well: each shutter time that is proposed has been tried.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.check.findings import LIMITS, Finding, Grade, amount, judged, percent
+from acquisition.check.taking import Shot
+from acquisition.framing.planes import CHANNELS, PAPER_PERCENTILE, frame_black, phases
+from acquisition.run.shutter import holds_whole_turns
+from drivers.raw.rawfile import Mosaic
+
+TARGET = 0.7
+"""White as a share of saturation that is looked for: the middle of what is good."""
+
+TRIALS = 8
+"""Shutter times that are tried at most: from any time to any other are five steps of 16 and a last one."""
+
+LONGER = 8.0
+"""How much longer a frame is exposed to see the sensor saturate: white's weakest channel has a third of the strongest,
+and a good exposure is at 0.7."""
+
+LONGEST_S = 30.0
+"""No longer time is tried: the wait, and hot photosites."""
+
+PROPORTIONAL = 0.9
+"""Of the counts that a longer time should give; what counts less is saturated. Times are stated as engraved, 0.3 s for
+0.315 s, which makes a ratio of two wrong by 8 % at most."""
+
+LEAST_RANGE = 0.25
+"""Share of the stated range from which on counts may be saturation: noise in the dark is not proportional either."""
+
+OVERFLOW = 0.95
+"""Share of saturation from which on white is taken for clipped: nothing is known of how bright it is."""
+
+_Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """Where the sensor saturates.
+
+    Attributes
+    ----------
+    counts
+        Raw count, the lowest of the positions of the 2×2 block.
+    measured
+        Whether a frame showed it; else it is what the file states.
+    stated
+        What the file states.
+    """
+
+    counts: float
+    measured: bool
+    stated: float
+
+    def __str__(self) -> str:
+        """Return "13584 counts, measured"."""
+        return f"{self.counts:.0f} counts, {'measured' if self.measured else 'as the file states, not measured'}"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A shutter time that was tried: white's share of saturation in R, G and B, and whether it overflowed."""
+
+    shutter_s: float
+    level: tuple[float, float, float]
+    clipped: bool
+
+    @property
+    def highest(self) -> float:
+        """White in the strongest channel."""
+        return max(self.level)
+
+
+def fitting_times(offered_s: Sequence[float], period_s: float | None) -> list[float]:
+    """Return those of the offered times, rising, that hold whole periods of the light, if it has one, up to 30 s."""
+    return [
+        time
+        for time in sorted(offered_s)
+        if time <= LONGEST_S and (period_s is None or holds_whole_turns(time, period_s))
+    ]
+
+
+def measure_saturation(first: Shot, take: Callable[[float], Shot], times_s: Sequence[float]) -> Saturation:
+    """Return where the sensor saturates, by frames of white exposed longer and longer.
+
+    Parameters
+    ----------
+    first
+        White at the time of the settings.
+    take
+        Takes a frame of white at a shutter time, seconds.
+    times_s
+        What may be tried.
+    """
+    stated = float(first.mosaic.white_level)
+    longer = first
+    while True:
+        longer_s = next((time for time in times_s if time >= LONGER * longer.shutter_s), max(times_s, default=0.0))
+        if longer_s < 1.5 * first.shutter_s or longer_s <= longer.shutter_s:
+            return Saturation(stated, False, stated)
+        # Against the frame before: in a dim first one the brightest hundredths are noise.
+        before, longer = longer, take(longer_s)
+        found = _plateaus(before, longer)
+        if found:
+            return Saturation(min(found), True, stated)
+
+
+def _plateaus(shorter: Shot, longer: Shot) -> list[float]:
+    """Return the counts at which positions of the block saturate in the longer of two frames; none where none does."""
+    before, after = _paper_counts(shorter.mosaic), _paper_counts(longer.mosaic)
+    black = frame_black(shorter.mosaic)
+    expected = (before - black) * longer.shutter_s / shorter.shutter_s
+    enough = LEAST_RANGE * (shorter.mosaic.white_level - black)
+    full = (after - black < PROPORTIONAL * expected) & (after - black > enough)
+    return [float(value) for value in after[full]]
+
+
+def _paper_counts(mosaic: Mosaic) -> _Array:
+    """Return (2, 2) float64: the raw counts of bare paper at each position of the block."""
+    return np.asarray(np.percentile(mosaic.block_planes()[:, :, ::2, ::2], PAPER_PERCENTILE, axis=(2, 3)))
+
+
+def level_of(shot: Shot, saturation: Saturation, white: _Array | None = None) -> Trial:
+    """Return how bright white is in a frame.
+
+    Parameters
+    ----------
+    shot
+        The frame.
+    saturation
+        The sensor's.
+    white
+        (3,) float64 counts above black of the brightest paper; None where the chart's place is not known: then the
+        brightest hundredth of the frame stands for it.
+    """
+    black = frame_black(shot.mosaic)
+    found = phases(shot.mosaic)
+    ranges = np.array([saturation.counts - np.mean([black[place] for place in found[channel]]) for channel in CHANNELS])
+    white = shot.brightest(99.0) if white is None else white
+    red, green, blue = (white / ranges).tolist()
+    return Trial(shot.shutter_s, (red, green, blue), max(red, green, blue) >= OVERFLOW)
+
+
+def search(first: Trial, measure: Callable[[float], Trial], times_s: Sequence[float]) -> tuple[Trial, ...]:
+    """Return the times that were tried until the best of those offered was among them; the first is `first`.
+
+    Parameters
+    ----------
+    first
+        White at the time of the settings.
+    measure
+        Takes a frame at a shutter time, seconds, and says how bright white is.
+    times_s
+        What may be tried, rising.
+    """
+    trials = [first]
+    while len(trials) < TRIALS:
+        wanted = _next_time(trials, times_s)
+        if wanted is None:
+            break
+        trials.append(measure(wanted))
+    return tuple(trials)
+
+
+def best_of(trials: Sequence[Trial]) -> Trial:
+    """Return the trial nearest to the target: the darkest where all overflow."""
+    whole = [trial for trial in trials if not trial.clipped]
+    if not whole:
+        return min(trials, key=lambda trial: trial.shutter_s)
+    inside = [trial for trial in whole if LIMITS["exposure"].grade(trial.highest) == "good"]
+    return min(inside or whole, key=lambda trial: abs(math.log(max(trial.highest, 1e-6) / TARGET)))
+
+
+def _next_time(trials: Sequence[Trial], times_s: Sequence[float]) -> float | None:
+    tried = {trial.shutter_s for trial in trials}
+    whole = [trial for trial in trials if not trial.clipped]
+    if not whole:
+        shortest = min(tried)
+        below = [time for time in times_s if time <= shortest / 4]
+        wanted = below[-1] if below else next((time for time in times_s if time < shortest), None)
+        return None if wanted in tried else wanted
+    brightest = max(whole, key=lambda trial: trial.highest)
+    # Too dark a frame tells little more than that it is dark.
+    gain = min(TARGET / max(brightest.highest, 1e-6), 16.0)
+    ceiling = min((trial.shutter_s for trial in trials if trial.clipped), default=math.inf)
+    low, high = LIMITS["exposure"].good
+    assert low is not None
+    assert high is not None
+    able = [time for time in times_s if time < ceiling]
+    target_s = brightest.shutter_s * gain
+    suited = [time for time in able if low <= brightest.highest * time / brightest.shutter_s <= high]
+    wanted = min(suited or able, key=lambda time: abs(math.log(time / target_s)), default=None)
+    if wanted is None or wanted in tried:
+        return None
+    predicted = brightest.highest * wanted / brightest.shutter_s
+    if low <= brightest.highest <= high and abs(math.log(predicted / TARGET)) > abs(
+        math.log(brightest.highest / TARGET)
+    ):
+        return None
+    return wanted
+
+
+def judge_exposure(
+    trials: Sequence[Trial], saturation: Saturation, times_s: Sequence[float], period_s: float | None, recorded: bool
+) -> Finding:
+    """Return the finding on the exposure of the settings, which is that of the first trial.
+
+    Parameters
+    ----------
+    trials
+        What was tried.
+    saturation
+        The sensor's.
+    times_s
+        Which times could be tried.
+    period_s
+        After which the light repeats, seconds; None where it is steady.
+    recorded
+        Whether frames come from a recording, which cannot be exposed anew.
+    """
+    first, best = trials[0], best_of(trials)
+    channel = CHANNELS[int(np.argmax(first.level))]
+    seen = "saturates" if first.clipped else f"is at {percent(first.highest)} of saturation"
+    said = f"white {seen} ({saturation}) in {channel} at {first.shutter_s:.4g} s"
+    details = {
+        "shutter_s": first.shutter_s,
+        "level": list(first.level),
+        "saturation_counts": saturation.counts,
+        "saturation_measured": saturation.measured,
+        "saturation_stated": saturation.stated,
+        "trials": [[trial.shutter_s, trial.highest, trial.clipped] for trial in trials],
+    }
+    if recorded:
+        remedy = "a recording cannot be exposed anew; take another session"
+    elif not times_s:
+        remedy = "the camera lists no shutter times; set another camera.shutter_s and check again"
+    elif LIMITS["exposure"].grade(best.highest) == "good" and not best.clipped:
+        remedy = f"set camera.shutter_s = {best.shutter_s:.4g} (tried: {percent(best.highest)})"
+        details["proposed_shutter_s"] = best.shutter_s
+    else:
+        remedy = _no_time(best, period_s)
+    found = judged(LIMITS["exposure"], 1.0 if first.clipped else first.highest, said, remedy, details)
+    if found.grade == "good" and not saturation.measured:
+        grade: Grade = "remark"
+        why = "nothing that was tried saturates the sensor, so that the share is of what the file states"
+        return replace(found, grade=grade, reason=why, remedy="" if recorded else "brighten the light if you can")
+    return found
+
+
+def _no_time(best: Trial, period_s: float | None) -> str:
+    turns = f" and holds whole turns of {amount(period_s, 's')}" if period_s else ""
+    nearest = (
+        f"even the shortest, {best.shutter_s:.4g} s, saturates"
+        if best.clipped
+        else f"the nearest, camera.shutter_s = {best.shutter_s:.4g}, gives {percent(best.highest)}"
+    )
+    bright = best.clipped or best.highest > TARGET
+    aperture, speed = ("higher", "lower") if bright else ("lower", "higher")
+    return (
+        f"no shutter time that the camera offers{turns} leads there, {nearest}: set a {aperture} f-number or a {speed} "
+        f"ISO speed{', or dim the projector' if bright else ', or a brighter projector'}"
+    )

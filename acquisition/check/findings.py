@@ -1,0 +1,342 @@
+"""What a check found: one frozen value for each thing looked at, its grade, the limits, text and JSON of all of them.
+
+Rules that hold inside:
+
+- A value within the limits of `good` is good, within those of `tolerable` a remark, beyond them a fault. A limit is
+  open on a side where it is None.
+- What could not be looked at is `not checked`, with the reason; it is never good.
+- A finding that is not good says what to do about it.
+- What lies beyond `tolerable` spoils the table or is refused later, by the run or by `build-lut`
+  (`calibration.verdict.thresholds` has the limits of a table).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from types import MappingProxyType
+from typing import Any, Literal
+
+from acquisition.framing.sharpness import MAX_BLUR_PX
+from acquisition.framing.visibility import MIN_CELL_PX
+
+Grade = Literal["fault", "remark", "not checked", "good"]
+GRADES: tuple[Grade, ...] = ("fault", "remark", "not checked", "good")
+"""In the order in which findings are told."""
+
+Range = tuple[float | None, float | None]
+"""Lowest and highest value, None where open."""
+
+JUDGEMENT = "judgement"
+"""The source of a limit that nothing but experience supports."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What a value may be.
+
+    Attributes
+    ----------
+    name
+        Of the finding that it judges.
+    title
+        The value for people.
+    unit
+        Of the value and its limits: "share" (0 … 1, shown as per cent), "px", "°", "s", or "" for a plain number.
+    good, tolerable
+        Lowest and highest value that is good, and that is but remarked on; beyond `tolerable` it is a fault.
+    why
+        What goes wrong beyond.
+    source
+        Where the numbers come from.
+    """
+
+    name: str
+    title: str
+    unit: str
+    good: Range
+    tolerable: Range
+    why: str
+    source: str = JUDGEMENT
+
+    def grade(self, value: float) -> Grade:
+        """Return the grade of a value; NaN is a fault."""
+        if _within(value, self.good):
+            return "good"
+        return "remark" if _within(value, self.tolerable) else "fault"
+
+    def wanted(self) -> str:
+        """Return the limits of `good` as words, "60 % to 80 %"."""
+        low, high = (None if bound is None else amount(bound, self.unit) for bound in self.good)
+        if low is None:
+            return f"at most {high}"
+        return f"at least {low}" if high is None else f"{low} to {high}"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes
+    ----------
+    name
+        What: "exposure", "evenness".
+    grade
+        good, remark, fault, or not checked.
+    said
+        What was seen, with its numbers; or why nothing was.
+    value
+        The number that was judged; None where there is none.
+    unit
+        Of the value and the limits, as in `Limit`.
+    good, tolerable
+        The limits.
+    reason
+        What goes wrong beyond them; empty where the value is good.
+    remedy
+        What to do; empty where nothing is to be done.
+    details
+        Further numbers and words by name, for programs.
+    """
+
+    name: str
+    grade: Grade
+    said: str
+    value: float | None = None
+    unit: str = ""
+    good: Range = (None, None)
+    tolerable: Range = (None, None)
+    reason: str = ""
+    remedy: str = ""
+    details: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    def sentence(self) -> str:
+        """Return what was seen, why it matters, and what to do, as one sentence."""
+        why = f" ({self.reason})" if self.reason else ""
+        return f"{self.said}{why}{f'; {self.remedy}' if self.remedy else ''}"
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What a whole check found.
+
+    Attributes
+    ----------
+    devices
+        What answered, a line each, and what was done with it.
+    findings
+        In the order in which they were looked at.
+    """
+
+    devices: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    def of(self, grade: Grade) -> tuple[Finding, ...]:
+        """Return the findings of one grade."""
+        return tuple(finding for finding in self.findings if finding.grade == grade)
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What must be mended before a session, a sentence each."""
+        return tuple(f"{finding.name}: {finding.sentence()}" for finding in self.of("fault"))
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the report as lines for a terminal: devices, then findings, faults first."""
+        told = [
+            f"{finding.grade:<12}{finding.name:<18}{finding.sentence()}"
+            for grade in GRADES
+            for finding in self.of(grade)
+        ]
+        return *self.devices, *told
+
+    def to_json(self) -> str:
+        """Return the report as JSON: `devices`, `faults` (their number), `findings` as `Finding` has them."""
+        document = {
+            "devices": list(self.devices),
+            "faults": len(self.of("fault")),
+            "findings": [_plain(asdict(finding)) for finding in self.findings],
+        }
+        return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
+
+
+def judged(limit: Limit, value: float, said: str, remedy: str, details: Mapping[str, Any] | None = None) -> Finding:
+    """Return the finding of a value: its grade by the limit, and reason and remedy where it is not good."""
+    grade = limit.grade(value)
+    wanted = "" if grade == "good" else f"{limit.wanted()} wanted: {limit.why}"
+    return Finding(
+        limit.name,
+        grade,
+        said,
+        value,
+        limit.unit,
+        limit.good,
+        limit.tolerable,
+        wanted,
+        "" if grade == "good" else remedy,
+        {} if details is None else details,
+    )
+
+
+def not_checked(name: str, why: str, remedy: str = "") -> Finding:
+    """Return the finding of what could not be looked at."""
+    return Finding(name, "not checked", why, remedy=remedy)
+
+
+def worst(grades: Iterable[Grade]) -> Grade:
+    """Return the worst of some grades; good of none."""
+    found: list[Grade] = ["good", *grades]
+    return min(found, key=lambda grade: GRADES.index(grade))
+
+
+def amount(value: float, unit: str) -> str:
+    """Return a value with its unit, a share as per cent.
+
+    >>> amount(0.046, "share"), amount(0.0004, "share"), amount(1.25, "px"), amount(3, "")
+    ('4.6 %', '0.04 %', '1.25 px', '3')
+    """
+    if unit == "share":
+        return percent(value)
+    return f"{value:.0f}" if unit == "" and value >= 100 else f"{value:.3g}{'' if unit in ('', '°') else ' '}{unit}"
+
+
+def percent(share: float) -> str:
+    """Return a share as per cent, two digits below ten.
+
+    >>> percent(0.7123), percent(0.0461), percent(0.00042), percent(0.0)
+    ('71 %', '4.6 %', '0.04 %', '0 %')
+    """
+    value = 100 * share
+    if abs(value) >= 10 or value == 0:
+        return f"{value:.0f} %"
+    return f"{value:.1f} %" if abs(value) >= 1 else f"{value:.2f} %"
+
+
+def _within(value: float, bounds: Range) -> bool:
+    low, high = bounds
+    return value == value and (low is None or value >= low) and (high is None or value <= high)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value that JSON can hold: a number that is none becomes null."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
+        return None
+    return value
+
+
+_SIMULATED = "measured on simulated frames"
+
+_LIMITS = (
+    Limit(
+        "exposure", "White under the brightest light, of measured saturation", "share", (0.6, 0.8), (0.3, 0.9),
+        "above, lights and places of the print that are brighter clip; below, dark colours drown in noise",
+        "0.8 leaves room for uneven light and the lamp's drift; each stop less doubles the noise of dark cells",
+    ),
+    Limit(
+        "clipping", "Photosites at 98 % of saturation and more, white frame", "share", (None, 0.0002), (None, 0.001),
+        "clipped cells cannot be used; beyond limits.clipped_percent the run refuses the frame",
+        "0.1 % is the run's own limit; hot photosites and reflections on pins stay below 0.02 %",
+    ),
+    Limit(
+        "brightest light", "A primary alone over white, channel by channel", "share", (None, 1.005), (None, 1.05),
+        "the exposure is judged by white, and another light is brighter and may clip",
+        "light adds: white holds every primary in full; 0.5 % is the lamp's flicker between two frames",
+    ),
+    Limit(
+        "additivity", "White against the sum of the primaries", "share", (-0.02, 0.02), (None, None),
+        "the projector mixes colours in its own way, so that lights are not what their codes say; "
+        "the table is valid all the same",
+        "the limit of a table's verdict",
+    ),
+    Limit(
+        "evenness", "Light missing at the chart's darkest place, of its brightest", "share", (None, 0.55), (None, 0.7),
+        "dark corners have too little light for their colours, and the smooth field that divides it out is not known "
+        "there well enough",
+        _SIMULATED + ": fields whose corners have 42 to 52 % of the centre are divided out to 0.2 %",
+    ),
+    Limit(
+        "colour evenness", "Change of white's R/G or B/G over the chart", "share", (None, 0.12), (None, 0.3),
+        "one end of the chart is lit by another colour than the other",
+        "projectors change by some per cent, simulated ones by 4 %; a stain on much of a small chart shows here, too",
+    ),
+    Limit(
+        "room light", "Paper under the black picture, of paper under white", "share", (None, 0.005), (None, 0.02),
+        "every light contains it, and the deep colours among the lights become paler",
+        "a contrast of 1 : 1500 gives 0.07 %; a pure primary gives the other channels 2 to 10 % of white, "
+        "of which 2 % are a fifth and more",
+    ),
+    Limit(
+        "sharpness", "Blur of printed edges, worst place", "px", (None, 0.8), (None, MAX_BLUR_PX),
+        "the samples of a cell take in light from its neighbours",
+        "a cell of 10 px has 0.2 % of its neighbours' light at 0.7 px and 1 % at 1 px",
+    ),
+    Limit(
+        "turn", "Angle between the chart's rows and the picture's", "°", (-5.0, 5.0), (-20.0, 20.0),
+        "the windows of samples stand along the picture's rows, and their corners come near the neighbouring cells",
+        "geometry: 5 px of samples in a cell of 10 px",
+    ),
+    Limit(
+        "tilt", "Longer over shorter of two opposite sides, less 1", "share", (None, 0.1), (None, 0.25),
+        "cells are smaller on the far side, and it lies out of the plane of focus",
+    ),
+    Limit(
+        "size", "Smallest cell", "px", (8.6, None), (MIN_CELL_PX, None),
+        "25 samples do not lie safely inside a cell",
+        "geometry: half of 5 px, 0.5 px of rounding, 0.25 px of registration, and the blur",
+    ),
+    Limit(
+        "stains", "Cells or references that are not of their codes' colours", "share", (None, 0.0), (None, 0.001),
+        "the table would hold the colours of a dirty or creased print; build-lut lists such cells as unfit",
+        "a stain of 60 mm covers 0.3 % of an A0 chart's cells, a thumb's 0.05 %",
+    ),
+    Limit(
+        "flicker", "Standard deviation of white's R/G over repeated frames", "share", (None, 0.005), (None, 0.01),
+        "frames that catch parts of a turn of the colour wheel have colours of their own",
+        "0.24 % at 0.5 s and 0.11 % at 1 s behind a wheel with 0.5 ms of jitter, 7 % at 1/60 s; "
+        "six frames state it to a third",
+    ),
+    Limit(
+        "brightness", "Standard deviation of white over repeated frames", "share", (None, 0.01), (None, 0.03),
+        "the lamp is not steady, or exposures differ",
+        "build-lut remarks on 1 % between white frames",
+    ),
+    Limit(
+        "hot photosites", "Photosites of a million that stand out in the dark", "", (None, 50.0), (None, 1000.0),
+        "each makes a cell unfit whose samples it lies under",
+        "100 photosites lie under a cell's samples: 50 of a million reach 0.5 % of the cells",
+    ),
+    Limit(
+        "noise reduction", "Time after the exposure that grows with it, of the exposure", "share", (None, 0.5),
+        (None, None),
+        "the body takes a dark frame of its own after each exposure: the session takes twice as long, and frames are "
+        "no longer as the sensor gave them",
+        "without it a file's transfer takes as long after any exposure",
+    ),
+    Limit(
+        "linearity", "Deviation from proportion to light, 5 to 95 % of saturation", "share", (None, 0.01), (None, 0.05),
+        "chromaticities change with brightness",
+        "EMVA 1288 asks for the range; 1 % is the limit of a table's verdict",
+    ),
+    Limit(
+        "disk", "Free space over what the plan needs", "", (1.0, None), (1.0, None),
+        "the run refuses to begin",
+        "the run's own estimate, retakes and a reserve included",
+    ),
+    Limit(
+        "battery", "Charge of the camera's battery, without mains", "share", (None, None), (0.5, None),
+        "a charge holds 440 frames (EOS 550D) to 1200 (EOS 6D Mark II), a session of 707 lights has 767",
+        "the maker's figures",
+    ),
+    Limit(
+        "card", "Free space on the camera's card over what the plan needs", "", (1.0, None), (1.0, None),
+        "the body stops when its card is full",
+        "the run's own estimate, retakes and a reserve included",
+    ),
+)  # fmt: skip
+
+LIMITS: Mapping[str, Limit] = MappingProxyType({limit.name: limit for limit in _LIMITS})
+"""The limits by the name of what they judge, in the order of docs/how-to/check.md."""

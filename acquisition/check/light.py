@@ -1,0 +1,328 @@
+"""The light: even over the chart, steady, additive, and dark where it should be.
+
+Lens and projector darken the corners together, and one frame does not tell them apart: what is judged is their product,
+as it is this that `build-lut` divides out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from acquisition.chart.model import Chart
+from acquisition.check.findings import LIMITS, Finding, judged, not_checked, percent
+from acquisition.check.places import Levels
+from acquisition.framing.planes import CHANNELS
+from acquisition.measures.least_squares import least_squares
+from acquisition.measures.paper import MIN_REFERENCES, PaperReader
+from acquisition.measures.polynomials import page_polynomial, page_powers
+from foundation.robust import huber_weights, sigma_of
+
+LEAST_COUNTS = 300.0
+"""Counts above black under white from which on a patch's ratio to another frame is good to 1 %."""
+
+AREAS = (3, 5)
+"""Rows and columns of the areas over which stray light is looked for: a lamp lights one end of a chart, not a cell."""
+
+MUTED_SHARE = 0.5
+"""Share of the black picture's light that must go when the picture is muted for it to be called the projector's."""
+
+MANY_REFERENCES = 150
+"""White references from which on the light is read as `build-lut` reads it, by a polynomial of up to sixth order in the
+counts; with fewer such a polynomial runs away beside them."""
+
+FEW_ORDER = 2
+"""Order of the light's logarithm where references are few: a slope and a bend."""
+
+_ROUNDS = 6
+"""Reweighted solutions in a row; Huber's weights have settled by then."""
+
+_Array = npt.NDArray[np.float64]
+
+
+class SmoothLight(Protocol):
+    """The shape of the light over the print; its mean over the cells is 1."""
+
+    def at(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return the light (N, 3) float64, > 0, at points (N, 2) mm."""
+        ...
+
+
+class BentLight:
+    """Light whose logarithm is a polynomial over the page, for charts of few references: positive everywhere.
+
+    Parameters
+    ----------
+    page_mm
+        Width and height of the page.
+    terms
+        (terms, 3) float64 of the logarithm, for R, G and B.
+    """
+
+    def __init__(self, page_mm: tuple[float, float], terms: _Array) -> None:
+        self._page_mm, self._terms = page_mm, terms
+        self._order = next(k for k in range(FEW_ORDER + 1) if len(page_powers(k)) == len(terms))
+
+    def at(self, points_mm: npt.ArrayLike) -> _Array:
+        """Return the light (N, 3) float64, > 0, at points (N, 2) mm."""
+        return np.exp(page_polynomial(points_mm, self._page_mm, self._order) @ self._terms)
+
+
+def measure_light(chart: Chart, references: Levels) -> SmoothLight | None:
+    """Return the light that a chart's references show under white.
+
+    None where fewer than six white ones can be used, or lie among the cells: a margin alone says nothing of the
+    middle.
+
+    Parameters
+    ----------
+    references
+        What white shows of the chart's references, in its order.
+    """
+    white = np.array([reference.is_white for reference in chart.references], dtype=np.bool_)
+    seen = np.where(references.clipped[:, None], np.nan, references.mean)
+    usable = np.isfinite(seen).all(axis=1) & (np.nan_to_num(seen).min(axis=1) > 0)
+    if (usable & white).sum() < MIN_REFERENCES or _among_cells(chart) < MIN_REFERENCES:
+        return None
+    places = np.array([reference.centre_mm for reference in chart.references], dtype=np.float64).reshape(-1, 2)
+    if (usable & white).sum() >= MANY_REFERENCES:
+        reader = PaperReader(places[white], chart.centres_mm, chart.page_mm)
+        return reader.read(np.where(usable[:, None], seen, np.nan)[white])[0].field
+    # Greys of one code lie in one light too: each code has a level of its own, which the light does not share.
+    codes, group = np.unique([reference.rgb for reference in chart.references], axis=0, return_inverse=True)
+    own = np.eye(len(codes))[group.ravel()]
+    chosen = usable & (own.sum(axis=0)[group.ravel()] >= 2) & (seen.min(axis=1) > LEAST_COUNTS / 3)
+    if chosen.sum() < MIN_REFERENCES:
+        return None
+    order = max((k for k in range(FEW_ORDER + 1) if 2 * len(page_powers(k)) <= int(chosen.sum())), default=0)
+    basis = page_polynomial(places[chosen], chart.page_mm, order)[:, 1:]
+    design = np.ascontiguousarray(np.column_stack([own[chosen], basis]))
+    terms = np.zeros((len(page_powers(order)), 3))
+    for channel in range(3):
+        values, weights = np.log(seen[chosen, channel]), np.ones(int(chosen.sum()))
+        for _ in range(_ROUNDS):
+            solution = least_squares(design, values, weights)
+            off = np.abs(values - design @ solution)
+            weights = huber_weights(off, max(sigma_of(off), 1e-4)) ** 2
+            terms[1:, channel] = solution[len(codes) :]
+    light = BentLight(chart.page_mm, terms)
+    terms[0] = -np.log(light.at(chart.centres_mm).mean(axis=0))
+    return BentLight(chart.page_mm, terms)
+
+
+def _among_cells(chart: Chart) -> int:
+    """Return how many white references lie among the cells."""
+    places = np.array([reference.centre_mm for reference in chart.white_references]).reshape(-1, 2)
+    low, high = chart.centres_mm.min(axis=0), chart.centres_mm.max(axis=0)
+    return int(((places >= low) & (places <= high)).all(axis=1).sum())
+
+
+def no_light(chart: Chart) -> str:
+    """Return why the light on a chart is not known."""
+    count = len(chart.white_references)
+    if count < MIN_REFERENCES:
+        return f"the chart has {count} white references, at least {MIN_REFERENCES} needed"
+    if _among_cells(chart) < MIN_REFERENCES:
+        return "the chart has bare paper in its margin only, which does not show the light in its middle"
+    return f"of the chart's {count} white references too few are bright, whole and not clipped"
+
+
+def judge_evenness(light: SmoothLight | None, chart: Chart) -> list[Finding]:
+    """Return the findings on how evenly the chart is lit, of lens and projector together.
+
+    Parameters
+    ----------
+    light
+        What the references show under white; None where there are too few.
+    chart
+        The chart.
+    """
+    if light is None:
+        return [not_checked(name, no_light(chart)) for name in ("evenness", "colour evenness")]
+    width, height = chart.page_mm
+    left, top = chart.centres_mm.min(axis=0)
+    right, bottom = chart.centres_mm.max(axis=0)
+    cells = light.at(chart.centres_mm)
+    falloff = 1 - cells.min(axis=0) / cells.max(axis=0)
+    corners = light.at([(left, top), (right, top), (right, bottom), (left, bottom)])
+    centre = light.at([(width / 2, height / 2)])[0]
+    shares = corners / centre
+    channel = int(np.argmax(falloff))
+    names = ("top left", "top right", "bottom right", "bottom left")
+    told = ", ".join(f"{name} {percent(share)}" for name, share in zip(names, shares[:, channel], strict=True))
+    each = ", ".join(f"{letter} {percent(value)}" for letter, value in zip(CHANNELS, falloff, strict=True))
+    darkest = chart.centres_mm[int(np.argmin(cells[:, channel]))]
+    even = judged(
+        LIMITS["evenness"],
+        float(falloff[channel]),
+        f"lens and projector together lose {each} over the chart; of the centre's light ({CHANNELS[channel]}) {told}",
+        "centre the chart in the projector's picture and zoom it out, stop the lens down, or step back and take a "
+        "longer lens; one frame cannot tell which of the two it is: turn the camera, what turns with it is the lens's",
+        {
+            "falloff": falloff.tolist(),
+            "corners_of_centre": {name: row.tolist() for name, row in zip(names, shares, strict=True)},
+            "darkest_mm": darkest.tolist(),
+        },
+    )
+    ratios = cells[:, [0, 2]] / cells[:, [1]]
+    changes = ratios.max(axis=0) / ratios.min(axis=0) - 1
+    coloured = judged(
+        LIMITS["colour evenness"],
+        float(changes.max()),
+        f"over the chart white's R/G changes by {percent(changes[0])}, its B/G by {percent(changes[1])}",
+        "keep coloured light off the chart, let no coloured wall reflect onto it, clean the print, and switch the "
+        "projector's shading correction on",
+        {"red_over_green": float(changes[0]), "blue_over_green": float(changes[1])},
+    )
+    return [even, coloured]
+
+
+def judge_room_light(
+    chart: Chart, points_mm: _Array, white: _Array, dark: _Array, muted: _Array | None, why_not_muted: str
+) -> Finding:
+    """Return the finding on the light that is there while the projector shows black.
+
+    The ratio of a patch in the dark to the same patch under white does not depend on its colour, so every patch that
+    white shows well enough takes part.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 2) patches of the print.
+    white, dark
+        (N, 3) counts above black under white and under the black picture, at one exposure.
+    muted
+        (N, 3) the same with the projector's picture muted; None where it could not be.
+    why_not_muted
+        Why not.
+    """
+    share, place = _worst_share(chart, points_mm, white, dark)
+    if share is None:
+        return not_checked("room light", "white is too dim for a ratio", "mend the exposure first, then check again")
+    said = f"the black picture has {percent(share)} of white's light"
+    details: dict[str, object] = {"share": share, "where": place}
+    if muted is None:
+        said += f" at {place}; projector's black and the room's light are not told apart: {why_not_muted}"
+        remedy = "darken the room, cover lamps and displays; what is then left is the projector's own black"
+    else:
+        left = _worst_share(chart, points_mm, white, muted)[0] or 0.0
+        own = max(share - left, 0.0)
+        details |= {"muted": left, "projector": own}
+        if own >= MUTED_SHARE * share:
+            said += f" at {place}, {percent(own)} of it the projector's black, {percent(left)} the room's"
+            remedy = "raise the projector's contrast (its iris, its picture mode), and darken the room"
+        else:
+            said += (
+                f" at {place}, {percent(left)} of it with the picture muted: the room's light, or a projector whose "
+                "mute shows black"
+            )
+            remedy = "darken the room, cover lamps and displays, keep daylight out"
+    return judged(LIMITS["room light"], share, said, remedy, details)
+
+
+def _worst_share(chart: Chart, points_mm: _Array, white: _Array, dark: _Array) -> tuple[float | None, str]:
+    """Return the largest ratio of areas of the chart and channels, and the area's name; None where white is too dim."""
+    rows, columns = AREAS
+    at = np.clip(points_mm / chart.page_mm, 0, 1 - 1e-9)
+    area = (at[:, 1] * rows).astype(int) * columns + (at[:, 0] * columns).astype(int)
+    best: tuple[float | None, str] = (None, "")
+    with np.errstate(invalid="ignore"):
+        known = white >= LEAST_COUNTS
+    for number in range(rows * columns):
+        for channel in range(3):
+            here = known[:, channel] & (area == number) & np.isfinite(dark[:, channel])
+            if here.sum() < 3:
+                continue
+            share = float(np.median(dark[here, channel] / white[here, channel]))
+            if best[0] is None or share > best[0]:
+                best = share, area_name(number // columns, number % columns)
+    return best
+
+
+def area_name(row: int, column: int) -> str:
+    """Return where one of the areas lies: "the top left", "the middle"."""
+    down = ("top", "middle", "bottom")[row]
+    across = ("far left", "left", "middle", "right", "far right")[column]
+    if down == across:
+        return "the middle"
+    return f"the {down} {across}"
+
+
+def judge_primaries(levels: Mapping[str, _Array], plan_has: bool) -> list[Finding]:
+    """Return the findings on whether white is the brightest light, and the sum of the primaries.
+
+    Parameters
+    ----------
+    levels
+        (3,) counts above black of paper under "white", "red", "green", "blue" and "black", at one exposure.
+    plan_has
+        Whether the plan holds lights at all.
+    """
+    white, black = levels["white"], levels["black"]
+    alone = np.stack([levels[name] for name in ("red", "green", "blue")])
+    over = alone / white[None]
+    primary, channel = np.unravel_index(int(np.argmax(over)), over.shape)
+    share = float(over[primary, channel])
+    name = ("red", "green", "blue")[int(primary)]
+    brightest = judged(
+        LIMITS["brightest light"],
+        share,
+        f"of the primaries {name} comes nearest to white, with {percent(share)} of it in {CHANNELS[int(channel)]}"
+        f"{'' if plan_has else ' (the plan has no lights)'}",
+        "switch off what dims a full picture in the projector's menu (dynamic contrast, eco mode), or expose less",
+        {"primaries_of_white": over.tolist()},
+    )
+    missing = float(np.max(np.abs((alone.sum(axis=0) - 2 * black) / white - 1)))
+    signed = (alone.sum(axis=0) - 2 * black) / white - 1
+    off = float(signed[int(np.argmax(np.abs(signed)))])
+    additive = judged(
+        LIMITS["additivity"],
+        off,
+        f"the three primaries together are {percent(missing)} {'above' if off > 0 else 'below'} white",
+        "switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
+        {"by_channel": signed.tolist()},
+    )
+    return [brightest, additive]
+
+
+def judge_flicker(whites: Sequence[_Array], shutter_s: float) -> list[Finding]:
+    """Return the findings on how white differs between frames of one exposure.
+
+    Parameters
+    ----------
+    whites
+        (3,) counts above black of paper, frame by frame; at least three.
+    shutter_s
+        Their shutter time.
+    """
+    seen = np.stack(whites)
+    ratio = seen[:, 0] / seen[:, 1]
+    spread = float(ratio.std(ddof=1) / ratio.mean())
+    strongest = int(np.argmax(seen.mean(axis=0)))
+    bright = float(seen[:, strongest].std(ddof=1) / seen[:, strongest].mean())
+    told = f"over {len(seen)} frames of {shutter_s:.4g} s"
+    return [
+        judged(
+            LIMITS["flicker"],
+            spread,
+            f"white's R/G has a standard deviation of {percent(spread)} {told}",
+            "expose for 0.5 s or more, and for whole turns of the colour wheel (set lab.projector.colour_wheel_hz)",
+            {"red_over_green": ratio.tolist()},
+        ),
+        judged(
+            LIMITS["brightness"],
+            bright,
+            f"white has a standard deviation of {percent(bright)} {told}",
+            "let the lamp warm up, switch off its eco mode and dynamic contrast, keep other light away",
+            {"counts": seen[:, strongest].tolist()},
+        ),
+    ]
+
+
+def light_share(light: SmoothLight, points_mm: npt.ArrayLike) -> _Array:
+    """Return the light (N, 3) float64 at points (N, 2) mm as a share of the brightest of them, channel by channel."""
+    seen = light.at(points_mm)
+    return seen / seen.max(axis=0)

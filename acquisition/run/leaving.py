@@ -1,0 +1,99 @@
+"""How a run leaves the lab: the screen black, the lamp's fate decided and said, whatever ended it.
+
+====================  =====================================  =========================================
+what ended the run    the lamp                               because
+====================  =====================================  =========================================
+all frames are there  goes out (`sequence.switch_off`)       its hours are counted
+it ended by itself    goes out                               nobody may be there till the morning; the
+                      (`sequence.lamp_if_unfinished`)        next run warms it up again
+somebody ended it     burns on                               he is there, and may go on at once
+====================  =====================================  =========================================
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from enum import Enum
+from typing import Final
+
+from acquisition.config import SequenceSettings
+from acquisition.run.devices import Devices
+from acquisition.run.patience import Report
+from drivers.presenter import BLACK
+from drivers.projector import Power, Projector
+from foundation.clock import Clock
+from foundation.errors import CropError, DeviceError
+
+OBEYS_S: Final = 5.0
+"""How long a projector may take to begin to switch off, after it has said that it will; they answer before they do."""
+LOOK_S: Final = 0.5
+"""Between two questions whether it has begun."""
+
+_BY_HAND: Final = "switch it off by hand"
+
+
+class RunEnd(Enum):
+    """What ended a run."""
+
+    COMPLETE = "complete"
+    UNFINISHED = "unfinished"
+    INTERRUPTED = "interrupted"
+
+
+def end_of(error: BaseException) -> RunEnd:
+    """Return what ended a run that raised `error`: somebody, by Ctrl-C or a signal, or the run itself."""
+    return RunEnd.INTERRUPTED if isinstance(error, KeyboardInterrupt) else RunEnd.UNFINISHED
+
+
+def leave_lab(devices: Devices, end: RunEnd, sequence: SequenceSettings, report: Report) -> None:
+    """Make the screen black, and let the lamp go out or burn on; what cannot be done is said, and raises nothing.
+
+    Parameters
+    ----------
+    devices
+        Still open.
+    end
+        What ended the run.
+    sequence
+        What the lamp is to do.
+    report
+        Told what the lamp does now, and what the screen could not.
+    """
+    try:
+        devices.presenter.show(BLACK)
+    except DeviceError as error:
+        _say(report, "screen", f"it could not be made black: {error}")
+    _say(report, "lamp", lamp_fate(devices.projector, end, sequence, devices.clock))
+
+
+def lamp_fate(projector: Projector | None, end: RunEnd, sequence: SequenceSettings, clock: Clock) -> str:
+    """Let the lamp go out or burn on, and return in a sentence what it does now."""
+    if projector is None:
+        return f"the projector is not under control: {_BY_HAND}"
+    goes_out = {
+        RunEnd.COMPLETE: sequence.switch_off,
+        RunEnd.UNFINISHED: sequence.lamp_if_unfinished == "off",
+        RunEnd.INTERRUPTED: False,
+    }[end]
+    try:
+        power = projector.power()
+        if power is not Power.ON and power is not Power.WARMING:
+            return f"it is out already: the projector is in {power.value}"
+        if not goes_out:
+            return f"it burns on, so that the next run needs no warm-up; else {_BY_HAND}"
+        projector.switch_off()
+        until = clock.monotonic() + OBEYS_S
+        while (power := projector.power()) is Power.ON and clock.monotonic() < until:
+            clock.sleep(LOOK_S)
+    except DeviceError as error:
+        undone = "whether it burns is not known" if not goes_out else "it could not be switched off"
+        return f"{undone}: {error}; {_BY_HAND}"
+    if power is Power.ON:
+        return f"it burns on though the projector was told to switch it off; {_BY_HAND}"
+    return "it was switched off"
+
+
+def _say(report: Report, what: str, sentence: str) -> None:
+    # The run has its end already, and that counts: a full disk, for one.
+    with suppress(CropError):
+        report(what, sentence)

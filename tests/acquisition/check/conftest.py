@@ -1,0 +1,57 @@
+"""Rooms for checks: a small chart before a small sensor, in the simulated lab that `acquire check` opens."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquisition.chart.layout import design_chart
+from acquisition.check.check import CheckOptions, check_lab
+from acquisition.check.findings import CheckReport
+from acquisition.config import load_lab
+from acquisition.lights.illuminations import plan_illuminations, save_illuminations
+
+Check = Callable[..., CheckReport]
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with charts of one to three bits and three lights."""
+    place = tmp_path_factory.mktemp("check")
+    for bits in (1, 2, 3):
+        design_chart(bits).save(place / f"chart{bits}.json")
+    save_illuminations(plan_illuminations(1, ()), place / "illuminations.csv")
+    return place
+
+
+def lab_toml(chart: str, camera: str = "", more: str = "", seed: int = 1, **room: Any) -> str:
+    """Return the text of a LAB.toml of a simulated room."""
+    told = "".join(f"{key} = {json.dumps(value)}\n" for key, value in room.items())
+    return (
+        f'rig = "simulated"\nchart = "{chart}"\nilluminations = "illuminations.csv"\n[camera]\n{camera}\n{more}\n'
+        f'[simulated]\nbody = "Test"\nseed = {seed}\n[simulated.room]\n{told}'
+    )
+
+
+@pytest.fixture(scope="session")
+def check(folder: Path) -> Check:
+    """Return what checks a room."""
+
+    def run(
+        bits: int = 2,
+        camera: str = "",
+        more: str = "",
+        chart: str | None = None,
+        options: CheckOptions | None = None,
+        seed: int = 1,
+        **room: Any,
+    ) -> CheckReport:
+        lab = folder / "LAB.toml"
+        lab.write_text(lab_toml(chart or f"chart{bits}.json", camera, more, seed, **room))
+        return check_lab(load_lab(lab), options or CheckOptions())
+
+    return run

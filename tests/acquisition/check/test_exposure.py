@@ -1,0 +1,122 @@
+"""Saturation is measured, and the search ends at a time that suits wherever there is one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from acquisition.check.exposure import (
+    TRIALS,
+    Saturation,
+    Trial,
+    best_of,
+    fitting_times,
+    judge_exposure,
+    measure_saturation,
+    search,
+)
+from acquisition.check.taking import Shot
+from acquisition.run.shutter import ENGRAVED_S
+from drivers.presenter import WHITE
+from drivers.raw.plain_dng import Area
+from drivers.raw.rawfile import Mosaic
+
+PERIOD_S = 1 / 60
+TIMES = fitting_times(ENGRAVED_S, PERIOD_S)
+BLACK = 2048
+
+
+def photographed(rate: float, shutter_s: float, full: int, spread: float = 0.0, stated: int = 15831) -> Shot:
+    """Return white paper of so many counts a second in the strongest of three channels, on a sensor that saturates."""
+    random = np.random.default_rng(1)
+    light = rate * shutter_s * np.array([[0.4, 1.0], [1.0, 0.7]])
+    signal = np.tile(light, (40, 60)) * random.uniform(0.9, 1.0, (80, 120))
+    top = full + spread * random.standard_normal(signal.shape)
+    noisy = BLACK + signal + 6 * random.standard_normal(signal.shape)
+    counts = np.clip(np.minimum(noisy, top), 0, 16383).astype(np.uint16)
+    mosaic = Mosaic(
+        counts, "RGGB", np.full((2, 2), float(BLACK)), stated, "a camera", counts, Area(0, 0, 80, 120), ()
+    )  # fmt: skip
+    return Shot(WHITE, shutter_s, mosaic, shutter_s + 1, 1)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.7, 1.5, 40.0])
+@pytest.mark.parametrize("spread", [0.0, 40.0])
+def test_saturation_is_measured_whatever_the_file_states(share: float, spread: float) -> None:
+    rate = share * (13584 - BLACK) / 0.5
+    found = measure_saturation(
+        photographed(rate, 0.5, 13584, spread), lambda s: photographed(rate, s, 13584, spread), TIMES
+    )
+    # At 1 % even 30 s do not saturate the strongest channel: sixty times as much is 60 %.
+    assert found.measured == (share > 0.01)
+    assert found.stated == 15831
+    assert found.counts == (pytest.approx(13584, abs=3 * spread + 1) if found.measured else 15831)
+
+
+def test_darkness_is_no_saturation() -> None:
+    found = measure_saturation(photographed(0, 0.5, 13584), lambda s: photographed(0, s, 13584), TIMES)
+    assert not found.measured
+
+
+def tried(rate: float, start_s: float, times: list[float]) -> tuple[Trial, ...]:
+    def measure(seconds: float) -> Trial:
+        level = min(rate * seconds, 1.0)
+        return Trial(seconds, (0.4 * level, level, 0.7 * level), level >= 0.95)
+
+    return search(measure(start_s), measure, times)
+
+
+def test_the_search_ends_at_a_good_time_wherever_there_is_one() -> None:
+    random = np.random.default_rng(2)
+    for _ in range(400):
+        rate = float(10 ** random.uniform(-2.5, 2.5))
+        start_s = float(random.choice(TIMES))
+        trials = tried(rate, start_s, TIMES)
+        assert len(trials) <= TRIALS
+        assert len({trial.shutter_s for trial in trials}) == len(trials), "no time is tried twice"
+        best = best_of(trials)
+        if any(0.6 <= rate * time <= 0.8 for time in TIMES):
+            assert 0.6 <= best.highest <= 0.8, (rate, start_s, trials)
+        else:
+            able = [time for time in TIMES if rate * time < 0.95] or TIMES[:1]
+            nearest = min(able, key=lambda time: abs(np.log(rate * time / 0.7)))
+            assert best.shutter_s == pytest.approx(nearest), (rate, start_s, trials)
+
+
+@pytest.mark.parametrize(
+    ("level", "grade"),
+    [(0.02, "fault"), (0.29, "fault"), (0.31, "remark"), (0.59, "remark"), (0.61, "good"), (0.79, "good"),
+     (0.81, "remark"), (0.93, "fault"), (1.0, "fault")],
+)  # fmt: skip
+def test_white_is_judged_at_the_settings_time(level: float, grade: str) -> None:
+    trials = tried(level / 0.5, 0.5, TIMES)
+    found = judge_exposure(trials, Saturation(13584, True, 15831), TIMES, PERIOD_S, recorded=False)
+    assert found.grade == grade
+    assert (found.remedy == "") == (grade == "good")
+    if grade != "good":
+        assert "set camera.shutter_s = " in found.remedy
+        assert found.details["proposed_shutter_s"] in TIMES
+
+
+def test_a_room_in_which_every_time_saturates_is_told() -> None:
+    found = judge_exposure(tried(1e4, 0.5, TIMES), Saturation(13584, True, 15831), TIMES, PERIOD_S, recorded=False)
+    assert found.grade == "fault"
+    assert "even the shortest, 0.01667 s, saturates: set a higher f-number" in found.remedy
+
+
+def test_a_dim_room_asks_for_more_light() -> None:
+    found = judge_exposure(tried(0.01, 0.5, TIMES), Saturation(15831, False, 15831), TIMES, PERIOD_S, recorded=False)
+    assert found.grade == "fault"
+    assert "set a lower f-number or a higher ISO speed" in found.remedy
+
+
+def test_a_share_of_a_stated_saturation_is_not_called_good() -> None:
+    found = judge_exposure(tried(1.4, 0.5, TIMES), Saturation(15831, False, 15831), TIMES, PERIOD_S, recorded=False)
+    assert found.grade == "remark"
+    assert "as the file states, not measured" in found.said
+
+
+def test_a_recording_is_judged_and_not_exposed_anew() -> None:
+    found = judge_exposure(tried(0.04, 0.5, [])[:1], Saturation(13584, True, 15831), [], PERIOD_S, recorded=True)
+    assert found.grade == "fault"
+    assert "cannot be exposed anew" in found.remedy

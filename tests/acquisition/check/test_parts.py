@@ -1,0 +1,171 @@
+"""What is computed without a room: tilt, noise, supplies, stains of few references, and the light of few."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import pytest
+
+from acquisition.chart.layout import design_chart
+from acquisition.check.light import judge_flicker, judge_primaries, measure_light
+from acquisition.check.optics import tilt_deg
+from acquisition.check.places import Levels
+from acquisition.check.sensor import fit_transfer, judge_noise_reduction, series_times
+from acquisition.check.supplies import judge_disk, judge_supplies
+from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
+from foundation.errors import LinkTimeout
+
+
+@pytest.mark.parametrize(("pan", "tilt"), [(0.0, 0.0), (8.0, 0.0), (0.0, -6.0), (-4.0, 3.0)])
+def test_tilt_is_read_from_a_homography(pan: float, tilt: float) -> None:
+    focal, centre = 3000.0, (1300.0, 866.0)
+    normal = np.array([np.tan(np.radians(pan)), np.tan(np.radians(tilt)), 1.0])
+    z = normal / np.linalg.norm(normal)
+    x = np.cross([0, 1, 0], z)
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z], axis=1)
+    camera = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
+    homography = camera @ np.column_stack([rotation[:, 0], rotation[:, 1], [-500.0, -400.0, 1800.0]])
+    assert tilt_deg(homography / homography[2, 2], focal, centre) == pytest.approx((pan, tilt), abs=1e-6)
+
+
+def test_the_transfer_of_a_sensor_is_read_from_variances() -> None:
+    random = np.random.default_rng(3)
+    level = random.uniform(50, 10_000, (4000, 3))
+    expected = 6.0**2 + level / 1.8
+    variance = expected * random.chisquare(24, level.shape) / 24
+    # Hot photosites and dust spoil a few windows.
+    variance[:40] *= 50
+    found = fit_transfer(level, variance)
+    assert found.gain_e == pytest.approx(1.8, rel=0.05)
+    assert found.read_noise == pytest.approx(6.0, rel=0.25)
+    assert np.isnan(fit_transfer(np.zeros((0, 3)), np.zeros((0, 3))).gain_e).all()
+
+
+def test_a_series_goes_from_dim_to_nearly_saturated() -> None:
+    times = series_times([0.01 * k for k in range(1, 200)], 0.5, 0.7)
+    assert len(times) == 8
+    assert 0.7 * times[0] / 0.5 == pytest.approx(0.06, abs=0.02)
+    assert 0.7 * times[-1] / 0.5 == pytest.approx(0.94, abs=0.02)
+    assert series_times([10.0], 0.5, 0.7) == []
+
+
+def test_a_body_that_takes_dark_frames_of_its_own_is_told() -> None:
+    plain = [(0.5, 2.5), (0.5, 2.6), (4.0, 6.1)]
+    assert judge_noise_reduction(plain).grade == "good"
+    doubled = [(0.5, 2.5), (0.5, 2.6), (4.0, 10.1)]
+    assert judge_noise_reduction(doubled).grade == "remark"
+    assert judge_noise_reduction([(0.1, 2.0), (0.5, 2.5)]).grade == "not checked"
+    assert judge_noise_reduction([]).grade == "not checked"
+
+
+def test_a_full_picture_that_is_dimmed_is_told() -> None:
+    white = np.array([3000.0, 7000.0, 4000.0])
+    black = np.array([3.0, 7.0, 4.0])
+    levels = {"white": white, "black": black, "red": np.array([2400.0, 700, 40]), "green": np.array([500.0, 6000, 400])}
+    good = judge_primaries({**levels, "blue": white + 2 * black - levels["red"] - levels["green"]}, plan_has=True)
+    assert [found.grade for found in good] == ["good", "good"]
+    bright = judge_primaries({**levels, "blue": np.array([100.0, 300.0, 4400.0])}, plan_has=True)
+    assert [found.grade for found in bright] == ["fault", "remark"]
+    assert "blue comes nearest to white, with 110 %" in bright[0].said
+
+
+def test_flicker_has_limits() -> None:
+    white = np.array([3000.0, 7000.0, 4000.0])
+    random = np.random.default_rng(4)
+
+    def grade(spread: float) -> str:
+        ratios = random.standard_normal(6)
+        ratios = (ratios - ratios.mean()) / ratios.std(ddof=1) * spread
+        return judge_flicker([white * (1 + ratio, 1, 1) for ratio in ratios], 0.5)[0].grade
+
+    assert [grade(spread) for spread in (0.0024, 0.0049, 0.007, 0.07)] == ["good", "good", "remark", "fault"]
+
+
+def test_the_disk_is_asked_where_the_session_will_be(tmp_path: Path) -> None:
+    there = judge_disk(tmp_path / "not" / "yet", 10, 1000)
+    assert there.grade == "good"
+    assert str(tmp_path) in there.said
+    assert judge_disk(tmp_path, 10**9, 25_000_000).grade == "fault"
+
+
+@dataclass
+class Body:
+    """A camera of which only the supplies are asked."""
+
+    left: Supplies | None
+
+    def identity(self) -> CameraIdentity:
+        return CameraIdentity("A", "B", "1")
+
+    def configure(self, settings: ExposureSettings) -> None:
+        raise NotImplementedError
+
+    def shutter_speeds(self) -> tuple[float, ...]:
+        return ()
+
+    def expose(self) -> datetime:
+        return datetime.now(UTC)
+
+    def download(self, into: BinaryIO) -> CapturedFrame:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        pass
+
+    def supplies(self) -> Supplies:
+        if self.left is None:
+            raise LinkTimeout("the camera does not answer")
+        return self.left
+
+
+def test_a_charge_that_lasts_is_good() -> None:
+    assert judge_supplies(Body(Supplies(battery=0.75)), 100, 1)[0].grade == "good"
+
+
+@pytest.mark.parametrize(
+    ("left", "battery", "card"),
+    [
+        (Supplies(), "not checked", "good"),
+        (Supplies(battery=1.0), "not checked", "good"),
+        (Supplies(battery=1.0, mains=False), "remark", "good"),
+        (Supplies(battery=0.75), "remark", "good"),
+        (Supplies(battery=0.25, mains=False), "fault", "good"),
+        (Supplies(battery=0.25, mains=True), "good", "good"),
+        (Supplies(saves_to_host=False), "not checked", "not checked"),
+        (Supplies(saves_to_host=False, card_free_bytes=10**11), "not checked", "good"),
+        (Supplies(saves_to_host=False, card_free_bytes=1000 * 10**6), "not checked", "fault"),
+        (None, "not checked", "not checked"),
+    ],
+)
+def test_battery_and_card_are_judged_as_far_as_the_body_tells(left: Supplies | None, battery: str, card: str) -> None:
+    assert [found.grade for found in judge_supplies(Body(left), 767, 25 * 10**6)] == [battery, card]
+
+
+@pytest.mark.parametrize(("bits", "few"), [(2, True), (5, False)])
+def test_light_is_read_from_few_references_and_from_many(bits: int, few: bool) -> None:
+    chart = design_chart(bits)
+    places = np.array([reference.centre_mm for reference in chart.references])
+    codes = np.array([reference.rgb[0] for reference in chart.references]) / 255
+    half = np.hypot(*chart.page_mm) / 2
+
+    def light(
+        points: np.ndarray[tuple[int, ...], np.dtype[np.float64]],
+    ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+        r = np.linalg.norm(points - np.array(chart.page_mm) / 2, axis=-1) / half
+        return np.asarray((1 - 0.4 * r**2)[..., None] * np.ones(3))
+
+    seen = 7000 * codes[:, None] ** 2.2 * light(places)
+    # A stain on two references moves nothing.
+    seen[3:5] *= 0.5
+    found = measure_light(chart, Levels(seen, np.zeros(len(seen), dtype=np.bool_)))
+    assert found is not None
+    expected = light(chart.centres_mm)
+    error = found.at(chart.centres_mm) / (expected / expected.mean(axis=0)) - 1
+    assert np.abs(error).max() < (0.04 if few else 0.005)
+    without = replace(chart, references=chart.references[:3])
+    assert measure_light(without, Levels(seen[:3], np.zeros(3, dtype=np.bool_))) is None
