@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from acquisition.chart.model import load_chart
 from acquisition.config import LabSettings
 from acquisition.lights.illuminations import load_illuminations
+from acquisition.monitor.report import write_session_report
+from acquisition.run.patience import TRY_S
+from acquisition.run.pipeline import Taken
 from acquisition.run.planning.dry_run import checked_plan
 from acquisition.run.planning.work import planned_steps, require_same
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.session.folder import Session, session_exists
+from acquisition.session.heartbeat import signs_of_life
 from foundation.console import Ending
-from foundation.errors import InputError
+from foundation.errors import CropError, InputError
 
 
 def run_session(
@@ -48,7 +52,7 @@ def run_session(
     DeviceError, StorageError
         See `acquisition.run.sequencer.take_session`; the session can be taken up again.
     """
-    with ExitStack() as opened:
+    with ExitStack() as at_last, ExitStack() as opened:
         session = opened.enter_context(_taken_up(settings, folder)) if session_exists(folder) else None
         if session is None and retake is not None:
             raise InputError(f"{folder}: nothing was taken yet that could be taken again; leave --retake out")
@@ -66,14 +70,21 @@ def run_session(
             session = opened.enter_context(_begun(settings, folder))
         total = len(session.steps)
         observe(len(session.done_steps()), total)
-        return take_session(
-            session,
-            devices,
-            settings,
-            observe=lambda taken: observe(total - taken.left, total),
-            announce=announce,
-            ending=ending,
-        )
+        # When the screen is dark and the journal at rest.
+        at_last.callback(_report, session)
+        alive = opened.enter_context(signs_of_life(session.journal.beat, session.journal.heartbeat, TRY_S))
+
+        def count(taken: Taken) -> None:
+            alive()
+            observe(total - taken.left, total)
+
+        return take_session(session, devices, settings, observe=count, announce=announce, ending=ending)
+
+
+def _report(session: Session) -> None:
+    """Write the session's report; it is derived, so that a disk that does not take it leaves the run as it ended."""
+    with suppress(CropError):
+        write_session_report(session)
 
 
 def open_session(settings: LabSettings, folder: Path) -> Session:
