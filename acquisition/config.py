@@ -127,7 +127,7 @@ class SequenceSettings(_Settings):
     """Whether the projector is switched off when the session is complete."""
     lamp_if_unfinished: Literal["off", "on"] = "off"
     """What the lamp does when a run ends by itself before the session is complete: it goes out, for nobody may be
-    there, or burns on, so that the next run needs no warm-up. After Ctrl-C it burns on."""
+    there, or burns on, so that the next run needs no warm-up. After Ctrl-C it is left as it is."""
     notify: Annotated[str, AfterValidator(_target_checked), Field(repr=False)] = ""
     """Who is told when a run pauses, goes on and ends: a URL that gets JSON by POST, or a command that gets the same on
     its standard input; empty: nobody. Kept out of messages and `session.toml`, but for the host or the program's

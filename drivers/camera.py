@@ -122,7 +122,7 @@ class Supplies:
     card_free_bytes
         Room on the card where frames go, bytes; on all cards together where there are several.
     saves_to_host
-        Whether frames go to the host and leave nothing on the card.
+        Whether frames go to the host and leave nothing on the card, once the camera is configured.
     """
 
     battery: float | None = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -163,7 +163,14 @@ def _chart_findings(
         why = "the chart was not found"
         return [Finding("chart", "fault", seen.trouble or why, remedy=look_at), *(not_checked(n, why) for n in names)]
     framing, place = figures.placed.framing, figures.placed.place
-    lit = [judge_print(figures.state, chart, place.matched), *judge_evenness(figures.light, chart)]
+    print_found, evenness, coloured = (
+        judge_print(figures.state, chart, place.matched),
+        *judge_evenness(figures.light, chart),
+    )
+    if evenness.grade == "fault" and print_found.grade in ("fault", "remark"):
+        said = f"{print_found.said}; the light is so uneven that it may be an edge of the light"
+        print_found = replace(print_found, said=said)
+    lit = [print_found, evenness, coloured]
     if not seen.usable:
         lit = [not_checked(name, CLIPPED) for name in ("stains", "evenness", "colour evenness")]
     return [

@@ -145,6 +145,9 @@ def measure_print(chart: Chart, cells: Levels, references: Levels, field: Smooth
     deviation[of_colour] = np.where(known, stains.largest_deviation(), np.nan)
     off = np.zeros(len(points), dtype=np.bool_)
     off[of_colour] = stains.stained
+    # A neighbourhood's mean is bounded; how dark a spot is, its cells tell themselves.
+    for colour in np.flatnonzero(stains.stained).tolist():
+        deviation[of_colour[colour]] = stains.deviation_of(colour)
     area = chart.cell_mm[0] * chart.cell_mm[1]
     spots = _spots(points, deviation, off, area, LEAST_CELLS)
     return PrintState(points, deviation, off, spots, False)

@@ -6,7 +6,7 @@ what ended the run    the lamp                               because
 all frames are there  goes out (`sequence.switch_off`)       its hours are counted
 it ended by itself    goes out                               nobody may be there till the morning; the
                       (`sequence.lamp_if_unfinished`)        next run warms it up again
-somebody ended it     burns on                               he is there, and may go on at once
+somebody ended it     is left as it is                       somebody is there, and may go on at once
 ====================  =====================================  =========================================
 """
 
@@ -70,11 +70,10 @@ def lamp_fate(projector: Projector | None, end: RunEnd, sequence: SequenceSettin
     """Let the lamp go out or burn on, and return in a sentence what it does now."""
     if projector is None:
         return f"the projector is not under control: {_BY_HAND}"
-    goes_out = {
-        RunEnd.COMPLETE: sequence.switch_off,
-        RunEnd.UNFINISHED: sequence.lamp_if_unfinished == "off",
-        RunEnd.INTERRUPTED: False,
-    }[end]
+    if end is RunEnd.INTERRUPTED:
+        # Somebody waits for the end: a projector that does not answer would hold it up.
+        return f"it is left as it is, so that the next run needs no warm-up; else {_BY_HAND}"
+    goes_out = sequence.switch_off if end is RunEnd.COMPLETE else sequence.lamp_if_unfinished == "off"
     try:
         power = projector.power()
         if power is not Power.ON and power is not Power.WARMING:

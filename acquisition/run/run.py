@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from acquisition.chart.model import load_chart
 from acquisition.config import LabSettings
 from acquisition.judge.judge import LiveJudge
 from acquisition.lights.illuminations import load_illuminations
+from acquisition.monitor.report import write_session_report
+from acquisition.run.patience import TRY_S
 from acquisition.run.planning.dry_run import checked_plan
 from acquisition.run.planning.work import planned_steps, require_same
 from acquisition.run.rig.opening import open_rig
@@ -17,8 +19,9 @@ from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.run.taking.pipeline import Taken
 from acquisition.run.taking.resuming import check_frames, require_same_devices, tie
 from acquisition.session.folder import Session, session_exists
+from acquisition.session.heartbeat import signs_of_life
 from foundation.console import Ending
-from foundation.errors import InputError
+from foundation.errors import CropError, InputError
 
 
 def run_session(
@@ -63,7 +66,7 @@ def run_session(
     def checking(done: int, total: int) -> None:
         state(f"checking frame {done} of {total}")
 
-    with ExitStack() as opened:
+    with ExitStack() as at_last, ExitStack() as opened:
         session = opened.enter_context(_taken_up(settings, folder)) if session_exists(folder) else None
         if session is None and retake is not None:
             raise InputError(f"{folder}: nothing was taken yet that could be taken again; leave --retake out")
@@ -84,8 +87,12 @@ def run_session(
         first = tie(session)
         total = len(session.steps)
         observe(len(session.done_steps()), total)
+        # When the screen is dark and the journal at rest.
+        at_last.callback(_report, session)
+        alive = opened.enter_context(signs_of_life(session.journal.beat, session.journal.heartbeat, TRY_S))
 
         def count(frame: Taken) -> None:
+            alive()
             taken(frame)
             # A reference may have been put behind the plan.
             total = len(session.steps)
@@ -93,6 +100,12 @@ def run_session(
 
         judge = LiveJudge(settings, session.chart, session.illuminations)
         return take_session(session, devices, settings, judge, count, announce, state, ending, first)
+
+
+def _report(session: Session) -> None:
+    """Write the session's report; it is derived, so that a disk that does not take it leaves the run as it ended."""
+    with suppress(CropError):
+        write_session_report(session)
 
 
 def open_session(settings: LabSettings, folder: Path) -> Session:

@@ -161,7 +161,6 @@ class _Telling:
         self._notices.tell(how, sentence, datetime.now(UTC))
         with suppress(StorageError):
             self._journal.note(self._clock.now(), how, sentence)
-            self._journal.beat("ended", f"{how}: {sentence}", datetime.now(UTC))
 
 
 def _taken(

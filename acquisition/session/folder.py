@@ -25,7 +25,7 @@ from acquisition.session.incoming import IncomingFile, ReceivedFile
 from acquisition.session.journal import JOURNAL_FILE, PATIENCE_S, Journal, time_text
 from acquisition.session.judgement import Judgement
 from acquisition.session.mending.retaking import BAD, lights_text, newest_report, parse_lights
-from acquisition.session.mending.verification import unsound_files
+from acquisition.session.mending.verification import require_frames_folder, unsound_files
 from acquisition.session.plan import SessionStep
 from acquisition.session.records import FrameRecord
 from drivers.camera import CapturedFrame
@@ -400,11 +400,7 @@ class Session:
             raise storage_error(self.frames_folder, error, "clear") from error
 
     def _set_aside_strays(self) -> list[Path]:
-        if not self.frames_folder.is_dir():
-            raise FormatError(
-                f"{self.frames_folder} is missing, where the session's raw files are; restore it from a copy, or begin "
-                "a new session"
-            )
+        require_frames_folder(self.folder)
         counted = {frame.file for frame in self.frames()}
         moved: list[Path] = []
         for path in sorted(self.frames_folder.iterdir()):

@@ -8,14 +8,19 @@ in a simulated lab, whose own time passes otherwise.
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 import subprocess
-from contextlib import suppress
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Literal
+
+from foundation.errors import CropError
 
 RunState = Literal["running", "waiting", "paused", "ended"]
 """What a run does: takes frames, waits for something that comes by itself, waits for somebody, or is over."""
@@ -23,6 +28,10 @@ RunState = Literal["running", "waiting", "paused", "ended"]
 LATE_S = 30.0
 """Seconds after which a sign of life that is due is missing: chosen; clocks of two machines that keep their time over
 a network differ by less than one, and a disk may stall for seconds."""
+
+BEAT_S = 5.0
+"""Seconds between two signs of life of a run that takes frames: each is a write to the disk, and "5 s ago" frightens
+nobody."""
 
 AGAIN = "run the same command again"
 """What helps after a run was killed."""
@@ -107,6 +116,59 @@ class Heartbeat:
         if not self.is_dead(now, alive):
             return self.sentence
         return f"stopped at {self.at.astimezone():%Y-%m-%d %H:%M:%S}, killed or power lost: {AGAIN}"
+
+
+@contextmanager
+def signs_of_life(
+    beat: Callable[[RunState, str, datetime], None], newest: Callable[[], Heartbeat | None], within_s: float
+) -> Generator[Callable[[], None]]:
+    """Say that a run is at work while the block runs, and in the end that it is over, and why.
+
+    Parameters
+    ----------
+    beat
+        `Journal.beat`. A disk that does not take a sign does not end the run: the frames will tell.
+    newest
+        `Journal.heartbeat`.
+    within_s
+        Seconds within which the next sign comes at the latest.
+
+    Yields
+    ------
+    callable
+        To be called after each frame; gives a sign every `BEAT_S`, and at once where the run is said to wait.
+    """
+    last = -math.inf
+
+    def say(state: RunState, sentence: str) -> None:
+        with suppress(CropError):
+            beat(state, sentence, datetime.now(UTC) + timedelta(seconds=within_s))
+
+    def waits() -> bool:
+        with suppress(CropError):
+            told = newest()
+            return told is not None and told.state != "running"
+        return False
+
+    def alive() -> None:
+        nonlocal last
+        if time.monotonic() - last >= BEAT_S or waits():
+            last = time.monotonic()
+            say("running", "frames are taken")
+
+    cause = f"ended by a mistake of the program; {AGAIN}"
+    try:
+        alive()
+        yield alive
+        cause = ""
+    except KeyboardInterrupt:
+        cause = f"interrupted; {AGAIN}"
+        raise
+    except CropError as error:
+        cause = str(error)
+        raise
+    finally:
+        say("ended", cause)
 
 
 def _boot() -> str:

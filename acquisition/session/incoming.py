@@ -48,7 +48,8 @@ class IncomingFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._final = path
-        self._file = whole_file(path, lambda: self._final)
+        # A folder that is gone means a disk that was unmounted: what lies under its name is another one.
+        self._file = whole_file(path, lambda: self._final, make=False)
         self._open = True
         self.stream: BinaryIO = self._file.__enter__()
 

@@ -22,7 +22,7 @@ import sqlite3
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import TypeVar
 from urllib.parse import quote
@@ -199,6 +199,8 @@ def open_for_run(path: Path, patience: LockPatience) -> sqlite3.Connection:
     except (OSError, sqlite3.DatabaseError) as error:
         raise reading_error(path, error) from error
     try:
+        with suppress(OSError):  # Left by a run that was killed while it made a copy.
+            partial_path(path).unlink(missing_ok=True)
         if not _on_network(path):
             connection = _in_write_ahead(path, connection, patience)
         if version < JOURNAL_VERSION:
@@ -419,7 +421,6 @@ def _in_write_ahead(path: Path, connection: sqlite3.Connection, patience: LockPa
         if not is_busy(error):
             raise
         copy = partial_path(path)
-        copy.unlink(missing_ok=True)
         # No other writer may be at work meanwhile.
         patience.insist(lambda: connection.execute("BEGIN IMMEDIATE"))
         with closing(_connect(path, "ro")) as source, closing(_connect(copy, "rwc")) as target:

@@ -261,7 +261,7 @@ class CanonEos:
             except DeviceError as error:
                 if not _curable(error):
                     raise
-                self._drop(error)
+                self._lose(error)
                 # A body that is busy in every session is kept so by its own settings, not by a fault.
                 busy = isinstance(error, OperationDeclined) and error.code == ResponseCode.DEVICE_BUSY
                 late = self._clock.monotonic() >= self._renewable_until
@@ -271,6 +271,16 @@ class CanonEos:
                     raise kind(self._given_up(error, f"the connection was renewed {times} without success")) from error
                 was_busy = busy
                 renewals += 1
+
+    def _lose(self, fault: DeviceError) -> None:
+        """Drop a connection that failed at its work, and keep the first such fault of a call.
+
+        What ails a new connection before it is made follows from the old one's end, and is no first cause.
+        """
+        if self._fault is None:
+            self._fault = fault
+            self._renewable_until = self._clock.monotonic() + self._limits.recovery_s
+        self._drop(fault)
 
     def _given_up(self, last: DeviceError, tried: str) -> str:
         """Return why a call ends, its first cause first, for whatever came of that says less."""
@@ -291,7 +301,7 @@ class CanonEos:
             try:
                 body.release()
             except (LinkError, ProtocolError) as error:
-                self._drop(error)
+                self._lose(error)
             return shot
 
         return self._carry_out(released)
@@ -388,10 +398,7 @@ class CanonEos:
         return body
 
     def _drop(self, fault: DeviceError | None) -> None:
-        """Close the cable, with a reset where the body may still be in the midst of something; note the first fault."""
-        if fault is not None and self._fault is None:
-            self._fault = fault
-            self._renewable_until = self._clock.monotonic() + self._limits.recovery_s
+        """Close the cable, with a reset where the body may still be in the midst of something."""
         transport, self._transport, self._body = self._transport, None, None
         if transport is not None:
             if fault is not None and not isinstance(fault, LinkClosed):

@@ -274,17 +274,19 @@ class FullScreen:
     def _fill_again(self) -> None:
         """Fill the display anew after it was away, switched off or in another mode; it must be as it was."""
         glfw = self._glfw
-        for found, monitor in displays_of(glfw):
+        for found, monitor in self._displays_now():
             if (found.name, found.width, found.height) == (
                 self.display.name,
                 self.display.width,
                 self.display.height,
             ):
                 self.display, self._monitor = found, monitor
-                # As a window it goes where it is put; see `_place`.
-                glfw.set_window_monitor(self._window, None, found.x, found.y, found.width, found.height, glfw.DONT_CARE)
-                self._place(self._window)
-                with contextlib.suppress(DeviceError):
+                place = found.x, found.y, found.width, found.height
+                # A display may go again while this happens.
+                with contextlib.suppress(DeviceError, glfw.GLFWError):
+                    # As a window it goes where it is put; see `_place`.
+                    glfw.set_window_monitor(self._window, None, *place, glfw.DONT_CARE)
+                    self._place(self._window)
                     self._wait_until_full()
                 break
         self._require_full()
@@ -299,11 +301,17 @@ class FullScreen:
 
     def _require_full(self) -> None:
         if not self._is_full():
-            there = "; ".join(str(found) for found, _ in displays_of(self._glfw)) or "none"
+            there = "; ".join(str(found) for found, _ in self._displays_now()) or "none"
             raise DeviceError(
                 f"the window no longer fills display {self.display}; displays now: {there}; check its cable and the "
                 "desktop's display settings, until it is as it was"
             )
+
+    def _displays_now(self) -> list[tuple[Display, Any]]:
+        try:
+            return displays_of(self._glfw)
+        except self._glfw.GLFWError:
+            return []  # they change this very moment
 
     def _require_lit(self) -> None:
         if self._screen is not None and is_dark(self._glfw.get_x11_display()):

@@ -122,12 +122,14 @@ class Gphoto2Camera:
         """
         with self._speaking() as camera:
             power = _text(camera, ("acpower",))
-            target = _text(camera, TARGET)
+            target = first_of(lambda name: _setting(camera, name), TARGET)
+            # What is not set yet, `configure` sets.
+            to_host = target is None or any(label in (target.value, *target.choices) for label in HOST_TARGETS)
             return Supplies(
                 battery_level(_text(camera, ("batterylevel",))),
                 {"On": True, "Off": False}.get(power),
                 _card_free_bytes(camera),
-                not target or target in HOST_TARGETS,
+                to_host,
             )
 
     def expose(self) -> datetime:

@@ -188,6 +188,7 @@ def test_a_projector_that_refuses_in_standby(bench: Bench, camera: str) -> None:
         def switch_on(self) -> None:
             raise DeviceRefused("not now")
 
+    bench.lab.write_text(bench.lab.read_text().replace("[sequence]", "[sequence]\npatience_s = 0"))
     with serve_pjlink(Stubborn(SystemClock()), 0) as server:
         code, said = bench.told(camera + pjlink(server.address[1]))
     assert code == 3

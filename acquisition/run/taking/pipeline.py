@@ -30,7 +30,7 @@ from typing import TypeVar
 from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import await_health, health_fault
-from acquisition.run.patience import TRY_S, Patience, Pause, is_curable
+from acquisition.run.patience import Patience, Pause, is_curable
 from acquisition.run.taking.agenda import REFERENCES, Agenda, step_name
 from acquisition.run.taking.saving import FilledFile, Saved, Saver, download
 from acquisition.session.folder import Session
@@ -54,9 +54,6 @@ later pause is twice the one before."""
 
 LONGEST_PROBE_S = 300.0
 """Between two such tries at most: each leaves a refused file of 25 MB, and an operator can wait for five minutes."""
-
-SIGN_S = 2.0
-"""Between two signs of life at least, seconds of this machine: each is a write that the disk must confirm."""
 
 PROMISE = "ending after this frame; press Ctrl-C again to end at once"
 """What somebody is told who asks a run to end."""
@@ -147,8 +144,6 @@ class Pipeline:
         self._void_ahead: dict[int, str] = {}
         self._pauses: dict[str, Pause] = {}
         self._lasting = ""
-        self._sign_due = 0.0
-        self._frame_s = settings.camera.shutter_s + settings.sequence.settle_s
         self._probing: tuple[Pause, float] | None = None
 
     def run(self) -> None:
@@ -243,7 +238,6 @@ class Pipeline:
         stem = step.stem if kept == 0 else f"{step.stem}_try{kept + 1}"
         number = self._insist(lambda: self._session.journal.begin(step, f"frames/{stem}", lit.shown_at), _DISK)
         self._agenda.begin(step)
-        self._give_sign(step)
         begun = clock.monotonic()
         try:
             self._devices.camera.expose()
@@ -253,14 +247,6 @@ class Pipeline:
             return None
         timings = {"show": lit.show_s, "settle": settling_s, "expose": clock.monotonic() - begun}
         return _Attempt(step, number, stem, clock.now(), self._screen_check(step), timings)
-
-    def _give_sign(self, step: SessionStep) -> None:
-        """Leave a sign of life in the journal, not with each frame."""
-        now = time.monotonic()
-        if now >= self._sign_due:
-            self._sign_due = now + SIGN_S
-            left = counted(len(self._agenda), "frame is", "frames are")
-            self._patience.beat("running", f"takes {step_name(step)}; {left} left", self._frame_s + TRY_S)
 
     def _screen_check(self, step: SessionStep) -> tuple[Check, ...]:
         """Ask the screen whether it still shows the light, before it may change."""

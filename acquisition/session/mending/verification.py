@@ -11,6 +11,7 @@ from pathlib import Path
 
 from acquisition.session.records import AcceptedFile
 from foundation.errors import FormatError, StorageError
+from foundation.files import storage_error
 from foundation.hashing import file_sha256
 from foundation.processors import ordered_map, processor_count
 
@@ -37,11 +38,10 @@ def unsound_files(folder: Path, frames: Sequence[AcceptedFile], observe: Callabl
     StorageError
         A file is there and cannot be read.
     """
-    if not (folder / "frames").is_dir():
-        raise FormatError(
-            f"{folder / 'frames'} is missing, where the session's raw files are; restore it from a copy, or begin a "
-            "new session"
-        )
+    try:
+        require_frames_folder(folder)
+    except OSError as error:
+        raise storage_error(folder / "frames", error) from error
     found: dict[int, str] = {}
     threads = min(processor_count(), MOST_THREADS)
     observe(0, len(frames))
@@ -55,6 +55,23 @@ def unsound_files(folder: Path, frames: Sequence[AcceptedFile], observe: Callabl
         if frame.attempt not in found and newest[frame.step] is not frame:
             found[frame.attempt] = f"taken again since, as {newest[frame.step].file}"
     return found
+
+
+def require_frames_folder(folder: Path) -> None:
+    """Refuse a session whose folder of raw files is missing: all of them would be taken again.
+
+    Raises
+    ------
+    FormatError
+        It is missing.
+    OSError
+        It cannot be looked for.
+    """
+    if not (folder / "frames").is_dir():
+        raise FormatError(
+            f"{folder / 'frames'} is missing, where the session's raw files are; restore it from a copy, or begin a "
+            "new session"
+        )
 
 
 def _fault(folder: Path, frame: AcceptedFile) -> str:

@@ -70,9 +70,12 @@ def test_the_right_side_of_a_limit(check: Check, room: dict[str, Any]) -> None:
 
 
 def test_a_light_that_falls_off_by_80_per_cent(check: Check) -> None:
-    found = of(check(3, projector_falloff=0.8), "evenness")
+    report = check(3, projector_falloff=0.8)
+    found = of(report, "evenness")
     assert found.grade == "fault"
     assert found.value == pytest.approx(0.85, abs=0.07)
+    stains = of(report, "stains")
+    assert stains.grade == "good" or "may be an edge of the light" in stains.said
 
 
 def test_a_room_in_which_white_saturates_at_every_time(check: Check) -> None:
@@ -108,7 +111,8 @@ def test_a_faint_thumb_s_stain_has_place_and_size(check: Check) -> None:
     found = of(check(3, stain_mm=25.0, stain_depth=0.15), "stains")
     (spot,) = found.details["spots"]
     assert spot["size_mm"] == pytest.approx(25, abs=5)
-    assert -0.12 < spot["deviation"] < -0.02
+    # 15 % of blue; cells that the stain covers in part, and codes predicted from stained ones, take some of it away.
+    assert -0.17 < spot["deviation"] < -0.06
 
 
 def test_a_stained_corner_is_no_falloff(check: Check, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

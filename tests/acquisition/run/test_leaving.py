@@ -41,7 +41,8 @@ def test_the_lamp_s_fate_is_decided_and_said(end: RunEnd, settings: SequenceSett
     ((what, sentence),) = said
     assert what == "lamp"
     assert ("was switched off" in sentence) == (power is OFF)
-    assert ("burns on" in sentence) == (power is ON)
+    assert ("burns on" in sentence) == (power is ON and end is not RunEnd.INTERRUPTED)
+    assert ("left as it is" in sentence) == (end is RunEnd.INTERRUPTED)
 
 
 def test_what_ended_a_run_is_known_by_what_it_raised() -> None:
@@ -79,7 +80,7 @@ def test_a_projector_out_of_reach_hides_nothing(end: RunEnd) -> None:
 
     clock = SimulatedClock()
     said = lamp_fate(Gone(clock, power=ON), end, SequenceSettings(), clock)
-    assert "nothing listens" in said
+    assert ("nothing listens" in said) == (end is not RunEnd.INTERRUPTED)
     assert "by hand" in said
     assert lamp_fate(None, end, SequenceSettings(), clock).endswith("by hand")
 

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import math
+import signal
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
+from acquisition.chart.layout import design_chart
+from acquisition.config import LabSettings
+from acquisition.lights.illuminations import Illumination
 from acquisition.run.patience import PAUSE_S, RETRY_S, Patience
+from acquisition.run.rig.opening import open_rig
+from acquisition.session.folder import Session
+from acquisition.session.plan import plan_steps
+from drivers.camera import keep_awake
+from drivers.presenter import WHITE
 from drivers.ptp.session import OperationDeclined
+from drivers.raw.rawfile import read_raw
 from foundation.errors import (
     ConfigurationError,
     CropError,
@@ -254,3 +265,40 @@ def test_two_pauses_have_each_their_time() -> None:
         begun = room.clock.monotonic()
         assert patience.attempt(room.broken(until(begun + 50, DeviceError("covered"))), "the screen") == "done"
     assert room.words == ["retry", "paused", "resumed"] * 3
+
+
+def test_a_full_disk_never_loses_the_frame_in_the_camera(tmp_path: Path) -> None:
+    """The real driver, and a kernel that lets no file grow: the download is repeated when there is space again."""
+    resource = pytest.importorskip("resource")
+    chart, light = design_chart(1), Illumination(0, "uniform", None, WHITE)
+    document = {"rig": "simulated", "chart": "c", "illuminations": "i", "simulated": {"body": "Test"}}
+    settings = LabSettings.model_validate(document)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    said: list[str] = []
+    with (
+        Session.create(tmp_path / "night", settings.to_toml(), chart, [light], plan_steps([light], 25)) as session,
+        open_rig(settings, chart) as devices,
+    ):
+        clock, camera = devices.clock, devices.camera
+        camera.configure(settings.camera.exposure)
+        devices.presenter.show(WHITE)
+        released_at = camera.expose()
+
+        def idle() -> None:
+            keep_awake(camera)
+            if clock.monotonic() > 300:
+                resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+        patience = Patience(clock, 600, lambda what, sentence: said.append(f"{what}: {sentence}"), idle)
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+            received = patience.attempt(lambda: session.receive("0000_white", camera.download), "the disk")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+            signal.signal(signal.SIGXFSZ, handler)
+    assert [sentence.split(":")[0] for sentence in said] == ["retry", "paused", "resumed"]
+    assert "no file may be so large there" in said[1]
+    assert received.captured.released_at == released_at
+    assert read_raw(received.path).counts.size > 0
+    assert [path.name for path in session.frames_folder.iterdir()] == [received.path.name]

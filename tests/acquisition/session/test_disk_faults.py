@@ -53,6 +53,11 @@ class Night:
         with Session.create(self._pristine, "rig", design_chart(1), LIGHTS, plan_steps(LIGHTS, 25)) as session:
             save(session, 0)
 
+    def restore(self) -> None:
+        """Put the session back to its one frame."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        shutil.copytree(self._pristine, self.folder)
+
     def run(self) -> None:
         with Session.open_for_run(self.folder) as session:
             session.set_aside_strays()
@@ -63,8 +68,7 @@ class Night:
         ended = 0
         for number in numbers:
             for at in range(0, 1000, every):
-                shutil.rmtree(self.folder, ignore_errors=True)
-                shutil.copytree(self._pristine, self.folder)
+                self.restore()
                 ran = self._disk.run(self.run, at, number, lasting=lasting)
                 if ran.error is not None:
                     ended += 1
@@ -117,10 +121,20 @@ def test_each_other_fault_of_a_disk(night: Night) -> None:
 
 
 def test_a_journal_that_is_damaged_is_called_so(night: Night) -> None:
-    shutil.copytree(night._pristine, night.folder)  # pyright: ignore[reportPrivateUsage]
+    night.restore()
     path = night.folder / "journal.sqlite"
     data = bytearray(path.read_bytes())
     data[4096:] = bytes(len(data) - 4096)
     path.write_bytes(data)
     with pytest.raises(FormatError, match=r"journal\.sqlite is damaged: .*; restore it from a copy"):
         night.run()
+
+
+def test_a_disk_that_was_unmounted_is_not_written_below(night: Night) -> None:
+    night.restore()
+    with Session.open_for_run(night.folder) as session:
+        # What an unmounted disk leaves: the open journal, and nothing under the name.
+        shutil.rmtree(session.frames_folder)
+        with pytest.raises(StorageError, match="its folder is gone: connect and mount the disk it was on"):
+            session.receive("0001_dark", capture(FRAMES[1]))
+        assert not session.frames_folder.exists()

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from acquisition.chart.layout import design_chart
 from acquisition.lights.illuminations import Illumination, save_illuminations
-from acquisition.session.folder import Session
+from acquisition.session.folder import Session, session_exists
 from acquisition.session.judgement import Judgement
 from acquisition.session.plan import plan_steps
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
-from foundation.errors import FormatError, InputError
+from foundation.errors import FormatError, InputError, StorageError
 
 LIGHTS = tuple(Illumination(number, "uniform", None, Colour(255, number, 0)) for number in range(5))
 NOW = datetime(2026, 1, 1, 9, 30, tzinfo=UTC)
@@ -113,3 +115,32 @@ def test_a_session_without_its_frames(session: Session) -> None:
     session.frames_folder.rmdir()
     with pytest.raises(FormatError, match=r"frames is missing, .*; restore it from a copy"):
         session.set_aside_strays()
+
+
+@pytest.mark.parametrize("call", ["stat", "iterdir", "unlink", "rename"])
+def test_a_disk_that_fails_is_no_traceback(session: Session, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (session.frames_folder / "stray.cr2").write_bytes(b"stray")
+    (session.frames_folder / ".0002_light_000.partial").write_bytes(b"half")
+    real = getattr(Path, call)
+
+    def fail(path: Path, *given: Any, **named: Any) -> Any:
+        if path.is_relative_to(session.frames_folder):
+            raise OSError(errno.EIO, "Input/output error", str(path))
+        return real(path, *given, **named)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, call, fail)
+        with pytest.raises(StorageError, match=r"frames: Input/output error; .*run the same command again"):
+            session.set_aside_strays()
+    assert len(session.set_aside_strays()) == 1, "when the disk is back the same goes through"
+
+
+def test_a_journal_that_cannot_be_looked_for_is_not_missing(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(path: Path, **_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error", str(path))
+
+    monkeypatch.setattr(Path, "stat", fail)
+    with pytest.raises(StorageError, match=r"cannot read .*journal\.sqlite: Input/output error; the disk fails"):
+        session_exists(session.folder)
+    with pytest.raises(StorageError, match=r"cannot read .*journal\.sqlite: Input/output error; the disk fails"):
+        Session.open(session.folder)

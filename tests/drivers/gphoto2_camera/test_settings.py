@@ -290,9 +290,12 @@ def test_a_fault_of_the_download_says_that_the_frame_is_lost(fake: Fake) -> None
 def test_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     nikon = Fake(monkeypatch, "Nikon D7100")
     assert isinstance(nikon.camera, ReportsSupplies)
-    assert nikon.camera.supplies() == Supplies(0.8, False, 3_072_000_000, saves_to_host=False)
-    nikon.camera.configure(SETTINGS)
-    assert nikon.camera.supplies() == Supplies(0.8, False, 3_072_000_000, saves_to_host=True)
+    assert nikon.body.tree["capturetarget"].value == "Memory card"
+    for _ in range(2):
+        assert nikon.camera.supplies() == Supplies(0.8, False, 3_072_000_000, saves_to_host=True)
+        nikon.camera.configure(SETTINGS)
+    nikon.body.tree["capturetarget"] = BodySetting("capturetarget", "Memory card", ("Memory card",))
+    assert not nikon.camera.supplies().saves_to_host
     assert Fake(monkeypatch, "Sony A6000").camera.supplies() == Supplies(None, None, None, saves_to_host=True)
 
 

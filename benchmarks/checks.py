@@ -1,0 +1,103 @@
+"""What `acquire check` says of simulated rooms: verdicts on both sides of their limits, false alarms in good rooms.
+
+    python -m benchmarks.checks              # charts of 1 to 3 bits before a small sensor: two minutes
+    python -m benchmarks.checks --full       # and the full chart before an EOS 550D: three minutes more
+
+Good rooms are the default one with other seeds: other paper, waves, noise and photosites.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from acquisition.chart.layout import design_chart
+from acquisition.check.check import check_lab
+from acquisition.check.findings import CheckReport
+from acquisition.config import load_lab
+from acquisition.lights.illuminations import plan_illuminations, save_illuminations
+
+SEEDS = range(30)
+"""Of the good rooms."""
+
+ROOMS: tuple[tuple[str, int, dict[str, Any]], ...] = (
+    *(("exposure", 2, {"white_level_share": share}) for share in (0.0002, 0.02, 0.35, 0.65, 0.85, 0.93, 4.0, 40.0)),
+    *(("room light", 2, {"ambient": share}) for share in (0.002, 0.01, 0.04)),
+    *(("room light", 2, {"black_leak": share}) for share in (0.002, 0.01, 0.03)),
+    *(("evenness", 3, {"projector_falloff": share}) for share in (0.3, 0.6, 0.8)),
+    *(("evenness", 3, {"vignetting": share}) for share in (0.4, 0.7)),
+    *(("sharpness", 2, {"blur_px": blur}) for blur in (0.5, 0.8, 1.1)),
+    *(("turn", 2, {"roll_deg": angle, "fill": 0.6}) for angle in (2.0, 8.0, 25.0, 90.0, 180.0)),
+    *(("tilt", 2, {"pan_deg": angle, "fill": 0.7}) for angle in (5.0, 14.0, 30.0)),
+    *(("stains", bits, {"stain_mm": 60.0}) for bits in (1, 2, 3)),
+    *(("stains", 3, {"stain_mm": 25.0, "stain_depth": depth}) for depth in (0.02, 0.1, 0.5)),
+    *(("stains", 3, {"fold_mm": height}) for height in (1.0, 3.0, 5.0)),
+    *(("flicker", 2, {"wheel_hz": 60.0, "shutter_s": time}) for time in (1 / 60, 0.1, 0.5)),
+    *(("hot photosites", 2, {"hot_per_million": rate}) for rate in (20.0, 300.0)),
+)
+"""The verdict that is looked at, bits of the chart, and what differs from the default room (`shutter_s` of the camera,
+with light to suit it)."""
+
+FULL: tuple[tuple[str, int, dict[str, Any]], ...] = (
+    *(
+        ("stains", 5, {"stain_mm": size, "stain_depth": depth})
+        for size, depth in ((60.0, 0.5), (25.0, 0.1), (8.0, 0.1))
+    ),
+    ("stains", 5, {"fold_mm": 5.0}),
+    ("evenness", 5, {"vignetting": 0.4}),
+)
+"""The same for the full chart on A0."""
+
+
+def check(folder: Path, bits: int, room: dict[str, Any], seed: int = 1) -> CheckReport:
+    """Return what a check says of a room; full charts hang before an EOS 550D."""
+    chart = folder / f"chart{bits}.json"
+    if not chart.exists():
+        design_chart(bits).save(chart)
+        save_illuminations(plan_illuminations(1, ()), folder / "illuminations.csv")
+    room = dict(room)
+    shutter_s = room.pop("shutter_s", 0.5)
+    if shutter_s != 0.5:
+        room["white_level_share"] = 0.7 * 0.5 / shutter_s
+    lab = folder / "LAB.toml"
+    lab.write_text(
+        f'rig = "simulated"\nchart = "{chart.name}"\nilluminations = "illuminations.csv"\n'
+        f"[camera]\nshutter_s = {shutter_s:.8f}\n"
+        f'[simulated]\nbody = "{"EOS 550D" if bits == 5 else "Test"}"\nseed = {seed}\n[simulated.room]\n'
+        + "".join(f"{key} = {json.dumps(value)}\n" for key, value in room.items())
+    )
+    return check_lab(load_lab(lab))
+
+
+def main() -> None:
+    """Print the table of rooms, then the false alarms."""
+    full = "--full" in sys.argv[1:]
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        print(f"{'verdict':<16}{'bits':<6}{'room':<52}{'grade':<13}said")
+        for name, bits, room in (*ROOMS, *(FULL if full else ())):
+            report = check(folder, bits, room)
+            found = next(each for each in report.findings if each.name == name)
+            others = [each.name for each in report.of("fault") if each.name != name]
+            told = ", ".join(f"{key} {value:g}" for key, value in room.items())
+            more = f" [also at fault: {', '.join(others)}]" if others else ""
+            print(f"{name:<16}{bits:<6}{told:<52}{found.grade:<13}{found.said[:110]}{more}", flush=True)
+        alarms = 0
+        for bits in (1, 2, 3):
+            for seed in SEEDS:
+                report = check(folder, bits, {}, seed)
+                for each in (*report.of("fault"), *report.of("remark")):
+                    alarms += 1
+                    print(f"false alarm: {bits} bits, seed {seed}: {each.name}: {each.sentence()}")
+        print(f"false alarms in {3 * len(SEEDS)} good rooms: {alarms}")
+        if full:
+            reports = [check(folder, 5, {}, seed) for seed in range(3)]
+            bad = [each for report in reports for each in (*report.of("fault"), *report.of("remark"))]
+            print(f"false alarms in 3 good rooms with the full chart: {len(bad)}")
+
+
+if __name__ == "__main__":
+    main()
