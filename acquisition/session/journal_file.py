@@ -28,7 +28,7 @@ from typing import TypeVar
 from urllib.parse import quote
 
 from foundation.errors import FormatError, InputError, StorageError
-from foundation.files import partial_path, storage_error, sync_folder
+from foundation.files import disk_remedy_of, partial_path, storage_error, sync_folder
 from foundation.files import reading_error as file_reading_error
 
 _T = TypeVar("_T")
@@ -235,8 +235,10 @@ def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatE
     if is_busy(error):
         return FormatError(f"cannot read {path}: {error}; see that no other program holds it")
     code = _primary_code(error)
-    failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and os.access(path, os.R_OK))
     fault = _disk_fault(path)
+    # Where permissions are in the way, the disk is not.
+    openable = os.access(path, os.R_OK) or (fault is not None and disk_remedy_of(fault) is not None)
+    failed = code == sqlite3.SQLITE_IOERR or (code == sqlite3.SQLITE_CANTOPEN and openable)
     if fault is not None and (failed or fault.errno not in _READABLE_FAULTS):
         return file_reading_error(path, fault, "check the permissions of its folder")
     if failed or (_is_damage(error) and _is_sound(path)):
