@@ -166,9 +166,10 @@ def camera(
     real time: a window in front lights its place, for its share of the exposure. With --watch-projector the projector's
     power, mute, freeze and input count, too. So `acquire` can be rehearsed as in a lab (docs/how-to/rehearsal.md).
 
-    Writes no file. Prints the address it listens on, and what each exposure of a watched screen saw; serves until
-    interrupted (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there is no such model, chart, room or
-    screen, or not exactly one cable, 3 when the port is taken or the screen cannot be reached.
+    Reads CHART where --chart names one; writes no file. Prints the address it listens on, and what each exposure of a
+    watched screen saw; serves until interrupted (Ctrl-C), which is its proper end: exit code 0. Exit code 2 when there
+    is no such model, chart, room or screen, or not exactly one cable, 3 when the port is taken or the screen cannot be
+    reached.
 
     With --port, any software that speaks PTP/IP can use it, for instance (both connections go to one port):
 
