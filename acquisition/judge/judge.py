@@ -11,7 +11,7 @@ value (`acquisition.judge.knowledge`), which each frame replaces.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -28,7 +28,7 @@ from acquisition.judge.basis import Light
 from acquisition.judge.evenness import judge_evenness
 from acquisition.judge.exposure import Exposure, disagreement, refusal
 from acquisition.judge.frame import Frame
-from acquisition.judge.knowledge import Found, Knowledge, codes_of, primary_of
+from acquisition.judge.knowledge import Found, Knowledge, Leaning, codes_of, primary_of
 from acquisition.judge.lights import judge_light
 from acquisition.judge.measuring import Measured, measure
 from acquisition.judge.references import judge_dark, judge_first_primary, judge_white
@@ -66,6 +66,7 @@ class _Looked:
     off: npt.NDArray[np.bool_] | None = None
     brightness: float = float("nan")
     stepped: bool = False
+    leaning: Leaning = field(default_factory=Leaning)
 
 
 class LiveJudge:
@@ -117,7 +118,13 @@ class LiveJudge:
         checks = _named_once(looked.checks)
         cause = next((check for check in checks if check.reason), None)
         found = Found(
-            looked.frame, looked.light, cause is None, cause.name if cause else "", looked.brightness, looked.stepped
+            looked.frame,
+            looked.light,
+            cause is None,
+            cause.name if cause else "",
+            looked.brightness,
+            looked.stepped,
+            looked.leaning,
         )
         self._known = known.after(step, found)
         if cause is None:
@@ -209,7 +216,7 @@ def _look_at_light(
     checks += [*evenness.checks, *verdict.checks]
     if step.kind == "white" and known.modelled:
         checks.append(Check("additivity", round(100 * known.model.overlap, 2), None, None, "%"))
-    return _Looked(frame, tuple(checks), light, evenness.off, verdict.brightness, verdict.stepped)
+    return _Looked(frame, tuple(checks), light, evenness.off, verdict.brightness, verdict.stepped, verdict.leaning)
 
 
 def _judge_file(

@@ -9,6 +9,7 @@ Rules that hold inside:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,6 +25,9 @@ from acquisition.session.plan import SessionStep
 RECENT = 6
 """Frames whose noise is compared with the next one's: a camera's memory card hands out none older."""
 
+LEANING = 3
+"""Frames whose small deviations are taken together; more would take a drift that is followed for a step."""
+
 _Array = npt.NDArray[np.float64]
 
 
@@ -34,6 +38,34 @@ class Seen:
     codes: Codes
     measured: Measured
     amounts: _Array | None
+
+
+@dataclass(frozen=True)
+class Leaning:
+    """By how much lights were off that were accepted: deviations too small for one frame show in two or three.
+
+    Attributes
+    ----------
+    lamp, added
+        Level of the lamp over the one expected (logarithm), and neutral light added (of white), of the newest frame
+        first, each with its standard deviation; at most `LEANING` frames.
+    """
+
+    lamp: tuple[tuple[float, float], ...] = ()
+    added: tuple[tuple[float, float], ...] = ()
+
+    def then(self, newer: Leaning) -> Leaning:
+        """Return both, the newer first."""
+        return Leaning((*newer.lamp, *self.lamp)[:LEANING], (*newer.added, *self.added)[:LEANING])
+
+
+def combined(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Return the weighted mean of values with standard deviations, and its own; (0, inf) of none."""
+    weights = [sd**-2 for _, sd in values]
+    total = sum(weights)
+    if not total:
+        return 0.0, float("inf")
+    return sum(value * weight for (value, _), weight in zip(values, weights, strict=True)) / total, total**-0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +86,8 @@ class Found:
         Level of the lamp over the one expected (logarithm); NaN where that is not known.
     stepped
         Whether it was accepted at another level of the lamp than expected.
+    leaning
+        How its light was off, however little.
     """
 
     frame: Frame
@@ -62,6 +96,7 @@ class Found:
     cause: str = ""
     brightness: float = float("nan")
     stepped: bool = False
+    leaning: Leaning = field(default_factory=Leaning)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +125,8 @@ class Knowledge:
         Names of checks that some accepted frame since the last good reference was too dark for.
     refused
         Cause, and number, of the refusals in a row.
+    leaning
+        By how much the last lights were off.
     candidate
         Level of the lamp (logarithm) and place of the chart (px) of the frame refused last; NaN where it was not that.
     rested
@@ -112,6 +149,7 @@ class Knowledge:
     digests: frozenset[bytes] = frozenset()
     untold: frozenset[str] = frozenset()
     refused: tuple[str, int] = ("", 0)
+    leaning: Leaning = field(default_factory=Leaning)
     candidate: tuple[float, float, float] = (float("nan"), float("nan"), float("nan"))
     rested: bool = False
     moved_on: bool = False
@@ -143,7 +181,9 @@ class Knowledge:
             return replace(known, refused=(found.cause, count), candidate=(lamp, x, y))
         known = replace(known, refused=("", 0), candidate=(float("nan"),) * 3, first=self.first or frame.measured)
         if step.kind != "dark":
-            known = replace(known, rested=False)
+            # After a step of the lamp nothing before it counts any more.
+            leaning = Leaning() if found.stepped or known.rested else known.leaning.then(found.leaning)
+            known = replace(known, rested=False, leaning=leaning)
         if not np.isnan(frame.moved_px).any():
             known = replace(known, moved_px=frame.moved_px)
         if frame.anchor is not None:

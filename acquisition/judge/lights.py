@@ -8,14 +8,14 @@ could be: the light of the frame before, another one of the plan, the ordered on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
 from acquisition.judge.basis import Light
-from acquisition.judge.knowledge import Knowledge, Seen, codes_of
+from acquisition.judge.knowledge import Knowledge, Leaning, Seen, codes_of, combined
 from acquisition.judge.response import Codes, Fit, ProjectorModel
 from acquisition.session.judgement import Check
 from acquisition.session.plan import SessionStep
@@ -33,11 +33,12 @@ _Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LightVerdict:
-    """What is said of a light: the checks, the lamp's level over the one expected, whether it is a step lived with."""
+    """What is said of a light: the checks, the lamp's level over the one expected, and what is kept of it."""
 
     checks: tuple[Check, ...]
     brightness: float = float("nan")
     stepped: bool = False
+    leaning: Leaning = field(default_factory=Leaning)
 
 
 def judge_light(
@@ -78,6 +79,10 @@ def judge_light(
         stepped = abs(fit.brightness) <= limits.LAMP_FOLLOWED and abs(fit.brightness - level) <= room / 2
         lamp = "" if stepped else _brightness_reason(fit.brightness, light.amounts)
     percent = 100 * float(np.expm1(fit.brightness))
+    leaning = Leaning(((fit.brightness, fit.brightness_sd),), (_added(model, light, codes),))
+    if not reason and not lamp and not stepped and not known.rested:
+        lamp, added = _crept(known.leaning.then(leaning), light, drift_percent / 100)
+        reason = _ambient_reason(added) if added else ""
     ambient = (Check("ambient", round(100 * added, 2), None, None, "%", reason),) if added else ()
     # Where another cause changes the light, its brightness is none of the lamp's.
     checks = (
@@ -85,7 +90,19 @@ def judge_light(
         Check("light", round(fit.angle_deg, 3), None, round(limit, 3), "°", "" if added else reason),
         Check("lamp", round(percent, 2), round(-100 * room, 2), round(100 * room, 2), "%", lamp),
     )
-    return LightVerdict(checks, fit.brightness, stepped)
+    return LightVerdict(checks, fit.brightness, stepped, leaning)
+
+
+def _crept(leaning: Leaning, light: Light, drift: float) -> tuple[str, float]:
+    """Return the reason against the lamp, or how much light is added, that the last lights together show."""
+    for count in range(2, len(leaning.lamp) + 1):
+        added, sd = combined(leaning.added[:count])
+        if added > max(limits.ADDED_LEAST, limits.BRIGHTNESS_SIGMAS * sd):
+            return "", added
+        brightness, sd = combined(leaning.lamp[:count])
+        if abs(brightness) > max(drift, limits.BRIGHTNESS_SIGMAS * sd):
+            return _brightness_reason(brightness, light.amounts), 0.0
+    return "", 0.0
 
 
 def same_light(one: _Array, other: _Array, scatter: float) -> float:
@@ -120,6 +137,9 @@ def _cause(
         if ambient is not None and ambient[1] < limits.LIGHT_SIGMAS**2:
             return _ambient_reason(ambient[0]), ambient[0]
         other = _other(model, light, codes, plan, squared)
+        coloured = 0.0 if other else _coloured(model, light, codes)
+        if coloured:
+            return _ambient_reason(coloured), coloured
         return other or _wrong_reason(model, light, codes), 0.0
     if fit.brightness > room and ambient is not None and ambient[1] + 9 < fit.distance**2:
         return _ambient_reason(ambient[0]), ambient[0]
@@ -171,6 +191,15 @@ def _near(model: ProjectorModel, amounts: _Array, plan: Sequence[Codes], most: i
     return [plan[k] for k in np.argsort(off, kind="stable")[:most].tolist()]
 
 
+def _added(model: ProjectorModel, light: Light, codes: Codes) -> tuple[float, float]:
+    """Return how much neutral light, of white, is added to the one ordered, and its standard deviation."""
+    expected, neutral = model.predict(codes), np.ones(3)
+    h = expected.amounts
+    weight = np.linalg.inv(expected.with_lamp + light.covariance + model.brightness_sd**2 * np.outer(h, h))
+    power = float(neutral @ weight @ neutral)
+    return float(neutral @ weight @ (light.amounts - h)) / power, power**-0.5
+
+
 def _ambient(model: ProjectorModel, light: Light, codes: Codes) -> tuple[float, float] | None:
     """Return how much neutral light, of white, added to the one ordered explains it, and the squared distance left."""
     expected = model.predict(codes)
@@ -185,6 +214,15 @@ def _ambient(model: ProjectorModel, light: Light, codes: Codes) -> tuple[float, 
     if added <= 4 * power**-0.5 or added < 0.002:
         return None
     return added, float(off @ weight @ off)
+
+
+def _coloured(model: ProjectorModel, light: Light, codes: Codes) -> float:
+    """Return how much light of any colour, of white, is added to the one ordered; 0 where it is not just more light."""
+    expected = model.predict(codes)
+    off = light.amounts - expected.amounts
+    sd = np.sqrt(np.diag(expected.with_lamp) + (model.brightness_sd * expected.amounts) ** 2)
+    more = float(np.mean(off))
+    return more if (off > -3 * sd).all() and limits.ADDED_LEAST < more < limits.ADDED_MOST else 0.0
 
 
 def _ambient_reason(added: float) -> str:

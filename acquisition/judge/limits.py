@@ -58,6 +58,13 @@ photosites' own differences are large; 0.3 is a correlation of 0.9, 0 the same f
 LEAST_NOISE: Final = 0.4
 """Standard deviation of a photosite, counts, below which noise cannot tell a repeated frame: rounding remains."""
 
+ADDED_LEAST: Final = 0.004
+"""Light added to several frames, of white, that is called ambient: build-lut warns of half as much in dark frames,
+which show less of it."""
+
+ADDED_MOST: Final = 0.1
+"""The most that a room's light is taken to add; more is another picture."""
+
 LAMP_FOLLOWED: Final = 0.055
 """Largest step of the lamp that is lived with when the frame is repeated and shows it again (logarithm, 5 %): each
 light has its own ground truth, so that brightness harms none; a larger step is a lamp that fails."""
