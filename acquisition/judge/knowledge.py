@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.judge import limits
 from acquisition.judge.anchor import Anchor
 from acquisition.judge.basis import Basis, Light
 from acquisition.judge.frame import Frame
@@ -116,7 +117,7 @@ class Knowledge:
     basis, model
         How a frame is a sum of primaries, and which amounts codes give.
     moved_px
-        (2,) where the chart lay last, from its place in the anchor; NaN if not known.
+        (2,) where the chart lies at rest, from its place in the anchor: (0, 0), or where a bump has left it.
     recent
         The last frames, the newest last.
     digests
@@ -184,7 +185,8 @@ class Knowledge:
             # After a step of the lamp nothing before it counts any more.
             leaning = Leaning() if found.stepped or known.rested else known.leaning.then(found.leaning)
             known = replace(known, rested=False, leaning=leaning)
-        if not np.isnan(frame.moved_px).any():
+        steady = float(np.hypot(*(frame.moved_px - np.array(self.candidate[1:])))) <= limits.STEADY_PX
+        if not np.isnan(frame.moved_px).any() and (self.moved_px is None or self.rested or steady):
             known = replace(known, moved_px=frame.moved_px)
         if frame.anchor is not None:
             known = known._anchored(frame.anchor)
