@@ -308,7 +308,7 @@ def monitor(
                 "is sent is not encrypted; use it in your own network only",
                 file=sys.stderr,
             )
-            if sys.stdout.isatty():
+            if sys.stdout.isatty() and "utf" in sys.stdout.encoding.lower():
                 from acquisition.monitor.qr import qr_text
 
                 print(qr_text(addresses[0]), flush=True)

@@ -25,7 +25,7 @@ from typing import BinaryIO, TypeVar
 from drivers.camera import CameraIdentity, CapturedFrame, ExposureSettings, Supplies
 from drivers.canon.body import EosBody
 from drivers.canon.state import WaitingObject, plan, shutter_speeds
-from drivers.ptp.codes import ResponseCode
+from drivers.ptp.codes import ObjectFormat, ResponseCode
 from drivers.ptp.session import PASSING, OperationDeclined
 from drivers.ptp.transport import Transport
 from foundation.clock import Clock, SystemClock
@@ -50,6 +50,7 @@ _STUCK = (
     ResponseCode.TRANSACTION_CANCELLED,
 )
 """Responses that a new session may cure."""
+_SUFFIXES: dict[int, str] = {ObjectFormat.CRW: ".CRW", ObjectFormat.CR2: ".CR2", ObjectFormat.CR3: ".CR3"}
 _REMEDY = (
     "check the cable and the battery, switch the camera off and on, and end other programs that use it (photo "
     "importers of the desktop do so by themselves); then run again"
@@ -412,5 +413,7 @@ def _curable(error: DeviceError) -> bool:
 
 
 def _file_name(frame: WaitingObject) -> str:
-    """Return the camera's name for a file, with nothing in it that a file name cannot hold."""
-    return re.sub(r"[^A-Za-z0-9._-]", "_", frame.name) or f"{frame.handle:08X}"
+    """Return the camera's name for a file, with nothing in it that a file name cannot hold, and a suffix."""
+    name = re.sub(r"[^A-Za-z0-9._-]", "_", frame.name).strip(".") or f"{frame.handle:08X}"
+    # Some bodies announce a file without its name, or without the suffix, but with its format.
+    return name if "." in name else name + _SUFFIXES.get(frame.format, "")

@@ -127,6 +127,24 @@ class LightCrafter:
             self._drop()
             raise
 
+    def verify(self, colour: Colour) -> None:
+        """Return if the controller generates exactly `colour` now; see `drivers.presenter.ReadsBack`.
+
+        Raises
+        ------
+        DeviceError
+            It generates another, does something else, or cannot be asked.
+        """
+        if not self._open or self._reports is None:
+            raise DeviceError("the LightCrafter was closed, or its cable was lost; show the colour again")
+        try:
+            fault = self._fault(colour)
+        except (LinkError, ProtocolError):
+            self._drop()
+            raise
+        if fault:
+            raise DeviceError(f"the LightCrafter shows {fault}; close other control programs")
+
     def close(self) -> None:
         """Leave the picture black and release the cable; a second call does nothing."""
         if not self._open:
@@ -140,9 +158,7 @@ class LightCrafter:
     def _confirm(self, colour: Colour) -> None:
         deadline = self._clock.monotonic() + SWITCHING_S
         while True:
-            shown = parse_colour(self._read(LightCrafterCommand.PATTERN_COLOUR))
-            expected = parse_colour(encode_colour(colour))
-            reason = f"colour {shown} in place of {expected} of 1023" if shown != expected else self._unsettled()
+            reason = self._fault(colour)
             if not reason:
                 return
             if self._clock.monotonic() > deadline:
@@ -150,6 +166,12 @@ class LightCrafter:
                     f"the LightCrafter confirms {reason}; close other control programs, then switch it off and on"
                 )
             self._clock.sleep(_LOOK_AGAIN_S)
+
+    def _fault(self, colour: Colour) -> str:
+        """Return what the controller does in place of showing a colour, empty where it shows it."""
+        shown = parse_colour(self._read(LightCrafterCommand.PATTERN_COLOUR))
+        expected = parse_colour(encode_colour(colour))
+        return f"colour {shown} in place of {expected} of 1023" if shown != expected else self._unsettled()
 
     def _unsettled(self) -> str:
         for command, value, mask in _SETTLED:

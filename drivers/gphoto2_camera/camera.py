@@ -24,7 +24,7 @@ from drivers.gphoto2_camera.settings import (
     HOST_TARGETS,
     SHUTTER,
     TARGET,
-    Setting,
+    BodySetting,
     battery_level,
     first_of,
     is_no_raw_file,
@@ -319,7 +319,7 @@ def _text(camera: gphoto2.Camera, names: Iterable[str]) -> str:
     return ""
 
 
-def _setting(camera: gphoto2.Camera, name: str) -> Setting | None:
+def _setting(camera: gphoto2.Camera, name: str) -> BodySetting | None:
     """Return a setting as the body shows it, None where it has none of that name."""
     gp = library()
     try:
@@ -336,7 +336,7 @@ def _setting(camera: gphoto2.Camera, name: str) -> Setting | None:
     elif kind == gp.GP_WIDGET_RANGE:
         least, greatest, _ = widget.get_range()
         bounds = least, greatest
-    return Setting(name, _shown(widget.get_value()), choices, bounds, bool(widget.get_readonly()))
+    return BodySetting(name, _shown(widget.get_value()), choices, bounds, bool(widget.get_readonly()))
 
 
 def _shown(value: object) -> str:

@@ -67,7 +67,7 @@ _BATTERY_WORDS = {"low": 0.0, "empty": 0.0, "full": 1.0}
 
 
 @dataclass(frozen=True)
-class Setting:
+class BodySetting:
     """A setting as a body shows it now.
 
     Attributes
@@ -98,11 +98,11 @@ class Setting:
         return listed or f"nothing (it stands at {self.value or 'nothing'})"
 
 
-Body = Callable[[str], Setting | None]
+Body = Callable[[str], BodySetting | None]
 """Gives a body's setting of a name, None where it has none."""
 
 
-def first_of(body: Body, names: Iterable[str]) -> Setting | None:
+def first_of(body: Body, names: Iterable[str]) -> BodySetting | None:
     """Return the first of some settings that a body has; of several, one that has something to choose from."""
     found = [setting for name in names if (setting := body(name)) is not None]
     return next((setting for setting in found if setting.choices or setting.bounds), found[0] if found else None)
@@ -158,7 +158,7 @@ def plan(body: Body, settings: ExposureSettings) -> dict[str, str]:
     return wanted
 
 
-def label_of(setting: Setting, wanted: float) -> str | None:
+def label_of(setting: BodySetting, wanted: float) -> str | None:
     """Return the label that sets a setting to a number, None where none comes near enough."""
     if setting.fixed:
         return setting.value if is_same(setting.value, f"{wanted:.9g}", TOLERANCE) else None
@@ -209,7 +209,7 @@ def is_no_raw_file(name: str) -> bool:
     return name.lower().endswith(_NOT_RAW_SUFFIXES)
 
 
-def _choose(setting: Setting | None, labels: tuple[str, ...], wanted: dict[str, str], refused: list[str]) -> None:
+def _choose(setting: BodySetting | None, labels: tuple[str, ...], wanted: dict[str, str], refused: list[str]) -> None:
     """Note which of some labels a setting is to have; a body that has it already need not offer it."""
     if setting is None:
         return

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from drivers.presenter import BLACK, WHITE, Colour, Presenter
+from drivers.presenter import BLACK, WHITE, Colour, Presenter, ReadsBack
 from foundation.errors import DeviceError
 
 RAMPS = tuple(
@@ -43,6 +43,20 @@ class PresenterContract:
         for _ in range(2):
             bench.presenter.show(Colour(200, 100, 50))
             assert bench.seen() == Colour(200, 100, 50)
+
+    def test_reads_back_what_it_shows_where_it_can(self, bench: Bench) -> None:
+        if not isinstance(bench.presenter, ReadsBack):
+            pytest.skip("it cannot read back")
+        for colour in (Colour(1, 2, 3), WHITE, BLACK):
+            bench.presenter.show(colour)
+            for _ in range(2):
+                bench.presenter.verify(colour)
+            with pytest.raises(DeviceError, match="in place of"):
+                bench.presenter.verify(Colour(1, 2, 4))
+            assert bench.seen() == colour, "it only looks"
+        bench.presenter.close()
+        with pytest.raises(DeviceError, match="closed"):
+            bench.presenter.verify(BLACK)
 
     def test_is_black_when_closed_and_stays_closed(self, bench: Bench) -> None:
         bench.presenter.show(WHITE)

@@ -338,14 +338,17 @@ function drawEvents() {
 
 async function poll() {
   try {
-    const answer = await fetch(`state.json?since=${encodeURIComponent(model.cursor)}`, { cache: "no-store", signal: AbortSignal.timeout(ANSWER_LIMIT_MS) });
+    const limit = new AbortController();
+    const timer = setTimeout(() => limit.abort(), ANSWER_LIMIT_MS);
+    const asked = fetch(`state.json?since=${encodeURIComponent(model.cursor)}`, { cache: "no-store", signal: limit.signal });
+    const answer = await asked.finally(() => clearTimeout(timer));
     if (!answer.ok) throw new Error(`answered ${answer.status}`);
     answeredAt = Date.now();
     clockOffset = Date.parse(answer.headers.get("Date")) + 500 - answeredAt;
     if (answer.status !== 204) take(await answer.json());
   } catch (error) {
     // Said by the page once it has lasted (drawClock); a fault of the page itself belongs in the console.
-    if (!["TypeError", "TimeoutError", "AbortError"].includes(error.name) && !String(error.message).startsWith("answered")) console.error(error);
+    if (!["TypeError", "AbortError"].includes(error.name) && !String(error.message).startsWith("answered")) console.error(error);
   }
   drawClock();
   waiting = setTimeout(poll, document.hidden ? POLL_HIDDEN_MS : POLL_MS);
@@ -396,6 +399,8 @@ function begin() {
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.altKey || event.metaKey) return;
     const frames = inOrder();
+    // Home and End scroll, but where the focus is on plots or planes.
+    if (["Home", "End"].includes(event.key) && !document.activeElement.closest("#planned, #seen, #series")) return;
     const acts = { ArrowLeft: () => stride(-1), ArrowRight: () => stride(1), Home: () => frames.length && choose(frames[0].id, frames), End: () => choose(null), Escape: () => choose(null) };
     if (!acts[event.key]) return;
     acts[event.key]();

@@ -16,7 +16,7 @@ from acquisition.lights.illuminations import plan_illuminations
 from acquisition.monitor.report import save_report
 from acquisition.monitor.server import MonitorServer, open_monitor
 from tests.acquisition.monitor.browser import Tab, browser_tab, needs_chromium
-from tests.acquisition.monitor.made_up import MadeUpRun
+from tests.acquisition.monitor.made_up import LIGHTS, MadeUpRun
 from tests.acquisition.monitor.page_checks import NAMELESS, OUTSIDE, POOR_CONTRAST, TOO_WIDE
 
 pytestmark = needs_chromium
@@ -69,12 +69,14 @@ def run(tmp_path: Path) -> Iterator[MadeUpRun]:
 
 
 @contextmanager
-def shown(tab: Tab, folder: Path, *, width: int = 1280, dark: bool = False) -> Generator[MonitorServer]:
-    with open_monitor(folder, 0) as server:
+def shown(
+    tab: Tab, folder: Path, *, width: int = 1280, dark: bool = False, host: str = "127.0.0.1"
+) -> Generator[MonitorServer]:
+    with open_monitor(folder, 0, host) as server:
         thread = threading.Thread(target=lambda: server.serve_forever(0.01))
         thread.start()
         try:
-            tab.open(f"http://127.0.0.1:{server.port}/", width=width, dark=dark)
+            tab.open(f"http://127.0.0.1:{server.port}/{server.path}", width=width, dark=dark)
             tab.wait_for("document.readyState === 'complete' && typeof model !== 'undefined' && model.cursor !== ''")
             yield server
         finally:
@@ -181,6 +183,9 @@ def test_keys_go_from_frame_to_frame_and_back_to_the_newest(tab: Tab, run: MadeU
         tab.press("ArrowLeft")
         assert number() == newest - 1
         tab.press("Home")
+        assert number() == newest - 1
+        tab.value("document.getElementById('series').focus()")
+        tab.press("Home")
         assert number() == 1
         tab.press("ArrowRight")
         assert number() == 2
@@ -227,6 +232,28 @@ def test_a_page_that_gets_no_answer_says_that_it_is_old(tab: Tab, run: MadeUpRun
         assert tab.value("document.getElementById('offline').hidden")
         tab.value("answeredAt -= 60000; drawClock()")
         assert "has not answered since" in tab.value("document.getElementById('offline').innerText")
+
+
+def test_a_page_may_be_opened_before_the_session_is_there(tab: Tab, tmp_path: Path) -> None:
+    with shown(tab, tmp_path / "later"):
+        assert tab.value("document.getElementById('state').textContent") == "… not begun"
+        assert "waits for it" in tab.value("document.getElementById('banner').innerText")
+        for key in ("ArrowLeft", "ArrowRight", "Escape"):
+            tab.press(key)
+        made = MadeUpRun.begin(tmp_path / "later")
+        tab.wait_for("document.getElementById('state').textContent === '▶ running'")
+        assert marks(tab, "planned", "planned") == len(LIGHTS)
+        tab.press("ArrowLeft")
+        made.take(made.steps[0])
+        tab.wait_for("document.getElementById('frame-caption').innerText.includes('white frame 0')")
+        made.journal.close()
+
+
+def test_a_phone_is_shown_the_same_behind_the_token(tab: Tab, run: MadeUpRun) -> None:
+    with shown(tab, run.folder, width=390, dark=True, host="0.0.0.0") as server:
+        assert len(server.path) > 20
+        assert marks(tab, "planned", "shown") == 1
+        tab.wait_for("document.getElementById('picture').naturalWidth === 360")
 
 
 def test_several_pages_look_at_once_and_a_frame_costs_little(tab: Tab, run: MadeUpRun) -> None:

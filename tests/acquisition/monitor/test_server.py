@@ -9,6 +9,7 @@ import shutil
 import socket
 import sys
 import threading
+import tomllib
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from http.server import ThreadingHTTPServer
@@ -202,6 +203,15 @@ def test_for_other_machines_the_address_holds_a_token(run: MadeUpRun) -> None:
         assert ask(monitor, f"/{monitor.path}frame/1.jpg")[0] == 200
         with served(run.folder, "0.0.0.0") as another:
             assert another.path != monitor.path
+
+
+def test_the_page_goes_where_the_package_goes() -> None:
+    root = Path(__file__).parents[3]
+    named = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    package = root / "acquisition" / "monitor"
+    parts = [path.relative_to(package) for path in package.rglob("*") if path.suffix in (".html", ".css", ".js")]
+    assert len(parts) == 5
+    assert all(any(part.match(pattern) for pattern in named["acquisition.monitor"]) for part in parts)
 
 
 def test_a_large_answer_is_compressed_for_who_can_read_it(opened: MonitorServer) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,36 @@ def test_a_page_that_follows_has_in_the_end_what_one_has_that_is_opened_then(run
     assert [frames[number] for number in sorted(frames)] == now["frames"]
     assert events == now["events"]
     assert min(sizes) < len(now["frames"])
+
+
+def test_many_pages_that_follow_at_once_all_get_everything(run: MadeUpRun) -> None:
+    watch = SessionWatch(run.folder)
+    over = threading.Event()
+    followed: list[set[int]] = []
+
+    def follow() -> None:
+        seen: set[int] = set()
+        cursor = ""
+        last = False
+        while True:
+            last = over.is_set()
+            news = watch.state(cursor)
+            if news is not None:
+                cursor = news["cursor"]
+                seen |= {frame["id"] for frame in news.get("frames", []) if frame.get("verdict") == "accepted"}
+            if last:
+                break
+        followed.append(seen)
+
+    pages = [threading.Thread(target=follow) for _ in range(4)]
+    for page in pages:
+        page.start()
+    for step in run.steps[4:]:
+        run.take(step)
+    over.set()
+    for page in pages:
+        page.join()
+    assert followed == [set(range(1, len(run.steps) + 1))] * 4
 
 
 def test_nothing_new_is_nothing_told_and_the_journal_is_not_opened(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import tracemalloc
 from collections.abc import Callable, Generator
 from dataclasses import replace
@@ -524,6 +525,29 @@ def test_a_transfer_goes_on_where_it_broke_off() -> None:
     lab.take(attempts=1)
     assert [offset for offset, _ in pieces] == [0, 1 << 20, 2 << 20]
     assert lab.openings == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "format", "comes"),
+    [
+        ("IMG_0042.CR3", 0xB108, "IMG_0042.CR3"),
+        ("IMG_0042", 0xB108, "IMG_0042.CR3"),
+        ("IMG_0042", 0xB103, "IMG_0042.CR2"),
+        ("", 0xB108, r"[0-9A-F]{8}\.CR3"),
+        ("", 0x3000, r"[0-9A-F]{8}"),
+        ("../../IMG 1.CR3", 0xB108, r"_\.\._IMG_1\.CR3"),
+    ],
+)
+def test_a_frame_is_named_as_the_body_does_and_after_its_format(lab: Lab, name: str, format: int, comes: str) -> None:
+    lab.device = Announcing(
+        lab.eos,
+        lambda records: tuple(
+            replace(record, name=name, format=format) if isinstance(record, TransferRequest) else record
+            for record in records
+        ),
+    )
+    lab.camera.configure(SETTINGS)
+    assert re.fullmatch(comes, lab.take(attempts=1).name)
 
 
 def test_what_stood_behind_the_place_in_the_file_is_gone(lab: Lab) -> None:

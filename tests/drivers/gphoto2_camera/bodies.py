@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from drivers.camera import ExposureSettings
-from drivers.gphoto2_camera.settings import Setting, number_of
+from drivers.gphoto2_camera.settings import BodySetting, number_of
 from foundation.clock import Clock
 from tests.contracts.camera import SeededFilm
 
@@ -35,85 +35,87 @@ NIKON_SPEEDS = (
 )  # fmt: skip
 
 
-def _tree(*settings: Setting) -> dict[str, Setting]:
+def _tree(*settings: BodySetting) -> dict[str, BodySetting]:
     return {setting.name: setting for setting in settings}
 
 
 NIKON_Z7 = _tree(
-    Setting("recordingmedia", "Card", ("Card", "SDRAM", "Unknown value 0002")),
-    Setting("capturetarget", "Internal RAM", ("Internal RAM", "Memory card")),
-    Setting("autofocus", "Off", ON_OFF),
-    Setting("acpower", "Off", ON_OFF, fixed=True),
-    Setting("batterylevel", "80%", fixed=True),
-    Setting("iso", "100", ("32", "40", "50", "64", "80", "100", "125", "160", "200", "250", "320", "400", "25600")),
-    Setting("isoauto", "On", ON_OFF),
-    Setting("autoiso", "Off", ON_OFF),
-    Setting("rawcompression", "Lossless", ("Lossless", "Lossy", "Unknown value 0002")),
-    Setting("longexpnr", "Off", ON_OFF),
-    Setting(
+    BodySetting("recordingmedia", "Card", ("Card", "SDRAM", "Unknown value 0002")),
+    BodySetting("capturetarget", "Internal RAM", ("Internal RAM", "Memory card")),
+    BodySetting("autofocus", "Off", ON_OFF),
+    BodySetting("acpower", "Off", ON_OFF, fixed=True),
+    BodySetting("batterylevel", "80%", fixed=True),
+    BodySetting("iso", "100", ("32", "40", "50", "64", "80", "100", "125", "160", "200", "250", "320", "400", "25600")),
+    BodySetting("isoauto", "On", ON_OFF),
+    BodySetting("autoiso", "Off", ON_OFF),
+    BodySetting("rawcompression", "Lossless", ("Lossless", "Lossy", "Unknown value 0002")),
+    BodySetting("longexpnr", "Off", ON_OFF),
+    BodySetting(
         "f-number", "f/5.6", ("f/4", "f/4.5", "f/5", "f/5.6", "f/6.3", "f/7.1", "f/8", "f/9", "f/10", "f/11", "f/22")
     ),
-    Setting(
+    BodySetting(
         "imagequality",
         "NEF+Fine",
         ("JPEG Basic", "JPEG Normal", "JPEG Fine", "Unknown value 0003", "NEF (Raw)", "NEF+Basic", "NEF+Fine"),
     ),
-    Setting("focusmode", "Manual", ("Manual", "AF-S", "AF-C", "Unknown value 8013")),
-    Setting("expprogram", "M", ("M", "P", "A", "S", "Auto", "Unknown value 8050"), fixed=True),
-    Setting("capturemode", "Single Shot", ("Single Shot", "Burst", "Continuous Low Speed", "Timer")),
-    Setting("shutterspeed", "0.0025s", NIKON_SPEEDS),
-    Setting("shutterspeed2", "1/400", NIKON_SPEEDS_2),
-    Setting("bracketing", "Off", ON_OFF),
-    Setting("serialnumber", "6001234"),
-    Setting("manufacturer", "Nikon Corporation"),
-    Setting("cameramodel", "Z 7"),
-    Setting("deviceversion", "V1.00"),
+    BodySetting("focusmode", "Manual", ("Manual", "AF-S", "AF-C", "Unknown value 8013")),
+    BodySetting("expprogram", "M", ("M", "P", "A", "S", "Auto", "Unknown value 8050"), fixed=True),
+    BodySetting("capturemode", "Single Shot", ("Single Shot", "Burst", "Continuous Low Speed", "Timer")),
+    BodySetting("shutterspeed", "0.0025s", NIKON_SPEEDS),
+    BodySetting("shutterspeed2", "1/400", NIKON_SPEEDS_2),
+    BodySetting("bracketing", "Off", ON_OFF),
+    BodySetting("serialnumber", "6001234"),
+    BodySetting("manufacturer", "Nikon Corporation"),
+    BodySetting("cameramodel", "Z 7"),
+    BodySetting("deviceversion", "V1.00"),
 )
 NIKON_D7100 = NIKON_Z7 | _tree(
-    Setting("capturetarget", "Memory card", ("Internal RAM", "Memory card")),
-    Setting("imagequality", "JPEG Normal", ("JPEG Basic", "JPEG Normal", "JPEG Fine", "NEF (Raw)", "NEF+Fine")),
-    Setting("focusmode", "Manual", ("Manual", "AF-S", "AF-C", "AF-A", "Unknown value 8013")),
-    Setting("focusmode2", "MF (fixed)", ("AF-S", "AF-C", "AF-A", "MF (fixed)", "MF (selection)")),
-    Setting("cameramodel", "D7100"),
+    BodySetting("capturetarget", "Memory card", ("Internal RAM", "Memory card")),
+    BodySetting("imagequality", "JPEG Normal", ("JPEG Basic", "JPEG Normal", "JPEG Fine", "NEF (Raw)", "NEF+Fine")),
+    BodySetting("focusmode", "Manual", ("Manual", "AF-S", "AF-C", "AF-A", "Unknown value 8013")),
+    BodySetting("focusmode2", "MF (fixed)", ("AF-S", "AF-C", "AF-A", "MF (fixed)", "MF (selection)")),
+    BodySetting("cameramodel", "D7100"),
 )
 del NIKON_D7100["rawcompression"], NIKON_D7100["autofocus"]
 SONY_A7M4 = _tree(
-    Setting("capturetarget", "sdram", ("sdram", "card+sdram", "card")),
-    Setting("iso", "Auto ISO"),
-    Setting("f-number", "f/8", ("f/1", "f/1.4", "f/2", "f/2.8", "f/4", "f/5.6", "f/8", "f/9", "f/10", "f/11", "f/64")),
-    Setting(
+    BodySetting("capturetarget", "sdram", ("sdram", "card+sdram", "card")),
+    BodySetting("iso", "Auto ISO"),
+    BodySetting(
+        "f-number", "f/8", ("f/1", "f/1.4", "f/2", "f/2.8", "f/4", "f/5.6", "f/8", "f/9", "f/10", "f/11", "f/64")
+    ),
+    BodySetting(
         "imagequality",
         "RAW+JPEG (X.Fine)",
         ("RAW", "RAW+JPEG (X.Fine)", "RAW+JPEG (Fine)", "RAW+JPEG (Std)", "Extra Fine", "Fine", "Standard"),
     ),
-    Setting("focusmode", "Manual", ("Undefined", "Manual", "Automatic", "Automatic Macro", "AF-A", "AF-C", "DMF")),
-    Setting("expprogram", "M", ("M", "P", "A", "S", "Creative"), fixed=True),
-    Setting("capturemode", "Single Shot", ("Single Shot", "Continuous Hi+ Speed", "Burst", "Selftimer 2s")),
-    Setting("shutterspeed", "4/10", SONY_SPEEDS),
-    Setting("serialnumber", "00000000000000003282933000123456"),
-    Setting("manufacturer", "Sony Corporation"),
-    Setting("cameramodel", "ILCE-7M4"),
-    Setting("deviceversion", "1.0"),
+    BodySetting("focusmode", "Manual", ("Undefined", "Manual", "Automatic", "Automatic Macro", "AF-A", "AF-C", "DMF")),
+    BodySetting("expprogram", "M", ("M", "P", "A", "S", "Creative"), fixed=True),
+    BodySetting("capturemode", "Single Shot", ("Single Shot", "Continuous Hi+ Speed", "Burst", "Selftimer 2s")),
+    BodySetting("shutterspeed", "4/10", SONY_SPEEDS),
+    BodySetting("serialnumber", "00000000000000003282933000123456"),
+    BodySetting("manufacturer", "Sony Corporation"),
+    BodySetting("cameramodel", "ILCE-7M4"),
+    BodySetting("deviceversion", "1.0"),
 )
 SONY_A6400 = SONY_A7M4 | _tree(
-    Setting("capturetarget", "sdram", ("sdram", "card+sdram")),
-    Setting("batterylevel", "100%", fixed=True),
-    Setting(
+    BodySetting("capturetarget", "sdram", ("sdram", "card+sdram")),
+    BodySetting("batterylevel", "100%", fixed=True),
+    BodySetting(
         "iso",
         "1250",
         ("Auto ISO", "25", "50", "64", "80", "100", "125", "160", "200", "100 Multi Frame Noise Reduction"),
     ),
-    Setting("f-number", "4.5", bounds=(0.0, 655.35)),
-    Setting("cameramodel", "ILCE-6400"),
+    BodySetting("f-number", "4.5", bounds=(0.0, 655.35)),
+    BodySetting("cameramodel", "ILCE-6400"),
 )
 SONY_A6000 = SONY_A6400 | _tree(
-    Setting("imagequality", "Fine", ("Standard", "Fine", "RAW", "RAW+JPEG")),
-    Setting("focusmode", "Manual", ("Manual", "Automatic", "Automatic Macro", "Unknown value 8004")),
-    Setting("cameramodel", "ILCE-6000"),
+    BodySetting("imagequality", "Fine", ("Standard", "Fine", "RAW", "RAW+JPEG")),
+    BodySetting("focusmode", "Manual", ("Manual", "Automatic", "Automatic Macro", "Unknown value 8004")),
+    BodySetting("cameramodel", "ILCE-6000"),
 )
 del SONY_A6000["capturetarget"], SONY_A6000["batterylevel"]
 
-BODIES: Mapping[str, dict[str, Setting]] = {
+BODIES: Mapping[str, dict[str, BodySetting]] = {
     "Nikon Z 7": NIKON_Z7,
     "Nikon D7100": NIKON_D7100,
     "Sony A7 IV": SONY_A7M4,
@@ -133,7 +135,7 @@ class GPhotoFault(Exception):
 class Widget:
     """A setting as gphoto2 hands it out: a copy, which is given back to set it."""
 
-    def __init__(self, setting: Setting, value: object) -> None:
+    def __init__(self, setting: BodySetting, value: object) -> None:
         self.setting, self.value = setting, value
 
     def get_type(self) -> str:
@@ -174,7 +176,7 @@ class FakeBody:
     `settles_after` is how many looks a new value takes to be seen; `stubborn` settings never take one.
     """
 
-    tree: dict[str, Setting]
+    tree: dict[str, BodySetting]
     film: SeededFilm
     clock: Clock
     suffix: str = "nef"
@@ -183,7 +185,7 @@ class FakeBody:
     fails: list[int] = field(default_factory=list[int])
     files: dict[str, bytes] = field(default_factory=dict[str, bytes])
     set_to: list[tuple[str, object]] = field(default_factory=list[tuple[str, object]])
-    pending: dict[str, tuple[int, Setting]] = field(default_factory=dict[str, tuple[int, Setting]])
+    pending: dict[str, tuple[int, BodySetting]] = field(default_factory=dict[str, tuple[int, BodySetting]])
     number: int = 0
     openings: int = 0
 

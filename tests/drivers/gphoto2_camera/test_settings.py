@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from drivers.camera import CameraIdentity, ExposureSettings, ReportsSupplies, Supplies, capture
 from drivers.gphoto2_camera import camera as gphoto2_camera
 from drivers.gphoto2_camera.camera import Gphoto2Camera
-from drivers.gphoto2_camera.settings import Setting, battery_level, is_same, label_of, number_of, plan
+from drivers.gphoto2_camera.settings import BodySetting, battery_level, is_same, label_of, number_of, plan
 from foundation.errors import DeviceError, DeviceRefused
 from sim.clock import SimulatedClock
 from tests.contracts.camera import SETTINGS, Bench, CameraContract, SeededFilm
@@ -98,38 +98,60 @@ def test_what_a_sony_is_given() -> None:
     assert "capturetarget" not in plan(SONY_A6000.get, SETTINGS)
 
 
-SPOILED: list[tuple[dict[str, Setting], Setting | str, str]] = [
-    (NIKON_Z7, Setting("expprogram", "A", ("M", "A")), "expprogram is A: turn the mode dial to M"),
-    (NIKON_Z7, Setting("focusmode", "AF-S", ("Manual", "AF-S")), "focusmode is AF-S: set the lens"),
-    (NIKON_Z7, Setting("capturemode", "Timer", ("Single Shot", "Timer")), "capturemode is Timer: set single shooting"),
-    (NIKON_Z7, Setting("capturemode", "Mirror Up", ("Single Shot",)), "capturemode is Mirror Up: set single shooting"),
-    (NIKON_Z7, Setting("bracketing", "On", ("On", "Off"), fixed=True), "bracketing is On, so that every frame would"),
-    (NIKON_Z7, Setting("isoauto", "On", ("On", "Off"), fixed=True), "isoauto is On, so that the body would choose"),
-    (NIKON_Z7, Setting("rawcompression", "Lossy", ("Lossy",)), "rawcompression is Lossy, so that raw values"),
+SPOILED: list[tuple[dict[str, BodySetting], BodySetting | str, str]] = [
+    (NIKON_Z7, BodySetting("expprogram", "A", ("M", "A")), "expprogram is A: turn the mode dial to M"),
+    (NIKON_Z7, BodySetting("focusmode", "AF-S", ("Manual", "AF-S")), "focusmode is AF-S: set the lens"),
     (
         NIKON_Z7,
-        Setting("imagequality", "JPEG Fine", ("JPEG Basic", "JPEG Fine", "NEF+Fine")),
+        BodySetting("capturemode", "Timer", ("Single Shot", "Timer")),
+        "capturemode is Timer: set single shooting",
+    ),
+    (
+        NIKON_Z7,
+        BodySetting("capturemode", "Mirror Up", ("Single Shot",)),
+        "capturemode is Mirror Up: set single shooting",
+    ),
+    (
+        NIKON_Z7,
+        BodySetting("bracketing", "On", ("On", "Off"), fixed=True),
+        "bracketing is On, so that every frame would",
+    ),
+    (NIKON_Z7, BodySetting("isoauto", "On", ("On", "Off"), fixed=True), "isoauto is On, so that the body would choose"),
+    (NIKON_Z7, BodySetting("rawcompression", "Lossy", ("Lossy",)), "rawcompression is Lossy, so that raw values"),
+    (
+        NIKON_Z7,
+        BodySetting("imagequality", "JPEG Fine", ("JPEG Basic", "JPEG Fine", "NEF+Fine")),
         r"imagequality offers JPEG Basic, JPEG Fine, NEF\+Fine, none of RAW, NEF \(Raw\)",
     ),
     (
         NIKON_Z7,
-        Setting("imagequality", "JPEG Fine", ("JPEG Fine", "NEF (Raw)"), fixed=True),
+        BodySetting("imagequality", "JPEG Fine", ("JPEG Fine", "NEF (Raw)"), fixed=True),
         r"imagequality offers JPEG Fine, NEF \(Raw\), none of RAW, .* that can be set",
     ),
     (NIKON_Z7, "imagequality", "a raw format cannot be asked for: the body shows neither imageformat nor imagequality"),
     (NIKON_Z7, "f-number", "aperture or f-number 8 cannot be asked for: the body does not show it"),
     (NIKON_Z7, "iso", "iso 100 cannot be asked for"),
-    (NIKON_Z7, Setting("f-number", "f/1.8", ("f/1.8", "f/2")), "f-number 8 is not offered; offered are f/1.8, f/2"),
-    (NIKON_Z7, Setting("capturetarget", "Memory card", ("Memory card",)), "capturetarget offers Memory card, none of"),
-    (SONY_A7M4, Setting("expprogram", "Unknown value 8000", ("M", "P")), "expprogram is Unknown value 8000"),
-    (SONY_A7M4, Setting("focusmode", "DMF", ("Manual", "DMF")), "focusmode is DMF"),
-    (SONY_A7M4, Setting("capturemode", "Bracketing WB Hi", ("Single Shot",)), "capturemode is Bracketing WB Hi"),
-    (SONY_A6400, Setting("f-number", "4.5", bounds=(3.5, 5.6)), "f-number 8 is not offered; offered are 3.5 to 5.6"),
+    (NIKON_Z7, BodySetting("f-number", "f/1.8", ("f/1.8", "f/2")), "f-number 8 is not offered; offered are f/1.8, f/2"),
+    (
+        NIKON_Z7,
+        BodySetting("capturetarget", "Memory card", ("Memory card",)),
+        "capturetarget offers Memory card, none of",
+    ),
+    (SONY_A7M4, BodySetting("expprogram", "Unknown value 8000", ("M", "P")), "expprogram is Unknown value 8000"),
+    (SONY_A7M4, BodySetting("focusmode", "DMF", ("Manual", "DMF")), "focusmode is DMF"),
+    (SONY_A7M4, BodySetting("capturemode", "Bracketing WB Hi", ("Single Shot",)), "capturemode is Bracketing WB Hi"),
+    (
+        SONY_A6400,
+        BodySetting("f-number", "4.5", bounds=(3.5, 5.6)),
+        "f-number 8 is not offered; offered are 3.5 to 5.6",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("tree", "spoiled", "says"), SPOILED)
-def test_what_would_spoil_a_series_is_refused(tree: dict[str, Setting], spoiled: Setting | str, says: str) -> None:
+def test_what_would_spoil_a_series_is_refused(
+    tree: dict[str, BodySetting], spoiled: BodySetting | str, says: str
+) -> None:
     plan(tree.get, SETTINGS)
     changed = dict(tree)
     if isinstance(spoiled, str):
@@ -148,12 +170,12 @@ def test_everything_that_is_wrong_is_told_at_once() -> None:
 
 
 def test_a_body_that_stands_at_raw_and_cannot_be_set_is_good() -> None:
-    tree = NIKON_Z7 | {"imagequality": Setting("imagequality", "NEF (Raw)", fixed=True)}
+    tree = NIKON_Z7 | {"imagequality": BodySetting("imagequality", "NEF (Raw)", fixed=True)}
     assert "imagequality" not in plan(tree.get, SETTINGS)
 
 
 def test_an_aperture_ring_that_stands_right_is_good() -> None:
-    ring = Setting("f-number", "f/8", ("f/8", "f/11"), fixed=True)
+    ring = BodySetting("f-number", "f/8", ("f/8", "f/11"), fixed=True)
     assert plan((NIKON_Z7 | {"f-number": ring}).get, SETTINGS)["f-number"] == "f/8"
     with pytest.raises(DeviceRefused, match="f-number 11 is not offered"):
         plan((NIKON_Z7 | {"f-number": ring}).get, replace(SETTINGS, aperture=11))
@@ -186,7 +208,7 @@ def test_any_label_is_a_number_or_none(label: str) -> None:
     number = number_of(label)
     assert number is None or 0 < number < float("inf")
     assert battery_level(label) is None or 0 <= (battery_level(label) or 0) <= 1
-    setting = Setting("iso", label, (label, "100"))
+    setting = BodySetting("iso", label, (label, "100"))
     assert label_of(setting, 100.0) is not None
 
 
