@@ -182,6 +182,12 @@ TRIALS = (
     Trial("half-changed picture", "half", (HalfChanged(),), stays=False),
     Trial("half-changed picture", "half, a fifth of the time", (HalfChanged(share=0.2),), stays=False),
     Trial("half-changed picture", "a corner, 4 %", (HalfChanged(place=(-9, -9, 0.2, 0.2)),), stays=False),
+    Trial(
+        "late picture",
+        "5 % of the time the light before",
+        (HalfChanged(place=(-9, -9, 9, 9), share=0.05),),
+        stays=False,
+    ),
     Trial("repeated file", "of the light before", stays=False, special="file"),
     Trial("repeated file", "of the same light", stays=False, special="again"),
     Trial("zeroed strip", "5 % of the rows", (ZeroedStrip(),), stays=False, at=ANY),
@@ -323,11 +329,11 @@ def with_white_segment(room: Room, share: float) -> Projector:
 
 
 def with_memory(room: Room, share: float) -> Projector:
-    """Return a projector that keeps a share of the picture before."""
+    """Return a projector whose primaries are weaker, by up to a share, the brighter each was in the picture before."""
 
     def light(colour: Colour, before: Colour) -> npt.NDArray[np.float64]:
         now, past = (room.light_of(np.array([c.red, c.green, c.blue])) for c in (colour, before))
-        return np.asarray((1 - share) * now + share * past, dtype=np.float64)
+        return np.asarray(now * (1 - share * past), dtype=np.float64)
 
     return light
 
@@ -364,7 +370,7 @@ def odd_worlds(folder: Path, lights: int) -> list[tuple[str, int, int, Counter[s
     cases: list[tuple[str, dict[str, Any]]] = [
         ("white segment, +20 %", {"projector": with_white_segment(room, 0.2)}),
         ("white segment, +60 %", {"projector": with_white_segment(room, 0.6)}),
-        ("2 % of the picture before remains", {"projector": with_memory(room, 0.02)}),
+        ("primaries weaker by up to 2 % after bright ones", {"projector": with_memory(room, 0.02)}),
         ("other light of 1 % that flickers by 3 %", {"flicker": 0.03}),
         ("lamp −10 % in the session, blue −13 %", {"events": Disturbances((fading,))}),
     ]  # fmt: skip

@@ -156,7 +156,7 @@ def _look(
     plan: Sequence[tuple[int, int, int]],
 ) -> _Looked:
     """Return what is found of a frame of a step."""
-    measured = measure(mosaic)
+    measured = measure(mosaic, black)
     frame = Frame(measured, np.full(3, np.nan), _NONE)
     checks = [
         *_judge_file(known, mosaic, measured, settings),

@@ -193,7 +193,7 @@ class Knowledge:
         known = known._referenced(step, frame)
         # A frame that makes the basis has been learnt from with it.
         if found.light is not None and self.modelled and known.modelled and step.kind != "dark":
-            model = known.model.stepped() if found.stepped else known.model
+            model = known.model.stepped(found.brightness) if found.stepped else known.model
             known = replace(known, model=model.learn(found.light.amounts, codes))
         return known
 

@@ -70,7 +70,7 @@ def judge_light(
     room = max(drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
     reason, added = "", 0.0
     if wrong or fit.distance > limits.STALE_SIGMAS or abs(fit.brightness) > room:
-        reason, added = _cause(model, light, codes, before, plan, fit, wrong, room)
+        reason, added = _cause(model, light, codes, before, plan, fit, wrong, room, known.refused[0] == "light")
     stepped = False
     lamp = ""
     if not reason and abs(fit.brightness) > room:
@@ -121,6 +121,7 @@ def _cause(
     fit: Fit,
     wrong: bool,
     room: float,
+    followed: bool,
 ) -> tuple[str, float]:
     """Return why a light is not the one ordered, empty where it is but its lamp, and how much light is added to it."""
     squared = fit.distance**2 + (fit.brightness / fit.brightness_sd) ** 2
@@ -132,14 +133,27 @@ def _cause(
                 "does the screen stand still, or is sequence.settle_s too short?",
                 0.0,
             )
-    ambient = _ambient(model, light, codes)
+    remains = _added_of(model, light, codes, before)
+    ambient = _added_of(model, light, codes, None)
+    if wrong and remains is not None and (ambient is None or remains[1] + 9 < ambient[1]):
+        return (
+            f"{100 * remains[0]:.1f} % of the light of the frame before remain in this one; let the picture settle for "
+            "longer (sequence.settle_s), and switch dynamic contrast and frame interpolation off",
+            0.0,
+        )
     if wrong:
-        if ambient is not None and ambient[1] < limits.LIGHT_SIGMAS**2:
+        if ambient is not None:
             return _ambient_reason(ambient[0]), ambient[0]
         other = _other(model, light, codes, plan, squared)
         coloured = 0.0 if other else _coloured(model, light, codes)
         if coloured:
             return _ambient_reason(coloured), coloured
+        again = before is not None and before.amounts is not None and before.codes == codes and followed
+        if again and not other and fit.angle_deg <= limits.LIGHT_FOLLOWED_DEG:
+            assert before is not None
+            assert before.amounts is not None
+            if same_light(light.amounts, before.amounts, model.chroma_sd) < limits.LIGHT_SIGMAS:
+                return "", 0.0
         return other or _wrong_reason(model, light, codes), 0.0
     if fit.brightness > room and ambient is not None and ambient[1] + 9 < fit.distance**2:
         return _ambient_reason(ambient[0]), ambient[0]
@@ -200,20 +214,26 @@ def _added(model: ProjectorModel, light: Light, codes: Codes) -> tuple[float, fl
     return float(neutral @ weight @ (light.amounts - h)) / power, power**-0.5
 
 
-def _ambient(model: ProjectorModel, light: Light, codes: Codes) -> tuple[float, float] | None:
-    """Return how much neutral light, of white, added to the one ordered explains it, and the squared distance left."""
+def _added_of(model: ProjectorModel, light: Light, codes: Codes, of: Seen | None) -> tuple[float, float] | None:
+    """Return how much light, neutral or of another frame, added to the one ordered explains what is seen.
+
+    And the squared distance left; None where that is nothing, or unlikely.
+    """
     expected = model.predict(codes)
-    h, neutral = expected.amounts, np.ones(3)
-    covariance = expected.covariance + light.covariance
-    # The lamp is where it was, within its scatter: what is added is asked for.
-    covariance = covariance + (model.brightness_sd**2 + 1e-6) * np.outer(h, h)
-    weight = np.linalg.inv(covariance)
-    power = float(neutral @ weight @ neutral)
-    added = float(neutral @ weight @ (light.amounts - h)) / power
-    off = light.amounts - h - added * neutral
-    if added <= 4 * power**-0.5 or added < 0.002:
+    h = expected.amounts
+    more = np.ones(3) if of is None else of.amounts
+    if more is None or (of is not None and (of.codes == codes or not any(of.codes))):
         return None
-    return added, float(off @ weight @ off)
+    # The lamp is where it was, within its scatter: what is added is asked for.
+    covariance = expected.covariance + light.covariance + (model.brightness_sd**2 + 1e-6) * np.outer(h, h)
+    weight = np.linalg.inv(covariance)
+    power = float(more @ weight @ more)
+    added = float(more @ weight @ (light.amounts - h)) / power
+    off = light.amounts - h - added * more
+    left = float(off @ weight @ off)
+    if added <= 4 * power**-0.5 or added < 0.002 or left > limits.LIGHT_SIGMAS**2:
+        return None
+    return added, left
 
 
 def _coloured(model: ProjectorModel, light: Light, codes: Codes) -> float:

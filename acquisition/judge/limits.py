@@ -72,6 +72,10 @@ light has its own ground truth, so that brightness harms none; a larger step is 
 LAMP_TOTAL: Final = 15.0
 """Largest change of paper white since the session's first white frame, per cent: beyond, build-lut makes no table."""
 
+LIGHT_FOLLOWED_DEG: Final = 2.0
+"""Largest angle between the light seen and the one ordered that is lived with when the frame is repeated and shows it
+again, and it is no other light: the projector mixes otherwise than was learnt. build-lut warns from there on."""
+
 MOVED_FOLLOWED_PX: Final = 1.0
 """Largest displacement that is lived with when the frame is repeated and shows the chart at rest there: build-lut moves
 its grid; beyond, it remarks on it."""
