@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.basis import Basis, Light, Residuals
+from acquisition.judge.basis import Basis, FrameLight, Residuals
 from acquisition.judge.measuring import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured
 from acquisition.session.judgement import Check
 from foundation.robust import sigma_of
@@ -48,7 +48,7 @@ class Evenness:
     off: npt.NDArray[np.bool_]
 
 
-def judge_evenness(basis: Basis, light: Light, frame: Measured, moved_px: _Array) -> Evenness:
+def judge_evenness(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Array) -> Evenness:
     """Return whether a lit frame shows one light everywhere; the chart lies `moved_px` (2,) from the basis."""
     rest = light.tiles
     systematic = limits.UNEVEN if basis.of_primaries else limits.UNEVEN_WHITE
@@ -77,7 +77,7 @@ def _beside(basis: Basis) -> _Array:
     return np.asarray(maximum_filter(strength, 3) / np.maximum(strength, 1e-6), dtype=np.float64).ravel()
 
 
-def _judge_rows(basis: Basis, light: Light, frame: Measured, moved_px: _Array, uneven: bool) -> list[Check]:
+def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Array, uneven: bool) -> list[Check]:
     """Return whether rows show what belongs into them, and by how much they are blurred if not."""
     down = float(moved_px[1])
     rest = basis.strips(frame, light.amounts, down)

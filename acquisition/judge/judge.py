@@ -24,11 +24,11 @@ from acquisition.framing.planes import CHANNELS, Channel, frame_black, phases
 from acquisition.framing.previews import preview_jpeg
 from acquisition.judge import limits
 from acquisition.judge.anchor import Anchor
-from acquisition.judge.basis import Light
+from acquisition.judge.basis import FrameLight
 from acquisition.judge.evenness import judge_evenness
 from acquisition.judge.exposure import Exposure, disagreement, refusal
 from acquisition.judge.frame import Frame
-from acquisition.judge.knowledge import Found, Knowledge, Leaning, codes_of, primary_of
+from acquisition.judge.knowledge import Examined, Knowledge, Leaning, codes_of, primary_of
 from acquisition.judge.lights import judge_light
 from acquisition.judge.measuring import Measured, measure
 from acquisition.judge.references import judge_dark, judge_first_primary, judge_white
@@ -62,7 +62,7 @@ class _Looked:
 
     frame: Frame
     checks: tuple[Check, ...]
-    light: Light | None = None
+    light: FrameLight | None = None
     off: npt.NDArray[np.bool_] | None = None
     brightness: float = float("nan")
     stepped: bool = False
@@ -100,7 +100,7 @@ class LiveJudge:
         if frame is None:
             return
         light = None if self._known.basis is None else self._known.basis.light(frame.measured)
-        self._known = self._known.after(step, Found(frame, light, accepted))
+        self._known = self._known.after(step, Examined(frame, light, accepted))
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
         """Return what is said of a raw file; see `acquisition.session.judgement.FrameJudge.judge`."""
@@ -117,7 +117,7 @@ class LiveJudge:
         looked = _look(known, mosaic, black, step, self._settings, self._chart, self._plan)
         checks = _named_once(looked.checks)
         cause = next((check for check in checks if check.reason), None)
-        found = Found(
+        found = Examined(
             looked.frame,
             looked.light,
             cause is None,

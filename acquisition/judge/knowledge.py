@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from acquisition.judge import limits
 from acquisition.judge.anchor import Anchor
-from acquisition.judge.basis import Basis, Light
+from acquisition.judge.basis import Basis, FrameLight
 from acquisition.judge.frame import Frame
 from acquisition.judge.measuring import Measured
 from acquisition.judge.response import FULL, Codes, ProjectorModel
@@ -70,7 +70,7 @@ def combined(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class Examined:
     """What was found of a frame, and said of it.
 
     Attributes
@@ -92,7 +92,7 @@ class Found:
     """
 
     frame: Frame
-    light: Light | None
+    light: FrameLight | None
     accepted: bool
     cause: str = ""
     brightness: float = float("nan")
@@ -166,7 +166,7 @@ class Knowledge:
             return self
         return replace(self, model=self.model.rested(), rested=True, recent=(), refused=("", 0))
 
-    def after(self, step: SessionStep, found: Found) -> Knowledge:
+    def after(self, step: SessionStep, found: Examined) -> Knowledge:
         """Return what is known after a frame of a step."""
         frame, codes = found.frame, codes_of(step)
         seen = Seen(codes, frame.measured, None if found.light is None else found.light.amounts)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.basis import Light
+from acquisition.judge.basis import FrameLight
 from acquisition.judge.knowledge import Knowledge, Leaning, Seen, codes_of, combined
 from acquisition.judge.response import Codes, Fit, ProjectorModel
 from acquisition.session.judgement import Check
@@ -42,7 +42,12 @@ class LightVerdict:
 
 
 def judge_light(
-    known: Knowledge, step: SessionStep, light: Light, plan: Sequence[Codes], angle_deg: float, drift_percent: float
+    known: Knowledge,
+    step: SessionStep,
+    light: FrameLight,
+    plan: Sequence[Codes],
+    angle_deg: float,
+    drift_percent: float,
 ) -> LightVerdict:
     """Return whether a lit frame shows what its step asks for.
 
@@ -93,7 +98,7 @@ def judge_light(
     return LightVerdict(checks, fit.brightness, stepped, leaning)
 
 
-def _crept(leaning: Leaning, light: Light, drift: float) -> tuple[str, float]:
+def _crept(leaning: Leaning, light: FrameLight, drift: float) -> tuple[str, float]:
     """Return the reason against the lamp, or how much light is added, that the last lights together show."""
     for count in range(2, len(leaning.lamp) + 1):
         added, sd = combined(leaning.added[:count])
@@ -114,7 +119,7 @@ def same_light(one: _Array, other: _Array, scatter: float) -> float:
 
 def _cause(
     model: ProjectorModel,
-    light: Light,
+    light: FrameLight,
     codes: Codes,
     before: Seen | None,
     plan: Sequence[Codes],
@@ -162,7 +167,7 @@ def _cause(
     return "", 0.0
 
 
-def _wrong_reason(model: ProjectorModel, light: Light, codes: Codes) -> str:
+def _wrong_reason(model: ProjectorModel, light: FrameLight, codes: Codes) -> str:
     expected = model.predict(codes).amounts
     parts = ", ".join(
         f"{name} {100 * seen:.1f} % instead of {100 * wanted:.1f} %"
@@ -174,7 +179,7 @@ def _wrong_reason(model: ProjectorModel, light: Light, codes: Codes) -> str:
     )
 
 
-def _other(model: ProjectorModel, light: Light, codes: Codes, plan: Sequence[Codes], squared: float) -> str:
+def _other(model: ProjectorModel, light: FrameLight, codes: Codes, plan: Sequence[Codes], squared: float) -> str:
     """Return the sentence that names the light of the plan, or black or white, that is seen instead; empty if none."""
     # Only what is about as bright and of that colour is compared in full.
     found: tuple[float, Codes] | None = None
@@ -205,7 +210,7 @@ def _near(model: ProjectorModel, amounts: _Array, plan: Sequence[Codes], most: i
     return [plan[k] for k in np.argsort(off, kind="stable")[:most].tolist()]
 
 
-def _added(model: ProjectorModel, light: Light, codes: Codes) -> tuple[float, float]:
+def _added(model: ProjectorModel, light: FrameLight, codes: Codes) -> tuple[float, float]:
     """Return how much neutral light, of white, is added to the one ordered, and its standard deviation."""
     expected, neutral = model.predict(codes), np.ones(3)
     h = expected.amounts
@@ -214,7 +219,7 @@ def _added(model: ProjectorModel, light: Light, codes: Codes) -> tuple[float, fl
     return float(neutral @ weight @ (light.amounts - h)) / power, power**-0.5
 
 
-def _added_of(model: ProjectorModel, light: Light, codes: Codes, of: Seen | None) -> tuple[float, float] | None:
+def _added_of(model: ProjectorModel, light: FrameLight, codes: Codes, of: Seen | None) -> tuple[float, float] | None:
     """Return how much light, neutral or of another frame, added to the one ordered explains what is seen.
 
     And the squared distance left; None where that is nothing, or unlikely.
@@ -236,7 +241,7 @@ def _added_of(model: ProjectorModel, light: Light, codes: Codes, of: Seen | None
     return added, left
 
 
-def _coloured(model: ProjectorModel, light: Light, codes: Codes) -> float:
+def _coloured(model: ProjectorModel, light: FrameLight, codes: Codes) -> float:
     """Return how much light of any colour, of white, is added to the one ordered; 0 where it is not just more light."""
     expected = model.predict(codes)
     off = light.amounts - expected.amounts
@@ -266,7 +271,7 @@ def _brightness_reason(brightness: float, amounts: _Array) -> str:
     )
 
 
-def _without_model(light: Light, codes: Codes, before: Seen | None) -> Check:
+def _without_model(light: FrameLight, codes: Codes, before: Seen | None) -> Check:
     """Return what can be said without frames of the primaries: whether nothing has changed since the frame before."""
     if before is None or before.amounts is None or before.codes == codes or not any(codes) or not any(before.codes):
         return Check("light")

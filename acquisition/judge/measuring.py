@@ -56,7 +56,7 @@ _Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Places:
+class FramePlaces:
     """The places of a frame of `rows` × `columns` blocks."""
 
     rows: int
@@ -111,7 +111,7 @@ class Sums:
     empty: int
 
 
-def sum_counts(counts: npt.NDArray[np.uint16], places: Places, clipping: float, floor: float) -> Sums:
+def sum_counts(counts: npt.NDArray[np.uint16], places: FramePlaces, clipping: float, floor: float) -> Sums:
     """Return the mean counts at all places, in one pass.
 
     Parameters
@@ -191,7 +191,7 @@ class Measured:
     empty: float
     camera: str
     serial: str
-    places: Places
+    places: FramePlaces
 
     @property
     def level(self) -> _Array:
@@ -202,7 +202,7 @@ class Measured:
 def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
     """Return what is measured of a frame; `black` (2, 2) float64 counts if it is known already."""
     blocks = mosaic.block_planes()
-    places = Places(int(blocks.shape[2]), int(blocks.shape[3]))
+    places = FramePlaces(int(blocks.shape[2]), int(blocks.shape[3]))
     black = frame_black(mosaic) if black is None else black
     mean_black = float(black.mean())
     floor = _EMPTY_SHARE * mean_black if mean_black >= _LEAST_BLACK else 0.0
@@ -235,7 +235,7 @@ def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
     )
 
 
-def strip_blocks(places: Places) -> float:
+def strip_blocks(places: FramePlaces) -> float:
     """Return how many blocks a strip has, on average."""
     return places.columns / SEGMENTS
 
