@@ -34,6 +34,9 @@ _CONTRAST = 2.0
 _BY_TURNS = 0.1
 """Share of deviating rows that are brighter, or darker, from which on they are rows of another place."""
 
+_UNSEEN_PX = 1.0
+"""Movement or blur, px, that rows at the print's edges must stand: those are measured where they can be told."""
+
 _EDGE = 0.15
 """Relative deviation of a row for each px that the chart lies sideways: cells at a strip's ends are others."""
 
@@ -123,7 +126,8 @@ def _wrong_rows(basis: Basis, rest: Residuals, moved_px: _Array) -> npt.NDArray[
     assert basis.strip_maps is not None
     strength = np.linalg.norm(basis.strip_maps.sum(axis=0), axis=1).reshape(-1, SEGMENTS)
     steep = np.abs(np.gradient(strength, axis=0)).ravel() / np.maximum(strength.ravel(), 1e-6)
-    least = limits.ROW_DEVIATION + (_EDGE + steep) * float(np.hypot(*moved_px))
+    by = float(np.hypot(*moved_px))
+    least = limits.ROW_DEVIATION + _EDGE * by + steep * max(by, _UNSEEN_PX)
     room = np.maximum(least, limits.ROW_SIGMAS * np.maximum(usual, rest.noise))
     return np.asarray(np.abs(np.where(seen, rest.signed, 0.0)) > room)
 

@@ -358,13 +358,14 @@ def _judge_movement(
         return [*checks, Check("blur", None, None, judge.blur_px, "px")], place
     softer = float(np.sign(shift.softer_px2) * np.sqrt(abs(shift.softer_px2)))
     blurred = ""
-    if abs(softer) > judge.blur_px:
+    low = -limits.SHARPER * judge.blur_px
+    if not low <= softer <= judge.blur_px:
         blurred = (
             f"the frame is {'softer' if softer > 0 else 'sharper'} than the first white frame by a blur of "
             f"{abs(softer):.2f} px, {judge.blur_px:g} px allowed; was the focus touched, is autofocus or stabilisation "
             "on, or does something shake?"
         )
-    return [*checks, Check("blur", round(softer, 3), -judge.blur_px, judge.blur_px, "px", blurred)], place
+    return [*checks, Check("blur", round(softer, 3), low, judge.blur_px, "px", blurred)], place
 
 
 _UNRECOGNISED = (

@@ -220,15 +220,19 @@ def _added(model: ProjectorModel, light: FrameLight, codes: Codes) -> tuple[floa
 
 
 def _added_of(model: ProjectorModel, light: FrameLight, codes: Codes, of: Seen | None) -> tuple[float, float] | None:
-    """Return how much light, neutral or of another frame, added to the one ordered explains what is seen.
+    """Return how much neutral light added to the one ordered, or share of another frame's in it, explains what is seen.
 
     And the squared distance left; None where that is nothing, or unlikely.
     """
     expected = model.predict(codes)
     h = expected.amounts
-    more = np.ones(3) if of is None else of.amounts
-    if more is None or (of is not None and (of.codes == codes or not any(of.codes))):
+    if of is None:
+        more = np.ones(3)
+    elif of.amounts is None or of.codes == codes or not any(of.codes):
         return None
+    else:
+        # For a share of the time the other light was there instead.
+        more = of.amounts - h
     # The lamp is where it was, within its scatter: what is added is asked for.
     covariance = expected.covariance + light.covariance + (model.brightness_sd**2 + 1e-6) * np.outer(h, h)
     weight = np.linalg.inv(covariance)

@@ -86,8 +86,12 @@ STEADY_PX: Final = 0.1
 DIM_DN: Final = 40.0
 """Counts of paper above black below which a frame is too dark to tell movement (0.02 px at 66) and blur."""
 
-BLUR_DIM_DN: Final = 250.0
-"""The same for blur alone, which is a second derivative of the picture."""
+BLUR_DIM_DN: Final = 500.0
+"""The same for blur alone, a second derivative of the picture: at 420 counts hot photosites in two of four tags gave
+0.4 px (200 of a million photosites, `benchmarks.detection`)."""
+
+SHARPER: Final = 2.0
+"""How many times larger a loss of blur may be than a growth: no sample suffers from it."""
 
 LASTING_FRAMES: Final = 3
 """Frames refused in a row for one cause that make it a lasting one: as many as a step has attempts by default."""
