@@ -195,15 +195,15 @@ class Session:
                 f"cannot read {path}, the settings of the session: {error}; restore it from a copy"
             ) from error
 
-    def receive(self, stem: str, capture: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
-        """Let the camera write a raw file into `frames/`; it is complete and on the disk when this returns.
+    def receive(self, stem: str, fill: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
+        """Let a raw file be written into `frames/`; it is complete and on the disk when this returns.
 
         Parameters
         ----------
         stem
             Name without suffix; the suffix is that of the camera's own file name.
-        capture
-            Writes the whole raw file into the stream it is given; `drivers.camera.Camera.download`.
+        fill
+            Writes the whole raw file into the stream it is given, as `drivers.camera.Camera.download` does.
 
         Raises
         ------
@@ -213,7 +213,7 @@ class Session:
             The disk is full, read-only or gone. Nothing is left behind.
         """
         with self.incoming(stem) as incoming:
-            return incoming.complete(capture(incoming.stream))
+            return incoming.complete(fill(incoming.stream))
 
     def incoming(self, stem: str) -> IncomingFile:
         """Return a raw file to be filled, for which `receive` is too simple; see `IncomingFile`.
