@@ -67,7 +67,7 @@ def run_session(
         state(f"checking frame {done} of {total}")
 
     with ExitStack() as at_last, ExitStack() as opened:
-        session = opened.enter_context(_taken_up(settings, folder)) if session_exists(folder) else None
+        session = opened.enter_context(_taken_up(settings, folder, announce)) if session_exists(folder) else None
         if session is None and retake is not None:
             raise InputError(f"{folder}: nothing was taken yet that could be taken again; leave --retake out")
         if session is not None:
@@ -83,6 +83,7 @@ def run_session(
         checked_plan(settings, folder, session, devices)
         if session is None:
             session = opened.enter_context(_begun(settings, folder))
+            session.journal.be_patient(settings.sequence.patience_s, announce)
         require_same_devices(session, devices, settings)
         first = tie(session)
         total = len(session.steps)
@@ -108,8 +109,8 @@ def _report(session: Session) -> None:
         write_session_report(session.folder)
 
 
-def _taken_up(settings: LabSettings, folder: Path) -> Session:
-    session = Session.open_for_run(folder)
+def _taken_up(settings: LabSettings, folder: Path, announce: Callable[[str], object]) -> Session:
+    session = Session.open_for_run(folder, settings.sequence.patience_s, announce)
     try:
         require_same(session, settings)
     except BaseException:

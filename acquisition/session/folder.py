@@ -133,7 +133,7 @@ class Session:
         cls,
         folder: Path,
         patience_s: float = PATIENCE_S,
-        announce: Callable[[str], None] = lambda sentence: None,
+        announce: Callable[[str], object] = lambda sentence: None,
     ) -> Session:
         """Open a session folder to take frames into it; it is held until it is closed, and `frames.csv` is made anew.
 

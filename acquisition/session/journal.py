@@ -109,7 +109,7 @@ class Journal:
         cls,
         path: Path,
         patience_s: float = PATIENCE_S,
-        announce: Callable[[str], None] = lambda sentence: None,
+        announce: Callable[[str], object] = lambda sentence: None,
     ) -> Journal:
         """Open a journal to write it; one of an older version gets what it lacks.
 
@@ -140,7 +140,7 @@ class Journal:
         else:
             self._connection.close()
 
-    def be_patient(self, patience_s: float, announce: Callable[[str], None]) -> None:
+    def be_patient(self, patience_s: float, announce: Callable[[str], object]) -> None:
         """Change how long a write waits and who is told; see `open_for_run`."""
         self._patience = LockPatience(self._path, patience_s, announce)
 

@@ -122,7 +122,7 @@ class LockPatience:
         Called with a sentence once for each write that waits.
     """
 
-    def __init__(self, path: Path, seconds: float, announce: Callable[[str], None]) -> None:
+    def __init__(self, path: Path, seconds: float, announce: Callable[[str], object]) -> None:
         self._path = path
         self._seconds = seconds
         self._announce = announce

@@ -6,6 +6,7 @@ import io
 import os
 import re
 import signal
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from acquisition.session.folder import Session
 from drivers.canon.camera import CanonEos
 from drivers.pjlink.projector import PjLinkProjector
 from drivers.raw.rawfile import read_raw
+from foundation.errors import StorageError
 
 Hashes = Callable[[Path], dict[tuple[str, str], list[str]]]
 
@@ -245,6 +247,22 @@ def test_two_programs_do_not_take_the_same_session(lab: Path) -> None:
     assert run_session(settings, folder, meanwhile).complete
     assert answers[0].returncode == 2
     assert "another program" in answers[0].stderr
+
+
+def test_a_journal_that_another_program_holds_is_waited_for_as_long_as_the_settings_say(lab: Path) -> None:
+    lab.write_text(lab.read_text().replace("[sequence]", "[sequence]\npatience_s = 0"))
+    folder = lab.parent / "session"
+    others: list[sqlite3.Connection] = []
+
+    def hold(done: int, total: int) -> None:
+        if done == 2 and not others:
+            others.append(sqlite3.connect(folder / "journal.sqlite", isolation_level=None))
+            others[0].execute("BEGIN IMMEDIATE")
+
+    with pytest.raises(StorageError, match="end the other program that holds the session"):
+        run_session(load_lab(lab), folder, hold)
+    others[0].close()
+    assert run_session(load_lab(lab), folder, lambda done, total: None).complete
 
 
 def test_a_full_disk_costs_nothing_taken(
