@@ -97,6 +97,8 @@ class LiveJudge:
         """Take in a frame of an earlier run; see `acquisition.session.judgement.FrameJudge.recall`."""
         frame = Frame.of_bytes(measurement) if measurement else None
         if frame is None:
+            lost = accepted and step.kind in ("white", "dark")
+            self._known = replace(self._known, lost=self._known.lost or lost)
             return
         light = None if self._known.basis is None else self._known.basis.light(frame.measured)
         self._known = self._known.after(step, Found(frame, light, accepted))
@@ -158,6 +160,8 @@ def _look(
     ]
     if any(check.reason for check in checks):
         return _Looked(frame, tuple(checks))
+    if known.awaits_primaries and (step.kind == "light" or (step.kind == "response" and not _is_compared(step))):
+        return _Looked(frame, (*checks, Check("light", reason=_UNFOUNDED)))
     anchor = known.anchor
     if step.kind != "dark" and (anchor is None or (known.rested and _moved_far(known, mosaic, black, measured))):
         # The first lit frame is white; of a run taken up again it is the first in which the chart lies elsewhere.
@@ -372,6 +376,12 @@ def _moved(by: tuple[float, float]) -> str:
         f"the chart has moved by {np.hypot(x, y):.2f} px in the picture ({x:+.2f} right, {y:+.2f} down); was camera or "
         "chart touched? fix them, and let nobody walk about"
     )
+
+
+_UNFOUNDED = (
+    "no frame of each primary, or none of black, is accepted, from which it is known what this light should look like; "
+    "see why those were refused"
+)
 
 
 _FOLLOWS: Mapping[str, frozenset[str]] = MappingProxyType(

@@ -96,6 +96,10 @@ class Knowledge:
         Whether the run was taken up again and no lit frame has been accepted since.
     moved_on
         Whether the chart lies elsewhere than in the white frame that is known.
+    asked
+        Whether this run has shown a primary alone, whatever the frame was like.
+    lost
+        Whether a reference of an earlier run is accepted and its measurement cannot be read.
     """
 
     anchor: Anchor | None = None
@@ -115,17 +119,24 @@ class Knowledge:
     candidate: tuple[float, float, float] = (float("nan"), float("nan"), float("nan"))
     rested: bool = False
     moved_on: bool = False
+    asked: bool = False
+    lost: bool = False
 
     @property
     def modelled(self) -> bool:
         """Whether amounts are those of the projector's primaries, so that codes foretell them."""
         return self.basis is not None and self.basis.of_primaries
 
+    @property
+    def awaits_primaries(self) -> bool:
+        """Whether lights cannot be foretold only because frames that this run asked for were refused."""
+        return self.asked and not self.modelled and not self.lost
+
     def paused(self) -> Knowledge:
         """Return what is known after a pause of the run: the lamp may be at another level, the chart elsewhere."""
         if self.rested or not self.digests:
             return self
-        return replace(self, model=self.model.rested(), rested=True, recent=(), refused=("", 0))
+        return replace(self, model=self.model.rested(), rested=True, recent=(), refused=("", 0), asked=False)
 
     def after(self, step: SessionStep, found: Found) -> Knowledge:
         """Return what is known after a frame of a step."""
@@ -135,6 +146,7 @@ class Knowledge:
             self,
             recent=(*self.recent, seen)[-RECENT:],
             digests=self.digests | {frame.measured.digest},
+            asked=self.asked or (step.kind == "response" and primary_of(codes) is not None),
         )
         if not found.accepted:
             count = self.refused[1] + 1 if found.cause == self.refused[0] else 1

@@ -212,6 +212,38 @@ def test_a_screen_that_stays_lit_is_told_in_the_dark_frame(taught: Bench) -> Non
     assert "of the frame before" in lab.show(lab.counts(lab.light(*ORANGE)), DARK_STEP).reason
 
 
+@pytest.mark.parametrize("wanting", [1, 4])
+def test_nothing_is_accepted_unseen_where_a_primary_or_the_dark_frame_is_wanting(
+    taught: Bench, tmp_path: Path, wanting: int
+) -> None:
+    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
+    lab.world = taught.world
+    green = SessionStep(903, "response", None, Colour(0, 250, 0))
+    for step in lab.steps[:5]:
+        if step.number != wanting:
+            assert lab.take(step).accepted
+        else:
+            assert not lab.show(lab.counts(green), step).accepted
+    # The screen stands still, and nothing would foretell its light.
+    grey, light = lab.steps[5], next(step for step in lab.steps if step.kind == "light")
+    unseen = [lab.show(lab.counts(green), step) for step in (grey, light)]
+    assert [cause(judgement) for judgement in unseen] == ["light", "light"]
+    assert "is accepted, from which it is known" in unseen[0].reason
+    assert lab.take(lab.steps[wanting]).accepted
+    assert [lab.take(step).reason for step in (grey, light)] == ["", ""]
+    assert cause(lab.show(lab.counts(green), light)) == "light"
+
+
+def test_a_session_whose_measurements_are_lost_goes_on(taught: Bench, tmp_path: Path) -> None:
+    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
+    lab.world = taught.world
+    for step in lab.steps[:2]:
+        lab.judge.recall(step, b"of another version", True)
+    said = [lab.take(step).reason for step in (*tie_steps(500), lab.light(*SKY), DARK_STEP, lab.light(*SKY))]
+    assert said == [""] * 7
+    assert lab.judge.knowledge.modelled
+
+
 def test_a_run_taken_up_again_knows_what_was_seen(taught: Bench, tmp_path: Path) -> None:
     first = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
     first.world = taught.world
