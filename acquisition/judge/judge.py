@@ -121,7 +121,13 @@ class LiveJudge:
         found = Found(
             looked.frame, looked.light, cause is None, cause.name if cause else "", looked.brightness, looked.stepped
         )
-        self._known = known.after(step, found)
+        following = known.after(step, found)
+        disagreeing = _judge_basis(known, following)
+        if disagreeing is not None:
+            checks = (*(check for check in checks if check.name != "uniformity"), disagreeing)
+            cause = disagreeing
+            following = known.after(step, replace(found, accepted=False, cause=cause.name)).begun_anew()
+        self._known = following
         if cause is None:
             untold = {check.name for check in checks if check.value is None and check.name in ("movement", "blur")}
             self._known = replace(self._known, untold=self._known.untold | untold)
@@ -136,7 +142,8 @@ class LiveJudge:
             seen=None if np.isnan(paper).any() else (red, green, blue),
             measurement=looked.frame.to_bytes(with_strips=_is_compared(step)),
             preview=preview_jpeg(mosaic, black, white, outlines, boxes, cause.reason if cause else ""),
-            voids=cause is not None and step.kind in ("white", "dark") and _voids(known, cause.name),
+            voids=disagreeing is not None
+            or (cause is not None and step.kind in ("white", "dark") and _voids(known, cause.name)),
             lasting=cause is not None and _lasts(self._known, cause.name),
         )
 
@@ -214,6 +221,26 @@ def _look_at_light(
     if step.kind == "white" and known.modelled:
         checks.append(Check("additivity", round(100 * known.model.overlap, 2), None, None, "%"))
     return _Looked(frame, tuple(checks), light, evenness.off, verdict.brightness, verdict.stepped)
+
+
+def _judge_basis(known: Knowledge, following: Knowledge) -> Check | None:
+    """Return why frames of the primaries that are now known make no picture of the white or grey one; None if they do.
+
+    Each of them alone tells nothing of a part that is covered; all that follows would be held against it.
+    """
+    if known.modelled or not following.modelled or known.witness is None or following.basis is None:
+        return None
+    witness = known.witness
+    moved = np.zeros(2) if following.moved_px is None else following.moved_px
+    evenness = judge_evenness(following.basis, following.basis.light(witness), witness, moved)
+    if all(check.passed for check in evenness.checks):
+        return None
+    uneven = next((check for check in evenness.checks if check.name == "uniformity"), Check("uniformity"))
+    return replace(
+        uneven,
+        reason="the frames of the three primaries do not add up to the white or grey frame before them everywhere; did "
+        "somebody pass, or a window cover the picture? all of them are taken again",
+    )
 
 
 def _judge_file(

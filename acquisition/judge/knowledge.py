@@ -98,6 +98,8 @@ class Knowledge:
         Whether the chart lies elsewhere than in the white frame that is known.
     asked
         Whether this run has shown a primary alone, whatever the frame was like.
+    witness
+        The newest white or grey frame from before the primaries were known, by which they are held against it.
     lost
         Whether a reference of an earlier run is accepted and its measurement cannot be read.
     """
@@ -120,6 +122,7 @@ class Knowledge:
     rested: bool = False
     moved_on: bool = False
     asked: bool = False
+    witness: Measured | None = None
     lost: bool = False
 
     @property
@@ -137,6 +140,12 @@ class Knowledge:
         if self.rested or not self.digests:
             return self
         return replace(self, model=self.model.rested(), rested=True, recent=(), refused=("", 0), asked=False)
+
+    def begun_anew(self) -> Knowledge:
+        """Return what is known where the frames of the primaries, or the one beside them, cannot be trusted."""
+        if not self.moved_on:
+            return Knowledge(first=self.first, recent=self.recent, digests=self.digests, refused=self.refused)
+        return replace(self, primaries=(None, None, None), basis=None, witness=None, asked=False)
 
     def after(self, step: SessionStep, found: Found) -> Knowledge:
         """Return what is known after a frame of a step."""
@@ -192,6 +201,8 @@ class Knowledge:
             if known.basis is not None and known.basis.of_primaries:
                 known = replace(known, basis=known.basis.with_dark(measured))
         primary = primary_of(codes_of(step))
+        if not self.modelled and (step.kind == "white" or (step.kind == "response" and primary is None)):
+            known = replace(known, witness=measured)
         if step.kind == "response" and primary is not None and len(measured.strips):
             of: list[Measured | None] = list(known.primaries)
             of[primary] = measured

@@ -135,8 +135,17 @@ class Agenda:
             self._first.append(step.number)
         return True
 
-    def void(self, numbers: Iterable[int], reason: str) -> None:
-        """Open steps again whose frames cannot be trusted any more; those without a try left are given up."""
+    def void(self, numbers: Iterable[int], reason: str, *, before_others: bool = False) -> None:
+        """Open steps again whose frames cannot be trusted any more; those without a try left are given up.
+
+        Parameters
+        ----------
+        before_others
+            Whether they are tried before all other steps, in the order of the plan.
+        """
+        numbers = sorted(numbers)
+        if before_others:
+            self._first = [*numbers, *(number for number in self._first if number not in numbers)]
         for number in numbers:
             self._open.add(number)
             if self._tries[number] >= self._attempts:

@@ -234,6 +234,39 @@ def test_nothing_is_accepted_unseen_where_a_primary_or_the_dark_frame_is_wanting
     assert cause(lab.show(lab.counts(green), light)) == "light"
 
 
+@pytest.mark.parametrize("passing", [0, 2, 4])
+def test_somebody_who_passes_in_a_frame_that_others_are_held_against_is_told(
+    taught: Bench, tmp_path: Path, passing: int
+) -> None:
+    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
+    lab.world = taught.world
+    hand = Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3)
+    said = [lab.take(step, *([hand] if step.number == passing else [])) for step in lab.steps[:5]]
+    assert [judgement.accepted for judgement in said] == [True] * 4 + [False]
+    assert cause(said[4]) == "uniformity"
+    assert said[4].voids
+    light = next(step for step in lab.steps if step.kind == "light")
+    again = [lab.take(step) for step in (*lab.steps[:6], light)]
+    assert [judgement.reason for judgement in again] == [""] * 7
+
+
+def test_somebody_who_passes_while_a_chart_that_moved_is_shown_the_primaries_is_told(
+    taught: Bench, tmp_path: Path
+) -> None:
+    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
+    lab.world = taught.world
+    first = [lab.take(step) for step in lab.steps[:-2]]
+    resumed = replace(lab, judge=LiveJudge(lab.settings, lab.chart, lab.lights))
+    for step, judgement in zip(lab.steps, first, strict=False):
+        resumed.judge.recall(step, judgement.measurement, True)
+    elsewhere, hand = Bump(px=6.7), Person(place=(0.7, 0.6, 0.82, 0.78), left=0.3)
+    ties = tie_steps(500)
+    said = [resumed.take(step, elsewhere, *([hand] if step.number == 502 else [])) for step in ties]
+    assert [judgement.voids for judgement in said] == [False, False, False, True]
+    again = [resumed.take(step, elsewhere) for step in (*ties, resumed.light(*SKY))]
+    assert [judgement.reason for judgement in again] == [""] * 5
+
+
 def test_a_session_whose_measurements_are_lost_goes_on(taught: Bench, tmp_path: Path) -> None:
     lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=6, every=6)
     lab.world = taught.world
