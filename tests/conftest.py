@@ -48,6 +48,7 @@ SLOW = (
     "calibration/radiometry/test_cell_field.py",
     "calibration/radiometry/test_dark_subtraction.py",
     "acquisition/framing/test_movement.py",
+    "acquisition/judge/test_judge.py",
     "calibration/registration/test_register.py",
     "calibration/registration/test_register_without_tags.py",
     "calibration/sampling/test_windows.py",

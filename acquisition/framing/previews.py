@@ -22,8 +22,11 @@ _GREEN, _RED, _AMBER = (60, 200, 60), (40, 40, 255), (40, 200, 255)
 """BGR codes: of tags, of what deviates, of the cause."""
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_LETTERS = 78
-"""Letters on a line of text of the cause."""
+_LETTER_PX = 7.4
+"""Width of a letter of the cause at `_SCALE`, px."""
+
+_SCALE = 0.42
+"""Size of the letters, of OpenCV's font: the least that is read with ease."""
 
 _FAINTEST = 0.01
 """Share of white to which a dark frame is brightened at most: else its noise would be the picture."""
@@ -79,12 +82,10 @@ def _written(image: npt.NDArray[np.uint8], cause: str) -> npt.NDArray[np.uint8]:
     """Return the picture with a sentence over its lower edge."""
     # OpenCV's letters are those of ASCII.
     plain = cause.replace("°", " deg").replace("×", "x").replace("–", "-").replace("−", "-").replace("…", "...")
-    lines = textwrap.wrap(plain.encode("ascii", "replace").decode(), _LETTERS)[:4]
-    height, width = image.shape[:2]
-    scale = 0.42 * width / WIDTH_PX
-    line = max(10, round(18 * width / WIDTH_PX))
+    lines = textwrap.wrap(plain.encode("ascii", "replace").decode(), max(20, int(image.shape[1] / _LETTER_PX)))[:5]
+    height, line = len(image), 17
     top = height - line * len(lines) - line // 2
     image[top:] //= 3
     for number, text in enumerate(lines):
-        cv2.putText(image, text, (6, top + line * (number + 1)), _FONT, scale, _AMBER, 1, cv2.LINE_AA)
+        cv2.putText(image, text, (6, top + line * (number + 1)), _FONT, _SCALE, _AMBER, 1, cv2.LINE_AA)
     return image

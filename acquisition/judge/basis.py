@@ -57,7 +57,7 @@ class Residuals:
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
+class FrameLight:
     """The light of a frame: amounts (3,) float64 of the primaries, their covariance (3, 3), and what they leave."""
 
     amounts: _Array
@@ -112,7 +112,7 @@ class Basis:
         strips = None if self.strip_maps is None else self.strip_maps / by
         return replace(self, maps=self.maps / by, strip_maps=strips)
 
-    def light(self, frame: Measured) -> Light:
+    def light(self, frame: Measured) -> FrameLight:
         """Return the light of a frame."""
         blocks = frame.places.tile_blocks
         design = self.maps
@@ -134,7 +134,7 @@ class Basis:
             inverse = np.asarray(np.linalg.inv(gram + 1e-12 * np.trace(gram) * np.eye(3)), dtype=np.float64)
             amounts = inverse @ np.einsum("ptc,tc,tc->p", design, weights, seen)
         tiles = _residuals(seen, amounts, design, self.dark, frame.noise, blocks, lit)
-        return Light(amounts, inverse, tiles)
+        return FrameLight(amounts, inverse, tiles)
 
     def strips(self, frame: Measured, amounts: _Array, down_px: float = 0.0, blur_px: float = 0.0) -> Residuals | None:
         """Return what amounts (3,) of light leave at the strips; None where these are not known.

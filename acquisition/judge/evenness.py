@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.basis import Basis, Light, Residuals
+from acquisition.judge.basis import Basis, FrameLight, Residuals
 from acquisition.judge.measuring import SEGMENTS, TILE_COLUMNS, TILE_ROWS, Measured
 from acquisition.session.judgement import Check
 from foundation.robust import sigma_of
@@ -34,6 +34,9 @@ _CONTRAST = 2.0
 _BY_TURNS = 0.1
 """Share of deviating rows that are brighter, or darker, from which on they are rows of another place."""
 
+_UNSEEN_PX = 1.0
+"""Movement or blur, px, that rows at the print's edges must stand: those are measured where they can be told."""
+
 _EDGE = 0.15
 """Relative deviation of a row for each px that the chart lies sideways: cells at a strip's ends are others."""
 
@@ -48,7 +51,7 @@ class Evenness:
     off: npt.NDArray[np.bool_]
 
 
-def judge_evenness(basis: Basis, light: Light, frame: Measured, moved_px: _Array) -> Evenness:
+def judge_evenness(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Array) -> Evenness:
     """Return whether a lit frame shows one light everywhere; the chart lies `moved_px` (2,) from the basis."""
     rest = light.tiles
     systematic = limits.UNEVEN if basis.of_primaries else limits.UNEVEN_WHITE
@@ -77,7 +80,7 @@ def _beside(basis: Basis) -> _Array:
     return np.asarray(maximum_filter(strength, 3) / np.maximum(strength, 1e-6), dtype=np.float64).ravel()
 
 
-def _judge_rows(basis: Basis, light: Light, frame: Measured, moved_px: _Array, uneven: bool) -> list[Check]:
+def _judge_rows(basis: Basis, light: FrameLight, frame: Measured, moved_px: _Array, uneven: bool) -> list[Check]:
     """Return whether rows show what belongs into them, and by how much they are blurred if not."""
     down = float(moved_px[1])
     rest = basis.strips(frame, light.amounts, down)
@@ -123,7 +126,8 @@ def _wrong_rows(basis: Basis, rest: Residuals, moved_px: _Array) -> npt.NDArray[
     assert basis.strip_maps is not None
     strength = np.linalg.norm(basis.strip_maps.sum(axis=0), axis=1).reshape(-1, SEGMENTS)
     steep = np.abs(np.gradient(strength, axis=0)).ravel() / np.maximum(strength.ravel(), 1e-6)
-    least = limits.ROW_DEVIATION + (_EDGE + steep) * float(np.hypot(*moved_px))
+    by = float(np.hypot(*moved_px))
+    least = limits.ROW_DEVIATION + _EDGE * by + steep * max(by, _UNSEEN_PX)
     room = np.maximum(least, limits.ROW_SIGMAS * np.maximum(usual, rest.noise))
     return np.asarray(np.abs(np.where(seen, rest.signed, 0.0)) > room)
 

@@ -22,7 +22,7 @@ from acquisition.framing.planes import CHANNELS, Channel, Plane
 from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.tags import FoundTag
 from acquisition.judge.anchor import Anchor
-from acquisition.judge.measuring import Measured, Noise, Places
+from acquisition.judge.measuring import FramePlaces, Measured, Noise
 
 VERSION = 1
 """Of the format of the bytes."""
@@ -100,7 +100,7 @@ class Frame:
                     empty=facts["levels"][3],
                     camera=facts["camera"][0],
                     serial=facts["camera"][1],
-                    places=Places(rows, columns),
+                    places=FramePlaces(rows, columns),
                 )
                 anchor = _anchor(arrays, facts["anchor"], (rows, columns)) if "anchor" in facts else None
                 return cls(measured, np.array(facts["paper"]), np.array(facts["moved_px"]), anchor)

@@ -11,7 +11,7 @@ value (`acquisition.judge.knowledge`), which each frame replaces.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -24,11 +24,11 @@ from acquisition.framing.planes import CHANNELS, Channel, frame_black, phases
 from acquisition.framing.previews import preview_jpeg
 from acquisition.judge import limits
 from acquisition.judge.anchor import Anchor
-from acquisition.judge.basis import Light
+from acquisition.judge.basis import FrameLight
 from acquisition.judge.evenness import judge_evenness
 from acquisition.judge.exposure import Exposure, disagreement, refusal
 from acquisition.judge.frame import Frame
-from acquisition.judge.knowledge import Found, Knowledge, codes_of, primary_of
+from acquisition.judge.knowledge import Examined, Knowledge, Leaning, codes_of, primary_of
 from acquisition.judge.lights import judge_light
 from acquisition.judge.measuring import Measured, measure
 from acquisition.judge.references import judge_dark, judge_first_primary, judge_white
@@ -62,10 +62,11 @@ class _Looked:
 
     frame: Frame
     checks: tuple[Check, ...]
-    light: Light | None = None
+    light: FrameLight | None = None
     off: npt.NDArray[np.bool_] | None = None
     brightness: float = float("nan")
     stepped: bool = False
+    leaning: Leaning = field(default_factory=Leaning)
 
 
 class LiveJudge:
@@ -101,7 +102,7 @@ class LiveJudge:
             self._known = replace(self._known, lost=self._known.lost or lost)
             return
         light = None if self._known.basis is None else self._known.basis.light(frame.measured)
-        self._known = self._known.after(step, Found(frame, light, accepted))
+        self._known = self._known.after(step, Examined(frame, light, accepted))
 
     def judge(self, file: Path, step: SessionStep) -> Judgement:
         """Return what is said of a raw file; see `acquisition.session.judgement.FrameJudge.judge`."""
@@ -118,8 +119,14 @@ class LiveJudge:
         looked = _look(known, mosaic, black, step, self._settings, self._chart, self._plan)
         checks = _named_once(looked.checks)
         cause = next((check for check in checks if check.reason), None)
-        found = Found(
-            looked.frame, looked.light, cause is None, cause.name if cause else "", looked.brightness, looked.stepped
+        found = Examined(
+            looked.frame,
+            looked.light,
+            cause is None,
+            cause.name if cause else "",
+            looked.brightness,
+            looked.stepped,
+            looked.leaning,
         )
         following = known.after(step, found)
         disagreeing = _judge_basis(known, following)
@@ -158,7 +165,7 @@ def _look(
     plan: Sequence[tuple[int, int, int]],
 ) -> _Looked:
     """Return what is found of a frame of a step."""
-    measured = measure(mosaic)
+    measured = measure(mosaic, black)
     frame = Frame(measured, np.full(3, np.nan), _NONE)
     checks = [
         *_judge_file(known, mosaic, measured, settings),
@@ -220,7 +227,7 @@ def _look_at_light(
     checks += [*evenness.checks, *verdict.checks]
     if step.kind == "white" and known.modelled:
         checks.append(Check("additivity", round(100 * known.model.overlap, 2), None, None, "%"))
-    return _Looked(frame, tuple(checks), light, evenness.off, verdict.brightness, verdict.stepped)
+    return _Looked(frame, tuple(checks), light, evenness.off, verdict.brightness, verdict.stepped, verdict.leaning)
 
 
 def _judge_basis(known: Knowledge, following: Knowledge) -> Check | None:
@@ -382,13 +389,14 @@ def _judge_movement(
         return [*checks, Check("blur", None, None, judge.blur_px, "px")], place
     softer = float(np.sign(shift.softer_px2) * np.sqrt(abs(shift.softer_px2)))
     blurred = ""
-    if abs(softer) > judge.blur_px:
+    low = -limits.SHARPER * judge.blur_px
+    if not low <= softer <= judge.blur_px:
         blurred = (
             f"the frame is {'softer' if softer > 0 else 'sharper'} than the first white frame by a blur of "
             f"{abs(softer):.2f} px, {judge.blur_px:g} px allowed; was the focus touched, is autofocus or stabilisation "
             "on, or does something shake?"
         )
-    return [*checks, Check("blur", round(softer, 3), -judge.blur_px, judge.blur_px, "px", blurred)], place
+    return [*checks, Check("blur", round(softer, 3), low, judge.blur_px, "px", blurred)], place
 
 
 _UNRECOGNISED = (

@@ -9,13 +9,15 @@ Rules that hold inside:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.judge import limits
 from acquisition.judge.anchor import Anchor
-from acquisition.judge.basis import Basis, Light
+from acquisition.judge.basis import Basis, FrameLight
 from acquisition.judge.frame import Frame
 from acquisition.judge.measuring import Measured
 from acquisition.judge.response import FULL, Codes, ProjectorModel
@@ -23,6 +25,9 @@ from acquisition.session.plan import SessionStep
 
 RECENT = 6
 """Frames whose noise is compared with the next one's: a camera's memory card hands out none older."""
+
+LEANING = 3
+"""Frames whose small deviations are taken together; more would take a drift that is followed for a step."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -36,8 +41,36 @@ class Seen:
     amounts: _Array | None
 
 
+@dataclass(frozen=True)
+class Leaning:
+    """By how much lights were off that were accepted: deviations too small for one frame show in two or three.
+
+    Attributes
+    ----------
+    lamp, added
+        Level of the lamp over the one expected (logarithm), and neutral light added (of white), of the newest frame
+        first, each with its standard deviation; at most `LEANING` frames.
+    """
+
+    lamp: tuple[tuple[float, float], ...] = ()
+    added: tuple[tuple[float, float], ...] = ()
+
+    def then(self, newer: Leaning) -> Leaning:
+        """Return both, the newer first."""
+        return Leaning((*newer.lamp, *self.lamp)[:LEANING], (*newer.added, *self.added)[:LEANING])
+
+
+def combined(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Return the weighted mean of values with standard deviations, and its own; (0, inf) of none."""
+    weights = [sd**-2 for _, sd in values]
+    total = sum(weights)
+    if not total:
+        return 0.0, float("inf")
+    return sum(value * weight for (value, _), weight in zip(values, weights, strict=True)) / total, total**-0.5
+
+
 @dataclass(frozen=True, eq=False)
-class Found:
+class Examined:
     """What was found of a frame, and said of it.
 
     Attributes
@@ -54,14 +87,17 @@ class Found:
         Level of the lamp over the one expected (logarithm); NaN where that is not known.
     stepped
         Whether it was accepted at another level of the lamp than expected.
+    leaning
+        How its light was off, however little.
     """
 
     frame: Frame
-    light: Light | None
+    light: FrameLight | None
     accepted: bool
     cause: str = ""
     brightness: float = float("nan")
     stepped: bool = False
+    leaning: Leaning = field(default_factory=Leaning)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +117,7 @@ class Knowledge:
     basis, model
         How a frame is a sum of primaries, and which amounts codes give.
     moved_px
-        (2,) where the chart lay last, from its place in the anchor; NaN if not known.
+        (2,) where the chart lies at rest, from its place in the anchor: (0, 0), or where a bump has left it.
     recent
         The last frames, the newest last.
     digests
@@ -90,6 +126,8 @@ class Knowledge:
         Names of checks that some accepted frame since the last good reference was too dark for.
     refused
         Cause, and number, of the refusals in a row.
+    leaning
+        By how much the last lights were off.
     candidate
         Level of the lamp (logarithm) and place of the chart (px) of the frame refused last; NaN where it was not that.
     rested
@@ -118,6 +156,7 @@ class Knowledge:
     digests: frozenset[bytes] = frozenset()
     untold: frozenset[str] = frozenset()
     refused: tuple[str, int] = ("", 0)
+    leaning: Leaning = field(default_factory=Leaning)
     candidate: tuple[float, float, float] = (float("nan"), float("nan"), float("nan"))
     rested: bool = False
     moved_on: bool = False
@@ -147,7 +186,7 @@ class Knowledge:
             return Knowledge(first=self.first, recent=self.recent, digests=self.digests, refused=self.refused)
         return replace(self, primaries=(None, None, None), basis=None, witness=None, asked=False)
 
-    def after(self, step: SessionStep, found: Found) -> Knowledge:
+    def after(self, step: SessionStep, found: Examined) -> Knowledge:
         """Return what is known after a frame of a step."""
         frame, codes = found.frame, codes_of(step)
         seen = Seen(codes, frame.measured, None if found.light is None else found.light.amounts)
@@ -164,15 +203,18 @@ class Knowledge:
             return replace(known, refused=(found.cause, count), candidate=(lamp, x, y))
         known = replace(known, refused=("", 0), candidate=(float("nan"),) * 3, first=self.first or frame.measured)
         if step.kind != "dark":
-            known = replace(known, rested=False)
-        if not np.isnan(frame.moved_px).any():
+            # After a step of the lamp nothing before it counts any more.
+            leaning = Leaning() if found.stepped or known.rested else known.leaning.then(found.leaning)
+            known = replace(known, rested=False, leaning=leaning)
+        steady = float(np.hypot(*(frame.moved_px - np.array(self.candidate[1:])))) <= limits.STEADY_PX
+        if not np.isnan(frame.moved_px).any() and (self.moved_px is None or self.rested or steady):
             known = replace(known, moved_px=frame.moved_px)
         if frame.anchor is not None:
             known = known._anchored(frame.anchor)
         known = known._referenced(step, frame)
         # A frame that makes the basis has been learnt from with it.
         if found.light is not None and self.modelled and known.modelled and step.kind != "dark":
-            model = known.model.stepped() if found.stepped else known.model
+            model = known.model.stepped(found.brightness) if found.stepped else known.model
             known = replace(known, model=model.learn(found.light.amounts, codes))
         return known
 

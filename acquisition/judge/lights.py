@@ -8,14 +8,14 @@ could be: the light of the frame before, another one of the plan, the ordered on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.judge import limits
-from acquisition.judge.basis import Light
-from acquisition.judge.knowledge import Knowledge, Seen, codes_of
+from acquisition.judge.basis import FrameLight
+from acquisition.judge.knowledge import Knowledge, Leaning, Seen, codes_of, combined
 from acquisition.judge.response import Codes, Fit, ProjectorModel
 from acquisition.session.judgement import Check
 from acquisition.session.plan import SessionStep
@@ -33,15 +33,21 @@ _Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LightVerdict:
-    """What is said of a light: the checks, the lamp's level over the one expected, whether it is a step lived with."""
+    """What is said of a light: the checks, the lamp's level over the one expected, and what is kept of it."""
 
     checks: tuple[Check, ...]
     brightness: float = float("nan")
     stepped: bool = False
+    leaning: Leaning = field(default_factory=Leaning)
 
 
 def judge_light(
-    known: Knowledge, step: SessionStep, light: Light, plan: Sequence[Codes], angle_deg: float, drift_percent: float
+    known: Knowledge,
+    step: SessionStep,
+    light: FrameLight,
+    plan: Sequence[Codes],
+    angle_deg: float,
+    drift_percent: float,
 ) -> LightVerdict:
     """Return whether a lit frame shows what its step asks for.
 
@@ -69,7 +75,7 @@ def judge_light(
     room = max(drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
     reason, added = "", 0.0
     if wrong or fit.distance > limits.STALE_SIGMAS or abs(fit.brightness) > room:
-        reason, added = _cause(model, light, codes, before, plan, fit, wrong, room)
+        reason, added = _cause(model, light, codes, before, plan, fit, wrong, room, known.refused[0] == "light")
     stepped = False
     lamp = ""
     if not reason and abs(fit.brightness) > room:
@@ -78,6 +84,10 @@ def judge_light(
         stepped = abs(fit.brightness) <= limits.LAMP_FOLLOWED and abs(fit.brightness - level) <= room / 2
         lamp = "" if stepped else _brightness_reason(fit.brightness, light.amounts)
     percent = 100 * float(np.expm1(fit.brightness))
+    leaning = Leaning(((fit.brightness, fit.brightness_sd),), (_added(model, light, codes),))
+    if not reason and not lamp and not stepped and not known.rested:
+        lamp, added = _crept(known.leaning.then(leaning), light, drift_percent / 100)
+        reason = _ambient_reason(added) if added else ""
     ambient = (Check("ambient", round(100 * added, 2), None, None, "%", reason),) if added else ()
     # Where another cause changes the light, its brightness is none of the lamp's.
     checks = (
@@ -85,7 +95,19 @@ def judge_light(
         Check("light", round(fit.angle_deg, 3), None, round(limit, 3), "°", "" if added else reason),
         Check("lamp", round(percent, 2), round(-100 * room, 2), round(100 * room, 2), "%", lamp),
     )
-    return LightVerdict(checks, fit.brightness, stepped)
+    return LightVerdict(checks, fit.brightness, stepped, leaning)
+
+
+def _crept(leaning: Leaning, light: FrameLight, drift: float) -> tuple[str, float]:
+    """Return the reason against the lamp, or how much light is added, that the last lights together show."""
+    for count in range(2, len(leaning.lamp) + 1):
+        added, sd = combined(leaning.added[:count])
+        if added > max(limits.ADDED_LEAST, limits.BRIGHTNESS_SIGMAS * sd):
+            return "", added
+        brightness, sd = combined(leaning.lamp[:count])
+        if abs(brightness) > max(drift, limits.BRIGHTNESS_SIGMAS * sd):
+            return _brightness_reason(brightness, light.amounts), 0.0
+    return "", 0.0
 
 
 def same_light(one: _Array, other: _Array, scatter: float) -> float:
@@ -97,13 +119,14 @@ def same_light(one: _Array, other: _Array, scatter: float) -> float:
 
 def _cause(
     model: ProjectorModel,
-    light: Light,
+    light: FrameLight,
     codes: Codes,
     before: Seen | None,
     plan: Sequence[Codes],
     fit: Fit,
     wrong: bool,
     room: float,
+    followed: bool,
 ) -> tuple[str, float]:
     """Return why a light is not the one ordered, empty where it is but its lamp, and how much light is added to it."""
     squared = fit.distance**2 + (fit.brightness / fit.brightness_sd) ** 2
@@ -115,11 +138,27 @@ def _cause(
                 "does the screen stand still, or is sequence.settle_s too short?",
                 0.0,
             )
-    ambient = _ambient(model, light, codes)
+    remains = _added_of(model, light, codes, before)
+    ambient = _added_of(model, light, codes, None)
+    if wrong and remains is not None and (ambient is None or remains[1] + 9 < ambient[1]):
+        return (
+            f"{100 * remains[0]:.1f} % of the light of the frame before remain in this one; let the picture settle for "
+            "longer (sequence.settle_s), and switch dynamic contrast and frame interpolation off",
+            0.0,
+        )
     if wrong:
-        if ambient is not None and ambient[1] < limits.LIGHT_SIGMAS**2:
+        if ambient is not None:
             return _ambient_reason(ambient[0]), ambient[0]
         other = _other(model, light, codes, plan, squared)
+        coloured = 0.0 if other else _coloured(model, light, codes)
+        if coloured:
+            return _ambient_reason(coloured), coloured
+        again = before is not None and before.amounts is not None and before.codes == codes and followed
+        if again and not other and fit.angle_deg <= limits.LIGHT_FOLLOWED_DEG:
+            assert before is not None
+            assert before.amounts is not None
+            if same_light(light.amounts, before.amounts, model.chroma_sd) < limits.LIGHT_SIGMAS:
+                return "", 0.0
         return other or _wrong_reason(model, light, codes), 0.0
     if fit.brightness > room and ambient is not None and ambient[1] + 9 < fit.distance**2:
         return _ambient_reason(ambient[0]), ambient[0]
@@ -128,7 +167,7 @@ def _cause(
     return "", 0.0
 
 
-def _wrong_reason(model: ProjectorModel, light: Light, codes: Codes) -> str:
+def _wrong_reason(model: ProjectorModel, light: FrameLight, codes: Codes) -> str:
     expected = model.predict(codes).amounts
     parts = ", ".join(
         f"{name} {100 * seen:.1f} % instead of {100 * wanted:.1f} %"
@@ -140,7 +179,7 @@ def _wrong_reason(model: ProjectorModel, light: Light, codes: Codes) -> str:
     )
 
 
-def _other(model: ProjectorModel, light: Light, codes: Codes, plan: Sequence[Codes], squared: float) -> str:
+def _other(model: ProjectorModel, light: FrameLight, codes: Codes, plan: Sequence[Codes], squared: float) -> str:
     """Return the sentence that names the light of the plan, or black or white, that is seen instead; empty if none."""
     # Only what is about as bright and of that colour is compared in full.
     found: tuple[float, Codes] | None = None
@@ -171,20 +210,48 @@ def _near(model: ProjectorModel, amounts: _Array, plan: Sequence[Codes], most: i
     return [plan[k] for k in np.argsort(off, kind="stable")[:most].tolist()]
 
 
-def _ambient(model: ProjectorModel, light: Light, codes: Codes) -> tuple[float, float] | None:
-    """Return how much neutral light, of white, added to the one ordered explains it, and the squared distance left."""
-    expected = model.predict(codes)
-    h, neutral = expected.amounts, np.ones(3)
-    covariance = expected.covariance + light.covariance
-    # The lamp is where it was, within its scatter: what is added is asked for.
-    covariance = covariance + (model.brightness_sd**2 + 1e-6) * np.outer(h, h)
-    weight = np.linalg.inv(covariance)
+def _added(model: ProjectorModel, light: FrameLight, codes: Codes) -> tuple[float, float]:
+    """Return how much neutral light, of white, is added to the one ordered, and its standard deviation."""
+    expected, neutral = model.predict(codes), np.ones(3)
+    h = expected.amounts
+    weight = np.linalg.inv(expected.with_lamp + light.covariance + model.brightness_sd**2 * np.outer(h, h))
     power = float(neutral @ weight @ neutral)
-    added = float(neutral @ weight @ (light.amounts - h)) / power
-    off = light.amounts - h - added * neutral
-    if added <= 4 * power**-0.5 or added < 0.002:
+    return float(neutral @ weight @ (light.amounts - h)) / power, power**-0.5
+
+
+def _added_of(model: ProjectorModel, light: FrameLight, codes: Codes, of: Seen | None) -> tuple[float, float] | None:
+    """Return how much neutral light added to the one ordered, or share of another frame's in it, explains what is seen.
+
+    And the squared distance left; None where that is nothing, or unlikely.
+    """
+    expected = model.predict(codes)
+    h = expected.amounts
+    if of is None:
+        more = np.ones(3)
+    elif of.amounts is None or of.codes == codes or not any(of.codes):
         return None
-    return added, float(off @ weight @ off)
+    else:
+        # For a share of the time the other light was there instead.
+        more = of.amounts - h
+    # The lamp is where it was, within its scatter: what is added is asked for.
+    covariance = expected.covariance + light.covariance + (model.brightness_sd**2 + 1e-6) * np.outer(h, h)
+    weight = np.linalg.inv(covariance)
+    power = float(more @ weight @ more)
+    added = float(more @ weight @ (light.amounts - h)) / power
+    off = light.amounts - h - added * more
+    left = float(off @ weight @ off)
+    if added <= 4 * power**-0.5 or added < 0.002 or left > limits.LIGHT_SIGMAS**2:
+        return None
+    return added, left
+
+
+def _coloured(model: ProjectorModel, light: FrameLight, codes: Codes) -> float:
+    """Return how much light of any colour, of white, is added to the one ordered; 0 where it is not just more light."""
+    expected = model.predict(codes)
+    off = light.amounts - expected.amounts
+    sd = np.sqrt(np.diag(expected.with_lamp) + (model.brightness_sd * expected.amounts) ** 2)
+    more = float(np.mean(off))
+    return more if (off > -3 * sd).all() and limits.ADDED_LEAST < more < limits.ADDED_MOST else 0.0
 
 
 def _ambient_reason(added: float) -> str:
@@ -208,7 +275,7 @@ def _brightness_reason(brightness: float, amounts: _Array) -> str:
     )
 
 
-def _without_model(light: Light, codes: Codes, before: Seen | None) -> Check:
+def _without_model(light: FrameLight, codes: Codes, before: Seen | None) -> Check:
     """Return what can be said without frames of the primaries: whether nothing has changed since the frame before."""
     if before is None or before.amounts is None or before.codes == codes or not any(codes) or not any(before.codes):
         return Check("light")

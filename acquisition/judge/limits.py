@@ -58,12 +58,23 @@ photosites' own differences are large; 0.3 is a correlation of 0.9, 0 the same f
 LEAST_NOISE: Final = 0.4
 """Standard deviation of a photosite, counts, below which noise cannot tell a repeated frame: rounding remains."""
 
+ADDED_LEAST: Final = 0.004
+"""Light added to several frames, of white, that is called ambient: build-lut warns of half as much in dark frames,
+which show less of it."""
+
+ADDED_MOST: Final = 0.1
+"""The most that a room's light is taken to add; more is another picture."""
+
 LAMP_FOLLOWED: Final = 0.055
 """Largest step of the lamp that is lived with when the frame is repeated and shows it again (logarithm, 5 %): each
 light has its own ground truth, so that brightness harms none; a larger step is a lamp that fails."""
 
 LAMP_TOTAL: Final = 15.0
 """Largest change of paper white since the session's first white frame, per cent: beyond, build-lut makes no table."""
+
+LIGHT_FOLLOWED_DEG: Final = 2.0
+"""Largest angle between the light seen and the one ordered that is lived with when the frame is repeated and shows it
+again, and it is no other light: the projector mixes otherwise than was learnt. build-lut warns from there on."""
 
 MOVED_FOLLOWED_PX: Final = 1.0
 """Largest displacement that is lived with when the frame is repeated and shows the chart at rest there: build-lut moves
@@ -75,8 +86,12 @@ STEADY_PX: Final = 0.1
 DIM_DN: Final = 40.0
 """Counts of paper above black below which a frame is too dark to tell movement (0.02 px at 66) and blur."""
 
-BLUR_DIM_DN: Final = 250.0
-"""The same for blur alone, which is a second derivative of the picture."""
+BLUR_DIM_DN: Final = 500.0
+"""The same for blur alone, a second derivative of the picture: at 420 counts hot photosites in two of four tags gave
+0.4 px (200 of a million photosites, `benchmarks.detection`)."""
+
+SHARPER: Final = 2.0
+"""How many times larger a loss of blur may be than a growth: no sample suffers from it."""
 
 LASTING_FRAMES: Final = 3
 """Frames refused in a row for one cause that make it a lasting one: as many as a step has attempts by default."""

@@ -56,7 +56,7 @@ _Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Places:
+class FramePlaces:
     """The places of a frame of `rows` × `columns` blocks."""
 
     rows: int
@@ -111,7 +111,7 @@ class Sums:
     empty: int
 
 
-def sum_counts(counts: npt.NDArray[np.uint16], places: Places, clipping: float, floor: float) -> Sums:
+def sum_counts(counts: npt.NDArray[np.uint16], places: FramePlaces, clipping: float, floor: float) -> Sums:
     """Return the mean counts at all places, in one pass.
 
     Parameters
@@ -167,7 +167,7 @@ class Measured:
     black
         Mean black level of the frame, counts.
     black_measured
-        Whether it was measured in the frame's masked border.
+        Whether the frame has a masked border to measure it in.
     range_dn
         Saturation minus black.
     brightest_dn
@@ -191,7 +191,7 @@ class Measured:
     empty: float
     camera: str
     serial: str
-    places: Places
+    places: FramePlaces
 
     @property
     def level(self) -> _Array:
@@ -199,12 +199,11 @@ class Measured:
         return np.asarray(self.tiles.mean(axis=0))
 
 
-def measure(mosaic: Mosaic) -> Measured:
-    """Return what is measured of a frame."""
+def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
+    """Return what is measured of a frame; `black` (2, 2) float64 counts if it is known already."""
     blocks = mosaic.block_planes()
-    places = Places(int(blocks.shape[2]), int(blocks.shape[3]))
-    black = frame_black(mosaic)
-    measured = bool(mosaic.masked) and mosaic.masked_black() is not None
+    places = FramePlaces(int(blocks.shape[2]), int(blocks.shape[3]))
+    black = frame_black(mosaic) if black is None else black
     mean_black = float(black.mean())
     floor = _EMPTY_SHARE * mean_black if mean_black >= _LEAST_BLACK else 0.0
     sums = sum_counts(mosaic.counts, places, CLIPPING_SHARE * mosaic.white_level, floor)
@@ -225,7 +224,7 @@ def measure(mosaic: Mosaic) -> Measured:
         digest=hashlib.blake2b(sampled.tobytes(), digest_size=16).digest(),
         noise=_noise(pair.astype(np.float64) - [black[place] for place in of["G"]]),
         black=mean_black,
-        black_measured=measured,
+        black_measured=bool(mosaic.masked),
         range_dn=float(mosaic.white_level - mean_black),
         brightest_dn=bright,
         clipped=sums.clipped / mosaic.counts.size,
@@ -236,7 +235,7 @@ def measure(mosaic: Mosaic) -> Measured:
     )
 
 
-def strip_blocks(places: Places) -> float:
+def strip_blocks(places: FramePlaces) -> float:
     """Return how many blocks a strip has, on average."""
     return places.columns / SEGMENTS
 

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from acquisition.judge import limits
 from acquisition.judge.frame import Frame
 from acquisition.judge.knowledge import Knowledge
 from acquisition.judge.lights import same_light
-from acquisition.judge.measuring import Measured
+from acquisition.judge.measuring import TILE_COLUMNS, TILE_ROWS, Measured
 from acquisition.session.judgement import Check
 
 _SIGMAS = 6.0
 """Standard deviations of a mean's noise that no change is made of."""
+
+_TILES = 16
+"""Tiles that are averaged before their change in the dark is looked at: a lamp in a corner lights as many."""
 
 _STALE_LEAST = 0.02
 """Amount of light in a dark frame, of a primary, from which on the frame before may be what is seen."""
@@ -21,8 +25,8 @@ _STALE_LEAST = 0.02
 def judge_dark(known: Knowledge, frame: Measured, dark_percent: float, ambient_percent: float) -> tuple[Check, ...]:
     """Return whether a dark frame is dark, and changed by no more than `ambient_percent` of white since the first.
 
-    Both limits are per cent of what white gives in the same channel; the larger of the frame's mean and its brightest
-    sixteenth counts, so that a lamp in a corner shows.
+    Both limits are per cent of what white gives in the same place and channel; the change is that of the region, one of
+    24, that changed most, so that a lamp in a corner shows.
     """
     if known.white is None:
         return (Check("dark"),)
@@ -49,11 +53,10 @@ def judge_dark(known: Knowledge, frame: Measured, dark_percent: float, ambient_p
     checks = [Check("light" if stale else "dark", round(value, 3), None, dark_percent, "%", reason)]
     first = known.first_dark
     if first is not None and not reason:
-        changed = 100 * (frame.tiles - first.tiles) / scale
+        changed = _by_region(100 * (frame.tiles - first.tiles) / scale)
         noise = 100 * float(np.sqrt(frame.noise.variance(frame.level).max() / frame.places.tile_blocks.mean()))
-        noise /= float(scale.min())
-        by_mean, local = np.abs(changed.mean(axis=0)), np.abs(changed)
-        drift = float(max(by_mean.max(), np.percentile(local, 94)))
+        noise /= float(scale.min()) * _TILES**0.5
+        drift = float(np.abs(changed).max())
         limit = max(ambient_percent, _SIGMAS * noise)
         # Without a masked border the black level is a constant of the file's, and its drift looks like light.
         if not frame.black_measured:
@@ -67,6 +70,13 @@ def judge_dark(known: Knowledge, frame: Measured, dark_percent: float, ambient_p
             )
         checks.append(Check("ambient", round(drift, 3), None, round(limit, 3), "%", reason))
     return tuple(checks)
+
+
+def _by_region(tiles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return means (24, 3) of 4×4 tiles each of tiles (T, 3)."""
+    side = round(_TILES**0.5)
+    grid = tiles.reshape(TILE_ROWS // side, side, TILE_COLUMNS // side, side, 3)
+    return np.asarray(grid.mean(axis=(1, 3))).reshape(-1, 3)
 
 
 def judge_white(known: Knowledge, frame: Frame) -> Check:

@@ -292,7 +292,7 @@ def test_an_output_that_is_switched_off_or_over_is_waited_for(made: Path, tmp_pa
             assert len(taken.done_steps()) == len(taken.steps)
 
 
-@pytest.mark.parametrize("compositor", [None])
+@pytest.mark.parametrize("compositor", [None, "xcompmgr"])
 def test_a_window_that_is_gone_before_the_exposure_ends_is_found(rehearsal: Rehearsal, compositor: str | None) -> None:
     """It leaves its pixels on a screen that no compositor repairs; where one does, they are in the frame alone."""
     if compositor is not None:

@@ -32,7 +32,7 @@ from sim.world.world import World
 LAB = 'rig = "simulated"\nchart = "chart.json"\nilluminations = "illuminations.csv"\n'
 
 Counts = npt.NDArray[np.uint16]
-_frames = itertools.count()
+FRAMES = itertools.count()
 
 
 @dataclass
@@ -55,7 +55,7 @@ class Bench:
         counts = self.world.expose(
             gone_wrong.shown(moment),
             self.settings.camera.exposure,
-            key=(next(_frames),),
+            key=(next(FRAMES),),
             situation=gone_wrong.situation(moment),
         )
         return gone_wrong.counted(counts, moment)

@@ -26,7 +26,8 @@ from sim.world.disturbances import (
 )
 from sim.world.room import Room
 from sim.world.sensors import BODIES
-from tests.acquisition.judge.conftest import EXPOSURE, LAB, Bench, bench
+from sim.world.situation import Situation
+from tests.acquisition.judge.conftest import EXPOSURE, FRAMES, LAB, Bench, bench
 
 ORANGE, SKY, DEEP_BLUE = (255, 197, 126), (113, 188, 255), (0, 0, 255)
 WHITE_STEP = SessionStep(901, "white", None, WHITE)
@@ -336,3 +337,42 @@ def test_a_chart_that_is_not_there_is_said_in_the_first_frame(tmp_path: Path, ta
     assert judgement.lasting
     bare = bench(tmp_path, Room(seed=3), lab=LAB + "[judge]\nchart = false\n")
     assert bare.show(wall, WHITE_STEP).accepted
+
+
+def test_a_projector_that_does_not_add_is_told_and_not_refused(tmp_path: Path, taught: Bench) -> None:
+    lab = bench(tmp_path, Room(seed=3, wheel_hz=60, transfer=2.2), count=16, every=8)
+    lab.world = taught.world
+
+    def shown(colour: Colour) -> Situation:
+        alone = lab.world.room.light_of(np.array([colour.red, colour.green, colour.blue])) / 1.4
+        return Situation(picture=(alone + 0.4 * alone.min()).astype(np.float32)[None, None])
+
+    def take(step: SessionStep, colour: Colour | None = None) -> Judgement:
+        key = (next(FRAMES),)
+        return lab.show(lab.world.expose(step.colour, EXPOSURE, key=key, situation=shown(colour or step.colour)), step)
+
+    said = [take(step) for step in lab.steps]
+    assert [judgement.reason for judgement in said if judgement.reason] == []
+    white = next(one for one, step in zip(said[::-1], lab.steps[::-1], strict=True) if step.kind == "white")
+    assert check(white, "additivity").value == pytest.approx(40, abs=3)
+    limits = [check(one, "light").high or 0 for one, step in zip(said, lab.steps, strict=True) if step.kind == "light"]
+    assert max(limits) > 0.8  # wider than where light adds
+    assert cause(take(lab.light(*ORANGE), Colour(*SKY))) == "light"
+
+
+def test_a_picture_that_comes_late_is_told(taught: Bench) -> None:
+    lab = taught.fork()
+    assert lab.take(lab.light(*SKY)).accepted
+    late = lab.take(lab.light(*ORANGE), HalfChanged(place=(-9, -9, 9, 9), share=0.08), before=Colour(*SKY))
+    assert cause(late) == "light"
+    assert "of the frame before" in late.reason
+
+
+def test_a_light_too_dark_for_it_leaves_blur_to_the_next_reference(taught: Bench) -> None:
+    lab = taught.fork()
+    dim = lab.take(lab.light(0, 0, 56), Defocus(px=1))
+    assert check(dim, "blur").value is None
+    assert dim.accepted, dim.reason
+    white = lab.take(WHITE_STEP, Defocus(px=1))
+    assert cause(white) == "blur"
+    assert white.voids
