@@ -28,7 +28,7 @@ from acquisition.judge.basis import FrameLight
 from acquisition.judge.evenness import judge_evenness
 from acquisition.judge.exposure import Exposure, disagreement, refusal
 from acquisition.judge.frame import Frame
-from acquisition.judge.knowledge import Examined, Knowledge, Leaning, codes_of, primary_of
+from acquisition.judge.knowledge import Examined, Knowledge, Leaning, codes_of, is_brightest_grey, primary_of
 from acquisition.judge.lights import judge_light
 from acquisition.judge.measuring import Measured, measure
 from acquisition.judge.references import judge_dark, judge_first_primary, judge_white
@@ -151,7 +151,7 @@ class LiveJudge:
             preview=preview_jpeg(mosaic, black, white, outlines, boxes, cause.reason if cause else ""),
             voids=disagreeing is not None
             or (cause is not None and step.kind in ("white", "dark") and _voids(known, cause.name)),
-            lasting=cause is not None and _lasts(self._known, cause.name),
+            lasting=cause is not None and _lasts(self._known, step, cause.name),
         )
 
 
@@ -201,7 +201,9 @@ def _look(
         frame = replace(frame, moved_px=moved)
     looked = _look_at_light(known, frame, step, settings, plan)
     if step.kind == "white":
-        checks.append(judge_white(known, frame))
+        checks.append(judge_white(known.first_white, frame))
+    if is_brightest_grey(step):
+        checks.append(judge_white(known.first_grey, frame))
     return replace(looked, checks=(*checks, *looked.checks))
 
 
@@ -463,6 +465,8 @@ def _voids(known: Knowledge, cause: str) -> bool:
     return cause in _HIDDEN or cause in known.untold or (cause in _BY_MODEL and not known.modelled)
 
 
-def _lasts(known: Knowledge, cause: str) -> bool:
+def _lasts(known: Knowledge, step: SessionStep, cause: str) -> bool:
     """Return whether taking the frame again will not help; `known` includes it."""
-    return cause in _AT_ONCE or known.refused[1] >= limits.LASTING_FRAMES
+    # A lamp that is another one at the beginning of a run would cost every light up to the next white frame.
+    another = cause == "white drift" and is_brightest_grey(step)
+    return another or cause in _AT_ONCE or known.refused[1] >= limits.LASTING_FRAMES

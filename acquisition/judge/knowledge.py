@@ -112,6 +112,8 @@ class Knowledge:
         The session's first accepted frame: camera, size, serial number.
     first_white, white, first_dark, dark
         Accepted references.
+    first_grey
+        The first frame of the brightest grey, whose paper that of a run taken up again is held against.
     primaries
         Frames of the three primaries at `FULL`.
     basis, model
@@ -145,6 +147,7 @@ class Knowledge:
     anchor: Anchor | None = None
     first: Measured | None = None
     first_white: Frame | None = None
+    first_grey: Frame | None = None
     white: Measured | None = None
     first_dark: Measured | None = None
     dark: Measured | None = None
@@ -243,6 +246,8 @@ class Knowledge:
             if known.basis is not None and known.basis.of_primaries:
                 known = replace(known, basis=known.basis.with_dark(measured))
         primary = primary_of(codes_of(step))
+        if is_brightest_grey(step):
+            known = replace(known, first_grey=self.first_grey or frame)
         if not self.modelled and (step.kind == "white" or (step.kind == "response" and primary is None)):
             known = replace(known, witness=measured)
         if step.kind == "response" and primary is not None and len(measured.strips):
@@ -273,6 +278,11 @@ class Knowledge:
 def codes_of(step: SessionStep) -> Codes:
     """Return the codes of red, green and blue that a step shows."""
     return step.colour.red, step.colour.green, step.colour.blue
+
+
+def is_brightest_grey(step: SessionStep) -> bool:
+    """Return whether a step shows grey at `FULL`, with which a run that is taken up again begins."""
+    return step.kind == "response" and codes_of(step) == (FULL, FULL, FULL)
 
 
 def primary_codes(primary: int) -> Codes:

@@ -391,7 +391,8 @@ class Pipeline:
         then = "it is taken again" if again else "it is left for the next run"
         sentence = f"{step_name(step)}: {judgement.reason}"
         self._patience.report("refused", f"{sentence} ({then})")
-        if judgement.lasting or self._agenda.is_stuck or self._probing:
+        # What would be taken again without a good reference would be voided again, all night.
+        if judgement.lasting or self._agenda.is_stuck or self._probing or (judgement.voids and not again):
             self._lasting = sentence
 
     def _void_since_reference(self, refused: _Attempt, why: str) -> None:

@@ -298,6 +298,13 @@ def test_a_run_taken_up_again_knows_what_was_seen(taught: Bench, tmp_path: Path)
     assert resumed.take(resumed.light(*SKY), weaker).accepted
     assert cause(resumed.show(resumed.counts(resumed.light(*SKY), weaker), resumed.light(*ORANGE))) == "light"
     assert cause(resumed.take(resumed.light(*SKY), LampStep(percent=-6))) == "lamp"
+    another = replace(first, judge=LiveJudge(first.settings, first.chart, first.lights))
+    for step, measurement in kept:
+        another.judge.recall(step, measurement, True)
+    # Another lamp is told before the first light is taken under it.
+    tie = another.take(tie_steps(500)[0], LampStep(percent=-21))
+    assert cause(tie) == "white drift"
+    assert tie.lasting
 
 
 def test_a_chart_that_moved_between_runs_is_told_and_followed(taught: Bench, tmp_path: Path) -> None:

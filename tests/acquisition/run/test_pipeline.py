@@ -187,6 +187,18 @@ class TestRefusals:
         accepted = [attempt.step for attempt in lab.session.journal.attempts() if attempt.verdict == "accepted"]
         assert sorted(accepted) == list(range(10)), "each step once"
 
+    def test_a_reference_that_voids_for_ever_ends_the_run_when_patience_does(self, folder: Path) -> None:
+        class NoWhite(ScriptedJudge):
+            def judge(self, file: Path, step: SessionStep) -> Judgement:
+                seen = super().judge(file, step)
+                return refused("white is 21 % weaker", voids=True) if step.number in (4, 8) else seen
+
+        lab = Lab(folder, lights=FOUR, reference_every=2)
+        with pytest.raises(QualityError, match="white is 21 % weaker"):
+            run(lab, NoWhite())
+        assert len(lab.taken()) < 40, "lights are not taken again and again meanwhile"
+        assert run(lab, ScriptedJudge()).complete
+
     def test_a_response_frame_voids_what_was_taken_since_the_last_light(self, folder: Path) -> None:
         lab = Lab(folder, lights=FOUR, reference_every=2)
         ending = Ending(lambda sentence: None)
