@@ -239,8 +239,8 @@ def run(
     """Take the session, or take up one that was interrupted.
 
     What a dry run prints is checked before anything moves. Reads LAB.toml, the chart and the lights it names. Writes
-    SESSION: session.toml, chart.json, illuminations.csv, frames/, journal.sqlite, frames.csv. Interrupt it as you like
-    and run it again. Ends with 4 when some frames were refused; the next run tries those again.
+    SESSION: session.toml, chart.json, illuminations.csv, frames/, previews/, journal.sqlite, frames.csv, report.html.
+    Interrupt it as you like and run it again. Ends with 4 when frames were refused; the next run tries those again.
     """
     from acquisition.config import load_lab
     from acquisition.run.run import run_session

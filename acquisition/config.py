@@ -158,22 +158,24 @@ class JudgeSettings(_Settings):
     """Whether a session begins with the projector's primaries and greys, by which the light of all codes is foretold:
     false saves some twenty frames, and lights are then held against less."""
     moved_px: NotNegative = 0.2
-    """Largest displacement of the chart since the first white frame, px: ten times the error of the measurement on a
-    dark frame (0.02 at 66 counts), and below 0.3, about the margin that the 25 samples of a cell have."""
+    """Largest displacement of the chart from where it lies at rest, px: in the first white frame, or where it was
+    pushed to and stays, if that is less than a pixel away. Ten times the error of the measurement on a dark frame
+    (0.02 at 66 counts), and below 0.3, about the margin that the 25 samples of a cell have."""
     blur_px: NotNegative = 0.3
     """Largest growth of the blur σ since the first white frame, px, as the root of the difference of the squares: less
     than a lens's own 0.5."""
     drift_percent: NotNegative = 1.0
-    """Largest change of paper white from one white frame to the next, per cent: usual for a warm lamp; `build-lut`
-    warns at as much."""
+    """Deviation of the lamp's level from the one expected after the frames before that is always allowed, per cent:
+    usual for a warm lamp; `build-lut` warns at as much. Where lights scatter, more is allowed."""
     dark_percent: NotNegative = 5.0
     """Largest light in a dark frame, of white, per cent: half of what `build-lut` refuses. It warns from 0.5 on, and so
     does `acquire check`: light that is always there harms deep colours, and no frame gets better by being retaken."""
     ambient_percent: NotNegative = 0.2
     """Largest change of that light since the first dark frame, of white, per cent: `build-lut` warns at as much."""
     light_deg: NotNegative = 0.5
-    """Largest angle between the light seen and the one ordered, as predicted from the primaries, degrees: a
-    quarter of the 2 degrees within which a fifth of the 707 have their neighbour."""
+    """Angle between the light seen and the one ordered, as predicted from the response frames, that is always allowed,
+    degrees; where the prediction is uncertain, more is. A quarter of the 2 degrees within which a fifth of the 707 have
+    their neighbour."""
 
 
 class SimulatedSettings(_Settings):

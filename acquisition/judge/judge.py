@@ -34,7 +34,7 @@ from acquisition.judge.measuring import Measured, measure
 from acquisition.judge.references import judge_dark, judge_first_primary, judge_white
 from acquisition.lights.illuminations import Illumination
 from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import SessionStep
+from acquisition.session.plan import REFERENCES, SessionStep
 from drivers.raw.rawfile import Mosaic, read_raw
 from foundation.errors import FormatError, RegistrationError
 
@@ -150,7 +150,7 @@ class LiveJudge:
             measurement=looked.frame.to_bytes(with_strips=_is_compared(step)),
             preview=preview_jpeg(mosaic, black, white, outlines, boxes, cause.reason if cause else ""),
             voids=disagreeing is not None
-            or (cause is not None and step.kind in ("white", "dark") and _voids(known, cause.name)),
+            or (cause is not None and step.kind in REFERENCES and _voids(known, cause.name)),
             lasting=cause is not None and _lasts(self._known, step, cause.name),
         )
 
@@ -457,7 +457,7 @@ def _shown_white(known: Knowledge, frame: Frame) -> npt.NDArray[np.float64]:
 
 
 def _is_compared(step: SessionStep) -> bool:
-    return step.kind in ("white", "dark") or (step.kind == "response" and primary_of(codes_of(step)) is not None)
+    return step.kind in REFERENCES or (step.kind == "response" and primary_of(codes_of(step)) is not None)
 
 
 def _voids(known: Knowledge, cause: str) -> bool:

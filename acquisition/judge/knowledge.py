@@ -20,8 +20,8 @@ from acquisition.judge.anchor import Anchor
 from acquisition.judge.basis import Basis, FrameLight
 from acquisition.judge.frame import Frame
 from acquisition.judge.measuring import Measured
-from acquisition.judge.response import FULL, Codes, ProjectorModel
-from acquisition.session.plan import SessionStep
+from acquisition.judge.response import Codes, ProjectorModel
+from acquisition.session.plan import PRIMARIES, REFERENCES, SessionStep
 
 RECENT = 6
 """Frames whose noise is compared with the next one's: a camera's memory card hands out none older."""
@@ -115,7 +115,7 @@ class Knowledge:
     first_grey
         The first frame of the brightest grey, whose paper that of a run taken up again is held against.
     primaries
-        Frames of the three primaries at `FULL`.
+        Frames of the three primaries at `acquisition.session.plan.TOP`.
     basis, model
         How a frame is a sum of primaries, and which amounts codes give.
     moved_px
@@ -237,7 +237,7 @@ class Knowledge:
         """Return what is known with a frame that later ones are compared with."""
         measured = frame.measured
         known = self
-        if step.kind in ("white", "dark"):
+        if step.kind in REFERENCES:
             known = replace(known, untold=frozenset())
         if step.kind == "white":
             known = replace(known, white=measured, first_white=self.first_white or frame, moved_on=False)
@@ -270,7 +270,7 @@ class Knowledge:
                 if self.white is not None and not self.moved_on:
                     model = model.learn(basis.light(self.white).amounts, (255, 255, 255))
                 return replace(self, basis=basis, model=model)
-            if self.white is not None and step.kind in ("white", "dark"):
+            if self.white is not None and step.kind in REFERENCES:
                 return replace(self, basis=Basis.of_white(self.white, self.dark))
         return self
 
@@ -286,10 +286,11 @@ def is_brightest_grey(step: SessionStep) -> bool:
 
 
 def primary_codes(primary: int) -> Codes:
-    """Return the codes that show primary 0, 1 or 2 alone at `FULL`."""
-    return (FULL if primary == 0 else 0, FULL if primary == 1 else 0, FULL if primary == 2 else 0)
+    """Return the codes that show primary 0, 1 or 2 alone at `TOP` (`acquisition.session.plan`)."""
+    colour = PRIMARIES[primary]
+    return colour.red, colour.green, colour.blue
 
 
 def primary_of(codes: Codes) -> int | None:
-    """Return which primary codes show alone at `FULL`; None if they show anything else."""
+    """Return which primary codes show alone at `TOP`; None if they show anything else."""
     return next((number for number in range(3) if codes == primary_codes(number)), None)

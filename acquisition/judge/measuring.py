@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.planes import CHANNELS, CLIPPING_SHARE, Channel, frame_black, phases
+from acquisition.judge.exposure import BRIGHTEST_PERCENTILE
 from drivers.raw.rawfile import Mosaic
 from foundation.compiled import compiled
 
@@ -48,9 +49,6 @@ _INNER = 0.3
 
 _INNER_SIGMAS = 0.3853
 """Standard deviations within which that share of normal deviates lies: Φ⁻¹(0.65)."""
-
-_BRIGHTEST = 99.9
-"""Percentile of sampled blocks' channels that stands for the brightest counts (as in `acquisition.judge.exposure`)."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -213,7 +211,7 @@ def measure(mosaic: Mosaic, black: _Array | None = None) -> Measured:
     greens = [2 * r + c for r, c in of["G"]]
     pair = sampled[:, greens]
     bright = max(
-        float(np.percentile(sampled[:, 2 * r + c], _BRIGHTEST) - black[r, c]) for places_of in of.values()
+        float(np.percentile(sampled[:, 2 * r + c], BRIGHTEST_PERCENTILE) - black[r, c]) for places_of in of.values()
         for r, c in places_of
     )  # fmt: skip
     tiles, strips = (_channels(means - black.ravel(), of) for means in (sums.tiles, sums.strips))

@@ -1,6 +1,6 @@
 """What a projector makes of its codes: learnt from response frames, refined by every light that was accepted.
 
-The light of a frame is described by the amounts of the three primaries, each 1 at its code of `FULL`. The logarithm of
+The light of a frame is described by the amounts of the three primaries, each 1 at its code of `TOP`. The logarithm of
 an amount is a power law of its code, plus a smooth deviation (the tone curve), plus what light is added where primaries
 overlap (a wheel with white, yellow, cyan or magenta segments, "brilliant colour"), plus the lamp's level. All of it is
 one linear Gaussian state, known with a covariance, which every accepted frame improves; a prediction therefore has an
@@ -19,8 +19,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-FULL = 250
-"""Code at which the primaries are shown: near the top, and never taken for a planned light or a reference."""
+from acquisition.session.plan import TOP
 
 _NODES = np.array([4, 8, 16, 24, 32, 44, 56, 72, 88, 104, 120, 136, 152, 168, 184, 200, 216, 232, 255.0])
 """Codes at which tone curves are known; between them a curve bends by less than a thousandth."""
@@ -36,7 +35,7 @@ _OWN = 0.15
 """How much of that a primary may have for itself: the three curves of a projector are much alike, LCDs least."""
 
 _LEVEL = 0.01
-"""Prior standard deviation of a primary's frame at `FULL` about its true level: a colour wheel's ½ %, and the
+"""Prior standard deviation of a primary's frame at `TOP` about its true level: a colour wheel's ½ %, and the
 lamp's."""
 
 _OVERLAP = 0.25
@@ -95,13 +94,13 @@ Codes = tuple[int, int, int]
 
 
 def _x(codes: npt.ArrayLike) -> _Array:
-    return np.log(np.maximum(np.asarray(codes, dtype=np.float64), 0.5) / FULL)
+    return np.log(np.maximum(np.asarray(codes, dtype=np.float64), 0.5) / TOP)
 
 
 def _kernel(a: _Array, b: _Array, slope: float, bend: float) -> _Array:
     far = (a[:, None] - b[None]) / _LENGTH
     near_full = np.exp(-0.5 * (a / _LENGTH) ** 2)[:, None] * np.exp(-0.5 * (b / _LENGTH) ** 2)[None]
-    # Bends are conditioned on none at `FULL`, where an amount is 1 by definition.
+    # Bends are conditioned on none at `TOP`, where an amount is 1 by definition.
     return slope**2 * a[:, None] * b[None] + bend**2 * (np.exp(-0.5 * far**2) - near_full)
 
 

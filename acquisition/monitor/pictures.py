@@ -5,18 +5,12 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
+from acquisition.session.records import preview_path
+
 MOST_PICTURE_BYTES = 4 << 20
 """Bytes of a preview that is shown: many times what one of 640 pixels has."""
 
 _JPEG = b"\xff\xd8\xff"
-
-
-def preview_path(folder: Path, file: str) -> Path:
-    """Return where the preview of a raw file is, if there is one; `file` as in the journal.
-
-    Only the name of `file` counts, so that no row of a journal leads out of `previews/`.
-    """
-    return folder / "previews" / f"{Path(file).stem}.jpg"
 
 
 def preview_version(folder: Path, file: str) -> int | None:

@@ -14,14 +14,13 @@ from pathlib import Path
 from acquisition.monitor.encoding import head_json
 from acquisition.monitor.head import Head
 from acquisition.monitor.page import still_page
-from acquisition.monitor.pictures import preview_path, read_picture
+from acquisition.monitor.pictures import read_picture
 from acquisition.monitor.reading import SessionView, read_session
 from acquisition.monitor.rows import AttemptView
 from acquisition.monitor.watching import SessionWatch
-from acquisition.session.folder import Session
 from acquisition.session.heartbeat import Process
 from acquisition.session.progress import duration_text
-from acquisition.session.records import ACCEPTED
+from acquisition.session.records import ACCEPTED, preview_path
 from foundation.errors import FormatError
 from foundation.files import write_whole
 
@@ -32,8 +31,8 @@ MOST_PICTURES_BYTES = 6 << 20
 """Bytes of all pictures in a report: with the third that base64 adds it can still be mailed (10 MB at most servers)."""
 
 
-def write_session_report(session: Session) -> Path:
-    """Write the report of a session into its folder, in place of one that is there, and return its path.
+def write_session_report(folder: Path) -> Path:
+    """Write the report of the session in `folder` into it, in place of one that is there, and return its path.
 
     To be called at the end of a run, also by the run itself: a run that goes on in this very process counts as ended.
 
@@ -44,8 +43,8 @@ def write_session_report(session: Session) -> Path:
     StorageError
         The disk is full, read-only or gone.
     """
-    path = session.folder / REPORT_FILE
-    save_report(session.folder, path)
+    path = folder / REPORT_FILE
+    save_report(folder, path)
     return path
 
 

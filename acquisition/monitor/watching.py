@@ -18,9 +18,10 @@ from pathlib import Path
 
 from acquisition.monitor.encoding import Json, attempt_json, digest, event_json, head_json, session_json
 from acquisition.monitor.head import Head
-from acquisition.monitor.pictures import preview_path, preview_version
+from acquisition.monitor.pictures import preview_version
 from acquisition.monitor.reading import SessionView, read_session
 from acquisition.session.journal import JOURNAL_FILE
+from acquisition.session.records import preview_path
 from foundation.errors import CropError
 
 FRESH_S = 0.25

@@ -105,7 +105,7 @@ def run_session(
 def _report(session: Session) -> None:
     """Write the session's report; it is derived, so that a disk that does not take it leaves the run as it ended."""
     with suppress(CropError):
-        write_session_report(session)
+        write_session_report(session.folder)
 
 
 def open_session(settings: LabSettings, folder: Path) -> Session:

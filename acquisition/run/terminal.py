@@ -116,7 +116,7 @@ class Terminal:
         self._bar.update(self._task, completed=done, total=total, left=left)
 
     def taken(self, taken: Taken) -> None:
-        """Show the verdict of a frame; one that was refused does not count for the time left."""
+        """Show the verdict of a frame, and take its time for that of those to come."""
         self._time.taken()
         self._bar.update(self._task, said=verdict_line(taken))
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
@@ -30,7 +30,7 @@ from acquisition.session.plan import SessionStep
 from acquisition.session.records import FrameRecord
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
-from foundation.errors import FormatError, StorageError
+from foundation.errors import FormatError
 from foundation.files import is_partial, reading_error, require_free, storage_error, whole_folder, write_whole
 from foundation.held_folders import held_folder
 
@@ -177,11 +177,6 @@ class Session:
         else:
             self._hold.close()
 
-    @property
-    def is_held(self) -> bool:
-        """Whether it was opened for a run."""
-        return self._hold is not None
-
     def settings_text(self) -> str:
         """Return the text of `session.toml`.
 
@@ -200,15 +195,15 @@ class Session:
                 f"cannot read {path}, the settings of the session: {error}; restore it from a copy"
             ) from error
 
-    def receive(self, stem: str, capture: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
-        """Let the camera write a raw file into `frames/`; it is complete and on the disk when this returns.
+    def receive(self, stem: str, fill: Callable[[BinaryIO], CapturedFrame]) -> ReceivedFile:
+        """Let a raw file be written into `frames/`; it is complete and on the disk when this returns.
 
         Parameters
         ----------
         stem
             Name without suffix; the suffix is that of the camera's own file name.
-        capture
-            Writes the whole raw file into the stream it is given; `drivers.camera.Camera.download`.
+        fill
+            Writes the whole raw file into the stream it is given, as `drivers.camera.Camera.download` does.
 
         Raises
         ------
@@ -218,7 +213,7 @@ class Session:
             The disk is full, read-only or gone. Nothing is left behind.
         """
         with self.incoming(stem) as incoming:
-            return incoming.complete(capture(incoming.stream))
+            return incoming.complete(fill(incoming.stream))
 
     def incoming(self, stem: str) -> IncomingFile:
         """Return a raw file to be filled, for which `receive` is too simple; see `IncomingFile`.
@@ -254,7 +249,7 @@ class Session:
         received
             The raw file.
         judgement
-            What was found; a preview is kept in `previews/`, as long as the disk takes it.
+            What was found; kept whole but for its preview.
         timings
             Seconds that each part of the attempt took, by name.
         exposure_s
@@ -273,13 +268,6 @@ class Session:
             judgement=judgement,
             timings=timings,
         )
-        if judgement.preview:
-            with suppress(StorageError):
-                write_whole(self.preview_path(received.path.stem), judgement.preview)
-
-    def preview_path(self, stem: str) -> Path:
-        """Return where the preview of a frame is, if there is one; `stem` is that of its raw file."""
-        return self.folder / "previews" / f"{stem}.jpg"
 
     def add_steps(self, steps: Sequence[SessionStep]) -> None:
         """Put steps at the end of the plan; their numbers must be free."""

@@ -16,6 +16,9 @@ known. Frames of the last kind are looked at while a session is taken, and never
 KINDS: tuple[FrameKind, ...] = get_args(FrameKind)
 """Every kind, as journals name them."""
 
+REFERENCES: tuple[FrameKind, ...] = ("white", "dark")
+"""Kinds of frames that lights are held against."""
+
 TOP = 250
 """Highest code of a response frame; 255 is left to white and to the lights, so that none is taken for one of them."""
 

@@ -1,9 +1,13 @@
-"""The rows of a session's journal as values: frames that count, attempts, events, and the words of verdicts."""
+"""The rows of a session's journal as values: frames that count, attempts, events, and the words of verdicts.
+
+And where the preview is that belongs to a row.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 
 from acquisition.session.plan import FrameKind
 
@@ -80,3 +84,11 @@ class SessionEvent:
     at: datetime
     what: str
     detail: str
+
+
+def preview_path(folder: Path, file: str) -> Path:
+    """Return where the preview of a raw file is, if there is one; `folder` is the session, `file` as in the journal.
+
+    Only the name of `file` counts, so that no row of a journal leads out of `previews/`.
+    """
+    return folder / "previews" / f"{Path(file).stem}.jpg"

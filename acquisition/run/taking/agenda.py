@@ -16,14 +16,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 
-from acquisition.session.plan import FrameKind, SessionStep
+from acquisition.session.plan import REFERENCES, FrameKind, SessionStep
 
 GIVEN_UP_IN_A_ROW = 3
 """Steps given up one after another after which going on makes no sense: something lasting is wrong. One may be chance,
 and two neighbours may share a cause that passes."""
-
-REFERENCES: tuple[FrameKind, ...] = ("white", "dark")
-"""Kinds of frames that lights are held against."""
 
 
 class Agenda:

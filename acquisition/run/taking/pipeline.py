@@ -31,11 +31,11 @@ from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
 from acquisition.run.lamp import await_health, health_fault
 from acquisition.run.patience import Patience, Pause, is_curable
-from acquisition.run.taking.agenda import REFERENCES, Agenda, step_name
+from acquisition.run.taking.agenda import Agenda, step_name
 from acquisition.run.taking.saving import FilledFile, Saved, Saver, download
 from acquisition.session.folder import Session
 from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import SessionStep
+from acquisition.session.plan import REFERENCES, SessionStep
 from acquisition.session.records import ACCEPTED
 from drivers.presenter import ReadsBack
 from foundation.console import Ending

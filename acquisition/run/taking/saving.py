@@ -17,6 +17,7 @@ from acquisition.session.folder import Session
 from acquisition.session.incoming import IncomingFile, ReceivedFile
 from acquisition.session.judgement import Check, FrameJudge, Judgement
 from acquisition.session.plan import SessionStep
+from acquisition.session.records import preview_path
 from drivers.camera import Camera, CapturedFrame
 from foundation.errors import DeviceError, StorageError
 from foundation.files import write_whole
@@ -113,5 +114,5 @@ class Saver:
             if seen.preview:
                 # It is derived and may be lost; flushing it would cost the devices' thread as much as a row.
                 with suppress(StorageError):
-                    write_whole(self._session.preview_path(received.path.stem), seen.preview)
+                    write_whole(preview_path(self._session.folder, received.path.name), seen.preview)
         return Saved(received, judgement, saved - begun, time.perf_counter() - saved)

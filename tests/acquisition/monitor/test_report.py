@@ -54,17 +54,14 @@ def test_it_holds_the_session_and_its_pictures(run: MadeUpRun, tmp_path: Path) -
 
 
 def test_a_run_that_writes_it_counts_as_ended_and_others_do_not(run: MadeUpRun) -> None:
-    class Opened:
-        folder = run.folder
-
-    path = write_session_report(Opened())  # pyright: ignore[reportArgumentType]
+    path = write_session_report(run.folder)
     assert path == run.folder / "report.html"
     head = data_of(path)["head"]
     assert head["state"] == "incomplete"
     assert head["sentence"] == "ended with 3 of 8 frames left; run the same command again"
     for step in run.steps[5:]:
         run.take(step)
-    assert data_of(write_session_report(Opened()))["head"]["state"] == "complete"  # pyright: ignore[reportArgumentType]
+    assert data_of(write_session_report(run.folder))["head"]["state"] == "complete"
 
 
 def test_pictures_are_bounded_and_those_of_refused_frames_go_first(
