@@ -21,7 +21,7 @@ from acquisition.judge.basis import Basis, FrameLight
 from acquisition.judge.frame import Frame
 from acquisition.judge.measuring import Measured
 from acquisition.judge.response import Codes, ProjectorModel
-from acquisition.session.plan import PRIMARIES, REFERENCES, SessionStep
+from acquisition.session.plan import PRIMARIES, REFERENCES, TOP, SessionStep
 
 RECENT = 6
 """Frames whose noise is compared with the next one's: a camera's memory card hands out none older."""
@@ -281,8 +281,8 @@ def codes_of(step: SessionStep) -> Codes:
 
 
 def is_brightest_grey(step: SessionStep) -> bool:
-    """Return whether a step shows grey at `FULL`, with which a run that is taken up again begins."""
-    return step.kind == "response" and codes_of(step) == (FULL, FULL, FULL)
+    """Return whether a step shows grey at `TOP`, with which a run that is taken up again begins."""
+    return step.kind == "response" and codes_of(step) == (TOP, TOP, TOP)
 
 
 def primary_codes(primary: int) -> Codes:
