@@ -21,6 +21,12 @@ class CameraIdentity:
     serial: str
     firmware: str = ""
 
+    @property
+    def name(self) -> str:
+        """Maker and model, the maker once where the model begins with it."""
+        first, begins = (words.casefold().split()[:1] for words in (self.maker, self.model))
+        return self.model if first == begins else f"{self.maker} {self.model}".strip()
+
 
 @dataclass(frozen=True)
 class ExposureSettings:

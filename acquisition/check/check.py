@@ -253,8 +253,7 @@ def _make_devices_ready(
 ) -> tuple[list[str], list[Finding]]:
     """Make every device ready for a frame; return a line about each, and what screen and projector report."""
     body = devices.camera.identity()
-    name = body.model if body.model.startswith(body.maker.split()[0]) else f"{body.maker} {body.model}"
-    lines = [f"camera      {name}, serial {body.serial}"]
+    lines = [f"camera      {body.name}, serial {body.serial}"]
     warnings = devices.presenter.warnings() if isinstance(devices.presenter, ReportsWarnings) else ()
     findings = [Finding("screen", "remark", warning) for warning in warnings]
     devices.camera.configure(settings.camera.exposure)

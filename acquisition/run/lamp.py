@@ -53,6 +53,13 @@ def make_ready(projector: Projector, sequence: SequenceSettings, patience: Patie
         _warm_up(projector, sequence, patience)
 
 
+def reported_error(projector: Projector) -> DeviceFault | None:
+    """Return the errors that a projector reports of its parts, in one sentence; None where it reports none."""
+    parts = ", ".join(fault.part for fault in projector.faults() if fault.severity is Severity.ERROR)
+    remedy = "look at its display and have it repaired"
+    return DeviceFault(f"the projector reports an error of its {parts}; {remedy}") if parts else None
+
+
 def require_healthy(projector: Projector) -> None:
     """Require that light leaves the projector and that it reports no error.
 
@@ -61,11 +68,8 @@ def require_healthy(projector: Projector) -> None:
     DeviceFault
         It is off, muted, frozen, without a signal, or reports an error.
     """
-    errors = [fault.part for fault in projector.faults() if fault.severity is Severity.ERROR]
-    if errors:
-        raise DeviceFault(
-            f"the projector reports an error of its {', '.join(errors)}; look at its display and have it repaired"
-        )
+    if (error := reported_error(projector)) is not None:
+        raise error
     power = projector.power()
     if power is not Power.ON:
         remedy = "it is waited for" if power is Power.WARMING else "switch it on"

@@ -108,17 +108,6 @@ def _report(session: Session) -> None:
         write_session_report(session.folder)
 
 
-def open_session(settings: LabSettings, folder: Path) -> Session:
-    """Open the session `folder` for a run, after making it if it is not there.
-
-    Raises
-    ------
-    InputError
-        As `run_session`.
-    """
-    return _taken_up(settings, folder) if session_exists(folder) else _begun(settings, folder)
-
-
 def _taken_up(settings: LabSettings, folder: Path) -> Session:
     session = Session.open_for_run(folder)
     try:

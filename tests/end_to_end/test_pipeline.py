@@ -13,7 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
+from acquisition.chart.model import load_chart
 from acquisition.config import load_lab
+from acquisition.lights.illuminations import load_illuminations
 from acquisition.run.rig.simulated import sheet, simulated_body, simulated_room
 from acquisition.session.folder import Session
 from calibration.table.lut import Lut, open_lut
@@ -201,10 +203,12 @@ def test_a_table_of_another_version_is_named(built: Path, lut: Lut, tmp_path: Pa
 
 
 def test_a_session_without_frames_is_said(built: Path, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    from acquisition.run.run import open_session
+    from acquisition.run.planning.work import planned_steps
 
     settings = load_lab(built / "LAB.toml")
-    open_session(settings, built / "bare").close()
+    lights = load_illuminations(settings.illuminations)
+    steps = planned_steps(settings, lights)
+    Session.create(built / "bare", settings.to_toml(), load_chart(settings.chart), lights, steps).close()
     assert run("calibration.cli", built / "bare", built / "never") in (2, 4)
     assert "frame" in capsys.readouterr().err
     assert not (built / "never").exists()

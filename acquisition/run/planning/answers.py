@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from acquisition.run.devices import Devices
+from acquisition.run.lamp import reported_error
 from drivers.camera import CameraIdentity, ReportsSupplies, Supplies
 from drivers.presenter import ReportsWarnings
-from drivers.projector import Power, Projector, Severity
-from foundation.errors import CropError, DeviceError, DeviceFault
+from drivers.projector import Power, Projector
+from foundation.errors import CropError, DeviceError
 
 _Answer = TypeVar("_Answer")
 
@@ -79,7 +80,8 @@ def ask(devices: Devices) -> Answers:
     if projector is not None:
         state, lit = answer(lambda: _state(projector), ("", None))
         if lit is not None:
-            faults += answer(lambda: _reported(projector), [])
+            error = answer(lambda: reported_error(projector), None)
+            faults += [] if error is None else [error]
     else:
         unasked.append("lamp: the projector is not under control; switch it on half an hour before")
     warnings: tuple[str, ...] = ()
@@ -97,9 +99,3 @@ def _state(projector: Projector) -> tuple[str, bool | None]:
     lit = power is Power.ON
     state = "its lamp burns and is taken as warm" if lit else f"in {power.value}: it will be lit"
     return f"{name}{f', lamp {hours}' if hours else ''}, {state}", lit
-
-
-def _reported(projector: Projector) -> list[CropError]:
-    parts = ", ".join(fault.part for fault in projector.faults() if fault.severity is Severity.ERROR)
-    remedy = "look at its display and have it repaired"
-    return [DeviceFault(f"the projector reports an error of its {parts}; {remedy}")] if parts else []

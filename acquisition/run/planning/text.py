@@ -70,9 +70,7 @@ def _disk(plan: RunPlan, count: str) -> str:
 def _camera(answers: Answers) -> str:
     if answers.camera is None:
         return "could not be asked"
-    maker, text = answers.camera.maker, answers.camera.model
-    if maker and not text.startswith(maker.split()[0]):
-        text = f"{maker} {text}"
+    text = answers.camera.name
     if answers.camera.serial:
         text += f", serial number {answers.camera.serial}"
     supplies = answers.supplies

@@ -31,7 +31,7 @@ def open_rig(
     chart
         What hangs on the wall, for the simulated lab.
     session
-        The session that is taken up; None for a check that records nothing.
+        The session that is taken up; None for a new one, and for a check, which records nothing.
 
     Raises
     ------
