@@ -401,6 +401,10 @@ def _judge_movement(
     return [*checks, Check("blur", round(softer, 3), low, judge.blur_px, "px", blurred)], place
 
 
+_ROWS_STAND_PX = 0.7
+"""Blur, px, below which rows show what belongs into them (simulated: none deviates at 0.75 px): rows that do not are
+what made edges look softer, and no blur."""
+
 _UNRECOGNISED = (
     "the chart is not recognised where it was: it is covered, out of focus, or has moved by more than its tags show; "
     "look at the picture, and put camera and chart back"
@@ -445,6 +449,11 @@ def _named_once(checks: Sequence[Check]) -> tuple[Check, ...]:
         # Tags that are not recognised have a cause; tags that moved are one.
         if movement.value is None:
             reasons.remove("movement")
+    blur = one.get("blur")
+    if "rows" in reasons and "blur" in reasons and blur is not None and abs(blur.value or np.inf) < _ROWS_STAND_PX:
+        reasons.remove("blur")
+        one["blur"] = replace(blur, reason="")
+        order = [one[check.name] for check in order]
     cause = reasons[0] if reasons else ""
     follows = _FOLLOWS.get(cause, frozenset())
     return tuple(replace(check, reason="") if check.name in follows else check for check in order)

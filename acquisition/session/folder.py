@@ -30,7 +30,7 @@ from acquisition.session.plan import SessionStep
 from acquisition.session.records import FrameRecord
 from drivers.camera import CapturedFrame
 from drivers.presenter import Colour
-from foundation.errors import FormatError
+from foundation.errors import FormatError, InputError
 from foundation.files import is_partial, reading_error, require_free, storage_error, whole_folder, write_whole
 from foundation.held_folders import held_folder
 
@@ -315,7 +315,7 @@ class Session:
         Raises
         ------
         InputError
-            The selection names no lights of this session.
+            The selection names no lights of this session, or the report no frames.
         FormatError
             There is no report on it.
         StorageError
@@ -326,6 +326,11 @@ class Session:
         known = range(len(self.illuminations))
         if selection.strip() == BAD:
             refused = newest_report(self.folder, {frame.sha256 for frame in self.frames()})
+            if not refused.sha256:
+                raise InputError(
+                    f"--retake bad: {refused.report}, the newest report on {self.folder}, names no frame to be taken "
+                    "again; leave --retake out, or name the lights, as in --retake 12,40-44"
+                )
             chosen = [frame.attempt for frame in accepted if frame.sha256 in refused.sha256]
             self.journal.void(chosen, at, f"refused by build-lut, as {refused.report} says")
             return parse_lights(refused.lights, known) if refused.lights else ()

@@ -372,6 +372,7 @@ class Pipeline:
         )
         if judgement.accepted:
             self._agenda.accept(step)
+            self._tell_movement(step, judgement)
             if self._probing and step.kind != "dark":
                 self._probing[0].over()
                 self._probing = None
@@ -385,14 +386,28 @@ class Pipeline:
             self._void_since_light(attempt, judgement.reason)
         self._observe(Taken(step, judgement, len(self._agenda)))
 
+    def _tell_movement(self, step: SessionStep, judgement: Judgement) -> None:
+        """Say that the chart lies elsewhere than before, where its new place is followed."""
+        moved = next((check.value for check in judgement.checks if check.name == "movement"), None)
+        if moved is not None and moved > self._settings.judge.moved_px:
+            self._patience.report(
+                "moved",
+                f"{step_name(step)}: the chart lies {moved:.2f} px from where it was; the run goes on with its new "
+                "place, and build-lut follows it with a remark. Fix camera and print; to have all lights of one place, "
+                "begin a new session",
+            )
+
     def _refuse(self, step: SessionStep, judgement: Judgement) -> None:
         first = judgement.lasting or (judgement.voids and step.kind in REFERENCES)
         again = self._agenda.refuse(step, judgement.reason, before_others=first)
-        then = "it is taken again" if again else "it is left for the next run"
+        # What would be taken again without a good reference would be voided again, all night.
+        in_vain = judgement.voids and not again
+        pauses = bool(judgement.lasting or self._agenda.is_stuck or self._probing or in_vain)
+        after = "it is tried again after a pause" if pauses else "it is left for the next run"
+        then = "it is taken again" if again else after
         sentence = f"{step_name(step)}: {judgement.reason}"
         self._patience.report("refused", f"{sentence} ({then})")
-        # What would be taken again without a good reference would be voided again, all night.
-        if judgement.lasting or self._agenda.is_stuck or self._probing or (judgement.voids and not again):
+        if pauses:
             self._lasting = sentence
 
     def _void_since_reference(self, refused: _Attempt, why: str) -> None:

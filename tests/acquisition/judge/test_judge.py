@@ -183,6 +183,11 @@ def test_missing_and_misplaced_rows_are_told(taught: Bench) -> None:
     assert cause(lab.take(lab.light(*ORANGE), ZeroedStrip(top=0.5, bottom=0.51))) == "data"
     assert cause(lab.take(lab.light(*ORANGE), ScrambledRows())) == "rows"
     assert cause(lab.take(lab.light(*ORANGE), ScrambledRows(top=0.5, bottom=0.55))) == "rows"
+    # Among the tags, whose edges look softer by it.
+    torn = lab.take(lab.light(*ORANGE), ScrambledRows(top=0.3, bottom=0.35))
+    assert (check(torn, "blur").value or 0) > 0.3
+    assert cause(torn) == "rows"
+    assert [found.name for found in torn.checks if found.reason] == ["rows"]
 
 
 def test_another_camera_exposure_or_file_is_told(taught: Bench, tmp_path: Path) -> None:

@@ -233,6 +233,29 @@ class TestRefusals:
         assert "the chart has moved by 3.1 px" in said[3]
         assert lab.verdicts().count("refused") == 2
 
+    @pytest.mark.parametrize(("moved_px", "told"), [(5.97, True), (0.15, False), (None, False)])
+    def test_a_chart_that_is_followed_is_told_of(self, folder: Path, moved_px: float | None, told: bool) -> None:
+        lab = Lab(folder)
+        said: list[str] = []
+        followed = Judgement((Check("movement", moved_px, None, None, "px"),), measurement=b"moved")
+        assert run(lab, ScriptedJudge({2: followed}), announce=said.append).complete
+        words = [sentence for sentence in said if sentence.startswith("moved: ")]
+        assert len(words) == told
+        assert not told or "lies 5.97 px from where it was" in words[0]
+        assert [event.what for event in lab.session.journal.events()].count("moved") == told
+
+    def test_what_is_tried_again_after_a_pause_is_not_said_to_be_left(self, folder: Path) -> None:
+        said: list[str] = []
+        with pytest.raises(QualityError):
+            run(
+                Lab(folder),
+                ScriptedJudge(dict.fromkeys(range(60), refused("night", lasting=True))),
+                announce=said.append,
+            )
+        refusals = [sentence for sentence in said if sentence.startswith("refused: ")]
+        assert any("it is tried again after a pause" in sentence for sentence in refusals)
+        assert not any("it is left for the next run" in sentence for sentence in refusals)
+
     def test_what_lasts_ends_the_run_when_patience_does(self, folder: Path) -> None:
         lab = Lab(folder, dict.fromkeys(range(1000), NIGHT))
         begun = lab.clock.monotonic()

@@ -208,6 +208,13 @@ def test_without_a_report_on_this_session_nothing_is_bad(session: Session, tmp_p
         session.retake("bad")
 
 
+def test_a_report_that_refused_nothing_is_named(session: Session, tmp_path: Path) -> None:
+    write_report(tmp_path / "lut.refused", "2", [b"frame 0004_light_002"], b"frame 0000_white", 100)
+    write_report(tmp_path / "lut", "", [], b"frame 0000_white", 200)
+    with pytest.raises(InputError, match=r"lut/report.json, the newest report .* names no frame.*leave --retake out"):
+        session.retake("bad")
+
+
 def test_a_reader_takes_nothing_again(session: Session) -> None:
     session.close()
     with closing(Session.open(session.folder)) as reader, pytest.raises(StorageError, match="readonly"):
