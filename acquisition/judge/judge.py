@@ -28,7 +28,7 @@ from acquisition.judge.basis import FrameLight
 from acquisition.judge.evenness import judge_evenness
 from acquisition.judge.exposure import Exposure, disagreement, refusal
 from acquisition.judge.frame import Frame
-from acquisition.judge.knowledge import Examined, Knowledge, Leaning, codes_of, primary_of
+from acquisition.judge.knowledge import Examined, Knowledge, Leaning, codes_of, is_brightest_grey, primary_of
 from acquisition.judge.lights import judge_light
 from acquisition.judge.measuring import Measured, measure
 from acquisition.judge.references import judge_dark, judge_first_primary, judge_white
@@ -98,6 +98,8 @@ class LiveJudge:
         """Take in a frame of an earlier run; see `acquisition.session.judgement.FrameJudge.recall`."""
         frame = Frame.of_bytes(measurement) if measurement else None
         if frame is None:
+            lost = accepted and step.kind in ("white", "dark")
+            self._known = replace(self._known, lost=self._known.lost or lost)
             return
         light = None if self._known.basis is None else self._known.basis.light(frame.measured)
         self._known = self._known.after(step, Examined(frame, light, accepted))
@@ -126,7 +128,13 @@ class LiveJudge:
             looked.stepped,
             looked.leaning,
         )
-        self._known = known.after(step, found)
+        following = known.after(step, found)
+        disagreeing = _judge_basis(known, following)
+        if disagreeing is not None:
+            checks = (*(check for check in checks if check.name != "uniformity"), disagreeing)
+            cause = disagreeing
+            following = known.after(step, replace(found, accepted=False, cause=cause.name)).begun_anew()
+        self._known = following
         if cause is None:
             untold = {check.name for check in checks if check.value is None and check.name in ("movement", "blur")}
             self._known = replace(self._known, untold=self._known.untold | untold)
@@ -141,8 +149,9 @@ class LiveJudge:
             seen=None if np.isnan(paper).any() else (red, green, blue),
             measurement=looked.frame.to_bytes(with_strips=_is_compared(step)),
             preview=preview_jpeg(mosaic, black, white, outlines, boxes, cause.reason if cause else ""),
-            voids=cause is not None and step.kind in REFERENCES and _voids(known, cause.name),
-            lasting=cause is not None and _lasts(self._known, cause.name),
+            voids=disagreeing is not None
+            or (cause is not None and step.kind in REFERENCES and _voids(known, cause.name)),
+            lasting=cause is not None and _lasts(self._known, step, cause.name),
         )
 
 
@@ -165,6 +174,8 @@ def _look(
     ]
     if any(check.reason for check in checks):
         return _Looked(frame, tuple(checks))
+    if known.awaits_primaries and (step.kind == "light" or (step.kind == "response" and not _is_compared(step))):
+        return _Looked(frame, (*checks, Check("light", reason=_UNFOUNDED)))
     anchor = known.anchor
     if step.kind != "dark" and (anchor is None or (known.rested and _moved_far(known, mosaic, black, measured))):
         # The first lit frame is white; of a run taken up again it is the first in which the chart lies elsewhere.
@@ -190,7 +201,9 @@ def _look(
         frame = replace(frame, moved_px=moved)
     looked = _look_at_light(known, frame, step, settings, plan)
     if step.kind == "white":
-        checks.append(judge_white(known, frame))
+        checks.append(judge_white(known.first_white, frame))
+    if is_brightest_grey(step):
+        checks.append(judge_white(known.first_grey, frame))
     return replace(looked, checks=(*checks, *looked.checks))
 
 
@@ -217,6 +230,26 @@ def _look_at_light(
     if step.kind == "white" and known.modelled:
         checks.append(Check("additivity", round(100 * known.model.overlap, 2), None, None, "%"))
     return _Looked(frame, tuple(checks), light, evenness.off, verdict.brightness, verdict.stepped, verdict.leaning)
+
+
+def _judge_basis(known: Knowledge, following: Knowledge) -> Check | None:
+    """Return why frames of the primaries that are now known make no picture of the white or grey one; None if they do.
+
+    Each of them alone tells nothing of a part that is covered; all that follows would be held against it.
+    """
+    if known.modelled or not following.modelled or known.witness is None or following.basis is None:
+        return None
+    witness = known.witness
+    moved = np.zeros(2) if following.moved_px is None else following.moved_px
+    evenness = judge_evenness(following.basis, following.basis.light(witness), witness, moved)
+    if all(check.passed for check in evenness.checks):
+        return None
+    uneven = next((check for check in evenness.checks if check.name == "uniformity"), Check("uniformity"))
+    return replace(
+        uneven,
+        reason="the frames of the three primaries do not add up to the white or grey frame before them everywhere; did "
+        "somebody pass, or a window cover the picture? all of them are taken again",
+    )
 
 
 def _judge_file(
@@ -386,6 +419,12 @@ def _moved(by: tuple[float, float]) -> str:
     )
 
 
+_UNFOUNDED = (
+    "no frame of each primary, or none of black, is accepted, from which it is known what this light should look like; "
+    "see why those were refused"
+)
+
+
 _FOLLOWS: Mapping[str, frozenset[str]] = MappingProxyType(
     {
         "movement": frozenset({"rows", "uniformity", "blur", "light", "lamp", "white drift"}),
@@ -435,6 +474,8 @@ def _voids(known: Knowledge, cause: str) -> bool:
     return cause in _HIDDEN or cause in known.untold or (cause in _BY_MODEL and not known.modelled)
 
 
-def _lasts(known: Knowledge, cause: str) -> bool:
+def _lasts(known: Knowledge, step: SessionStep, cause: str) -> bool:
     """Return whether taking the frame again will not help; `known` includes it."""
-    return cause in _AT_ONCE or known.refused[1] >= limits.LASTING_FRAMES
+    # A lamp that is another one at the beginning of a run would cost every light up to the next white frame.
+    another = cause == "white drift" and is_brightest_grey(step)
+    return another or cause in _AT_ONCE or known.refused[1] >= limits.LASTING_FRAMES

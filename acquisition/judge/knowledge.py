@@ -21,7 +21,7 @@ from acquisition.judge.basis import Basis, FrameLight
 from acquisition.judge.frame import Frame
 from acquisition.judge.measuring import Measured
 from acquisition.judge.response import Codes, ProjectorModel
-from acquisition.session.plan import PRIMARIES, REFERENCES, SessionStep
+from acquisition.session.plan import PRIMARIES, REFERENCES, TOP, SessionStep
 
 RECENT = 6
 """Frames whose noise is compared with the next one's: a camera's memory card hands out none older."""
@@ -112,6 +112,8 @@ class Knowledge:
         The session's first accepted frame: camera, size, serial number.
     first_white, white, first_dark, dark
         Accepted references.
+    first_grey
+        The first frame of the brightest grey, whose paper that of a run taken up again is held against.
     primaries
         Frames of the three primaries at `acquisition.session.plan.TOP`.
     basis, model
@@ -134,11 +136,18 @@ class Knowledge:
         Whether the run was taken up again and no lit frame has been accepted since.
     moved_on
         Whether the chart lies elsewhere than in the white frame that is known.
+    asked
+        Whether this run has shown a primary alone, whatever the frame was like.
+    witness
+        The newest white or grey frame from before the primaries were known, by which they are held against it.
+    lost
+        Whether a reference of an earlier run is accepted and its measurement cannot be read.
     """
 
     anchor: Anchor | None = None
     first: Measured | None = None
     first_white: Frame | None = None
+    first_grey: Frame | None = None
     white: Measured | None = None
     first_dark: Measured | None = None
     dark: Measured | None = None
@@ -154,17 +163,31 @@ class Knowledge:
     candidate: tuple[float, float, float] = (float("nan"), float("nan"), float("nan"))
     rested: bool = False
     moved_on: bool = False
+    asked: bool = False
+    witness: Measured | None = None
+    lost: bool = False
 
     @property
     def modelled(self) -> bool:
         """Whether amounts are those of the projector's primaries, so that codes foretell them."""
         return self.basis is not None and self.basis.of_primaries
 
+    @property
+    def awaits_primaries(self) -> bool:
+        """Whether lights cannot be foretold only because frames that this run asked for were refused."""
+        return self.asked and not self.modelled and not self.lost
+
     def paused(self) -> Knowledge:
         """Return what is known after a pause of the run: the lamp may be at another level, the chart elsewhere."""
         if self.rested or not self.digests:
             return self
-        return replace(self, model=self.model.rested(), rested=True, recent=(), refused=("", 0))
+        return replace(self, model=self.model.rested(), rested=True, recent=(), refused=("", 0), asked=False)
+
+    def begun_anew(self) -> Knowledge:
+        """Return what is known where the frames of the primaries, or the one beside them, cannot be trusted."""
+        if not self.moved_on:
+            return Knowledge(first=self.first, recent=self.recent, digests=self.digests, refused=self.refused)
+        return replace(self, primaries=(None, None, None), basis=None, witness=None, asked=False)
 
     def after(self, step: SessionStep, found: Examined) -> Knowledge:
         """Return what is known after a frame of a step."""
@@ -174,6 +197,7 @@ class Knowledge:
             self,
             recent=(*self.recent, seen)[-RECENT:],
             digests=self.digests | {frame.measured.digest},
+            asked=self.asked or (step.kind == "response" and primary_of(codes) is not None),
         )
         if not found.accepted:
             count = self.refused[1] + 1 if found.cause == self.refused[0] else 1
@@ -222,6 +246,10 @@ class Knowledge:
             if known.basis is not None and known.basis.of_primaries:
                 known = replace(known, basis=known.basis.with_dark(measured))
         primary = primary_of(codes_of(step))
+        if is_brightest_grey(step):
+            known = replace(known, first_grey=self.first_grey or frame)
+        if not self.modelled and (step.kind == "white" or (step.kind == "response" and primary is None)):
+            known = replace(known, witness=measured)
         if step.kind == "response" and primary is not None and len(measured.strips):
             of: list[Measured | None] = list(known.primaries)
             of[primary] = measured
@@ -250,6 +278,11 @@ class Knowledge:
 def codes_of(step: SessionStep) -> Codes:
     """Return the codes of red, green and blue that a step shows."""
     return step.colour.red, step.colour.green, step.colour.blue
+
+
+def is_brightest_grey(step: SessionStep) -> bool:
+    """Return whether a step shows grey at `TOP`, with which a run that is taken up again begins."""
+    return step.kind == "response" and codes_of(step) == (TOP, TOP, TOP)
 
 
 def primary_codes(primary: int) -> Codes:

@@ -79,16 +79,15 @@ def _by_region(tiles: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.asarray(grid.mean(axis=(1, 3))).reshape(-1, 3)
 
 
-def judge_white(known: Knowledge, frame: Frame) -> Check:
-    """Return how far paper white is from that of the session's first white frame."""
-    first = known.first_white
+def judge_white(first: Frame | None, frame: Frame) -> Check:
+    """Return how far paper is from that of the session's first frame of this light, white or the brightest grey."""
     if first is None or np.isnan(frame.paper).any() or np.isnan(first.paper).any():
         return Check("white drift")
     drift = float(100 * (frame.paper.sum() / max(first.paper.sum(), 1.0) - 1))
     reason = ""
     if abs(drift) > limits.LAMP_TOTAL:
         reason = (
-            f"paper white is {drift:+.0f} % from the session's first white frame, {limits.LAMP_TOTAL:g} % allowed; let "
+            f"paper white is {drift:+.0f} % from the session's first frame, {limits.LAMP_TOTAL:g} % allowed; let "
             "the lamp warm up, or begin a new session"
         )
     return Check("white drift", round(drift, 2), -limits.LAMP_TOTAL, limits.LAMP_TOTAL, "%", reason)

@@ -60,7 +60,8 @@ class Judgement:
     preview
         The frame as JPEG for the eye; empty if there is none.
     voids
-        A refused reference: what was taken since the last good one cannot be trusted.
+        What was taken before cannot be trusted: of a refused reference all since the last good one, of another refused
+        frame all since the last light.
     lasting
         Taking the frame again will not help before somebody has removed the cause.
     """

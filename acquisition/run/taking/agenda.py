@@ -53,6 +53,7 @@ class Agenda:
     ) -> None:
         self._steps = {step.number: step for step in steps}
         self._first = list(first)
+        self._probes: list[int] = []
         self._open = {step.number for step in steps if step.number not in done} | set(self._first)
         self._attempts = attempts
         self._tries: Counter[int] = Counter()
@@ -97,10 +98,15 @@ class Agenda:
         self._tries[step.number] -= 1
 
     def retry(self) -> None:
-        """Give the steps that were given up their tries again: somebody has had time to remove the cause."""
+        """Give the steps that were given up their tries again: somebody has had time to remove the cause.
+
+        Those that came before all others do so again: they show whether it is removed.
+        """
         for number in self._given_up:
             self._tries[number] = 0
         self._given_up.clear()
+        self._first = [*self._probes, *self._first]
+        self._probes = []
         self._in_a_row = 0
 
     def accept(self, step: SessionStep) -> None:
@@ -125,15 +131,24 @@ class Agenda:
         """
         self._under_way.discard(step.number)
         self._open.add(step.number)
+        if before_others and step.number not in self._first:
+            self._first.append(step.number)
         if self._tries[step.number] >= self._attempts:
             self._give_up(step.number, reason)
             return False
-        if before_others and step.number not in self._first:
-            self._first.append(step.number)
         return True
 
-    def void(self, numbers: Iterable[int], reason: str) -> None:
-        """Open steps again whose frames cannot be trusted any more; those without a try left are given up."""
+    def void(self, numbers: Iterable[int], reason: str, *, before_others: bool = False) -> None:
+        """Open steps again whose frames cannot be trusted any more; those without a try left are given up.
+
+        Parameters
+        ----------
+        before_others
+            Whether they are tried before all other steps, in the order of the plan.
+        """
+        numbers = sorted(numbers)
+        if before_others:
+            self._first = [*numbers, *(number for number in self._first if number not in numbers)]
         for number in numbers:
             self._open.add(number)
             if self._tries[number] >= self._attempts:
@@ -143,6 +158,8 @@ class Agenda:
         if number not in self._given_up:
             self._in_a_row += 1
         self._given_up[number] = reason
+        if number in self._first:
+            self._probes.append(number)
         self._forget_first(number)
 
     def _forget_first(self, number: int) -> None:

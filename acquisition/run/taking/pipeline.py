@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -380,8 +380,10 @@ class Pipeline:
             self._refuse(step, judgement)
         if (reason := self._void_ahead.pop(attempt.number, "")) and judgement.accepted:
             self._void({attempt.number: step.number}, reason)
-        if judgement.voids:
+        if judgement.voids and step.kind in REFERENCES:
             self._void_since_reference(attempt, judgement.reason)
+        elif judgement.voids:
+            self._void_since_light(attempt, judgement.reason)
         self._observe(Taken(step, judgement, len(self._agenda)))
 
     def _tell_movement(self, step: SessionStep, judgement: Judgement) -> None:
@@ -396,8 +398,11 @@ class Pipeline:
             )
 
     def _refuse(self, step: SessionStep, judgement: Judgement) -> None:
-        again = self._agenda.refuse(step, judgement.reason, before_others=judgement.voids or judgement.lasting)
-        pauses = bool(judgement.lasting or self._agenda.is_stuck or self._probing)
+        first = judgement.lasting or (judgement.voids and step.kind in REFERENCES)
+        again = self._agenda.refuse(step, judgement.reason, before_others=first)
+        # What would be taken again without a good reference would be voided again, all night.
+        in_vain = judgement.voids and not again
+        pauses = bool(judgement.lasting or self._agenda.is_stuck or self._probing or in_vain)
         after = "it is tried again after a pause" if pauses else "it is left for the next run"
         then = "it is taken again" if again else after
         sentence = f"{step_name(step)}: {judgement.reason}"
@@ -423,13 +428,27 @@ class Pipeline:
         # Their frames have left the camera; whether they are accepted is known only later.
         self._void_ahead.update({pending.attempt.number: reason for pending in self._pending})
 
-    def _void(self, attempts: Mapping[int, int], reason: str) -> None:
-        """Void accepted attempts, given with the numbers of their steps, and have the steps taken again."""
+    def _void_since_light(self, refused: _Attempt, why: str) -> None:
+        """Void what was taken since the last light: the frames by which those to come would be judged."""
+        reason = f"taken together with {step_name(refused.step)}, which was refused: {why}"
+        since: dict[int, int] = {}
+        for attempt in self._session.journal.attempts():
+            if attempt.verdict == ACCEPTED and attempt.id < refused.number:
+                since = {} if attempt.kind == "light" else {**since, attempt.id: attempt.step}
+        # The refused one is taken again in its place among them.
+        self._void(since, reason, (*since.values(), refused.step.number))
+        self._void_ahead.update({pending.attempt.number: reason for pending in self._pending})
+
+    def _void(self, attempts: Mapping[int, int], reason: str, first: Collection[int] = ()) -> None:
+        """Void accepted attempts, given with the numbers of their steps, and have the steps taken again.
+
+        Steps numbered `first` are taken before all others.
+        """
         if not attempts:
             return
         now = self._devices.clock.now()
         self._insist(lambda: self._session.journal.void(tuple(attempts), now, reason), _DISK)
-        self._agenda.void(set(attempts.values()), reason)
+        self._agenda.void({*attempts.values(), *first}, reason, before_others=bool(first))
         if self._agenda.is_stuck:
             self._lasting = reason
         self._patience.report("voided", f"{counted(len(attempts), 'frame')}, to be taken again: {reason}")

@@ -100,6 +100,15 @@ def test_a_reference_that_voids_is_probed_before_what_it_voids() -> None:
     assert take(agenda) == [4, 2, 3, 5, 6, 7, 8, 9]
 
 
+def test_what_is_voided_can_come_before_all_others() -> None:
+    agenda = Agenda(STEPS, {0, 1, 2, 8, 9}, 3, first=(8,))
+    refused = begun(agenda)
+    agenda.accept(refused)
+    agenda.refuse(begun(agenda), "somebody passed")
+    agenda.void([9, 8, 3], "voided", before_others=True)
+    assert take(agenda) == [3, 8, 9, 4, 5, 6, 7]
+
+
 def test_the_last_lights_that_are_voided_are_closed_again() -> None:
     agenda = agenda_of(set(range(8)))
     agenda.refuse(begun(agenda), "the picture is stuck", before_others=True)

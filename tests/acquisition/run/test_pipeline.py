@@ -17,7 +17,7 @@ from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.run.taking.pipeline import Taken
 from acquisition.session.folder import Session
 from acquisition.session.judgement import Check, Judgement
-from acquisition.session.plan import SessionStep
+from acquisition.session.plan import SessionStep, tie_steps
 from drivers.presenter import BLACK, WHITE, Colour
 from drivers.projector import Power
 from foundation.console import Ending
@@ -186,6 +186,41 @@ class TestRefusals:
         assert voided == ["l2", "l3", "d5"], "and what was under way, but not the dark frame beside the good white"
         accepted = [attempt.step for attempt in lab.session.journal.attempts() if attempt.verdict == "accepted"]
         assert sorted(accepted) == list(range(10)), "each step once"
+
+    def test_a_reference_that_voids_for_ever_ends_the_run_when_patience_does(self, folder: Path) -> None:
+        class NoWhite(ScriptedJudge):
+            def judge(self, file: Path, step: SessionStep) -> Judgement:
+                seen = super().judge(file, step)
+                return refused("white is 21 % weaker", voids=True) if step.number in (4, 8) else seen
+
+        lab = Lab(folder, lights=FOUR, reference_every=2)
+        with pytest.raises(QualityError, match="white is 21 % weaker"):
+            run(lab, NoWhite())
+        assert len(lab.taken()) < 40, "lights are not taken again and again meanwhile"
+        assert run(lab, ScriptedJudge()).complete
+
+    def test_a_response_frame_voids_what_was_taken_since_the_last_light(self, folder: Path) -> None:
+        lab = Lab(folder, lights=FOUR, reference_every=2)
+        ending = Ending(lambda sentence: None)
+
+        def end_after(frames: int) -> Callable[[object], None]:
+            left = iter(range(frames - 1))
+            return lambda taken: None if next(left, None) is not None else ending.ask()
+
+        with pytest.raises(KeyboardInterrupt):
+            run(lab, ScriptedJudge(), ending=ending, observe=end_after(3))
+        before = len(lab.taken())
+        ties = tie_steps(lab.session.steps[-1].number + 1)
+        lab.session.add_steps(ties)
+        judge = ScriptedJudge({3: refused("somebody passed", voids=True)})
+        assert run(lab, judge, first=tuple(step.number for step in ties)).complete
+        names = [f"r{step.number}" for step in ties]
+        taken = [step for step, _ in lab.taken()][before:]
+        assert taken[:4] == names
+        assert taken[5:9] == names, "before the lights, behind the one that was under way"
+        accepted = [attempt.step for attempt in lab.session.journal.attempts() if attempt.verdict == "accepted"]
+        assert sorted(accepted) == list(range(14)), "each step once, and no light of the earlier run is voided"
+        assert lab.verdicts()[:before] == ["accepted"] * before
 
     def test_what_lasts_pauses_and_goes_on_when_it_is_removed(self, folder: Path) -> None:
         lab = Lab(folder)
