@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the screen is a
 
 HOW_TO = (Path(__file__).parents[2] / "docs" / "how-to" / "rehearsal.md").read_text(encoding="utf-8")
 SIZE = "320x240"
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
 """For what must come; nothing takes this long unless it fails."""
 
 PROGRAMS = {"acquire": "acquisition.cli", "build-lut": "calibration.cli", "sim": "synthesis.cli"}

@@ -315,7 +315,7 @@ class TestEnding:
     def test_ctrl_c_waits_for_what_is_being_finished(self, capfd: pytest.CaptureFixture[str]) -> None:
         before = signal.getsignal(signal.SIGINT)
         with orderly_end() as ending, ending.finishing("ending soon"):
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
             assert ending.asked
         assert "ending soon" in capfd.readouterr().err
         assert signal.getsignal(signal.SIGINT) == before
