@@ -308,9 +308,9 @@ def test_a_window_that_is_gone_before_the_exposure_ends_is_found(rehearsal: Rehe
         rehearsal.camera.hears(f"exposure {covered} half over")
     assert "not plain" in rehearsal.camera.hears(f"exposure {covered} ends")
     assert session.ends() == 0, session.text
-    (reason,) = refusals(rehearsal.folder / "session")
-    expected = "the screen shows" if compositor is None else "does a window cover the picture"
-    assert expected in reason
+    expected = "the screen shows" if compositor is None else "window cover the picture"
+    reasons = refusals(rehearsal.folder / "session")
+    assert any(expected in reason for reason in reasons), reasons
     with Session.open(rehearsal.folder / "session") as taken:
         assert len(taken.done_steps()) == len(taken.steps)
 

@@ -18,7 +18,7 @@ from acquisition.session.plan import SessionStep, plan_steps
 from calibration.pipeline.build import build
 from calibration.report.report import write_report
 from drivers.camera import CapturedFrame
-from foundation.errors import FormatError, QualityError
+from foundation.errors import FormatError, InputError, QualityError
 from tests.calibration.lab import LIGHTS, SETTINGS, TAKEN_AT, Lab, Paint, take
 
 SHORT = LIGHTS[:3]
@@ -90,7 +90,8 @@ def test_a_shadow_on_one_frame_costs_that_frame(
         build(session, out, report=write_report)
     says = json.loads((out / "report.json").read_text())
     assert (says["retake"], says["retake_sha256"]) == ("", [])
-    assert take_again(lab, folder) == [], "the newest report has nothing to say against it"
+    with pytest.raises(InputError, match="names no frame to be taken again"):
+        take_again(lab, folder)
 
 
 def test_a_frame_that_ends_the_build_is_named_too(lab: Lab, tmp_path: Path) -> None:
