@@ -313,9 +313,12 @@ class TestEnding:
                 raise AssertionError("begun")
 
     def test_ctrl_c_waits_for_what_is_being_finished(self, capfd: pytest.CaptureFixture[str]) -> None:
+        # A shell that is not interactive starts what it puts in the background with SIGINT ignored.
+        inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
         before = signal.getsignal(signal.SIGINT)
         with orderly_end() as ending, ending.finishing("ending soon"):
             signal.raise_signal(signal.SIGINT)
             assert ending.asked
         assert "ending soon" in capfd.readouterr().err
         assert signal.getsignal(signal.SIGINT) == before
+        signal.signal(signal.SIGINT, inherited)
