@@ -3,7 +3,7 @@
 Rules that hold inside:
 
 - A frame is decoded once and measured once (`acquisition.judge.measuring`); what it is compared with is one frozen
-value (`acquisition.judge.knowledge`), which each frame replaces.
+  value (`acquisition.judge.knowledge`), which each frame replaces.
 - Every check has its number and its limits, also where it passes; one that cannot tell has no number.
 - A cause is named once: what follows from it (a chart that moved does not look like its old picture) has no reason.
 """
