@@ -28,7 +28,7 @@ from acquisition.session.folder import Session
 from acquisition.session.records import FrameRecord
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.figures.table_figures import TableFigures
-from calibration.pipeline.baseline import baseline_of
+from calibration.pipeline.baseline import baseline_of, with_lens
 from calibration.pipeline.checkpoint import Checkpoint, UnfinishedTable, unfinished_table
 from calibration.pipeline.collecting import check_figures, table_figures
 from calibration.pipeline.frames import (
@@ -71,7 +71,7 @@ REPORT_FILES = (REPORT_PAGE, REPORT_JSON)
 CHECKPOINT_EVERY = 16
 """Frames from one checkpoint to the next: what a build that is killed has to do again."""
 
-METHOD = 5
+METHOD = 6
 """Raised when samples or ground truth come out otherwise than before, so that no table is made by two methods."""
 
 _IN_PLACE = Shift(0.0, 0.0, 0.0, 0)
@@ -219,7 +219,7 @@ def check(
     selected = select_frames(session)
     first = decode_frame(session, selected.registered)
     try:
-        baseline = baseline_of(session.chart, first, replace(options, subtract_dark=False))
+        baseline = with_lens(baseline_of(session.chart, first, replace(options, subtract_dark=False)), first)
     except RegistrationError as error:
         if picture is None:
             raise RegistrationError(f"{error}; see what is there with --picture PNG") from error
@@ -345,8 +345,9 @@ def _begin(job: _Job, checkpoint: Checkpoint | None, writer: LutWriter) -> _Buil
     """Register the chart, and return the state that an earlier program left, or the one before any frame."""
     session, selected = job.session, job.selected
     first = decode_frame(session, selected.registered)
-    baseline = baseline_of(session.chart, first, job.options)
-    primaries = measure_primaries(baseline, (decode_frame(session, record) for record in selected.primaries))
+    pure = [decode_frame(session, record) for record in selected.primaries]
+    baseline = with_lens(baseline_of(session.chart, first, job.options), first, pure)
+    primaries = measure_primaries(baseline, pure)
     intake = Intake(session, selected, replace(baseline, primaries=primaries))
     linearity = None if job.linearity is None else read_linearity(job.linearity, baseline)
     taken = intake.before_all_frames(first.saturation)

@@ -13,7 +13,7 @@ from foundation.errors import InputError
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """How a table is built; the defaults are the paper's: 25 samples, nothing subtracted but black.
+    """How a table is built; by default 25 samples, the paper's, from which black and the lens's spread are subtracted.
 
     Attributes
     ----------
@@ -24,6 +24,9 @@ class BuildOptions:
     corners
         Four corners (x, y) of the field of cells in the frame that is registered first, half-size px, clockwise from
         the printed top-left, for a chart without tags; None to have it found.
+    lens_correction
+        Whether what the lens spreads beside its sharp core is subtracted from samples and ground truth, where the print
+        proves that it does.
 
     Raises
     ------
@@ -34,6 +37,7 @@ class BuildOptions:
     window: int = WINDOW
     subtract_dark: bool = False
     corners: Corners | None = None
+    lens_correction: bool = True
 
     def __post_init__(self) -> None:
         if self.window not in WINDOWS:
