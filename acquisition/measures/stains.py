@@ -54,6 +54,9 @@ _LEAST_KNOWN = 9
 _LEAST_NEIGHBOURS = 5
 """Cells of a neighbourhood that must be known for its mean to count."""
 
+_MANY_BESIDE = 3
+"""Stained cells of a neighbourhood from which on it need not deviate itself for a cell to belong to the stain."""
+
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
 
@@ -141,8 +144,9 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     with np.errstate(invalid="ignore"):
         off = (np.abs(np.expm1(log_ratios)) > np.maximum(RIM_SIGMA * _usual(log_ratios), STAINED)).any(axis=1)
     # Part of a neighbourhood that a stain reaches deviates, too; a cell that does so alone is its prediction's error.
-    reached = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1)
-    rim = off & reached & stained[near].any(axis=1)
+    beside = stained[near].sum(axis=1)
+    reached = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1) | (beside >= _MANY_BESIDE)
+    rim = off & reached & (beside > 0)
     return Stains(deviation, error, np.expm1(log_ratios), stained | rim)
 
 
