@@ -97,6 +97,14 @@ def build_lut(
             "from the ground truth.",
         ),
     ] = False,
+    no_lens_correction: Annotated[
+        bool,
+        typer.Option(
+            "--no-lens-correction",
+            help="Leave in the samples what the lens spreads from cell to cell and over the frame, where the print "
+            "proves that it does; measured it is all the same.",
+        ),
+    ] = False,
     corners: Annotated[
         tuple[str, str, str, str] | None,
         typer.Option(
@@ -203,6 +211,7 @@ def build_lut(
     made = {
         "--window": window is not None,
         "--subtract-dark": subtract_dark,
+        "--no-lens-correction": no_lens_correction,
         "--corners": corners is not None,
         "--linearity": linearity is not None,
     }
@@ -234,7 +243,7 @@ def build_lut(
         if picture is not None and not check:
             raise InputError("--picture goes with --check; a table that is built has its report")
         places = None if corners is None else parse_corners(corners)
-        options = BuildOptions(WINDOW if window is None else window, subtract_dark, places)
+        options = BuildOptions(WINDOW if window is None else window, subtract_dark, places, not no_lens_correction)
         if compare is not None:
             if linearity is not None:
                 raise InputError("--linearity is for the report of one table; leave it out of --compare")

@@ -27,7 +27,14 @@ from calibration.radiometry.photon_transfer import PhotonTransfer, photon_transf
 from calibration.radiometry.primaries import Primaries
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites, gather, gather_means
-from calibration.spread.correction import FrameCorrection, LensCorrection, PrintView, SpreadFrame, measure_spread
+from calibration.spread.correction import (
+    FrameCorrection,
+    LensCorrection,
+    LensFigures,
+    PrintView,
+    SpreadFrame,
+    measure_spread,
+)
 from calibration.spread.fitting import LEAST_COUNTS, LOOSE_UNEVENNESS, USUAL_UNEVENNESS
 from calibration.spread.printed_grid import printed_grid, unsuitable
 from calibration.spread.surroundings import Levels, Surroundings, photosite_offsets_px
@@ -250,6 +257,17 @@ def with_lens(baseline: Baseline, first: DecodedFrame, primaries: Sequence[Decod
         return measured
     corrected = _baseline(chart, points, baseline.options, first, replace(registered, lens=correction))
     return replace(corrected, lens=lens)
+
+
+def lens_figures(baseline: Baseline) -> LensFigures:
+    """Return what is said of the lens of a session, measured or not, corrected or not."""
+    if baseline.lens is None:
+        why = unsuitable(baseline.chart) or f"no channel of paper has {LEAST_COUNTS:g} counts in a frame to measure on"
+        return LensFigures.unknown(why)
+    figures = baseline.lens.figures
+    if not baseline.options.lens_correction and baseline.lens.spread.proven:
+        return replace(figures, corrected=False, why_not="left out by --no-lens-correction")
+    return figures
 
 
 def beyond_print(decoded: DecodedFrame, beyond: Sites) -> _Array:

@@ -392,6 +392,9 @@ def _write_table(work: _BuildState, figures: TableFigures) -> None:
     )
     if figures.primaries is not None:
         done.append(figures.primaries.correction(lights.white))
+    lens = work.intake.baseline.lens
+    if lens is not None and figures.lens.corrected:
+        done.append(lens.correction())
     provenance = Provenance(
         camera=work.camera,
         bits=session.chart.bits,

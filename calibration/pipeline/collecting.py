@@ -20,7 +20,7 @@ from calibration.figures.table_figures import (
     TableFigures,
     direction_error_deg,
 )
-from calibration.pipeline.baseline import Baseline
+from calibration.pipeline.baseline import Baseline, lens_figures
 from calibration.pipeline.intake import Intake, IntakeState
 from calibration.radiometry.projector import additivity, drift_gains
 
@@ -128,6 +128,8 @@ def _figures(
         dark_frames=statistics.dark_summary(),
         cells=CellFigures(baseline.options.window, statistics.unfit(saturation, stains), stains),
         primaries=baseline.primaries,
+        lens=lens_figures(baseline),
+        point_spread=None if baseline.lens is None else baseline.lens.spread,
     )
 
 

@@ -35,6 +35,7 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "channels": _channels(figures),
         "chart_places": _chart_places(figures),
         "off_codes_deg": None if off_codes_deg is None else [float(f"{angle:.3g}") for angle in off_codes_deg.tolist()],
+        "lens": figures.lens.to_json() | ({} if figures.point_spread is None else figures.point_spread.to_json()),
         "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
         "figures": {name: _rounded(value) for name, value in judged_values(figures).items()},
         **retake_json(retaken_frames(verdict, figures), _registered_sha256(figures)),

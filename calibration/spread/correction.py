@@ -10,6 +10,8 @@ P patches as in `PrintedGrid`; counts above black; half-size pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +22,7 @@ from acquisition.measures.polynomials import page_polynomial, page_powers
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites, sites_at
 from calibration.spread.fitting import SpreadData, fit_spread, predicted_levels
-from calibration.spread.point_spread import FAR_PX, NEAR_PX, PointSpread
+from calibration.spread.point_spread import FAR_PX, NEAR_PX, PLACES, PointSpread, kernel_of_terms, terms_of
 from calibration.spread.printed_grid import PrintedGrid
 from calibration.spread.surroundings import Levels, NearLight, Surroundings, light_at, surroundings
 
@@ -48,6 +50,8 @@ class PrintView:
         Places of the white references among the patches.
     photosites_px
         (3, 2) float64, where each channel's photosites lie from a block's centre.
+    frame_px
+        Rows and columns of the half-size frame.
     light, slot_light
         The usual field at patches (P, 3) and slots (R K, 3).
     beyond
@@ -58,6 +62,7 @@ class PrintView:
     neighbours: npt.NDArray[np.int32]
     whites: slice
     photosites_px: _Array
+    frame_px: tuple[int, int]
     light: _Array
     slot_light: _Array
     beyond: Sites
@@ -88,12 +93,12 @@ class PrintView:
             Pixels along a patch's window.
         """
         beyond = _places_beyond(grid, registration, shape, window)
-        return PrintView(grid, grid.neighbours, whites, photosites_px, *light_at(grid, field), beyond)
+        return PrintView(grid, grid.neighbours, whites, photosites_px, shape, *light_at(grid, field), beyond)
 
     def around(self, registration: Registration, cells: Sites, references: Sites) -> Surroundings:
         """Return the surroundings of the patches of a frame, given where they are sampled."""
         return surroundings(
-            self.grid, self.neighbours, self.photosites_px, registration, cells, references, self.whites,
+            self.grid, self.neighbours, self.photosites_px, self.frame_px, registration, cells, references, self.whites,
             (self.light, self.slot_light),
         )  # fmt: skip
 
@@ -109,7 +114,7 @@ class FrameCorrection:
     near
         Weights of the near kernels.
     far, veil
-        Shares of the far kernels (F,) and of the veil.
+        Shares of the far kernels (F,), and of the veil.
     beyond
         Places that show what lies behind the print.
     """
@@ -124,9 +129,8 @@ class FrameCorrection:
     def of(spread: PointSpread, view: PrintView, around: Surroundings) -> FrameCorrection:
         """Return the correction for a point spread and the surroundings of a frame's patches."""
         amounts, near = spread.amounts(), len(NEAR_PX)
-        return FrameCorrection(
-            around, around.near(amounts[:, :near]), amounts[0, near:-1], float(amounts[0, -1]), view.beyond
-        )
+        far, veil = amounts[0, 0, near:-1], float(amounts[0, 0, -1])
+        return FrameCorrection(around, around.near(amounts[:, :, :near]), far, veil, view.beyond)
 
     def added(self, levels: Levels) -> _Array:
         """Return what the lens added to each patch, (P, 3) float64 counts; negative where it took more away."""
@@ -185,6 +189,8 @@ class LensFigures:
         the largest.
     left_in_worst
         The same beyond that of the window's mean, which is what is corrected.
+    measured, corrected
+        Whether the lens could be measured on the print, and whether samples and ground truth are corrected by it.
     why_not
         Why nothing was measured or nothing is corrected; "" where it is.
     """
@@ -196,7 +202,30 @@ class LensFigures:
     veil_error: float
     beyond_cell: float
     left_in_worst: float
+    measured: bool = True
+    corrected: bool = True
     why_not: str = ""
+
+    @staticmethod
+    def unknown(why_not: str) -> LensFigures:
+        """Return the figures of a lens that could not be measured, and why."""
+        return LensFigures(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, measured=False, corrected=False, why_not=why_not)
+
+    @property
+    def uncorrected_in_worst(self) -> float:
+        """Share of the worst sample's light from beyond its cell, but for the sharp core's, that is not corrected."""
+        return max(self.left_in_worst, 0.0) if self.corrected else self.beyond_cell
+
+    @property
+    def left(self) -> float:
+        """RMS error that the lens leaves in the means of cells, relative to paper."""
+        return self.residual if self.corrected or not self.beyond_cell else float(np.hypot(self.rms, self.residual))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as `lut.json` and `report.json` state them."""
+        shares = ("rms", "worst", "residual", "veil", "veil_error", "beyond_cell", "left_in_worst")
+        found: dict[str, Any] = {name: float(f"{getattr(self, name):.4g}") for name in shares}
+        return {"measured": self.measured, "corrected": self.corrected, "why_not": self.why_not, **found}
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,6 +241,20 @@ class LensCorrection:
     view: PrintView
     spread: PointSpread
     figures: LensFigures
+
+    def correction(self) -> dict[str, Any]:
+        """Return what was done, for `lut.json`."""
+        return {
+            "name": "lens",
+            "how": "subtracted from samples, ground truth and references before the field is divided out, one number "
+            "for each patch and channel: sum over kernels k of share[k] (B_k - m) + share[veil] (M - m); m the patch's "
+            "mean in the frame, B_k the print as the frame shows it, blurred by a Gaussian of sigma_px[k] half-size px "
+            "and averaged over the patch's window, M the frame's mean light; share[term][channel][kernel], terms "
+            "P_i(x) P_j(y) over the frame, Legendre, j rising slowest, i, j 0 ... 2, x, y -1 ... 1; the last kernel is "
+            "the veil; samples' noise is not touched; build-lut --no-lens-correction leaves it out",
+            **self.figures.to_json(),
+            **self.spread.to_json(),
+        }
 
     def of(self, registration: Registration, cells: Sites, references: Sites) -> FrameCorrection:
         """Return the correction of frames that are sampled at these places."""
@@ -237,13 +280,19 @@ def measure_spread(
     count = 8**bits
     data: list[SpreadData] = []
     scales: list[_Array] = []
-    for frame in frames:
+    # Of each channel the frame in which it has most light.
+    best: list[int] = np.argmax([frame.white for frame in frames], axis=0).tolist() if frames else []
+    for number, frame in enumerate(frames):
+        if number not in best:
+            continue
         changes, gains = _changes(frame, page_mm, bits)
         for channel in range(3):
-            if frame.white[channel] >= least_counts:
-                level = (frame.levels.patches / (frame.field * frame.white))[:count, channel]
+            if best[channel] == number and frame.white[channel] >= least_counts:
+                relative = frame.field[:count, channel] * frame.white[channel]
+                level = frame.levels.patches[:count, channel] / relative
+                even = _even(frame, channel) / relative
                 usable = frame.usable[:count]
-                data.append(SpreadData(channel, level, changes[:, :, channel].T, usable, frame.unevenness))
+                data.append(SpreadData(channel, level, changes[:, :, channel].T, even, usable, frame.unevenness))
                 scales.append(np.append(gains[:, channel], frame.white[channel]))
     if not data:
         return None
@@ -252,43 +301,60 @@ def measure_spread(
     return None if spread is None else (spread, _figures(spread, data, scales, frames[0].around, bits, least_counts))
 
 
+def _even(frame: SpreadFrame, channel: int) -> float:
+    """Return the mean light of a frame in a channel, counts."""
+    return float(frame.around.image(frame.levels)[..., channel].mean(dtype=np.float64))
+
+
 def _changes(frame: SpreadFrame, page_mm: tuple[float, float], bits: int) -> tuple[_Array, _Array]:
-    """Return the change (K, C, 3) of cells' levels for a whole share of each kernel, and the mean change of white (K, 3).
+    """Return the change (T, C, 3) of levels for a whole share of each unknown, and the mean change of white (T, 3).
 
     What comes in, less what the white references get, since the field is fitted through them; their mean, by which
     all levels change alike, is returned apart.
     """
     around, levels, count = frame.around, frame.levels, 8**bits
-    relative = frame.field * frame.white
+    relative = np.maximum(frame.field * frame.white, 1e-6)
     expected = predicted_levels((levels.patches / relative)[:count], bits)
-    local, image = around.local(levels), around.image(levels)
     points = around.grid.points_mm
     whites = np.arange(len(points))[around.whites]
     whites = whites[frame.usable[whites]]
     order = next((n for n in range(_FIELD_ORDER, 0, -1) if 3 * len(page_powers(n)) <= len(whites)), 0)
-    at_whites, at_cells = (page_polynomial(where, page_mm, order) for where in (points[whites], points[:count]))
-    changes, gains = np.empty((len(NEAR_PX) + len(FAR_PX) + 1, count, 3)), np.empty((len(NEAR_PX) + len(FAR_PX) + 1, 3))
-    one = np.eye(len(NEAR_PX))
-    for kernel in range(len(changes)):
-        if kernel < len(NEAR_PX):
-            near = around.near(np.tile(one[kernel], (3, 1)))
-            own = near.own
-            seen = near.at(levels, local)
-        elif kernel < len(changes) - 1:
-            own = np.full_like(levels.patches, around.own_share(FAR_PX[kernel - len(NEAR_PX)]))
-            seen = around.far(image, FAR_PX[kernel - len(NEAR_PX)])
-        else:
-            own = np.zeros_like(levels.patches)
-            seen = np.broadcast_to(image.mean(axis=(0, 1), dtype=np.float64), levels.patches.shape)
-        coming = (seen - own * levels.patches) / np.maximum(relative, 1e-6)
-        usual = own[:count].mean(axis=0)
+    at_whites, at_cells = (
+        np.ascontiguousarray(page_polynomial(where, page_mm, order)) for where in (points[whites], points[:count])
+    )
+    terms = kernel_of_terms()
+    changes, gains = np.empty((len(terms), count, 3)), np.empty((len(terms), 3))
+    seen, own = _seen(frame)
+    for term, (kernel, place) in enumerate(terms):
+        share = np.ones((len(points), 1)) if place is None else around.places[:, [place]]
+        coming = share * (seen[kernel] - own[kernel] * levels.patches) / relative
+        differs = share * (own[kernel] - own[kernel][:count].mean(axis=0))
         for channel in range(3):
-            of_white = coming[whites, channel] + own[whites, channel] - usual[channel]
-            smooth = at_cells @ least_squares(np.ascontiguousarray(at_whites), of_white, np.ones(len(whites)))
-            gains[kernel, channel] = smooth.mean()
-            kept = own[:count, channel] - usual[channel] - (smooth - gains[kernel, channel])
-            changes[kernel, :, channel] = coming[:count, channel] + kept * expected[:, channel]
+            of_white = coming[whites, channel] + differs[whites, channel]
+            smooth = at_cells @ least_squares(at_whites, of_white, np.ones(len(whites)))
+            gains[term, channel] = smooth.mean()
+            kept = differs[:count, channel] - (smooth - gains[term, channel])
+            changes[term, :, channel] = coming[:count, channel] + kept * expected[:, channel]
     return changes, gains
+
+
+def _seen(frame: SpreadFrame) -> tuple[list[_Array], list[_Array]]:
+    """Return for each kernel the light (P, 3) that it brings, counts, and the share (P, 3) of a patch's own in it."""
+    around, levels = frame.around, frame.levels
+    local, image = around.local(levels), around.image(levels)
+    seen: list[_Array] = []
+    own: list[_Array] = []
+    for kernel in range(len(NEAR_PX)):
+        whole = np.zeros((PLACES, 3, len(NEAR_PX)))
+        whole[0, :, kernel] = 1
+        near = around.near(whole)
+        seen.append(near.at(levels, local))
+        own.append(near.own)
+    for scale in FAR_PX:
+        seen.append(around.far(image, scale))
+        own.append(np.full_like(levels.patches, around.own_share(scale)))
+    seen.append(np.broadcast_to(image.mean(axis=(0, 1), dtype=np.float64), levels.patches.shape))
+    return seen, [*own, np.zeros_like(levels.patches)]
 
 
 def _figures(
@@ -302,29 +368,28 @@ def _figures(
     amounts = spread.amounts()
     corrected: list[_Array] = []
     unknown: list[_Array] = []
-    from calibration.spread.point_spread import terms_of
-
     for one, scale in zip(data, scales, strict=True):
         expected = predicted_levels(one.level[:, None], bits)[:, 0]
         lit = one.usable & (one.level * scale[-1] > least_counts)
         # All of the change: with white's mean, by which a level over paper's changes too.
         change = (one.changes[lit] - np.outer(expected[lit], scale[:-1])) / one.level[lit, None]
-        corrected.append(change @ amounts[one.channel])
         terms = terms_of(one.channel)
+        corrected.append(change @ spread.shares[terms])
         unknown.append(np.einsum("nk,kl,nl->n", change, spread.covariance[np.ix_(terms, terms)], change))
     size, left = np.concatenate(corrected), np.concatenate(unknown)
     worst, mean = _beyond_cell(around)
-    near = amounts[:, : len(NEAR_PX)]
-    wide = amounts[:, len(NEAR_PX) :].sum(axis=1)
+    near = amounts[:, :, : len(NEAR_PX)]
+    wide = amounts[:, :, len(NEAR_PX) :].sum(axis=2)
     nothing = len(size) == 0
     return LensFigures(
         rms=0.0 if nothing else float(np.sqrt((size**2).mean())),
         worst=0.0 if nothing else float(np.abs(size).max()),
         residual=0.0 if nothing else float(np.sqrt(left.mean())),
-        veil=float(amounts[0, -1]),
-        veil_error=float(spread.errors()[0, -1]),
+        veil=float(amounts[0, 0, -1]),
+        veil_error=float(spread.errors()[0, 0, -1]),
         beyond_cell=float((near @ worst + wide).max()),
         left_in_worst=float((near @ (worst - mean)).max()),
+        corrected=spread.proven,
         why_not="" if spread.proven else "no spread beside the sharp core is proven",
     )
 
@@ -354,10 +419,11 @@ def _places_beyond(grid: PrintedGrid, registration: Registration, shape: tuple[i
     low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
     sheet = grid.slots_mm[grid.others[..., 2].ravel() < 0.5]
     low, high = np.minimum(low, sheet.min(axis=0)), np.maximum(high, sheet.max(axis=0))
-    low, high = low - (width / 2, height / 2), high + (width / 2, height / 2)
+    half = np.array([width, height]) / 2
+    low, high = low - half, high + half
     along = np.linspace(0, 1, 40)[:, None]
     corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]], low])
-    outline = np.concatenate([a + (b - a) * along for a, b in zip(corners[:-1], corners[1:], strict=True)])
+    outline = np.concatenate([a + (b - a) * along for a, b in pairwise(corners)])
     edge = registration.to_pixels(outline)
     covered = np.zeros((rows, columns), dtype=np.uint8)
     cv2.fillPoly(covered, [np.rint(edge).astype(np.int32).reshape(-1, 1, 2)], 1)

@@ -7,11 +7,11 @@ codes beside show; what it differs by from that is regressed on what each kernel
 Rules that hold inside:
 
 - Nothing that carries a cell's own noise is among the regressors: own levels are predicted ones there.
-- What the field's fit and the print's unevenness can be wrong by, smooth factors of a cell's level, is fitted along, and
-  held near 0 by what is usual of them. Veil is told from it since it adds the same to dark and bright cells.
-- A share is not below 0, and a kernel whose omission costs less than `LEAST_GAIN` is left out.
+- What the field's fit and the print's unevenness can be wrong by, smooth factors of a cell's level, is fitted along,
+  and held near 0 by what is usual of them. Veil is told from it since it adds the same to dark and bright cells.
+- A far kernel's share is not below 0, and a kernel whose omission costs less than `LEAST_GAIN` is left out.
 
-C cells in the order of colour indices; K kernels, the veil last.
+C cells in the order of colour indices; T unknowns of a channel.
 """
 
 from __future__ import annotations
@@ -23,11 +23,14 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.measures.polynomials import page_polynomial, page_powers
-from calibration.spread.point_spread import FAR_PX, NEAR_PX, TERMS, PointSpread, terms_of
+from calibration.spread.point_spread import TERMS, PointSpread, free_terms, groups_of_terms, terms_of
 from foundation.robust import MAD_TO_SIGMA
 
 LEAST_GAIN = 16.0
 """By how much a kernel must lower the sum of squares, in units of its variance: a share of four standard errors."""
+
+MOST_MISFIT = 5.0
+"""Misfit from which on a veil is not told from other light; 1.5 to 3.3 in simulated rooms whose lens has a veil."""
 
 LEAST_COUNTS = 300.0
 """Counts above black of bare paper from which on a channel of a frame is used."""
@@ -51,18 +54,25 @@ _FACTOR_ORDER, _INK_ORDER = 4, 2
 _PRIOR_SHARE = 0.1
 """Standard deviation that a share is expected to have at most: keeps kernels solvable that the windows hardly see."""
 
+USUAL_VEIL = 0.01
+"""Standard deviation of the veil that lenses have before it is measured: 0.3 to 1.5 % by ISO 9358 and ISO 18844. Where
+a print is lit so evenly that it shows no veil, this is what is known of it."""
+
 _LEVELS = 40
 """Groups of like levels, in each of which the scatter is measured."""
 
 _HUBER = 3.0
 """Standard deviations beyond which a cell weighs less."""
 
-_ROUNDS = 3
+_ROUNDS = 2
 """Solutions in a row, each weighted by what the one before left."""
 
 _ROUNDING = 1e-7
 """Step of a stored share: far below its error, far above what another order of sums changes, so that a table's bytes
 do not depend on the machine's linear algebra."""
+
+FULL_BITS = 5
+"""Bits of a full chart, whose codes stand so near each other that their curvature is less than the noise of a cell."""
 
 _BESIDE = 5
 """Codes along each side of the square in which the usual curvature across an axis is taken."""
@@ -81,7 +91,9 @@ class SpreadData:
     level
         (C,) float64, bare paper 1, the field divided out.
     changes
-        (C, K) float64, change of `level` for a whole share of each kernel, by the light that comes in.
+        (C, T) float64, change of `level` for a whole share of each unknown of the channel, by the light that comes in.
+    even
+        (C,) float64, change of `level` for light that lies evenly over all of the frame.
     usable
         (C,) bool.
     unevenness
@@ -91,13 +103,14 @@ class SpreadData:
     channel: int
     level: _Array
     changes: _Array
+    even: _Array
     usable: npt.NDArray[np.bool_]
     unevenness: float
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Rows of the regression: (N,) values, (N, K + M) design, (N,) levels, (N,) fold, and the columns' unknowns."""
+    """Rows of the regression: (N,) values, (N, T + M) design, (N,) levels, (N,) fold, and the columns' unknowns."""
 
     value: _Array
     design: _Array
@@ -109,8 +122,9 @@ class _Rows:
 def colour_residual(columns: npt.NDArray[np.floating], bits: int) -> tuple[_Array, npt.NDArray[np.bool_]]:
     """Return how values of cells differ from what their neighbours in colour predict.
 
-    Linear in the values. Along each axis of the code the mean of both neighbours predicts a cell's, but for the
-    curvature, which is the mean over the codes beside it across that axis.
+    Linear in the values. The mean of both neighbours along each axis of the code predicts a cell's. Where codes stand
+    further apart than the 32 levels of a full chart, it is corrected for the curvature: the mean over the codes beside
+    it across that axis.
 
     Parameters
     ----------
@@ -124,9 +138,23 @@ def colour_residual(columns: npt.NDArray[np.floating], bits: int) -> tuple[_Arra
     residual, known
         (C, M) float64, and (C,) bool, whether a cell has two neighbours along any axis.
     """
-    from scipy.ndimage import uniform_filter
+    from calibration.spread import kernels
 
     side = 1 << bits
+    codes = np.arange(side**3)
+    inner = [(codes // side**axis % side > 0) & (codes // side**axis % side < side - 1) for axis in range(3)]
+    known = np.any(inner, axis=0)
+    if bits < FULL_BITS:
+        return _less_curvature(columns, side), known
+    residual = np.empty(columns.shape)
+    kernels.colour_differences(np.ascontiguousarray(columns, dtype=np.float64), side, residual)
+    return residual, known
+
+
+def _less_curvature(columns: npt.NDArray[np.floating], side: int) -> _Array:
+    """Return the residuals (C, M) of a chart of fewer codes."""
+    from scipy.ndimage import uniform_filter
+
     cube = np.asarray(columns, dtype=np.float64).reshape(side, side, side, -1)
     total, count = np.zeros_like(cube), np.zeros((side, side, side, 1))
     for axis in range(3):
@@ -135,12 +163,10 @@ def colour_residual(columns: npt.NDArray[np.floating], bits: int) -> tuple[_Arra
         )
         second = cube[inner] - 0.5 * (cube[before] + cube[after])
         size = [1 if other == axis else _BESIDE for other in range(3)]
-        own = 1 / _BESIDE**2
         # The mean is that of the codes beside, without the cell's own.
-        total[inner] += (second - uniform_filter(second, [*size, 1], mode="nearest")) / (1 - own)
+        total[inner] += (second - uniform_filter(second, [*size, 1], mode="nearest")) / (1 - 1 / _BESIDE**2)
         count[inner] += 1
-    residual = total / np.maximum(count, 1)
-    return residual.reshape(columns.shape), (count > 0).reshape(-1)
+    return (total / np.maximum(count, 1)).reshape(columns.shape)
 
 
 def predicted_levels(level: _Array, bits: int) -> _Array:
@@ -167,26 +193,55 @@ def fit_spread(
     if not data:
         return None
     rows = [_rows(one, number, cells_mm, page_mm, bits) for number, one in enumerate(data)]
-    factors = rows[0].design.shape[1] - len(terms_of(0))
-    size = TERMS + factors * len(rows)
+    shapes = len(page_powers(_FACTOR_ORDER)) - 1
+    size = max(int(one.unknowns.max()) for one in rows) + 1
     prior = np.full(size, 1 / _PRIOR_SHARE**2)
-    for number, one in enumerate(data):
-        prior[TERMS + number * factors : TERMS + (number + 1) * factors] = 1 / one.unevenness**2
+    prior[TERMS - 1] = 1 / USUAL_VEIL**2
+    for one, row in zip(data, rows, strict=True):
+        prior[row.unknowns[len(terms_of(0)) + shapes :]] = 1 / one.unevenness**2
+    shape = np.arange(TERMS, TERMS + shapes)
+    everything = np.delete(np.arange(size), shape)
     solution = np.zeros(size)
     normal, right = np.zeros((FOLDS, size, size)), np.zeros((FOLDS, size))
     for _ in range(_ROUNDS):
         normal, right = _normal_equations(rows, solution)
-        solution = _solved(normal.sum(axis=0), right.sum(axis=0), prior, np.arange(TERMS))
+        solution[everything] = _solved(*_of(normal.sum(axis=0), right.sum(axis=0), prior, everything), np.arange(TERMS))
+    misfit = _misfit(normal.sum(axis=0), right.sum(axis=0), prior, shapes)
+    normal, right = normal[:, everything][:, :, everything], right[:, everything]
+    prior = prior[everything]
     matrix, vector = _without_factors(normal.sum(axis=0), right.sum(axis=0), prior)
-    kept = _selected(matrix, vector)
+    covariance: _Array = np.asarray(misfit * np.linalg.inv(matrix), dtype=np.float64)
+    candidates = groups_of_terms()
+    if misfit > MOST_MISFIT:
+        # Other light lies smoothly over the frame, and what an even veil would have been taken for is not known.
+        covariance[-1, -1] += _positive(matrix, vector, np.arange(TERMS))[0][-1] ** 2
+        candidates.pop()
+    kept = _selected(matrix, vector, misfit, candidates)
     shares, gain = _positive(matrix, vector, kept)
     held_out = 0.0
     for fold in range(FOLDS):
         others = normal.sum(axis=0) - normal[fold], right.sum(axis=0) - right[fold]
         with_kernels, without = (_solved(*others, prior, chosen) for chosen in (kept, kept[:0]))
         held_out += _explained(normal[fold], right[fold], with_kernels) - _explained(normal[fold], right[fold], without)
-    covariance = np.linalg.inv(matrix)
-    return PointSpread(np.round(shares / _ROUNDING) * _ROUNDING, covariance, gain, held_out)
+    return PointSpread(np.round(shares / _ROUNDING) * _ROUNDING, covariance, gain, held_out, misfit)
+
+
+def _of(normal: _Array, right: _Array, prior: _Array, chosen: npt.NDArray[np.int64]) -> tuple[_Array, _Array, _Array]:
+    """Return equations of some unknowns alone."""
+    return normal[np.ix_(chosen, chosen)], right[chosen], prior[chosen]
+
+
+def _misfit(normal: _Array, right: _Array, prior: _Array, shapes: int) -> float:
+    """Return what smooth light beyond the kernels' explains for each of its unknowns, over chance, at least 1.
+
+    The unknowns behind the shares are light that changes smoothly over the frame and adds to dark and bright cells
+    alike. Where the kernels and an even veil are all that there is, each of them lowers the sum of squares by about 1.
+    """
+    with_shape = _without_factors(normal, right, prior, TERMS + shapes)
+    without = np.delete(np.arange(len(prior)), np.arange(TERMS, TERMS + shapes))
+    plain = _without_factors(*_of(normal, right, prior, without))
+    gains = [_explained(*found, np.asarray(np.linalg.solve(*found), dtype=np.float64)) for found in (with_shape, plain)]
+    return max(1.0, (gains[0] - gains[1]) / shapes)
 
 
 def _rows(one: SpreadData, number: int, cells_mm: _Array, page_mm: tuple[float, float], bits: int) -> _Rows:
@@ -200,29 +255,33 @@ def _rows(one: SpreadData, number: int, cells_mm: _Array, page_mm: tuple[float, 
     factor = page_polynomial(cells_mm, page_mm, _FACTOR_ORDER)[:, 1:]
     ink = factor[:, : len(page_powers(_INK_ORDER)) - 1]
     dense = expected * np.log(np.clip(expected, 0.01, None))
-    columns = np.column_stack([level, one.changes, factor * expected[:, None], ink * dense[:, None]])
+    even = factor * one.even[:, None]
+    columns = np.column_stack([level, one.changes, even, factor * expected[:, None], ink * dense[:, None]])
     residual, known = colour_residual(columns, bits)
     chosen = known & one.usable
     places = np.floor(cells_mm / (max(page_mm) / _PATCHWORK)).astype(np.int64)
-    kernels = one.changes.shape[1]
-    unknowns = TERMS + number * (columns.shape[1] - 1 - kernels) + np.arange(columns.shape[1] - 1 - kernels)
+    common = TERMS + even.shape[1]
+    own = factor.shape[1] + ink.shape[1]
+    smooth: npt.NDArray[np.int64] = np.arange(own, dtype=np.int64) + common + number * own
+    shape: npt.NDArray[np.int64] = np.arange(TERMS, common, dtype=np.int64)
     return _Rows(
         value=residual[chosen, 0],
         design=np.ascontiguousarray(residual[chosen, 1:]),
         level=expected[chosen],
         fold=((places[:, 0] + 2 * places[:, 1]) % FOLDS)[chosen],
-        unknowns=np.concatenate([terms_of(one.channel), unknowns]),
+        unknowns=np.concatenate([terms_of(one.channel), shape, smooth]),
     )
 
 
 def _weights(left: _Array, level: _Array) -> _Array:
     """Return the weight (N,) of each row from what is left of it: over the usual variance of its level, Huber's."""
-    variance = np.empty(len(left))
+    variance = np.empty(len(left), dtype=np.float64)
     parts: list[npt.NDArray[np.int64]] = np.array_split(np.argsort(level, kind="stable"), min(_LEVELS, len(left) // 8))
     for part in parts:
-        variance[part] = (MAD_TO_SIGMA * np.median(np.abs(left[part]))) ** 2 + 1e-12
+        variance[part] = (MAD_TO_SIGMA * float(np.median(np.abs(left[part])))) ** 2 + 1e-12
     far = np.abs(left) / np.sqrt(variance)
-    return np.asarray(np.minimum(1, _HUBER / np.maximum(far, 1e-9)) / variance, dtype=np.float64)
+    weights: _Array = np.minimum(1.0, _HUBER / np.maximum(far, 1e-9)) / variance
+    return weights
 
 
 def _normal_equations(rows: Sequence[_Rows], solution: _Array) -> tuple[_Array, _Array]:
@@ -239,12 +298,12 @@ def _normal_equations(rows: Sequence[_Rows], solution: _Array) -> tuple[_Array, 
     return normal, right
 
 
-def _without_factors(normal: _Array, right: _Array, prior: _Array) -> tuple[_Array, _Array]:
-    """Return the equations (TERMS, TERMS), (TERMS,) of the shares alone: smooth factors eliminated (Schur)."""
+def _without_factors(normal: _Array, right: _Array, prior: _Array, kept: int = TERMS) -> tuple[_Array, _Array]:
+    """Return the equations (kept, kept), (kept,) of the first unknowns alone: smooth factors eliminated (Schur)."""
     full = normal + np.diag(prior)
-    share = np.linalg.solve(full[TERMS:, TERMS:], full[TERMS:, :TERMS]).T
-    matrix = full[:TERMS, :TERMS] - share @ full[TERMS:, :TERMS]
-    return 0.5 * (matrix + matrix.T), right[:TERMS] - share @ right[TERMS:]
+    share = np.linalg.solve(full[kept:, kept:], full[kept:, :kept]).T
+    matrix = full[:kept, :kept] - share @ full[kept:, :kept]
+    return 0.5 * (matrix + matrix.T), right[:kept] - share @ right[kept:]
 
 
 def _solved(normal: _Array, right: _Array, prior: _Array, kept: npt.NDArray[np.int64]) -> _Array:
@@ -261,33 +320,41 @@ def _explained(matrix: _Array, vector: _Array, solution: _Array) -> float:
 
 
 def _positive(matrix: _Array, vector: _Array, kept: npt.NDArray[np.int64]) -> tuple[_Array, float]:
-    """Return the shares (TERMS,) ≥ 0 that lower the sum of squares most, others than the kept ones 0, and by how much.
+    """Return the shares (TERMS,) that lower the sum of squares most, others than the kept ones 0, and by how much.
 
-    Non-negative least squares of the equations' Cholesky factor (C. Lawson and R. Hanson, Solving Least Squares
-    Problems, 1974).
+    Far kernels' and the veil's are 0 or more: non-negative least squares of the equations' Cholesky factor (C. Lawson
+    and R. Hanson, Solving Least Squares Problems, 1974), the free ones eliminated.
     """
     from scipy.optimize import nnls
 
     shares = np.zeros(TERMS)
-    if len(kept):
-        factor = np.linalg.cholesky(matrix[np.ix_(kept, kept)])
-        shares[kept] = nnls(factor.T, np.linalg.solve(factor, vector[kept]))[0]
+    free, bound = (kept[free_terms()[kept] == wanted] for wanted in (True, False))
+    inner, across = matrix[np.ix_(free, free)], matrix[np.ix_(free, bound)]
+    if len(bound):
+        reduced = matrix[np.ix_(bound, bound)] - across.T @ np.linalg.solve(inner, across)
+        right = vector[bound] - across.T @ np.linalg.solve(inner, vector[free])
+        factor = np.linalg.cholesky(0.5 * (reduced + reduced.T))
+        shares[bound] = nnls(factor.T, np.linalg.solve(factor, right))[0]
+    if len(free):
+        shares[free] = np.linalg.solve(inner, vector[free] - across @ shares[bound])
     return shares, _explained(matrix, vector, shares)
 
 
-def _selected(matrix: _Array, vector: _Array) -> npt.NDArray[np.int64]:
+def _selected(
+    matrix: _Array, vector: _Array, misfit: float, candidates: list[npt.NDArray[np.int64]]
+) -> npt.NDArray[np.int64]:
     """Return the unknowns that are worth their place: the weakest kernel is left out until each one gains enough."""
-    near = len(NEAR_PX)
-    kernels = [np.arange(3) * near + kernel for kernel in range(near)]
-    kernels += [np.array([3 * near + kernel]) for kernel in range(len(FAR_PX) + 1)]
-    _, gain = _positive(matrix, vector, np.arange(TERMS))
+    kernels = list(candidates)
+    _, gain = _positive(matrix, vector, _terms(kernels))
     while kernels:
         without = [
             np.concatenate([*kernels[:k], *kernels[k + 1 :], np.zeros(0, dtype=np.int64)]) for k in range(len(kernels))
         ]
         gains = [_positive(matrix, vector, np.sort(rest))[1] for rest in without]
-        weakest = int(np.argmax(gains))
-        if gain - gains[weakest] > LEAST_GAIN:
+        # Chance gains one for each unknown.
+        worth = [gain - less - misfit * (LEAST_GAIN + len(own) - 1) for less, own in zip(gains, kernels, strict=True)]
+        weakest = int(np.argmin(worth))
+        if worth[weakest] > 0:
             break
         gain = gains[weakest]
         kernels.pop(weakest)

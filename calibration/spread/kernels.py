@@ -82,7 +82,7 @@ def weights_around(
     grid
         (4,) first pitch and its step, first offset and its step.
     amount
-        (3, K) float64, how much of each kernel there is in each channel.
+        (N, 3, K) float64, how much of each kernel there is in each channel at each patch.
     """
     kernels, count = shares.shape[0], len(row)
     x, y = np.empty(ACROSS * PARTS), np.empty(ACROSS * PARTS)
@@ -91,7 +91,7 @@ def weights_around(
             weights[n, channel] = 0
             others[n, channel] = 0
             for k in range(kernels):
-                share = amount[channel, k]
+                share = amount[n, channel, k]
                 if share == 0:
                     continue
                 dx, dy = offset[n, channel, 0], offset[n, channel, 1]
@@ -143,3 +143,29 @@ def blur_rows(image: _Float, taps: _Float, out: _Float) -> None:
             for column in range(image.shape[1]):
                 for channel in range(3):
                     out[row, column, channel] += weight * image[source, column, channel]
+
+
+@compiled
+def colour_differences(columns: _Array, side: int, residual: _Array) -> None:
+    """Fill residual (C, M) with values less the mean of their two neighbours along each axis of the code that has two.
+
+    `columns` (C, M) float64 are values of C = side³ cells in the order of colour indices.
+    """
+    for red in range(side):
+        for green in range(side):
+            for blue in range(side):
+                cell = (red * side + green) * side + blue
+                axes = 0
+                for column in range(columns.shape[1]):
+                    residual[cell, column] = 0.0
+                for axis in range(3):
+                    code = red if axis == 0 else green if axis == 1 else blue
+                    if code == 0 or code == side - 1:
+                        continue
+                    step = side * side if axis == 0 else side if axis == 1 else 1
+                    axes += 1
+                    for column in range(columns.shape[1]):
+                        beside = 0.5 * (columns[cell - step, column] + columns[cell + step, column])
+                        residual[cell, column] += columns[cell, column] - beside
+                for column in range(columns.shape[1]):
+                    residual[cell, column] /= max(axes, 1)

@@ -128,7 +128,7 @@ def printed_grid(chart: Chart) -> PrintedGrid:
     patches = source[:, None, :, None]
     parts = np.where(patches >= 0, patches, of_slots).reshape(parts.shape).astype(np.int32)
     kinds = parts.reshape(rows, PARTS, columns, PARTS, 1) == np.arange(count, count + 3)
-    slot_x, slot_y = np.meshgrid(x.reshape(columns, PARTS).mean(axis=1), y.reshape(rows, PARTS).mean(axis=1))
+    slot_x, slot_y = x[PARTS // 2 :: PARTS], y[PARTS // 2 :: PARTS]
     return PrintedGrid(
         pitch_mm=(width, height),
         points_mm=_points(chart),
@@ -137,5 +137,5 @@ def printed_grid(chart: Chart) -> PrintedGrid:
         source=source,
         parts=parts,
         others=kinds.mean(axis=(1, 3)).astype(np.float32),
-        slots_mm=np.column_stack([slot_x.ravel(), slot_y.ravel()]),
+        slots_mm=np.column_stack([np.tile(slot_x, rows), np.repeat(slot_y, columns)]),
     )

@@ -22,7 +22,7 @@ from acquisition.measures.flat_field import FlatField
 from calibration.registration.registration import Registration
 from calibration.sampling.samples import Sites
 from calibration.spread import kernels
-from calibration.spread.point_spread import FAR_PX, NEAR_PX
+from calibration.spread.point_spread import NEAR_PX, place_terms
 from calibration.spread.printed_grid import PARTS, PrintedGrid
 from drivers.raw.rawfile import Mosaic
 
@@ -70,6 +70,8 @@ class Surroundings:
         (P, 3, 2) float64, from each patch's centre to the middle of its window, along the print's axes, by channel.
     pitch_px
         (P, 2) float64, a slot's width and height.
+    places
+        (P, 9) float64, the terms of a share over the frame at each patch (`place_terms`).
     whites
         Places of the white references among the patches.
     light, slot_light
@@ -81,12 +83,13 @@ class Surroundings:
     neighbours: npt.NDArray[np.int32]
     offset_px: _Array
     pitch_px: _Array
+    places: _Array
     whites: slice
     light: _Array
     slot_light: _Array
 
     def near(self, amounts: _Array) -> NearLight:
-        """Return the light that near kernels bring, `amounts` (3, N) of each in each channel."""
+        """Return the light that near kernels bring, `amounts` (9, 3, N) of each: terms over the frame, by channel."""
         count = len(self.grid.row)
         first, step, number = _OFFSETS_PX
         low, high = float(self.pitch_px.min()), float(self.pitch_px.max())
@@ -98,12 +101,12 @@ class Surroundings:
         weights = np.empty((count, 3, kernels.ACROSS**2), dtype=np.float32)
         others = np.empty((count, 3, 3), dtype=np.float32)
         table = np.array([pitches[0], pitches[1] - pitches[0], first, step])
-        grid, amounts = self.grid, np.ascontiguousarray(amounts, dtype=np.float64)
+        grid, local = self.grid, np.ascontiguousarray(np.einsum("np,pck->nck", self.places, amounts))
         kernels.weights_around(
-            grid.row, grid.column, self.neighbours, grid.parts, self.offset_px, self.pitch_px, shares, table, amounts,
+            grid.row, grid.column, self.neighbours, grid.parts, self.offset_px, self.pitch_px, shares, table, local,
             weights, others,
         )  # fmt: skip
-        return NearLight(self.neighbours, weights, others, amounts.sum(axis=1))
+        return NearLight(self.neighbours, weights, others, local.sum(axis=2))
 
     def inks(self, levels: Levels) -> tuple[_Array, _Array]:
         """Return bare paper and black ink (3,) float64, counts where the field is 1."""
@@ -155,7 +158,7 @@ class NearLight:
     weights, others
         (P, 3, 25) and (P, 3, 3) float32, of each of them, and of bare paper, black ink and what lies behind.
     total
-        (3,) float64, sum of a channel's weights.
+        (P, 3) float64, sum of a patch's weights.
     """
 
     neighbours: npt.NDArray[np.int32]
@@ -189,6 +192,7 @@ def surroundings(
     grid: PrintedGrid,
     neighbours: npt.NDArray[np.int32],
     mosaic_offsets_px: _Array,
+    frame_px: tuple[int, int],
     registration: Registration,
     cells: Sites,
     references: Sites,
@@ -203,6 +207,8 @@ def surroundings(
         The print.
     mosaic_offsets_px
         (3, 2) float64, where each channel's photosites lie from a block's centre, `photosite_offsets_px`.
+    frame_px
+        Rows and columns of the half-size frame.
     registration, cells, references
         The chart's place, and where the patches are sampled.
     whites
@@ -223,7 +229,8 @@ def surroundings(
     )
     from_centre = (middle - registration.to_pixels(points))[:, None] + mosaic_offsets_px
     offset = np.einsum("nij,ncj->nci", to_slots, from_centre) * pitch[:, None]
-    return Surroundings(grid, cells.window, neighbours, np.ascontiguousarray(offset), pitch, whites, *light)
+    places = place_terms(middle.astype(np.float64), frame_px)
+    return Surroundings(grid, cells.window, neighbours, np.ascontiguousarray(offset), pitch, places, whites, *light)
 
 
 def photosite_offsets_px(mosaic: Mosaic) -> _Array:
@@ -236,6 +243,3 @@ def light_at(grid: PrintedGrid, field: FlatField) -> tuple[_Array, _Array]:
     """Return a field at the patches (P, 3) and at the slots (R K, 3); beyond the outermost patches as at those."""
     low, high = grid.points_mm.min(axis=0), grid.points_mm.max(axis=0)
     return field.at(grid.points_mm), field.at(np.clip(grid.slots_mm, low, high))
-
-
-__all__ = ["FAR_PX", "Levels", "NearLight", "Surroundings", "light_at", "photosite_offsets_px", "surroundings"]
