@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager, suppress
 
+from foundation.command_line import logging_as_before, shows_progress
 from foundation.errors import EXIT_INTERRUPTED, CropError, InputError, StorageError
 from foundation.files import disk_remedy_of, remedy_of
 
@@ -40,7 +41,8 @@ def run(command: Callable[[], object], *, keeps: bool = True) -> int:
     keeps
         Whether it goes on, called again after an interruption, with what it had done; the user is told which.
     """
-    code = _outcome(command, keeps)
+    with logging_as_before():
+        code = _outcome(command, keeps)
     try:
         # What is still to be printed fails here, where it can be judged, and not while the interpreter ends.
         sys.stdout.flush()
@@ -245,7 +247,12 @@ def progress(unit: str) -> Generator[Callable[[int, int], None]]:
         TimeRemainingColumn(),
     )
     # What is printed meanwhile appears above the bar, but not on the terminal where standard output goes elsewhere.
-    bar = Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty())
+    bar = Progress(
+        *columns,
+        console=Console(stderr=True),
+        redirect_stdout=sys.stdout.isatty(),
+        disable=not shows_progress(),
+    )
     task = bar.add_task(unit, total=None)
     with ExitStack() as shown:
 

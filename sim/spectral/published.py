@@ -70,5 +70,5 @@ def _read(name: str) -> dict[str, PublishedSpectrum]:
     for line in text.splitlines()[1:]:
         light, first, step, values = line.split(";")
         power = np.array(values.split(), dtype=np.float64)
-        found[light] = PublishedSpectrum(float(first) + float(step) * np.arange(len(power)), power)
+        found[light] = PublishedSpectrum(float(first) + float(step) * np.arange(len(power), dtype=np.float64), power)
     return found

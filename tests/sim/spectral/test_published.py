@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import colour
 import numpy as np
 import pytest
@@ -10,8 +12,8 @@ from sim.spectral.published import daylight, published_spectra
 
 
 def test_every_light_is_the_published_one() -> None:
-    theirs = {str(name): light for family in (colour.SDS_ILLUMINANTS, colour.SDS_LIGHT_SOURCES)
-              for name, light in family.items()}  # fmt: skip
+    families: tuple[Any, ...] = (colour.SDS_ILLUMINANTS, colour.SDS_LIGHT_SOURCES)
+    theirs: dict[str, Any] = {str(name): light for family in families for name, light in family.items()}
     found = published_spectra()
     assert set(found) == set(theirs)
     for name, light in found.items():
