@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from foundation import console
-from foundation.command_line import Quiet, Verbose, Version, common_first, new_app
-from foundation.console import EXIT_CODES, orderly_end
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app, orderly_end
 from foundation.errors import InputError, QualityError, first_of
 
 if TYPE_CHECKING:

@@ -13,8 +13,7 @@ from evaluation.commands import run as run_command
 from evaluation.commands import train as train_command
 from evaluation.commands import transfer as transfer_command
 from evaluation.commands import tune as tune_command
-from foundation.command_line import Quiet, Verbose, Version, common_first, is_common, new_app
-from foundation.console import EXIT_CODES, run
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, is_common, new_app, run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from foundation.command_line import new_app
-from foundation.console import EXIT_CODES, run
+from foundation.console import EXIT_CODES, new_app, run
 from foundation.errors import InputError
 from foundation.processors import processor_count
 from generator.command.grouping import grouped

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from foundation import console
-from foundation.command_line import Quiet, Verbose, Version, common_first, new_app
-from foundation.console import EXIT_CODES
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app
 
 if TYPE_CHECKING:
     import numpy as np

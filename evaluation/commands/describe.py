@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
-from foundation.command_line import shows_progress
-from foundation.console import EXIT_CODES
+from foundation.console import EXIT_CODES, shows_progress
 
 if TYPE_CHECKING:
     from evaluation.experiments.describing import DataDescription

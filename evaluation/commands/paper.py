@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
-from foundation.command_line import new_app, shows_progress
-from foundation.console import EXIT_CODES
+from foundation.console import EXIT_CODES, new_app, shows_progress
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from foundation.command_line import Quiet, Verbose, Version
+from foundation.console import Quiet, Verbose, Version
 from foundation.errors import InputError
 from foundation.processors import processor_count
 from generator.command.grouping import option

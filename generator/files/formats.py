@@ -196,8 +196,8 @@ def decode_image(data: bytes, form: Format, what: str) -> npt.NDArray[np.uint16]
     return image.astype(np.uint16, copy=False)
 
 
-def decode_array(data: bytes, form: Literal["png", "tiff", "exr", "jxl"]) -> npt.NDArray[np.generic]:
-    """Return the array in a file's bytes, whatever its type and channels, as it stands there.
+def decode_array(data: bytes, form: Format) -> npt.NDArray[np.generic]:
+    """Return the array in a file's bytes, (H, W) or (H, W, channels), uint8, uint16 or float32, as it stands there.
 
     Raises
     ------

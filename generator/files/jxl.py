@@ -31,7 +31,7 @@ def encode_jxl(image: npt.NDArray[np.uint16]) -> bytes:
 
 
 def decode_jxl(data: bytes) -> npt.NDArray[np.generic]:
-    """Return what a JPEG XL file holds, (H, W, channels) or (H, W), of the type in which it is stored.
+    """Return what a JPEG XL file holds, (H, W, channels) or (H, W), uint8, uint16 or float32 as it is stored.
 
     Raises
     ------

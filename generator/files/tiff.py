@@ -49,7 +49,7 @@ def encode_tiff(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes
 
 
 def decode_tiff(data: bytes) -> npt.NDArray[np.generic]:
-    """Return the first picture of a TIFF, (H, W) or (H, W, channels), of the type in which it is stored.
+    """Return the first picture of a TIFF, (H, W) or (H, W, channels), uint8, uint16, float32 or whatever is stored.
 
     OpenCV's reader is not used: of pictures stored plane by plane, and of files that are cut off, it makes others.
 

@@ -1,7 +1,7 @@
 """Light as the CIE's standard observer sees it: spectra to XYZ, XYZ to linear sRGB, and black bodies.
 
 The colour-matching functions are those of the CIE 1931 2° standard observer at 1 nm (ISO/CIE 11664-1), in
-`foundation/data/cie_1931_2_degree.csv`; that folder's README says where they are from.
+`foundation/colorimetry/data/cie_1931_2_degree.csv`; that folder's README says where they are from.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 _C1_W_M2: Final = 3.741771e-16
+"""First radiation constant of Planck's law, W m² (CODATA)."""
+
 _C2_M_K: Final = 1.4388e-2
-"""First and second radiation constant as CIE 15 uses them for black bodies, in W m² and m K."""
+"""Second radiation constant as CIE 15:2018 has it for black bodies, m K; CODATA's has more places."""
 
 XYZ_TO_SRGB: Final = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 """(3, 3) float64, CIE XYZ to linear sRGB (IEC 61966-2-1:1999, equation 7)."""
@@ -26,7 +28,9 @@ _Array = npt.NDArray[np.float64]
 @cache
 def observer_cie_1931() -> tuple[_Array, _Array]:
     """Return the wavelengths (471,) float64, 360 … 830 nm by 1, and x̄, ȳ, z̄ there, (471, 3) float64; read-only."""
-    with resources.files("foundation").joinpath("data/cie_1931_2_degree.csv").open(encoding="utf-8") as file:
+    with (
+        resources.files("foundation.colorimetry").joinpath("data/cie_1931_2_degree.csv").open(encoding="utf-8") as file
+    ):
         table = np.loadtxt(file, delimiter=",", skiprows=1)
     table.flags.writeable = False
     return table[:, 0], table[:, 1:]
@@ -38,7 +42,7 @@ def planck(wavelengths_nm: npt.ArrayLike, temperature_k: float) -> _Array:
     Parameters
     ----------
     wavelengths_nm
-        Above 0, nm.
+        Of any shape, float64, above 0, nm.
     temperature_k
         Above 0, K.
     """

@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foundation.command_line import common_first, is_common, shows_progress
-from foundation.console import progress, run
+from foundation.console import common_first, is_common, progress, run, shows_progress
 from foundation.version import software
 
 COMMANDS = ("acquisition", "calibration", "generator", "evaluation", "synthesis")
@@ -47,7 +46,7 @@ def test_a_command_leaves_logging_as_it_was(name: str) -> None:
 
 
 def test_errors_alone_means_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
-    from foundation import command_line
+    from foundation import console as command_line
 
     seen: list[bool] = []
 
