@@ -89,6 +89,14 @@ def build_lut(
             "from the ground truth.",
         ),
     ] = False,
+    correct_drift: Annotated[
+        bool,
+        typer.Option(
+            "--correct-drift",
+            help="Take the lamp's drift between white frames out of samples and ground truth, so that all lights are "
+            "of one lamp; recorded, and undone by its numbers. Refused where white frames leave it open.",
+        ),
+    ] = False,
     corners: Annotated[
         tuple[str, str, str, str] | None,
         typer.Option(
@@ -195,6 +203,7 @@ def build_lut(
     made = {
         "--window": window is not None,
         "--subtract-dark": subtract_dark,
+        "--correct-drift": correct_drift,
         "--corners": corners is not None,
         "--linearity": linearity is not None,
     }
@@ -226,7 +235,7 @@ def build_lut(
         if picture is not None and not check:
             raise InputError("--picture goes with --check; a table that is built has its report")
         places = None if corners is None else parse_corners(corners)
-        options = BuildOptions(WINDOW if window is None else window, subtract_dark, places)
+        options = BuildOptions(WINDOW if window is None else window, subtract_dark, places, correct_drift)
         if compare is not None:
             if linearity is not None:
                 raise InputError("--linearity is for the report of one table; leave it out of --compare")

@@ -38,6 +38,7 @@ SLOW = (
     "calibration/comparison/test_compared_sessions.py",
     "calibration/pipeline/test_build.py",
     "calibration/pipeline/test_checkpoint.py",
+    "calibration/pipeline/test_drift_correction.py",
     "calibration/pipeline/test_linearity.py",
     "calibration/pipeline/test_options.py",
     "calibration/pipeline/test_plain_session.py",

@@ -158,6 +158,14 @@ THRESHOLDS: tuple[Threshold, ...] = (
         JUDGEMENT + "; 1 % between whites is usual for a warm lamp", _WARM_UP,
     ),
     Threshold(
+        "drift_left", "Drift that white frames leave open, where it is taken out", "share", "at most", 0.002, 0.005,
+        "between two white frames the lamp jumps or flickers, and a light there is given another brightness than it "
+        "had; its own ground truth goes along, so its colour is right",
+        SIMULATED + ": 0.1 % of a steady drift on a small chart; a jump of 1 % leaves 0.5 %",
+        "build the table without --correct-drift, let the lamp warm up, or take white frames more often "
+        "(sequence.reference_every)",
+    ),
+    Threshold(
         "white_drift_deg", "Drift of white's colour", *TABLE_LIMITS["white_drift_deg"].numbers,
         "the lamp's spectrum changes, not its brightness alone",
         JUDGEMENT + ": a tenth of a good method's error", _WARM_UP,
