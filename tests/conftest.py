@@ -32,6 +32,7 @@ SLOW = (
     "acquisition/session/test_journal_model.py",
     "acquisition/session/test_states.py",
     "acquisition/test_chart_command.py",
+    "calibration/causes/test_sessions.py",
     "calibration/checks/test_frame_consistency.py",
     "calibration/checks/test_light_codes.py",
     "calibration/checks/test_stains.py",
