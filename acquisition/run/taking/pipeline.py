@@ -484,4 +484,4 @@ class Pipeline:
 
 def of_disk(fault: CropError) -> bool:
     """Return whether a fault is one of the disk."""
-    return isinstance(fault, StorageError)
+    return isinstance(fault, StorageError) and is_curable(fault)
