@@ -109,9 +109,10 @@ class World:
         """
         from sim.world.rendering import counts
 
-        of_lamp = lamp * self._turned(settings, key) * np.array(situation.lamp)
+        body, room = self.body, self.room
+        of_lamp = lamp * room.wheel_light(settings.shutter_s, self._random(4, *key)) * np.array(situation.lamp)
         light, weights = self._lighting(colour, settings, of_lamp, situation)
-        body, visible = self.body, self.body.visible
+        visible = body.visible
         black = body.black + situation.black_dn
         noise_dn, gain_e = body.noise_dn(settings.iso), body.gain_e(settings.iso)
         frame = np.empty(body.sensor, dtype=np.uint16)
@@ -162,11 +163,25 @@ class World:
             points = self._points(nodes, first, last)
             shown = self._collected(situation.shown(points, page, plain, self.decoded), settings, lamp, ambient)
             shown *= situation.passed(points, page)[..., None]
-            falling[:, first:last] = self.lens.unveiled(light[:, first:last], veil, first) * shown.transpose(2, 0, 1)
+            there = self.lens.unveiled(light[:, first:last], veil, first)
+            if situation.glares:
+                there = there + self._mirrored(points, situation, first)
+            falling[:, first:last] = there * shown.transpose(2, 0, 1)
 
         _in_blocks(self.body.visible.height, block)
         self.lens.veiled(falling, self.body.pattern)
         return falling, np.ones(3, dtype=np.float32)
+
+    def _mirrored(self, points: NDArray[np.float64], situation: Situation, first: int) -> NDArray[np.float32]:
+        """Return (3, rows, columns) float32: what photosites of rows from `first` on get by mirroring, as `_render`."""
+        row, column = np.mgrid[first : first + len(points), : points.shape[1]]
+        paper = self._signals(self._reflectance([PAPER]))[0][self._channels()[row % 2, column % 2]]
+        added = situation.mirrored(points, self.sheet.page_mm)[..., None] * self.field(points) * paper
+        return added.transpose(2, 0, 1).astype(np.float32)
+
+    def _channels(self) -> NDArray[np.int64]:
+        """Return (2, 2) int64: the camera channel of a photosite by the parity of its row and column."""
+        return np.array([_CHANNELS.index(letter) for letter in self.body.pattern], dtype=np.int64).reshape(2, 2)
 
     def decoded(self, colour: Colour) -> NDArray[np.float64]:
         """Return (3,) float64, 0 … 1: the light of each primary that a colour's codes stand for."""
@@ -366,18 +381,6 @@ class World:
         means = self.field(np.stack([x, y], axis=-1)).mean(axis=(0, 1))
         return means[1] / means
 
-    def _turned(self, settings: ExposureSettings, key: tuple[int, ...]) -> NDArray[np.float64]:
-        """Return (3,) the light of each primary that the wheel lets through, over that of steady light."""
-        if self.room.wheel_hz == 0:
-            return np.ones(3)
-        random = self._random(4, *key)
-        start = random.uniform()
-        time = max(settings.shutter_s + self.room.shutter_jitter_s * random.standard_normal(), 0)
-        turns = np.array([start, start + time * self.room.wheel_hz])[:, None]
-        segment = np.arange(3) / 3
-        shone = np.floor(turns) / 3 + np.clip(turns - np.floor(turns) - segment, 0, 1 / 3)
-        return 3 * (shone[1] - shone[0]) / (settings.shutter_s * self.room.wheel_hz)
-
     def _reflectance(self, rgb: ArrayLike) -> NDArray[np.float64]:
         """Return (N, 81): reflectance of the chart's codes (N, 3) on this print."""
         return printed_reflectance(rgb, self.room.profile, self.room.paper)
@@ -416,7 +419,7 @@ class World:
         if self.lens.splits_colours:
             views = [self._nodes(situation, channel) for channel in _CHANNELS]
         sigma = ((2 * room.blur_px) ** 2 + (2 * situation.defocus_px) ** 2 + APERTURE_VARIANCE) ** 0.5
-        channels = np.array([_CHANNELS.index(letter) for letter in self.body.pattern], dtype=np.int64).reshape(2, 2)
+        channels = self._channels()
         out = np.empty((3, visible.height, visible.width), dtype=np.float32)
         # The projector stays where it is.
         falloff = self._falloff.copy()
