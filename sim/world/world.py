@@ -27,13 +27,14 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from foundation.processors import processor_count
+from sim.optics.falloff import lens_falloff, projector_falloff
 from sim.optics.photographic_lens import APERTURE_VARIANCE, PhotographicLens
 from sim.world.drawing import PAPER, Print, label_map
 from sim.world.geometry import View, surface_of
 from sim.world.profile import printed_reflectance
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import Body, HotPattern
-from sim.world.situation import UNDISTURBED, Situation, moved_back
+from sim.world.situation import UNDISTURBED, Situation, moved, moved_back
 from sim.world.spectra import projector_primaries, sensitivities
 from sim.world.wear import worn
 
@@ -72,7 +73,11 @@ class World:
         self._sensitivities = sensitivities(body.sensitivities)
         paper = np.einsum("pl,l,lc->c", self._primaries, self._reflectance([PAPER])[0], self._sensitivities)
         self._dn = room.white_level_share * (body.saturation - body.black) / float(paper.max())
-        self._vignetting, self._falloff = self._shading()
+        axis = 2 * self.view.centre_px[0] + 0.5, 2 * self.view.centre_px[1] + 0.5
+        self._vignetting = lens_falloff(axis, (body.visible.width, body.visible.height), room.vignetting)
+        self._falloff = projector_falloff(
+            sheet.page_mm, room.projector_falloff, room.primary_difference, self._random(2)
+        )
         self._falloff[:, 3] = self._balance()
         self.hot = HotPattern.drawn(self._random(6), body.sensor, room.hot_per_million, room.hot_dn_per_s)
         self._lock = threading.Lock()
@@ -187,12 +192,14 @@ class World:
         """Return (3,) float64, 0 … 1: the light of each primary that a colour's codes stand for."""
         return self.room.light_of(np.array([colour.red, colour.green, colour.blue]))
 
-    def signal(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float32]:
-        """Return what a frame would be without noise, black, hot photosites and clipping.
+    def signal(
+        self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0, situation: Situation = UNDISTURBED
+    ) -> NDArray[np.float32]:
+        """Return what a frame would be without noise, black, hot photosites and clipping, by a wheel's mean light.
 
         Parameters
         ----------
-        colour, settings, lamp
+        colour, settings, lamp, situation
             As for `expose`.
 
         Returns
@@ -200,10 +207,12 @@ class World:
         ndarray
             (rows, columns) float32, DN above black, of the body's visible photosites, their response included.
         """
-        drive = np.asarray(self.drive(colour, settings, lamp), dtype=np.float32)
-        return np.tensordot(drive, self._render()[0], 1)
+        light, drive = self._lighting(colour, settings, lamp * np.array(situation.lamp), situation)
+        return np.tensordot(drive, light, 1)
 
-    def project(self, points_mm: NDArray[np.float64], channel: str = "G") -> NDArray[np.float64]:
+    def project(
+        self, points_mm: NDArray[np.float64], channel: str = "G", situation: Situation = UNDISTURBED
+    ) -> NDArray[np.float64]:
         """Return the half-size pixels where points of the print are seen.
 
         Parameters
@@ -212,13 +221,18 @@ class World:
             (..., 2) float64, millimetres.
         channel
             ``R``, ``G`` or ``B``: of the camera; they differ where the lens has lateral chromatic aberration.
+        situation
+            Where the chart has been moved to.
 
         Returns
         -------
         ndarray
             (..., 2) float64, x then y.
         """
-        return self.lens.shifted(self.view.project(np.asarray(points_mm, dtype=np.float64)), channel)
+        points = np.asarray(points_mm, dtype=np.float64)
+        if any(situation.view):
+            points = moved(points, np.array(self.sheet.page_mm) / 2, self._bumped(situation), situation.turn_deg)
+        return self.lens.shifted(self.view.project(points), channel)
 
     def white(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float64]:
         """Return (3,) float64: R, G, B of bare paper in DN above black, without clipping, where `field` is 1."""
@@ -360,20 +374,6 @@ class World:
         from_spot = ((points[..., None, :] - self._falloff[:, :2]) ** 2).sum(axis=-1)
         return passed[..., None] * self._falloff[:, 3] / (1 + self._falloff[:, 2] * from_spot)
 
-    def _shading(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the constants of the lens's and the projector's falloff, as `sim.world.rendering.light` takes them."""
-        room, visible = self.room, self.body.visible
-        axis = 2 * np.array(self.view.centre_px) + 0.5
-        corner2 = (visible.width**2 + visible.height**2) / 4
-        lens = np.array([*axis, ((1 - room.vignetting) ** -0.5 - 1) / corner2])
-        page = np.array(self.sheet.page_mm)
-        half_diagonal = float(np.hypot(*page)) / 2
-        random = self._random(2)
-        lost = room.projector_falloff * (1 + room.primary_difference * np.array([-1.0, 0.0, 1.0]))
-        aside = np.array([0.05, -0.1]) + room.primary_difference * random.uniform(-0.5, 0.5, (3, 2))
-        spots = page / 2 + half_diagonal * aside
-        return lens, np.column_stack([spots, lost / (1 - lost) / half_diagonal**2, np.ones(3)])
-
     def _balance(self) -> NDArray[np.float64]:
         """Return (3,) the gains of the primaries that give all three green's mean over the sheet."""
         width, height = self.sheet.page_mm
@@ -410,7 +410,7 @@ class World:
         from sim.world.rendering import light
 
         visible, room = self.body.visible, self.room
-        drawing = label_map(self.sheet)
+        drawing, channels = label_map(self.sheet), self._channels()
         backdrop = np.full((1, len(self._sensitivities)), _BACKDROP_REFLECTANCE)
         reflectance = np.concatenate([self._reflectance(drawing.codes), backdrop])
         table = self._signals(reflectance).astype(np.float32)
@@ -419,14 +419,12 @@ class World:
         if self.lens.splits_colours:
             views = [self._nodes(situation, channel) for channel in _CHANNELS]
         sigma = ((2 * room.blur_px) ** 2 + (2 * situation.defocus_px) ** 2 + APERTURE_VARIANCE) ** 0.5
-        channels = self._channels()
         out = np.empty((3, visible.height, visible.width), dtype=np.float32)
         # The projector stays where it is.
         falloff = self._falloff.copy()
         falloff[:, :2] = self._moved_back(falloff[:, :2], situation)
 
-        places, lines = np.stack(views), (drawing.x_lines, drawing.y_lines)
-        spread = room.shoulder_share > 0
+        places, lines, spread = np.stack(views), (drawing.x_lines, drawing.y_lines), room.shoulder_share > 0
 
         def block(first: int, last: int) -> None:
             # Shoulders lie between the print and the photosites' response.
@@ -457,9 +455,12 @@ class World:
         if not any(situation.view):
             # Rounding would make other counts of the undisturbed chart, here and there one.
             return points_mm
+        return moved_back(points_mm, np.array(self.sheet.page_mm) / 2, self._bumped(situation), situation.turn_deg)
+
+    def _bumped(self, situation: Situation) -> NDArray[np.float64]:
+        """Return (2,) float64 mm, how far the chart has been pushed."""
         view = self.view
-        by = np.array(situation.bump_mm) + np.array(situation.bump_px) * (view.distance_mm / view.focal_px)
-        return moved_back(points_mm, np.array(self.sheet.page_mm) / 2, by, situation.turn_deg)
+        return np.array(situation.bump_mm) + np.array(situation.bump_px) * (view.distance_mm / view.focal_px)
 
     def _points(self, nodes: NDArray[np.float64], first: int, last: int) -> NDArray[np.float64]:
         """Return (rows, columns, 2) float64, mm: the places on the print that some rows of photosites see."""
