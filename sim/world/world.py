@@ -190,7 +190,7 @@ class World:
 
     def decoded(self, colour: Colour) -> NDArray[np.float64]:
         """Return (3,) float64, 0 … 1: the light of each primary that a colour's codes stand for."""
-        return self.room.light_of(np.array([colour.red, colour.green, colour.blue]))
+        return self.room.light_of(np.array(colour.codes))
 
     def signal(
         self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0, situation: Situation = UNDISTURBED
