@@ -33,8 +33,13 @@ from calibration.registration.raster import Raster
 from calibration.registration.tile_comparison import TileComparison, compare_tiles
 from foundation.errors import RegistrationError
 
-_COARSE_CELLS = 10
-"""Cells along a block that is searched for: found to 0.14 px RMS where the sheet waves by 3 mm, in simulated frames."""
+_COARSE_BLOCKS = ((10, 1.5), (5, 1.0))
+"""Cells along the blocks that are searched for, and how far, first and then: large ones are never taken for others,
+small ones follow waves of 150 mm and curled edges to 0.2 … 0.3 px RMS, in simulated frames (of 6 mm)."""
+
+_COARSE_ROUGHNESS_PX = 2.0
+"""Usual second difference of the displacement between knots of a sheet that waves by 6 mm every 150 mm. A smoother one
+leaves 1 to 2 px there, which the fine comparison needs ten steps for."""
 
 _BLOCK_CELLS = 8
 """Cells along the window of the fine comparison: blocks of 6 leave larger errors at the worst cell, .40 px for .38."""
@@ -251,29 +256,32 @@ class Matcher:
         RegistrationError
             Too little of the chart is in the frame, or the cells are not the chart's.
         """
-        raster = Raster.of(self._low, self._cell / _COARSE_PER_CELL, self._cells_across * _COARSE_PER_CELL)
+        n, across = _COARSE_PER_CELL, int(self._cells_across.min())
+        blocks = [int(np.clip(across // 3, 2, cells)) for cells, _ in _COARSE_BLOCKS]
+        reaches = [round(n * min(far, 0.25 * blocks[0])) for _, far in _COARSE_BLOCKS]
+        # The raster goes on beyond the outermost cells as far as they are looked for, so that blocks reach the rim.
+        step, beyond = self._cell / n, max(reaches)
+        raster = Raster.of(self._low - beyond * step, step, self._cells_across * n + 2 * beyond)
         cover = raster.coverage(self._centres, self._sizes)
-        block = int(np.clip(self._cells_across.min() // 3, 2, _COARSE_CELLS))
-        reach = round(_COARSE_PER_CELL * min(1.5, 0.25 * block))
         best = 0.0
-        for _ in range(2):
+        for block, reach in zip(blocks, reaches, strict=True):
             template = self._template(raster, cover, self._elements(raster, max(self.blur_px, 0.7)))
             image, there = self._rectified(raster)
             # What is printed in the margin must not move cells.
-            bare = ~raster.near(cover, _COARSE_PER_CELL)
+            bare = ~raster.near(cover, n)
             image[bare] = template[bare]
-            found = find_blocks(raster, template, image, there, block * _COARSE_PER_CELL, reach)
+            found = find_blocks(raster, template, image, there, block * n, reach, block**2)
             if not len(found.score):
                 raise RegistrationError(
                     f"{what}: too little of the chart lies in the picture; bring all of it into the picture"
                 )
             centre = found.centres_mm
-            best = float(np.median(found.score))
+            best = max(best, float(np.median(found.score)))
             shift = self.to_pixels(centre + found.moves_mm) - self.to_pixels(centre)
             information = found.information(shift, self._cell * block, self.cell_px)
             total = self.displacement.at(centre) + shift
             self.displacement = self.displacement.fitted(
-                centre, information, np.einsum("nij,nj->ni", information, total)
+                centre, information, np.einsum("nij,nj->ni", information, total), _COARSE_ROUGHNESS_PX
             )
             self.colours = self._fit_colours()
         if best < _LEAST_BLOCK_SCORE:
@@ -281,8 +289,8 @@ class Matcher:
                 what, f"blocks of cells correlate by {best:.2f} with the chart's, {_LEAST_BLOCK_SCORE:g} expected"
             )
 
-    def follow(self, sigma_cells: float) -> float:
-        """Move the map by one Gauss-Newton step of what is coarser than cells; return the RMS movement, px.
+    def follow(self, sigma_cells: float) -> None:
+        """Move the map by one Gauss-Newton step of what is coarser than cells.
 
         Blurred by `sigma_cells`, the steps between cells are gone, and with them the danger to lock onto the
         neighbouring cell; folds of a smooth order and the texture of a random one remain. Where the colours only rise
@@ -290,9 +298,8 @@ class Matcher:
         """
         # What the colours leave is alike over many cells: a window is about one measurement.
         repeat = (_FOLLOWED_CELLS * _COARSE_PER_CELL) ** 2 / _WINDOW_WORTH
-        moved = self._move(self._compared_softly(sigma_cells).weakened(repeat))
+        self._move(self._compared_softly(sigma_cells).weakened(repeat))
         self.colours = self._fit_colours()
-        return moved
 
     def _compared_softly(self, sigma_cells: float) -> TileComparison:
         """Return the comparison of print and frame, both blurred by some cells."""
@@ -338,8 +345,8 @@ class Matcher:
         )
         return self._low + places * self._cell, parts
 
-    def step(self) -> float:
-        """Move the map by one Gauss-Newton step of all cells together; return the RMS movement, px."""
+    def step(self) -> tuple[float, float]:
+        """Move the map by one Gauss-Newton step of all cells together; return the RMS and largest movement, px."""
         raster, n = self._raster, self._per_cell
         template = self._template(raster, self._cover, self._elements(raster, self.blur_px))
         image, there = self._rectified(raster)
@@ -355,8 +362,8 @@ class Matcher:
         self._left = compared.after(self.displacement.at(compared.points_mm) - before.at(compared.points_mm))
         return moved
 
-    def _move(self, compared: TileComparison) -> float:
-        """Move the map to where tiles and anchors measured it; return the RMS movement of the tiles, px."""
+    def _move(self, compared: TileComparison) -> tuple[float, float]:
+        """Move the map to where tiles and anchors measured it; return the tiles' RMS and largest movement, px."""
         anchors, points = self._anchors, compared.points_mm
         all_points = np.concatenate([points, anchors.points_mm])
         all_information = np.concatenate([compared.information, anchors.information])
@@ -366,7 +373,8 @@ class Matcher:
         total = np.concatenate([compared.pull, anchored]) + np.einsum("nij,nj->ni", all_information, before)
         self.displacement = self.displacement.fitted(all_points, all_information, total)
         moved = (self.displacement.at(all_points) - before)[: len(points)]
-        return rms(moved[compared.information[:, 0, 0] > 0])
+        moved = moved[compared.information[:, 0, 0] > 0]
+        return rms(moved), float(np.linalg.norm(moved, axis=1).max(initial=0.0))
 
 
 def not_this_chart(what: str, measured: str) -> RegistrationError:
