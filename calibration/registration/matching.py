@@ -6,7 +6,8 @@ Rules that hold inside:
   on the frame itself), and a smooth displacement is fitted to what does not coincide.
 - First whole blocks are found where they are, by correlation (`block_search`); then all cells move together, by
   Gauss-Newton steps (`tile_comparison`). Without the first the second locks onto the neighbouring cell.
-- All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres.
+- All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres,
+  and the lens's lateral chromatic aberration is measured with the map, which is green's.
 
 Source: B. D. Lucas and T. Kanade, "An iterative image registration technique", IJCAI 1981.
 """
@@ -22,12 +23,13 @@ from scipy import ndimage, sparse
 
 from acquisition.chart.model import PAPER_WHITE, Chart
 from acquisition.framing.homography import rms
-from acquisition.framing.planes import Plane
+from acquisition.framing.planes import CHANNELS, Channel, Plane
 from calibration.registration.block_search import find_blocks
 from calibration.registration.blocks import Blocks, fit_blocks
 from calibration.registration.colour_checks import slipped_parts
 from calibration.registration.colour_model import ColourModel, fit_colours
 from calibration.registration.displacement import Displacement
+from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.lens import Lens
 from calibration.registration.raster import Raster
 from calibration.registration.tile_comparison import TileComparison, compare_tiles
@@ -95,11 +97,14 @@ class Anchors:
         (N, 2) float64 where they are seen.
     information
         (N, 2, 2) float64, inverse covariance of the places, px⁻².
+    channel
+        The colour that they were seen in; "G" where it is all of them.
     """
 
     points_mm: _Array
     places_px: _Array
     information: _Array
+    channel: Channel = "G"
 
 
 class Matcher:
@@ -124,6 +129,8 @@ class Matcher:
     ----------
     displacement
         What is added to the lens; zero at first.
+    lateral
+        Where red and blue lie against green; none at first.
     colours
         The frame's colour model, fitted again as the map moves.
     """
@@ -136,6 +143,8 @@ class Matcher:
         self._smooth_order = not chart.tags
         self._planes = planes
         self.lens = lens
+        height, width = planes[0].values.shape
+        self.lateral = LateralColour.unmeasured((width, height))
         self._anchors = anchors
         self.blur_px = blur_px
         self.cell_px = cell_px
@@ -172,16 +181,17 @@ class Matcher:
         self.colours = self._fit_colours()
         self._left: TileComparison | None = None
 
-    def to_pixels(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the half-size pixels (N, 2) float64 of points (N, 2) mm by the map of the moment."""
-        return self.lens.to_pixels(points_mm) + self.displacement.at(points_mm)
+    def to_pixels(self, points_mm: npt.ArrayLike, channel: Channel = "G") -> _Array:
+        """Return the half-size pixels (N, 2) float64 where a channel sees points (N, 2) mm by the map of the moment."""
+        places = self.lens.to_pixels(points_mm) + self.displacement.at(points_mm)
+        return places + self.lateral.shift_px(places, channel)
 
     def _seen(self) -> _Array:
         """Return the camera RGB (N, 3) at the middle of every patch, counts, NaN outside the frame."""
         places = self.to_pixels(self._centres)
         seen = np.empty((len(places), 3))
         for column, plane in enumerate(self._planes):
-            x, y = (places - plane.offset_px).T
+            x, y = (places + self.lateral.shift_px(places, plane.channel) - plane.offset_px).T
             smooth = cv2.blur(plane.values, (3, 3))
             seen[:, column] = ndimage.map_coordinates(smooth, [y, x], order=1, cval=float("nan"))
         return seen
@@ -232,10 +242,13 @@ class Matcher:
         places = raster.element_places(self.to_pixels)
         image = np.empty((*raster.shape, 3), dtype=np.float32)
         for channel, plane in enumerate(self._planes):
+            own = places
+            if plane.channel != "G" and self.lateral.terms_px.any():
+                own = raster.element_places(lambda points, colour=plane.channel: self.to_pixels(points, colour))
             image[..., channel] = cv2.remap(
                 plane.values,
-                places[..., 0] - np.float32(plane.offset_px[0]),
-                places[..., 1] - np.float32(plane.offset_px[1]),
+                own[..., 0] - np.float32(plane.offset_px[0]),
+                own[..., 1] - np.float32(plane.offset_px[1]),
                 cv2.INTER_CUBIC,
                 borderMode=cv2.BORDER_REPLICATE,
             )
@@ -357,10 +370,30 @@ class Matcher:
         )
         if self._smooth_order:
             compared = compared.weakened(_COLOURS_REPEAT)
-        before = self.displacement
+        points = compared.points_mm
+        before, places = self.displacement, self.to_pixels(points)
+        shifted = [self.lateral.shift_px(places, channel) for channel in CHANNELS]
+        self.lateral = self.lateral.remeasured(*self._in_blocks(compared, places))
+        turned = np.stack([self.lateral.shift_px(places, channel) for channel in CHANNELS]) - shifted
+        compared = compared.after(turned)
         moved = self._move(compared)
-        self._left = compared.after(self.displacement.at(compared.points_mm) - before.at(compared.points_mm))
+        self._left = compared.after(self.displacement.at(points) - before.at(points))
         return moved
+
+    def _in_blocks(self, compared: TileComparison, places_px: _Array) -> tuple[_Array, _Array, _Array]:
+        """Return middles (B, 2) px of blocks of cells, and their information (3, B, 2, 2) and pull (3, B, 2)."""
+        column, row = np.floor((compared.points_mm - self._low) / (self._cell * self._block_cells)).astype(int).T
+        number = row * (column.max() + 1) + column
+        count = int(number.max()) + 1
+
+        def summed(values: _Array) -> _Array:
+            total = np.zeros((count, *values.shape[1:]))
+            np.add.at(total, number, values)
+            return total
+
+        tiles = np.maximum(np.bincount(number, minlength=count), 1)
+        information, pull = (np.stack([summed(one) for one in channels]) for channels in compared.of_channels)
+        return summed(places_px) / tiles[:, None], information, pull
 
     def _move(self, compared: TileComparison) -> tuple[float, float]:
         """Move the map to where tiles and anchors measured it; return the tiles' RMS and largest movement, px."""
@@ -368,7 +401,7 @@ class Matcher:
         all_points = np.concatenate([points, anchors.points_mm])
         all_information = np.concatenate([compared.information, anchors.information])
         before = self.displacement.at(all_points)
-        off = anchors.places_px - self.to_pixels(anchors.points_mm)
+        off = anchors.places_px - self.to_pixels(anchors.points_mm, anchors.channel)
         anchored = np.einsum("nij,nj->ni", anchors.information, off)
         total = np.concatenate([compared.pull, anchored]) + np.einsum("nij,nj->ni", all_information, before)
         self.displacement = self.displacement.fitted(all_points, all_information, total)

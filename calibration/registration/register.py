@@ -154,7 +154,8 @@ def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
     tags = {tag.id: tag for tag in chart.tags}
     corners_mm = np.concatenate([tags[tag.id].corners_mm for tag in framing.tags])
     corners_px = np.concatenate([tag.corners_px for tag in framing.tags])
-    return Anchors(corners_mm, corners_px, np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2)))
+    known = np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2))
+    return Anchors(corners_mm, corners_px, known, framing.plane.channel)
 
 
 def _outline(field: FoundField) -> Anchors:
@@ -223,7 +224,7 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
     """Return the map with all figures of its quality."""
     seen, expected, paper = matcher.patches()
     there = np.asarray(np.isfinite(seen).all(axis=1))
-    residual = marks.places_px - matcher.to_pixels(marks.points_mm)
+    residual = marks.places_px - matcher.to_pixels(marks.points_mm, marks.channel)
     if framing.field is not None:
         residual = (residual * framing.field.normals).sum(axis=1, keepdims=True) * framing.field.normals
     mismatched_cells = mismatched(seen, expected, paper, chart)
@@ -235,6 +236,7 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
         framing=framing,
         lens=matcher.lens,
         displacement=matcher.displacement,
+        lateral=matcher.lateral,
         marks_residual_px=residual,
         lens_residual_px=lens_rms,
         blocks=blocks,
