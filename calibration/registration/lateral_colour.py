@@ -103,7 +103,7 @@ class LateralColour:
         if not seen.any():
             return self
         places, own, by = places_px[seen], information[:, seen], pull[:, seen]
-        inverse: _Array = np.linalg.inv(total[seen])
+        inverse = np.asarray(np.linalg.inv(total[seen]), dtype=np.float64)
         away = (places - self.centre_px) / self.radius_px
         design = np.stack([away, away * (away**2).sum(axis=1, keepdims=True)], axis=-1)
         colours = [CHANNELS.index("R"), CHANNELS.index("B")]
