@@ -24,6 +24,8 @@ class BuildOptions:
     corners
         Four corners (x, y) of the field of cells in the frame that is registered first, half-size px, clockwise from
         the printed top-left, for a chart without tags; None to have it found.
+    correct_drift
+        Whether the lamp's drift between white frames is taken out of samples and ground truth at the end.
     lens_correction
         Whether what the lens spreads beside its sharp core is subtracted from samples and ground truth, where the print
         proves that it does.
@@ -37,6 +39,7 @@ class BuildOptions:
     window: int = WINDOW
     subtract_dark: bool = False
     corners: Corners | None = None
+    correct_drift: bool = False
     lens_correction: bool = True
 
     def __post_init__(self) -> None:

@@ -311,7 +311,8 @@ def _solved(normal: _Array, right: _Array, prior: _Array, kept: npt.NDArray[np.i
     shares, _ = _positive(*_without_factors(normal, right, prior), kept)
     full = normal + np.diag(prior)
     factors = np.linalg.solve(full[TERMS:, TERMS:], right[TERMS:] - full[TERMS:, :TERMS] @ shares)
-    return np.concatenate([shares, factors])
+    found: _Array = np.concatenate([shares, factors])
+    return found
 
 
 def _explained(matrix: _Array, vector: _Array, solution: _Array) -> float:
