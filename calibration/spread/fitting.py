@@ -17,17 +17,14 @@ C cells in the order of colour indices; T unknowns of a channel.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from acquisition.measures.polynomials import page_polynomial, page_powers
-from calibration.spread.point_spread import TERMS, PointSpread, free_terms, groups_of_terms, terms_of
+from calibration.spread.point_spread import LEAST_GAIN, TERMS, PointSpread, free_terms, groups_of_terms, terms_of
 from foundation.robust import MAD_TO_SIGMA
-
-LEAST_GAIN = 16.0
-"""By how much a kernel must lower the sum of squares, in units of its variance: a share of four standard errors."""
 
 MOST_MISFIT = 5.0
 """Misfit from which on a veil is not told from other light; 1.5 to 3.3 in simulated rooms whose lens has a veil."""
@@ -70,6 +67,12 @@ _ROUNDS = 2
 _ROUNDING = 1e-7
 """Step of a stored share: far below its error, far above what another order of sums changes, so that a table's bytes
 do not depend on the machine's linear algebra."""
+
+VARYING_BITS = 4
+"""Bits of a channel from which on cells are enough for shares that change over the frame."""
+
+_EVEN_TERMS = 3
+"""Unknowns of a kernel that is the same all over the frame, at most: one for each channel."""
 
 FULL_BITS = 5
 """Bits of a full chart, whose codes stand so near each other that their curvature is less than the noise of a cell."""
@@ -212,6 +215,8 @@ def fit_spread(
     matrix, vector = _without_factors(normal.sum(axis=0), right.sum(axis=0), prior)
     covariance: _Array = np.asarray(misfit * np.linalg.inv(matrix), dtype=np.float64)
     candidates = groups_of_terms()
+    if bits < VARYING_BITS:
+        candidates = [group for group in candidates if len(group) <= _EVEN_TERMS]
     if misfit > MOST_MISFIT:
         # Other light lies smoothly over the frame, and what an even veil would have been taken for is not known.
         covariance[-1, -1] += _positive(matrix, vector, np.arange(TERMS))[0][-1] ** 2
@@ -223,7 +228,8 @@ def fit_spread(
         others = normal.sum(axis=0) - normal[fold], right.sum(axis=0) - right[fold]
         with_kernels, without = (_solved(*others, prior, chosen) for chosen in (kept, kept[:0]))
         held_out += _explained(normal[fold], right[fold], with_kernels) - _explained(normal[fold], right[fold], without)
-    return PointSpread(np.round(shares / _ROUNDING) * _ROUNDING, covariance, gain, held_out, misfit)
+    found = PointSpread(np.round(shares / _ROUNDING) * _ROUNDING, covariance, gain, held_out, misfit)
+    return found if found.proven else replace(found, shares=np.zeros(TERMS))
 
 
 def _of(normal: _Array, right: _Array, prior: _Array, chosen: npt.NDArray[np.int64]) -> tuple[_Array, _Array, _Array]:
@@ -310,9 +316,10 @@ def _solved(normal: _Array, right: _Array, prior: _Array, kept: npt.NDArray[np.i
     """Return all unknowns (T,), shares other than the kept ones 0."""
     shares, _ = _positive(*_without_factors(normal, right, prior), kept)
     full = normal + np.diag(prior)
-    factors = np.linalg.solve(full[TERMS:, TERMS:], right[TERMS:] - full[TERMS:, :TERMS] @ shares)
-    found: _Array = np.concatenate([shares, factors])
-    return found
+    solution = np.empty(len(right))
+    solution[:TERMS] = shares
+    solution[TERMS:] = np.linalg.solve(full[TERMS:, TERMS:], right[TERMS:] - full[TERMS:, :TERMS] @ shares)
+    return solution
 
 
 def _explained(matrix: _Array, vector: _Array, solution: _Array) -> float:

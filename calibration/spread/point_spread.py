@@ -30,6 +30,10 @@ _NEAR_TERMS = PLACES * len(NEAR_PX)
 TERMS = 3 * _NEAR_TERMS + len(FAR_PX) + 1
 """Unknowns: near kernels for each channel and term over the frame, far ones and the veil for all channels together."""
 
+LEAST_GAIN = 16.0
+"""By how much a kernel must lower the sum of squares, in units of its variance: a share of four standard errors. All
+together must do as much on parts of the print that they were not fitted on."""
+
 _Array = npt.NDArray[np.float64]
 
 
@@ -112,7 +116,7 @@ class PointSpread:
     @property
     def proven(self) -> bool:
         """Whether there is anything to correct, and it holds on parts of the print that it was not fitted on."""
-        return bool(self.shares.any()) and self.held_out > 0
+        return bool(self.shares.any()) and self.held_out > LEAST_GAIN * self.misfit
 
     def amounts(self) -> _Array:
         """Return the share (9, 3, K) float64 of each kernel: terms over the frame, by channel, the veil last."""

@@ -227,7 +227,8 @@ def surroundings(
     middle = np.stack(
         [np.concatenate([cells.columns, references.columns]), np.concatenate([cells.rows, references.rows])], axis=1
     )
-    from_centre = (middle - registration.to_pixels(points))[:, None] + mosaic_offsets_px
+    seen = np.stack([registration.to_pixels(points, channel) for channel in CHANNELS], axis=1)
+    from_centre = middle[:, None] + mosaic_offsets_px - seen
     offset = np.einsum("nij,ncj->nci", to_slots, from_centre) * pitch[:, None]
     places = place_terms(middle.astype(np.float64), frame_px)
     return Surroundings(grid, cells.window, neighbours, np.ascontiguousarray(offset), pitch, places, whites, *light)
