@@ -50,6 +50,8 @@ SLOW = (
     "calibration/pipeline/test_small_charts.py",
     "calibration/radiometry/test_cell_field.py",
     "calibration/radiometry/test_dark_subtraction.py",
+    "acquisition/framing/test_movement.py",
+    "acquisition/judge/test_judge.py",
     "calibration/registration/test_register.py",
     "calibration/registration/test_register_without_tags.py",
     "calibration/report/test_places.py",

@@ -127,7 +127,7 @@ def photograph(
     near_y, near_x = sites.rows[:, None, None] + steps[:, None], sites.columns[:, None, None] + steps
     random = np.random.default_rng([seed, 5])
     clean = image[near_y, near_x].mean(axis=(1, 2))
-    noisy = clean + random.normal(size=clean.shape) * np.sqrt(clean / 1.8 / 25 + 0.5)
+    noisy = clean + np.asarray(random.normal(size=clean.shape), dtype=np.float64) * np.sqrt(clean / 1.8 / 25 + 0.5)
     field_at = light[sites.rows, sites.columns][:, None].repeat(3, axis=1)
     cells, references = CHART.colour_count, len(where)
     uniform = FlatField.uniform(CHART.page_mm)
