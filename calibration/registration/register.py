@@ -26,14 +26,15 @@ from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.homography import rms
 from acquisition.framing.outline import refine_edges
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
-from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
+from acquisition.framing.sharpness import blur_px
 from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.visibility import MIN_CELL_PX
+from acquisition.limits.bleed import largest_blur_px
 from calibration.registration.blocks import Blocks
 from calibration.registration.colour_checks import agreement, mismatched
 from calibration.registration.lens import Lens, fit_lens
 from calibration.registration.matching import Anchors, Matcher, not_this_chart
-from calibration.registration.registration import SAMPLE_REACH_PX, Registration
+from calibration.registration.registration import Registration
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
@@ -208,9 +209,7 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
             f"{what}: a cell is {cell_px:.1f} px wide, at least {MIN_CELL_PX:g} expected for 25 pixels inside it; "
             "bring the camera nearer"
         )
-    # Up to MAX_BLUR_PX cells of any size are found to a few hundredths of a pixel. What such a blur mixes into their
-    # samples depends on the cells' size; the verdict judges it as bleed.
-    allowed = max(MAX_BLUR_PX, (cell_px / 2 - SAMPLE_REACH_PX) / 2)
+    allowed = largest_blur_px(cell_px)
     if not blur <= allowed:
         raise RegistrationError(
             f"{what} is out of focus: edges are blurred by σ = {blur:.2f} px, at most {allowed:.2f} allowed for cells "

@@ -9,13 +9,11 @@ import numpy.typing as npt
 
 from acquisition.framing.finding import Framing
 from acquisition.framing.homography import rms
+from acquisition.limits.bleed import SAMPLE_REACH_PX
 from calibration.registration.blocks import Blocks
 from calibration.registration.colour_model import ColourModel
 from calibration.registration.displacement import Displacement
 from calibration.registration.lens import Lens
-
-SAMPLE_REACH_PX = 3.25
-"""From a cell's true centre to the outer edge of its 25 pixels: 2.5, rounding 0.5, registration 0.25."""
 
 CLEARANCE_PX = 1.75
 """From there to the edge of a cell of 10 px, for which the limits of places were found."""
