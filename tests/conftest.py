@@ -35,6 +35,7 @@ SLOW = (
     "calibration/checks/test_frame_consistency.py",
     "calibration/checks/test_light_codes.py",
     "calibration/checks/test_stains.py",
+    "calibration/comparison/test_compared_sessions.py",
     "calibration/pipeline/test_build.py",
     "calibration/pipeline/test_checkpoint.py",
     "calibration/pipeline/test_linearity.py",

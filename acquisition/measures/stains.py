@@ -9,7 +9,7 @@ Rules that hold inside:
 - What a code gives is predicted from the codes next to it in colour, which lie elsewhere on the sheet: no model of ink
   or paper, and next to nothing in common with the cell's own place.
 - A cell is judged by its neighbourhood: one deviating cell is the prediction's error or noise. Next to a stain it is
-  judged alone as well, for only half of the neighbourhood of a cell at a stain's rim is stained.
+  judged alone as well, for only half of the neighbourhood of a cell at a stain's rim is stained; that half must show.
 - Charts of less than `LEAST_BITS` cannot be judged: between four levels of a code curvature does not change slowly.
 - A deviation must be significant and large enough to matter. What is found is listed, never corrected.
 """
@@ -53,6 +53,9 @@ _LEAST_KNOWN = 9
 
 _LEAST_NEIGHBOURS = 5
 """Cells of a neighbourhood that must be known for its mean to count."""
+
+_MANY_BESIDE = 3
+"""Stained cells of a neighbourhood from which on it need not deviate itself for a cell to belong to the stain."""
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
@@ -140,7 +143,11 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
         trusted = usable & ~stained
     with np.errstate(invalid="ignore"):
         off = (np.abs(np.expm1(log_ratios)) > np.maximum(RIM_SIGMA * _usual(log_ratios), STAINED)).any(axis=1)
-    return Stains(deviation, error, np.expm1(log_ratios), stained | (off & stained[near].any(axis=1)))
+    # Part of a neighbourhood that a stain reaches deviates, too; a cell that does so alone is its prediction's error.
+    beside = stained[near].sum(axis=1)
+    reached = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1) | (beside >= _MANY_BESIDE)
+    rim = off & reached & (beside > 0)
+    return Stains(deviation, error, np.expm1(log_ratios), stained | rim)
 
 
 def _usual(log_ratios: _Array) -> _Array:

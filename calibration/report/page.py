@@ -21,7 +21,7 @@ MOST_UNFIT = 200
 _CLASSES: dict[Outcome, str] = {"accept": "accept", "accept with remarks": "remark", "refuse": "refuse"}
 """Classes of the style sheet, and the words of the table's first column."""
 
-_STYLE = f"""
+STYLE = f"""
 body {{ font: 16px/1.5 system-ui, sans-serif; color: {INK}; max-width: 1100px; margin: 2rem auto; padding: 0 1rem }}
 h1 {{ font-size: 1.6rem; margin-bottom: .2rem }} h2 {{ font-size: 1.15rem; margin: 2.2rem 0 .6rem }}
 table {{ border-collapse: collapse; font-size: .95rem }} th {{ text-align: left; font-weight: 600 }}
@@ -35,6 +35,7 @@ td.accept {{ border-left-color: #2f8f46 }} td.remark {{ border-left-color: #d9a4
 td.refuse {{ border-left-color: #c8382e; font-weight: 600 }}
 td.number {{ white-space: nowrap }} figure {{ margin: 0 }} img {{ max-width: 100%; height: auto }}
 """
+"""The style sheet of a table's pages."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +54,10 @@ def page(result: BuildResult, pictures: Sequence[Picture]) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>\n"
+        f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>\n"
         f'<h1>{html.escape(title)}</h1><p class="note">Session {html.escape(session.folder.name)}</p>\n'
         f"{_verdict(result.verdict)}{_retaking(result)}<h2>Figures</h2>{_summary(result)}"
-        f"{''.join(map(_picture, pictures))}{_unfit(result.figures.cells.unfit)}</body></html>\n"
+        f"{''.join(map(picture_html, pictures))}{_unfit(result.figures.cells.unfit)}</body></html>\n"
     )
 
 
@@ -109,7 +110,8 @@ def _summary(result: BuildResult) -> str:
     return f"<table>{rows}</table>"
 
 
-def _picture(picture: Picture) -> str:
+def picture_html(picture: Picture) -> str:
+    """Return a picture with its heading and caption as HTML; the file is part of the text."""
     heading = html.escape(picture.heading)
     return (
         f"<figure><h2>{heading}</h2><img alt='{heading}' "
