@@ -47,8 +47,12 @@ _HELD_SD_DEG = 10.0
 _FEW = 24
 """Lights up to which each is left out in turn where names do not fit; of more, the majority decides."""
 
-_SUSPECTS = 6
+_SUSPECTS = 8
 """Lights among which exchanged names are looked for then: those whose absence helps most."""
+
+_AS_GOOD = 9.0
+"""Misfit by which exchanged names may be worse than leaving a light out, to be believed: that takes three numbers away,
+which each have 1 on average."""
 
 _CHROMA_SD, _MOST_CHROMA_SD = 0.003, 0.012
 """Scatter of a channel against the others, relative: what healthy lamps have, and up to where that of the session at
@@ -67,6 +71,10 @@ dimensions have 6 on average and once in ten million times this."""
 
 _FREE = 10.0
 """Standard deviation of a light's brightness, relative, where only its direction counts."""
+
+_FAR = 3.0
+"""Squared distance of two predictions, over `EXCHANGED`, up to which an exchange is weighed whole: both lights would be
+off, so that twice this distance is to be expected of one."""
 
 _BLOCK_PAIRS = 20_000
 """Pairs whose exchange is weighed at a time: a hundred megabytes."""
@@ -119,6 +127,9 @@ class CodeAgreement:
         (L,) bool, whether a light is held against its codes (`HELD_DEG`).
     exchange_deg
         Largest angle between two lights whose exchange would go unnoticed; 0 where none would.
+    misfit
+        By how much whites and codes of few lights disagree, all taken together, over what healthy rooms have; 0 of
+        many.
     """
 
     angle_deg: _Array
@@ -130,19 +141,19 @@ class CodeAgreement:
     exchanges: tuple[Exchange, ...]
     held: npt.NDArray[np.bool_]
     exchange_deg: float
+    misfit: float
 
-    def first(self, lights: int) -> CodeAgreement:
-        """Return the same of the first lights alone; exchanges with others are left out."""
+    def rows(self, lights: slice) -> CodeAgreement:
+        """Return the same of some lights alone; `seen_as` and `exchanges` name lights by the numbers they had."""
         return replace(
             self,
-            angle_deg=self.angle_deg[:lights],
-            error_deg=self.error_deg[:lights],
-            off_deg=self.off_deg[:lights],
-            brightness=self.brightness[:lights],
-            off_brightness=self.off_brightness[:lights],
-            seen_as=self.seen_as[:lights],
-            exchanges=tuple(pair for pair in self.exchanges if max(pair.one, pair.other) < lights),
-            held=self.held[:lights],
+            angle_deg=self.angle_deg[lights],
+            error_deg=self.error_deg[lights],
+            off_deg=self.off_deg[lights],
+            brightness=self.brightness[lights],
+            off_brightness=self.off_brightness[lights],
+            seen_as=self.seen_as[lights],
+            held=self.held[lights],
         )
 
 
@@ -164,24 +175,25 @@ def code_agreement(
     drift_known
         Whether white frames showed the lamp's drift.
     """
-    fit, swapped = _fitted(np.asarray(codes), white, error, dark_known=dark_known, drift_known=drift_known)
+    fit, swapped, misfit = _fitted(np.asarray(codes), white, error, dark_known=dark_known, drift_known=drift_known)
     count = len(white)
     mean, spread = fit.predicted(np.arange(count)[:, None])
     angle, deviation, error_deg = _directions(mean, spread, white)
     off_deg = angle * np.maximum(1 - CERTAIN / np.maximum(deviation, 1e-9), 0)
     brightness, off_brightness = _brightness(mean, spread, white)
-    pairs, evidence, expected, apart = _pairs(fit)
+    pairs, evidence, expected, apart = _pairs(fit, mean, spread, off_deg > 0)
     held, unnoticed = error_deg < _HELD_SD_DEG, expected < EXCHANGED
     held[pairs[unnoticed & (apart > HELD_DEG)].ravel()] = False
     found = np.flatnonzero(evidence > EXCHANGED)
     exchanges = [
-        Exchange(*(int(light) for light in pairs[k]), float(apart[k]), float(evidence[k]))
+        Exchange(int(pairs[k, 0]), int(pairs[k, 1]), float(apart[k]), float(evidence[k]))
         for k in found[np.argsort(-evidence[found], kind="stable")].tolist()
     ]
     if swapped is not None:
         # Found by whole fits, which reach further than the tangent at this one.
-        k = int(np.flatnonzero((pairs == sorted(swapped)).all(axis=1))[0])
-        exchanges = [Exchange(*sorted(swapped), float(apart[k]), max(float(evidence[k]), EXCHANGED)), *exchanges]
+        one, other = swapped
+        k = int(np.flatnonzero((pairs == swapped).all(axis=1))[0])
+        exchanges = [Exchange(one, other, float(apart[k]), max(float(evidence[k]), EXCHANGED)), *exchanges]
     return CodeAgreement(
         angle_deg=angle,
         error_deg=error_deg,
@@ -192,13 +204,17 @@ def code_agreement(
         exchanges=_each_once(exchanges),
         held=held,
         exchange_deg=float(apart[unnoticed].max(initial=0.0)),
+        misfit=misfit,
     )
 
 
 def _fitted(
     codes: npt.NDArray[np.integer], white: _Array, error: _Array, *, dark_known: bool, drift_known: bool
-) -> tuple[ProjectorFit, tuple[int, int] | None]:
-    """Return the fit to the lights that agree with each other, and the exchange of two names that makes them agree."""
+) -> tuple[ProjectorFit, tuple[int, int] | None, float]:
+    """Return the fit to lights that agree, the exchange of names that makes them agree, and the misfit of all.
+
+    The misfit is over that of healthy rooms; 0 of many lights, among which some may be off.
+    """
     brightness_sd = _BRIGHTNESS_SD if drift_known else _UNTIED_SD
 
     def fit(codes: npt.NDArray[np.integer], chroma_sd: float, used: npt.NDArray[np.bool_] | None) -> ProjectorFit:
@@ -214,11 +230,12 @@ def _fitted(
         scatter = _CHROMA_SD * float(np.sqrt(max(np.median(deviation**2) / 1.39, 1.0)))
         if scatter > _CHROMA_SD:
             found = fit(codes, min(scatter, _MOST_CHROMA_SD), None)
-        return found, None
+        return found, None, 0.0
     every = np.ones(count, dtype=np.bool_)
     found = fit(codes, _CHROMA_SD, every)
-    if found.misfit < _healthy(count) or count < 2:
-        return found, None
+    misfit = found.misfit / _healthy(count)
+    if misfit < 1 or count < 2:
+        return found, None, misfit
     used = every
     for _ in range(count // 2):
         without = {light: used & (np.arange(count) != light) for light in np.flatnonzero(used).tolist()}
@@ -226,16 +243,15 @@ def _fitted(
         ranked = sorted(fits, key=lambda light: fits[light].misfit)
         nearest = fits[ranked[0]]
         healed = nearest.misfit < _healthy(int(used.sum()) - 1)
-        # Of two lights each agrees with itself: they are asked first whether their names are exchanged.
-        if used.all() and (count == 2 or not healed):
-            swap = _healing_exchange(fit, codes, found.misfit, ranked[:_SUSPECTS])
-            if swap is not None:
+        if used.all():
+            swap, left = _healing_exchange(fit, codes, found.misfit, ranked[:_SUSPECTS])
+            if swap is not None and left < nearest.misfit + _AS_GOOD:
                 rest = ~np.isin(np.arange(count), swap)
-                return fit(codes, _CHROMA_SD, rest), swap
+                return fit(codes, _CHROMA_SD, rest), swap, misfit
         used, found = without[ranked[0]], nearest
         if healed:
             break
-    return found, None
+    return found, None, misfit
 
 
 def _healthy(lights: int) -> float:
@@ -248,8 +264,8 @@ def _healing_exchange(
     codes: npt.NDArray[np.integer],
     misfit: float,
     suspects: Sequence[int],
-) -> tuple[int, int] | None:
-    """Return the two of some lights whose exchanged names make all lights agree; None where there are none."""
+) -> tuple[tuple[int, int] | None, float]:
+    """Return the two of some lights whose exchanged names make all lights agree, None without, and the misfit left."""
     best, found = _healthy(len(codes)), None
     for one, other in combinations(sorted(suspects), 2):
         exchanged = codes.copy()
@@ -257,20 +273,21 @@ def _healing_exchange(
         left = fit(exchanged, _CHROMA_SD, np.ones(len(codes), dtype=np.bool_)).misfit
         if left < best and misfit - left > EXCHANGED / 2:
             best, found = left, (one, other)
-    return found
+    return found, best
 
 
 def _directions(mean: _Array, spread: _Array, white: _Array) -> tuple[_Array, _Array, _Array]:
-    """Return the angle (L,) degrees between whites and predicted ones, in standard errors too, and the largest of these.
+    """Return the angle (L,) degrees between whites and predictions, it in standard errors, and the largest of these.
 
     Brightness is left free: a lamp that flickers is no wrong name.
     """
     toward = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
-    free = spread + (_FREE * np.linalg.norm(white, axis=1))[:, None, None] ** 2 * toward[:, :, None] * toward[:, None]
+    along = np.asarray(_FREE**2 * (white**2).sum(axis=1), dtype=np.float64)
+    free = spread + along[:, None, None] * toward[:, :, None] * toward[:, None]
     # The prediction as bright as the white: what is off is then across it, as an angle is.
     level = np.maximum((white * toward).sum(axis=1, keepdims=True), 0)
     off = white - level * toward
-    deviation = np.sqrt(np.maximum(np.einsum("lc,lcd,ld->l", off, np.linalg.inv(free), off), 0))
+    deviation = np.sqrt(np.maximum(np.einsum("lc,lcd,ld->l", off, np.asarray(np.linalg.inv(free)), off), 0))
     across = np.eye(3) - toward[:, :, None] * toward[:, None]
     largest = np.linalg.eigvalsh(across @ spread @ across)[:, -1]
     error = np.degrees(np.sqrt(np.maximum(largest, 0)) / np.maximum(np.linalg.norm(mean, axis=1), 1e-9))
@@ -286,9 +303,20 @@ def _brightness(mean: _Array, spread: _Array, white: _Array) -> tuple[_Array, _A
     return more, np.maximum(np.abs(more) - CERTAIN * error, 0)
 
 
-def _pairs(fit: ProjectorFit) -> tuple[_Whole, _Array, _Array, _Array]:
-    """Return every pair of lights (P, 2), the evidence (P,) for an exchange, that to expect, and degrees apart."""
+def _pairs(
+    fit: ProjectorFit, mean: _Array, spread: _Array, off: npt.NDArray[np.bool_]
+) -> tuple[_Whole, _Array, _Array, _Array]:
+    """Return pairs of lights (P, 2), the evidence (P,) for an exchange, that to expect of one, and degrees apart.
+
+    All pairs of few lights; of many those that are near each other, and those of which one is `off` its codes: others
+    would be far off if they were exchanged. `mean` (L, 3) and `spread` (L, 3, 3) are the predictions.
+    """
     pairs = np.stack(np.triu_indices(len(fit.white), 1), axis=-1)
+    if len(fit.white) > _FEW:
+        one, other = pairs.T
+        between = mean[one] - mean[other]
+        far2 = np.einsum("pa,pab,pb->p", between, np.linalg.inv(spread[one] + spread[other]), between)
+        pairs = pairs[(far2 < _FAR * EXCHANGED) | off[one] | off[other]]
     blocks = [pairs[at : at + _BLOCK_PAIRS] for at in range(0, len(pairs), _BLOCK_PAIRS)]
     found = [_weighed(fit, block) for block in blocks]
     none = (np.zeros(0),) * 3

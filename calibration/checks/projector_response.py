@@ -78,16 +78,18 @@ _FLOOR = 2e-4
 _FREEDOM = 4.0
 """Degrees of freedom of Student's t: outliers lose their weight, healthy lights keep nearly all of it."""
 
-_SCHEDULE = (0.5, 0.25, 0.1, 0.04, 0.015, 0.0, 0.0, 0.0, 0.0)
+_SCHEDULE = (0.5, 0.2, 0.06, 0.015, 0.0, 0.0, 0.0)
 """Noise added to each white in turn, as a share of it: from that of the priors down to none."""
 
-_STEPS = 3
+_STEPS = 4
 """Steps of Gauss and Newton for each of these."""
 
-_HALVINGS = 12
-"""Times that a step is halved at most: what is left of it then is nothing."""
+_DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)
+"""Damping of a step that is tried in turn, over the curvature."""
 
-_N = len(_NODES)
+_N = 12
+"""Principal components of a tone curve that are kept: the next ones have standard deviations below .003."""
+
 _CURVES, _OVERLAPS = 4 * _N, len(_TERMS) * len(_OVERLAP_NODES)
 
 _Array = npt.NDArray[np.float64]
@@ -108,8 +110,9 @@ def _kernel(a: _Array, b: _Array) -> _Array:
 def _curve_basis() -> _Array:
     """Return (256, N): what each of N independent normal numbers adds to the logarithm of a curve at each code."""
     nodes = _x(_NODES)
-    root = np.linalg.cholesky(_kernel(nodes, nodes) + 1e-8 * np.eye(_N))
-    return _kernel(_x(np.arange(256)), nodes) @ np.linalg.inv(root).T
+    variance, across = np.linalg.eigh(_kernel(nodes, nodes))
+    variance, across = variance[-_N:], across[:, -_N:]
+    return np.asarray(_kernel(_x(np.arange(256)), nodes) @ (across / np.sqrt(variance)), dtype=np.float64)
 
 
 @cache
@@ -118,8 +121,8 @@ def _overlap_basis() -> _Array:
     nodes, codes = _OVERLAP_NODES, np.arange(256.0)
     far = (nodes[:, None] - nodes[None]) / _OVERLAP_LENGTH
     root = np.linalg.cholesky(_OVERLAP**2 + _OVERLAP_BEND**2 * np.exp(-0.5 * far**2) + 1e-8 * np.eye(len(nodes)))
-    between = np.stack([np.interp(codes, nodes, np.eye(len(nodes))[k]) for k in range(len(nodes))], axis=-1)
-    return between @ root
+    between: list[_Array] = [np.asarray(np.interp(codes, nodes, row), dtype=np.float64) for row in np.eye(len(nodes))]
+    return np.asarray(np.stack(between, axis=-1) @ root, dtype=np.float64)
 
 
 @cache
@@ -129,7 +132,7 @@ def _primary_root() -> _Array:
     same_channel, same_primary = channel[:, None] == channel[None], primary[:, None] == primary[None]
     covariance = np.diag(_SEEN_SD.ravel() ** 2) + _SCALE_SD**2
     covariance += _CHANNEL_SD**2 * same_channel + _PRIMARY_SD**2 * same_primary
-    return np.linalg.cholesky(covariance)
+    return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,36 +257,39 @@ def fit_projector(
         loose[:, channels, channels] += (added * level) ** 2
         weights = np.linalg.inv(loose) * trust[:, None, None]
         for _ in range(_STEPS):
-            covariance, weighted = _posterior(slopes, weights)
-            towards = white - fitted + slopes @ state
-            # The tangent may lead too far: the step is halved until it is one towards the mode.
-            by, before = covariance @ (weighted.T @ towards.ravel()) - state, _misfit(state, white - fitted, weights)
-            for _ in range(_HALVINGS):
-                fitted, slopes = _model(state + by, given, scale, rest)
-                if _misfit(state + by, white - fitted, weights) <= before:
+            precision, weighted = _precision(slopes, weights)
+            before = _misfit(state, white - fitted, weights)
+            downhill = weighted.T @ (white - fitted).ravel() - state
+            # The tangent may lead too far: the step is damped until it is one towards the mode (Levenberg, Marquardt).
+            for damping in _DAMPINGS:
+                by = np.linalg.solve(precision + damping * np.diag(np.diag(precision)), downhill)
+                reached, there = _model(state + by, given, scale, rest)
+                if _misfit(state + by, white - reached, weights) <= before:
+                    state, fitted, slopes = state + by, reached, there
                     break
-                by = by / 2
-            state = state + by
         if used is not None:
             continue
-        covariance, _ = _posterior(slopes, weights)
+        covariance = _inverse(_precision(slopes, weights)[0])
         fit = ProjectorFit(white, slopes, covariance, white - fitted, loose, trust)
         mean, spread = fit.predicted(np.arange(len(white))[:, None])
         off = white - mean
         distance2 = np.einsum("lc,lcd,ld->l", off, np.linalg.inv(spread), off)
         trust = (_FREEDOM + 3) / (_FREEDOM + np.maximum(distance2, 3))
     weights = np.linalg.inv(noise) * trust[:, None, None]
-    covariance, _ = _posterior(slopes, weights)
+    covariance = _inverse(_precision(slopes, weights)[0])
     misfit = _misfit(state, white - fitted, weights)
     return ProjectorFit(white, slopes, covariance, white - fitted, noise, trust, misfit)
 
 
-def _posterior(slopes: _Array, weights: _Array) -> tuple[_Array, _Array]:
-    """Return the covariance (K, K) of the model's numbers, and the weighted slopes (3 L, K)."""
+def _precision(slopes: _Array, weights: _Array) -> tuple[_Array, _Array]:
+    """Return the inverse covariance (K, K) of the model's numbers, and the weighted slopes (3 L, K)."""
     size = slopes.shape[2]
     weighted = (weights @ slopes).reshape(-1, size)
-    inverse = np.eye(size) + slopes.reshape(-1, size).T @ weighted
-    return np.asarray(np.linalg.inv(inverse), dtype=np.float64), weighted
+    return np.eye(size) + slopes.reshape(-1, size).T @ weighted, weighted
+
+
+def _inverse(matrix: _Array) -> _Array:
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
 
 
 def _misfit(state: _Array, residual: _Array, weights: _Array) -> float:
