@@ -84,7 +84,7 @@ _Whole = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Exchange:
+class ExchangedLights:
     """Two lights that fit better with their names exchanged.
 
     Attributes
@@ -138,7 +138,7 @@ class CodeAgreement:
     brightness: _Array
     off_brightness: _Array
     seen_as: _Whole
-    exchanges: tuple[Exchange, ...]
+    exchanges: tuple[ExchangedLights, ...]
     held: npt.NDArray[np.bool_]
     exchange_deg: float
     misfit: float
@@ -165,11 +165,11 @@ def code_agreement(
     Parameters
     ----------
     codes
-        (L, 3) integers 0 … 255, of different lights or of the same.
+        (L, 3) int64, 0 … 255, of different lights or of the same.
     white
-        (L, 3) counts of bare paper, exposed alike, the lamp's drift and what is there at black taken off.
+        (L, 3) float64 counts of bare paper, exposed alike, the lamp's drift and what is there at black taken off.
     error
-        (L, 3) standard errors.
+        (L, 3) float64 counts, standard errors.
     dark_known
         Whether dark frames showed what is there at black.
     drift_known
@@ -186,14 +186,14 @@ def code_agreement(
     held[pairs[unnoticed & (apart > HELD_DEG)].ravel()] = False
     found = np.flatnonzero(evidence > EXCHANGED)
     exchanges = [
-        Exchange(int(pairs[k, 0]), int(pairs[k, 1]), float(apart[k]), float(evidence[k]))
+        ExchangedLights(int(pairs[k, 0]), int(pairs[k, 1]), float(apart[k]), float(evidence[k]))
         for k in found[np.argsort(-evidence[found], kind="stable")].tolist()
     ]
     if swapped is not None:
         # Found by whole fits, which reach further than the tangent at this one.
         one, other = swapped
         k = int(np.flatnonzero((pairs == swapped).all(axis=1))[0])
-        exchanges = [Exchange(one, other, float(apart[k]), max(float(evidence[k]), EXCHANGED)), *exchanges]
+        exchanges = [ExchangedLights(one, other, float(apart[k]), max(float(evidence[k]), EXCHANGED)), *exchanges]
     return CodeAgreement(
         angle_deg=angle,
         error_deg=error_deg,
@@ -283,11 +283,13 @@ def _directions(mean: _Array, spread: _Array, white: _Array) -> tuple[_Array, _A
     """
     toward = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     along = np.asarray(_FREE**2 * (white**2).sum(axis=1), dtype=np.float64)
-    free = spread + along[:, None, None] * toward[:, :, None] * toward[:, None]
+    free: _Array = spread + along[:, None, None] * toward[:, :, None] * toward[:, None]
     # The prediction as bright as the white: what is off is then across it, as an angle is.
     level = np.maximum((white * toward).sum(axis=1, keepdims=True), 0)
     off = white - level * toward
-    deviation = np.sqrt(np.maximum(np.einsum("lc,lcd,ld->l", off, np.asarray(np.linalg.inv(free)), off), 0))
+    deviation = np.sqrt(
+        np.maximum(np.einsum("lc,lcd,ld->l", off, np.asarray(np.linalg.inv(free), dtype=np.float64), off), 0)
+    )
     across = np.eye(3) - toward[:, :, None] * toward[:, None]
     largest = np.linalg.eigvalsh(across @ spread @ across)[:, -1]
     error = np.degrees(np.sqrt(np.maximum(largest, 0)) / np.maximum(np.linalg.norm(mean, axis=1), 1e-9))
@@ -353,10 +355,10 @@ def _seen_as(mean: _Array, spread: _Array, white: _Array, off_deg: _Array) -> _W
     return seen_as
 
 
-def _each_once(exchanges: Sequence[Exchange]) -> tuple[Exchange, ...]:
+def _each_once(exchanges: Sequence[ExchangedLights]) -> tuple[ExchangedLights, ...]:
     """Return exchanges with each light in one of them, the first that names it."""
     named: set[int] = set()
-    kept: list[Exchange] = []
+    kept: list[ExchangedLights] = []
     for pair in exchanges:
         if named.isdisjoint({pair.one, pair.other}):
             named |= {pair.one, pair.other}

@@ -230,11 +230,11 @@ def fit_projector(
     Parameters
     ----------
     codes
-        (L, 3) integers 0 … 255.
+        (L, 3) int64, 0 … 255.
     white
-        (L, 3) counts of bare paper, exposed alike, what is there at black taken off.
+        (L, 3) float64 counts of bare paper, exposed alike, what is there at black taken off.
     error
-        (L, 3) standard errors of them.
+        (L, 3) float64 counts, standard errors of them.
     dark_known
         Whether dark frames showed what is there at black.
     chroma_sd, brightness_sd

@@ -19,6 +19,7 @@ from calibration.checks.light_codes import CodeAgreement
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.radiometry.dark_frames import DarkSummary
+from calibration.radiometry.drift import DriftCorrection
 from calibration.radiometry.greys import tint_deg
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
@@ -79,6 +80,8 @@ class LightFigures:
     white_frames
         The same of the white frames: of the first alone where the others differ from it as a lamp drifts, or of all.
         None without.
+    drift
+        How the lights are brought to one lamp in the table; None where that was not asked for. All else is as measured.
     """
 
     white: _Array
@@ -89,6 +92,7 @@ class LightFigures:
     additivity: _Array | None
     codes: CodeAgreement | None
     white_frames: CodeAgreement | None
+    drift: DriftCorrection | None = None
 
     @cached_property
     def white_error_deg(self) -> _Array:
@@ -226,6 +230,12 @@ class TableFigures:
     def white_frames(self) -> tuple[FrameFigures, ...]:
         """The white frames, in the order taken."""
         return tuple(frame for frame in self.frames if frame.record.kind == "white")
+
+    @property
+    def registered_frame(self) -> FrameFigures:
+        """The frame that was registered first; another where that one is not among those measured."""
+        named = (frame for frame in self.frames if frame.record.file == self.session.registered_file)
+        return next(named, self.frames[0])
 
     @property
     def largest_shift_px(self) -> float:

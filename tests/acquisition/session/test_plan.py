@@ -50,10 +50,13 @@ def test_response_frames_come_after_the_first_pair_and_are_taken_for_nothing_els
 
 def test_the_steps_that_tie_a_run_to_the_one_before_go_on_in_number() -> None:
     steps = tie_steps(40)
-    assert [step.number for step in steps] == [40, 41, 42, 43]
+    assert [step.number for step in steps] == [40, 41, 42, 43, 44, 45]
     assert [step.colour for step in steps] == [
         Colour(250, 250, 250),
         Colour(250, 0, 0),
         Colour(0, 250, 0),
         Colour(0, 0, 250),
+        Colour(255, 255, 255),
+        Colour(0, 0, 0),
     ]
+    assert [step.kind for step in steps] == [*["response"] * 4, "white", "dark"]

@@ -47,6 +47,7 @@ SESSIONS: dict[str, Codes] = {
     "thirteen": [light.codes for light in plan_illuminations(3, (2500, 4500, 6500))],
     "41 black bodies": [light.codes for light in plan_illuminations(0, tuple(range(2000, 10001, 200)))],
 }  # fmt: skip
+_SCATTER = ([0, 0.003, 0.01, 0.03], [0.0003, 0.001, 0.002], [0.0002, 0.0005, 0.002])
 CAMERAS = ("Canon_EOS-1Ds_Mark_III", "Canon_EOS_200D", "Canon_EOS_5DS", "Canon_EOS_5D_Mark_II", "Canon_EOS_600D")
 
 
@@ -80,14 +81,15 @@ def random_session(codes: Codes, seed: int) -> tuple[_Array, _Array]:
         np.fill_diagonal(mixing, 1)
         primaries = mixing @ primaries
     primaries = primaries / primaries.sum(axis=0).max() * random.uniform(2000, 12000)
-    white = light @ primaries
+    white: _Array = np.asarray(light @ primaries, dtype=np.float64)
     if random.random() < 0.4:
         for subset in ((0, 1), (0, 2), (1, 2), (0, 1, 2)):
             added = random.uniform(0, 0.5) * light[:, subset].min(axis=1)
             white = white + added[:, None] * primaries[list(subset)].sum(axis=0)
-    white = white * (1 + random.choice([0, 0.003, 0.01, 0.03]) * random.standard_normal((len(codes), 1)))
-    white = white * (1 + random.choice([0.0003, 0.001, 0.002]) * random.standard_normal(white.shape))
-    error = np.sqrt((random.choice([0.0002, 0.0005, 0.002]) * white) ** 2 + random.choice([0.05, 0.3]) ** 2)
+    flicker, colour, noise = (float(random.choice(values)) for values in _SCATTER)
+    white = white * (1 + flicker * random.standard_normal((len(codes), 1)))
+    white = np.asarray(white * (1 + colour * random.standard_normal(white.shape)), dtype=np.float64)
+    error = np.sqrt((noise * white) ** 2 + random.uniform(0.05, 0.3) ** 2)
     return white + error * random.standard_normal(white.shape), error
 
 
