@@ -54,6 +54,7 @@ SLOW = (
     "acquisition/judge/test_judge.py",
     "calibration/registration/test_register.py",
     "calibration/registration/test_register_without_tags.py",
+    "calibration/report/test_places.py",
     "calibration/sampling/test_windows.py",
     "drivers/display/test_fullscreen.py",
     "drivers/ptp/test_malformed.py",

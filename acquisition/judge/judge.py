@@ -28,7 +28,7 @@ from acquisition.judge.basis import FrameLight
 from acquisition.judge.evenness import judge_evenness
 from acquisition.judge.exposure import Exposure, disagreement, refusal
 from acquisition.judge.frame import Frame
-from acquisition.judge.knowledge import Examined, Knowledge, Leaning, codes_of, is_brightest_grey, primary_of
+from acquisition.judge.knowledge import Examined, Knowledge, Leaning, is_brightest_grey, primary_of
 from acquisition.judge.lights import judge_light
 from acquisition.judge.measuring import Measured, measure
 from acquisition.judge.references import (
@@ -227,7 +227,7 @@ def _look_at_light(
 ) -> _Looked:
     """Return what is found of the light of a lit frame, and of its evenness."""
     measured = frame.measured
-    primary = primary_of(codes_of(step)) if step.kind == "response" else None
+    primary = primary_of(step.colour.codes) if step.kind == "response" else None
     checks: list[Check] = []
     if primary is not None and not known.modelled:
         checks.append(judge_first_primary(known, measured, primary))
@@ -484,7 +484,7 @@ def _shown_white(known: Knowledge, frame: Frame) -> npt.NDArray[np.float64]:
 
 
 def _is_compared(step: SessionStep) -> bool:
-    return step.kind in REFERENCES or (step.kind == "response" and primary_of(codes_of(step)) is not None)
+    return step.kind in REFERENCES or (step.kind == "response" and primary_of(step.colour.codes) is not None)
 
 
 def _voids(known: Knowledge, cause: str) -> bool:

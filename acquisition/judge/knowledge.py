@@ -232,7 +232,7 @@ class Knowledge:
 
     def after(self, step: SessionStep, found: Examined) -> Knowledge:
         """Return what is known after a frame of a step."""
-        frame, codes = found.frame, codes_of(step)
+        frame, codes = found.frame, step.colour.codes
         seen = Seen(codes, frame.measured, None if found.light is None else found.light.amounts)
         known = replace(
             self,
@@ -303,7 +303,7 @@ class Knowledge:
             known = replace(known, dark=measured, first_dark=self.first_dark or measured)
             if known.basis is not None and known.basis.of_primaries:
                 known = replace(known, basis=known.basis.with_dark(measured))
-        primary = primary_of(codes_of(step))
+        primary = primary_of(step.colour.codes)
         if is_brightest_grey(step):
             known = replace(known, first_grey=self.first_grey or frame)
         if not self.modelled and (step.kind == "white" or (step.kind == "response" and primary is None)):
@@ -333,20 +333,14 @@ class Knowledge:
         return self
 
 
-def codes_of(step: SessionStep) -> Codes:
-    """Return the codes of red, green and blue that a step shows."""
-    return step.colour.red, step.colour.green, step.colour.blue
-
-
 def is_brightest_grey(step: SessionStep) -> bool:
     """Return whether a step shows grey at `TOP`, with which a run that is taken up again begins."""
-    return step.kind == "response" and codes_of(step) == (TOP, TOP, TOP)
+    return step.kind == "response" and step.colour.codes == (TOP, TOP, TOP)
 
 
 def primary_codes(primary: int) -> Codes:
     """Return the codes that show primary 0, 1 or 2 alone at `TOP` (`acquisition.session.plan`)."""
-    colour = PRIMARIES[primary]
-    return colour.red, colour.green, colour.blue
+    return PRIMARIES[primary].codes
 
 
 def primary_of(codes: Codes) -> int | None:

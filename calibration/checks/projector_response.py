@@ -240,6 +240,9 @@ def fit_projector(
     chroma_sd, brightness_sd
         Scatter of a channel against the others, and of all together, from light to light, relative: of the lamp, and
         of what the model lacks.
+    used
+        (L,) bool, lights to learn from, each with its full weight; None where the distance from what others predict
+        decides.
     """
     given = _Codes.of(codes)
     level = np.maximum(np.abs(white), _FLOOR * white.max())

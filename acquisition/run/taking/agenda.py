@@ -198,7 +198,8 @@ class Agenda:
         for kind in self._closing:
             if not any(number > light and self._steps[number].kind == kind for number in self._open):
                 self._appended(self._append, kind)
-            if self._reference_every is not None and self._lights_since[kind] >= self._reference_every:
+            coming = any(self._steps[number].kind == kind for number in self._under_way)
+            if self._reference_every and self._lights_since[kind] >= self._reference_every and not coming:
                 self._lights_since[kind] = 0
                 return self._appended(self._append, kind)
         return light

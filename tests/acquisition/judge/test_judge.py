@@ -356,7 +356,7 @@ def test_a_projector_that_does_not_add_is_told_and_not_refused(tmp_path: Path, t
     lab.world = taught.world
 
     def shown(colour: Colour) -> Situation:
-        alone = lab.world.room.light_of(np.array([colour.red, colour.green, colour.blue])) / 1.4
+        alone = lab.world.room.light_of(np.array(colour.codes)) / 1.4
         return Situation(picture=(alone + 0.4 * alone.min()).astype(np.float32)[None, None])
 
     def take(step: SessionStep, colour: Colour | None = None) -> Judgement:

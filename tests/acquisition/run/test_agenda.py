@@ -120,6 +120,15 @@ def test_many_lights_taken_again_in_a_row_have_references_between_them() -> None
     assert take(agenda) == [2, 3, 12, 13, 6, 7, 10, 11], "a refused one voids two of them at most"
     whole = agenda_of(set(), reference_every=2)
     assert take(whole) == list(range(10)), "the plan has its own"
+    ahead = agenda_of(set(), reference_every=2)
+    before, order = begun(ahead), [0]
+    while (step := ahead.next()) is not None or len(ahead):
+        if step is not None:
+            ahead.begin(step)
+            order.append(step.number)
+        ahead.accept(before)
+        before = step or before
+    assert order == list(range(10)), "also while the verdict on one of them is awaited"
 
 
 def test_the_last_lights_that_are_voided_are_closed_again() -> None:

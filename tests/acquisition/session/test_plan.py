@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple
-
 from acquisition.lights.illuminations import Illumination
 from acquisition.session.plan import RESPONSE, SessionStep, plan_steps, tie_steps
 from drivers.presenter import BLACK, WHITE, Colour
@@ -43,7 +41,7 @@ def test_response_frames_come_after_the_first_pair_and_are_taken_for_nothing_els
     assert "".join(step.kind[0] for step in steps) == "wd" + "r" * len(RESPONSE) + "llwdllwdlwd"
     response = [step for step in steps if step.kind == "response"]
     assert tuple(step.colour for step in response) == RESPONSE
-    assert all(step.illumination is None and max(astuple(step.colour)) < 255 for step in response)
+    assert all(step.illumination is None and max(step.colour.codes) < 255 for step in response)
     assert response[0].stem == "0002_response"
     assert len(set(RESPONSE)) == len(RESPONSE)
 
