@@ -51,6 +51,10 @@ CASES: list[tuple[str, Evidence, Cause]] = [
     ("unlike_block", replace(LIGHT, share=0.8, deviation=-0.05), UNKNOWN),
     ("doubtful_share", replace(PRINT, deviation=-0.1, tint=0.7, added=0, kept=0.9), STAIN),
     ("doubtful_share", replace(PRINT, deviation=-0.03, tint=0.1, added=0, kept=0.97), SHADOW),
+    # Cells at its rim are half under it, and most under it do not look like the chart's.
+    ("doubtful_share", replace(PRINT, deviation=-0.2, tint=0.63, added=0.025, kept=0.64), STAIN),
+    ("unfit_share", Evidence(white_residual=1, deviation=-0.2, tint=0.7, share=0.03, rim_frames=0, hot=0), STAIN),
+    ("unfit_share", Evidence(white_residual=1, deviation=-0.2, tint=0.1, share=0.03, rim_frames=0, hot=0), UNKNOWN),
     # Between a stain and a shadow: both are possible.
     ("doubtful_share", replace(PRINT, deviation=-0.05, tint=0.3, added=0, kept=0.95), UNKNOWN),
     ("doubtful_share", replace(PRINT, deviation=0.1, tint=0.2, added=0.03, kept=0.97), REFLECTION),
