@@ -210,6 +210,7 @@ RULES: tuple[Rule, ...] = (
         (
             Condition("in_first", 0, 0),
             Condition("even_showing", 0, 0),
+            Condition("some_whites", 0, 0),
             Condition("frames", 2, _FAR),
             Condition("added", 0.004, _FAR),
             Condition("deviation", 0, _FAR),
@@ -229,6 +230,7 @@ RULES: tuple[Rule, ...] = (
         (
             Condition("in_first", 0, 0),
             Condition("even_showing", 0, 0),
+            Condition("some_whites", 0, 0),
             Condition("frames", 2, _FAR),
             Condition("deviation", -1, -0.01),
             Condition("added", -0.05, 0.05),
@@ -255,6 +257,7 @@ RULES: tuple[Rule, ...] = (
         (
             Condition("in_first", 0, 0),
             Condition("even_showing", 0, 0),
+            Condition("some_whites", 0, 0),
             Condition("frames", 2, _FAR),
             Condition("deviation", -1, -0.005),
             Condition("added", -0.02, 0.004),
