@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from foundation import console
-from foundation.console import EXIT_CODES
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app, shows_progress
 from foundation.errors import FormatError, InputError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from calibration.pipeline.options import BuildOptions
     from calibration.verdict.result import BuildResult
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = new_app()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -37,14 +37,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         130 interrupted.
     """
     return console.run(lambda: app(args=None if argv is None else list(argv)))
-
-
-def _version(asked: bool) -> None:
-    if asked:
-        from importlib.metadata import version
-
-        print(f"croplab {version('croplab')}")
-        raise typer.Exit
 
 
 @app.command(
@@ -86,7 +78,7 @@ def build_lut(
     window: Annotated[
         int | None,
         typer.Option(
-            "--window", metavar="N", help="Pixels along the side of a cell's window: 3, 5, 7 or 9.  [default: 5]"
+            "--window", metavar="N", help="Pixels along the side of a cell's window: 3, 5, 7 or 9. \\[default: 5]"
         ),
     ] = None,
     subtract_dark: Annotated[
@@ -198,9 +190,9 @@ def build_lut(
             show_default=False,
         ),
     ] = None,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
-    ] = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+    version: Version = False,
 ) -> None:
     """Build, check or read a table; the help text says what the command does."""
     reading = {"--info": info, "--verify": verify, "--match": match, "--publish": publish, "--fetch": fetch}
@@ -410,7 +402,7 @@ def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not shows_progress()) as bar:
         task = bar.add_task(beginning, total=None)
         yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
 

@@ -207,6 +207,12 @@ class TableFigures:
         return tuple(frame for frame in self.frames if frame.record.kind == "white")
 
     @property
+    def registered_frame(self) -> FrameFigures:
+        """The frame that was registered first; another where that one is not among those measured."""
+        named = (frame for frame in self.frames if frame.record.file == self.session.registered_file)
+        return next(named, self.frames[0])
+
+    @property
     def largest_shift_px(self) -> float:
         """The chart's largest movement between a frame and the registration that it was sampled by, half-size px."""
         return max((frame.shift.length_px for frame in self.frames), default=0.0)

@@ -12,7 +12,7 @@ from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import largest_window
 from calibration.table.file_names import REPORT_FORMAT, REPORT_VERSION
 from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import retake_json, retaken_frames
+from calibration.verdict.retaking import findings, retake_command, retake_json, retaken_frames
 from calibration.verdict.values import judged_values
 
 PLACES = (7, 5)
@@ -37,9 +37,36 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "off_codes_deg": None if off_codes_deg is None else [float(f"{angle:.3g}") for angle in off_codes_deg.tolist()],
         "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
         "figures": {name: _rounded(value) for name, value in judged_values(figures).items()},
+        "causes": _causes(result),
         **retake_json(retaken_frames(verdict, figures), _registered_sha256(figures)),
         "limits": [asdict(row.threshold) | {"outcome": row.outcome} for row in verdict.rows],
     }
+
+
+def _causes(result: BuildResult) -> list[dict[str, Any]]:
+    """Return what each figure beyond its limit is probably caused by, and what that was decided from."""
+    return [
+        {
+            "figure": name,
+            "cause": found.decision.cause.name,
+            "why": "" if found.decision.rule is None else found.decision.rule.why,
+            "remedy": found.decision.cause.remedy,
+            "mends": found.decision.cause.mends,
+            "command": retake_command(found.frames) if found.is_of_frames else "",
+            "files": [frame.file for frame in found.frames],
+            "places": [
+                {
+                    "file": place.file,
+                    "x_mm": _rounded(place.x_mm),
+                    "y_mm": _rounded(place.y_mm),
+                    "size_mm": _rounded(place.size_mm),
+                }
+                for place in found.places
+            ],
+            "evidence": {known: _rounded(value) for known, value in found.evidence.known().items()},
+        }
+        for name, found in findings(result.verdict, result.figures).items()
+    ]
 
 
 def _registered_sha256(figures: TableFigures) -> str:

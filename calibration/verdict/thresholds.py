@@ -120,7 +120,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
     ),
     Threshold(
         "doubtful_share", "Cells in surroundings 1 % off their codes' colours", *TABLE_LIMITS["doubtful_share"].numbers,
-        "a stain, a fold or a shadow lies on the print; from 2 % on its cells are listed as unfit",
+        "the print, or the light on it, is not the same there as elsewhere; from 2 % on its cells are listed as unfit",
         SIMULATED + ": none on a clean flat print", "clean the print, hang it flatter, and look for shadows on it",
     ),
     Threshold(
@@ -138,7 +138,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
     ),
     Threshold(
         "unlike_block", "Deviation of the worst block of cells, worst frame", "share", "at most", 0.01, 0.03,
-        "a hand, a shadow or a reflection lay on the print in that frame, and its samples contain it",
+        "something lay, or shone, on the print in that frame or in the one compared with, and its samples contain it",
         SIMULATED + ": to 0.4 % beyond noise",
         "see that nobody comes between lamp, print and camera",
     ),
@@ -190,7 +190,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
     ),
     Threshold(
         "additivity", "White against the sum of the primaries", *TABLE_LIMITS["additivity"].numbers,
-        "the projector brightens or converts white, so a light cannot be predicted from its codes; the table is valid",
+        "a light cannot be predicted from its codes: the projector brightens or converts white, or frames are not what "
+        "they are called, or exposed otherwise",
         JUDGEMENT + "; the drift of the lamp is taken out first",
         "switch off brilliant colour, white boost and dynamic contrast in the projector's menu",
     ),
@@ -230,7 +231,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold(
         "reference_spread", "White references about the flat field, under white",
         *TABLE_LIMITS["reference_spread"].numbers,
-        "a stain, a fold or a shadow is not smooth, so that the flat field leaves it in the samples",
+        "what is not smooth, or falls off otherwise than lenses do, is left in the samples by the flat field",
         SIMULATED + ": 0.3 % of noise and photosites' response",
         "clean or flatten the print, and look for shadows on it",
     ),

@@ -53,7 +53,7 @@ def require_pyarrow() -> None:
         It is not.
     """
     if find_spec("pyarrow") is None:
-        raise InputError("the layout parquet needs pyarrow; install it with: pip install croplab[parquet]")
+        raise InputError("the layout parquet needs pyarrow; install it with: pip install pyarrow")
 
 
 def schema(previews: bool, maps: bool, details: bool) -> pa.Schema:
