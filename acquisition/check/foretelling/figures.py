@@ -58,7 +58,7 @@ class ForetoldTable:
     @property
     def outcome(self) -> TableOutcome:
         """The worst of them: the verdict as far as it is known."""
-        return max(self.outcomes.values(), key=OUTCOMES.index, default="accept")
+        return OUTCOMES[max((OUTCOMES.index(each) for each in self.outcomes.values()), default=0)]
 
     @property
     def not_known(self) -> tuple[str, ...]:
@@ -167,7 +167,7 @@ def _stains(chart: Chart, cells: Levels, paper: Paper) -> Stains:
     order = chart.cell_of_colour
     points = chart.centres_mm[order]
     level = np.nan_to_num(cells.mean[order]) / paper.field.at(points)
-    return find_stains(level, points, chart.bits, np.isfinite(cells.mean[order]).all(axis=1))
+    return find_stains(level, points, chart.bits, np.asarray(np.isfinite(cells.mean[order]).all(axis=1)))
 
 
 def _unfit(cells: Levels, stains: Stains | None, chart: Chart) -> dict[str, _Mask]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from acquisition.chart.layout import paper_chart
@@ -15,8 +16,9 @@ from acquisition.check.check import CheckOptions, check_lab
 from acquisition.check.findings import CheckReport, Finding
 from acquisition.cli import main
 from acquisition.config import load_lab
-from sim.world.wear import Stain
-from sim.world.world import World
+from sim.world import world
+from sim.world.room import Room
+from sim.world.wear import Stain, worn
 from tests.acquisition.check.conftest import Check, lab_toml
 
 UNTOLD = {"battery", "card", "noise reduction"}
@@ -62,7 +64,10 @@ def test_a_room_with_one_thing_wrong(check: Check, room: dict[str, Any], bad: st
     assert said in found.sentence()
     # A field that falls off so far leaves more of the references beside it, which the verdict remarks on as well.
     # So does the darkest light of a plan where white is dim.
-    also = {"evenness": {"references"}, "exposure": {"darkest light"} if "darkest light" in not_good(report) else set[str]()}
+    also = {
+        "evenness": {"references"},
+        "exposure": {"darkest light"} if "darkest light" in not_good(report) else set[str](),
+    }
     assert not_good(report) == {bad} | also.get(bad, set())
 
 
@@ -137,13 +142,13 @@ def test_a_faint_thumb_s_stain_has_place_and_size(check: Check) -> None:
 
 
 def test_a_stained_corner_is_no_falloff(check: Check, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = World._wear  # pyright: ignore[reportPrivateUsage]
+    whole = worn
 
-    def stained(world: World) -> Any:
-        width, height = world.sheet.page_mm
-        return Stain((width - 36, height - 30), 26.0, (0.8, 0.7, 0.5)), whole(world)[1]
+    def stained(room: Room, page_mm: tuple[float, float], random: np.random.Generator) -> Any:
+        width, height = page_mm
+        return Stain((width - 36, height - 30), 26.0, (0.8, 0.7, 0.5)), whole(room, page_mm, random)[1]
 
-    monkeypatch.setattr(World, "_wear", stained)
+    monkeypatch.setattr(world, "worn", stained)
     report = check(3)
     (spot,) = of(report, "stains").details["spots"]
     width, height = load_chart(folder / "chart3.json").page_mm
