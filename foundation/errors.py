@@ -26,14 +26,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from foundation.trust.secret_texts import masked
+
 EXIT_INTERRUPTED = 130
 """Exit code of a command that Ctrl-C ended; 128 + SIGINT, as shells have it."""
 
 
 class CropError(Exception):
-    """Root of the tree: a foreseeable fault, described in one sentence."""
+    """Root of the tree: a foreseeable fault, described in one sentence that holds no secret of an address."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        """Return the sentence, users, passwords and tokens of addresses in it masked."""
+        return masked(super().__str__())
 
 
 class InputError(CropError):

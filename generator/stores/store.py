@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
 
 from foundation.errors import CropError, FormatError, StorageError
 from foundation.files import is_partial, partial_path, storage_error, sync_folder
+from foundation.trust.secret_texts import masked
 from generator.stores.places import filesystem, is_remote, local_path
 
 Pieces = Iterable[bytes | memoryview]
@@ -44,7 +45,7 @@ class Store(Protocol):
 
     @property
     def place(self) -> str:
-        """The path or URL, as a user writes it."""
+        """The path or URL, as a user writes it but for its secrets; for messages and records."""
         ...
 
     def put(self, name: str, data: bytes | Pieces) -> None:
@@ -197,8 +198,8 @@ class RemoteStore:
 
     @property
     def place(self) -> str:
-        """The URL."""
-        return self.url.rstrip("/")
+        """The URL, for people: user, password and other secrets in it are masked."""
+        return masked(self.url.rstrip("/"))
 
     @property
     def _files(self) -> AbstractFileSystem:
@@ -270,7 +271,7 @@ class RemoteStore:
         except (CropError, MemoryError):
             raise
         except Exception as error:
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            reason = masked(" ".join(f"{type(error).__name__}: {error}".split()))
             if reading:
                 raise FormatError(
                     f"cannot read {self.place}/{name}: {reason}; check the address and that you may read there"
