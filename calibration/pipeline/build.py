@@ -364,9 +364,10 @@ def _finish(
     job.progress(frames, frames, "writing the report")
     figures = table_figures(work.intake, work.taken, work.camera, work.linearity)
     result = BuildResult(figures, judge(judged_values(figures), thresholds), out)
-    _write_table(work, figures)
+    # The table lists the hashes of its report.
     if report is not None:
         report(result, job.session, unfinished.folder)
+    _write_table(work, figures)
     if result.verdict.refused:
         unfinished.discard()
         raise _refused(result, out, unfinished.folder)
