@@ -341,7 +341,7 @@ def parse_lab(text: str, where: str, folder: Path | None = None) -> LabSettings:
     """
     try:
         document = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigurationError(f"{where} is not TOML: {error}") from error
     if folder is not None:
         _look_up_secrets(document, folder, where)

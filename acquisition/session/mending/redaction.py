@@ -14,6 +14,7 @@ import tomli_w
 
 from foundation.errors import FormatError
 from foundation.files import reading_error, write_whole
+from foundation.trust.foreign_folders import read_inside
 from foundation.trust.secret_texts import MASK, target_label
 
 SETTINGS_FILE: Final = "session.toml"
@@ -75,12 +76,10 @@ def redact(folder: Path) -> tuple[str, ...]:
 
 def _settings(path: Path) -> dict[str, Any]:
     try:
-        if not path.is_file() or path.stat().st_size > _MOST_BYTES:
-            raise FormatError(f"{path} is no file of settings; restore it from a copy")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(read_inside(path.parent, path.name, _MOST_BYTES).decode("utf-8"))
     except OSError as error:
         raise reading_error(path, error, "restore it from a copy", "the session's settings") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError(f"{path} is damaged: {error}; restore it from a copy") from error
 
 
