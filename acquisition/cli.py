@@ -12,17 +12,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from foundation import console
-from foundation.console import EXIT_CODES, orderly_end
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app, orderly_end
 from foundation.errors import InputError, QualityError, first_of
 
 if TYPE_CHECKING:
     from acquisition.config import LabSettings
 
-app = typer.Typer(
+app = new_app(
+    "Plan, print and take a session: a chart photographed raw under many known lights.\n\n" + EXIT_CODES,
     no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Plan, print and take a session: a chart photographed raw under many known lights.\n\n" + EXIT_CODES,
 )
 
 
@@ -35,7 +33,12 @@ class Arrangement(Enum):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `acquire` with these arguments, or those of the process, and return the exit code (`EXIT_CODES`)."""
-    return console.run(lambda: app(args=argv, prog_name="acquire"))
+    return console.run(lambda: app(args=common_first(argv), prog_name="acquire"))
+
+
+@app.callback()
+def acquire(verbose: Verbose = 0, quiet: Quiet = False, version: Version = False) -> None:
+    """Take what all commands take."""
 
 
 @app.command(epilog=EXIT_CODES)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from foundation import console
-from foundation.console import EXIT_CODES
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, new_app, shows_progress
 from foundation.errors import FormatError, InputError
 from foundation.trust.secret_texts import masked, printable
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from calibration.table.lut import Lut
     from calibration.verdict.result import BuildResult
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = new_app()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -41,14 +41,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     return console.run(lambda: app(args=None if argv is None else list(argv)))
 
 
-def _version(asked: bool) -> None:
-    if asked:
-        from importlib.metadata import version
-
-        print(f"croplab {version('croplab')}")
-        raise typer.Exit
-
-
 @app.command(
     no_args_is_help=True,
     help="Build the look-up table of a session: samples of every colour under every light, and the ground truth.\n\n"
@@ -61,7 +53,11 @@ def _version(asked: bool) -> None:
     "With --check, finds the chart in the session's best frame, judges it, and writes nothing. With --append, takes in "
     "the frames that have come so far of a session that is being taken; LUT appears with the last of them. With "
     "--info, --verify and --match, reads a table and writes nothing. With --publish and --fetch, copies a table to a "
-    "store for others and back.\n\n" + EXIT_CODES,
+    "store for others and back.\n\n"
+    "With --compare A B, says how far two sessions or tables of one chart differ in the lights' colour and brightness "
+    "and in every cell, what noise alone predicts of it, and whether they are the same within noise; --json prints it "
+    "for programs, --out writes a page. The exit code is 0 whatever is found, 2 where the charts differ or no light "
+    "is in both, 4 where a session makes no table.\n\n" + EXIT_CODES,
 )
 def build_lut(
     session: Annotated[
@@ -84,7 +80,7 @@ def build_lut(
     window: Annotated[
         int | None,
         typer.Option(
-            "--window", metavar="N", help="Pixels along the side of a cell's window: 3, 5, 7 or 9.  [default: 5]"
+            "--window", metavar="N", help="Pixels along the side of a cell's window: 3, 5, 7 or 9. \\[default: 5]"
         ),
     ] = None,
     subtract_dark: Annotated[
@@ -93,6 +89,14 @@ def build_lut(
             "--subtract-dark",
             help="Subtract the light of the dark frames, the projector's leak and the room's, from every sample and "
             "from the ground truth.",
+        ),
+    ] = False,
+    correct_drift: Annotated[
+        bool,
+        typer.Option(
+            "--correct-drift",
+            help="Take the lamp's drift between white frames out of samples and ground truth, so that all lights are "
+            "of one lamp; recorded, and undone by its numbers. Refused where white frames leave it open.",
         ),
     ] = False,
     corners: Annotated[
@@ -139,6 +143,37 @@ def build_lut(
             show_default=False,
         ),
     ] = None,
+    compare: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(
+            "--compare",
+            metavar="A B",
+            help="Compare two tables, or sessions, of one chart: what differs, and whether noise alone explains it. A "
+            "session's table is made for it and thrown away.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="With --compare, print the comparison as JSON.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FOLDER",
+            help="With --compare, write report.html with its pictures, comparison.json, lights.csv and cells.csv into "
+            "a new folder.",
+            show_default=False,
+        ),
+    ] = None,
+    chart: Annotated[
+        Path | None,
+        typer.Option(
+            "--chart",
+            metavar="CHART.json",
+            help="With --compare of tables and --out, the chart.json of both, so that differences are drawn on the "
+            "print; sessions have it.",
+            show_default=False,
+        ),
+    ] = None,
     publish: Annotated[
         tuple[Path, str] | None,
         typer.Option(
@@ -167,19 +202,20 @@ def build_lut(
             show_default=False,
         ),
     ] = None,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
-    ] = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+    version: Version = False,
 ) -> None:
     """Build, check or read a table; the help text says what the command does."""
     reading = {"--info": info, "--verify": verify, "--match": match, "--publish": publish, "--fetch": fetch}
-    asked = {"--check": check, "--append": append, **reading}
+    asked = {"--check": check, "--append": append, "--compare": compare, **reading}
     given = [name for name, value in asked.items() if value]
     if len(given) > 1:
         raise InputError(f"{' and '.join(given)} are two commands; give one of them")
     made = {
         "--window": window is not None,
         "--subtract-dark": subtract_dark,
+        "--correct-drift": correct_drift,
         "--corners": corners is not None,
         "--linearity": linearity is not None,
     }
@@ -190,7 +226,10 @@ def build_lut(
         )
     if expect is not None and fetch is None:
         raise InputError("--expect goes with --fetch; leave it out")
-    if (lut if verify else session if any(reading.values()) else None) is not None:
+    told = {"--json": as_json, "--out": out, "--chart": chart}
+    if compare is None and any(told.values()):
+        raise InputError(f"{next(name for name, value in told.items() if value)} goes with --compare; leave it out")
+    if (lut if verify else session if compare or any(reading.values()) else None) is not None:
         raise InputError(f"{given[0]} does not expect {lut or session}; leave it out")
     if info is not None:
         _print_table(info)
@@ -210,7 +249,12 @@ def build_lut(
         if picture is not None and not check:
             raise InputError("--picture goes with --check; a table that is built has its report")
         places = None if corners is None else parse_corners(corners)
-        options = BuildOptions(WINDOW if window is None else window, subtract_dark, places)
+        options = BuildOptions(WINDOW if window is None else window, subtract_dark, places, correct_drift)
+        if compare is not None:
+            if linearity is not None:
+                raise InputError("--linearity is for the report of one table; leave it out of --compare")
+            _compare(*compare, options, as_json, out, chart)
+            return
         _make(session, lut, check, append, options, linearity, picture)
 
 
@@ -314,6 +358,34 @@ def _match(one: Path, other: Path) -> None:
     print(f"{one} and {other} ({cameras}): colours and lights correspond number by number")
 
 
+def _compare(
+    one: Path, other: Path, options: BuildOptions, as_json: bool, out: Path | None, chart: Path | None
+) -> None:
+    from acquisition.chart.model import load_chart
+    from calibration.comparison.comparing import compare
+    from calibration.comparison.sources import chart_of, table_of
+    from calibration.comparison.wording import comparison_json, lines
+    from foundation.files import require_free
+
+    if out is not None:
+        require_free(out, "the comparison")
+    with _bar("reading") as progress, table_of(one, options, progress) as a, table_of(other, options, progress) as b:
+        found = compare(a, b, lambda done, total: progress(done, total, "comparing lights"), (one, other))
+        drawn = chart_of((one, other)) if chart is None else load_chart(chart)
+        if drawn is not None and drawn.sha256 != a.provenance.chart_sha256:
+            raise FormatError(f"{chart} is not the chart of {one}; name the chart.json that was printed")
+    if as_json:
+        import json
+
+        print(json.dumps(comparison_json(found), indent=2))
+    else:
+        print("\n".join(lines(found)))
+    if out is not None:
+        from calibration.comparison.report import write_comparison
+
+        write_comparison(found, out, drawn)
+
+
 def _publish(folder: Path, url: str) -> None:
     from calibration.table.lut import open_lut
     from calibration.table.zarr_store import publish
@@ -358,7 +430,7 @@ def _bar(beginning: str) -> Generator[Callable[[int, int, str], None]]:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not shows_progress()) as bar:
         task = bar.add_task(beginning, total=None)
         yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING
-
-import typer
 
 from evaluation.commands import compare as compare_command
 from evaluation.commands import cv as cv_command
@@ -16,20 +13,18 @@ from evaluation.commands import run as run_command
 from evaluation.commands import train as train_command
 from evaluation.commands import transfer as transfer_command
 from evaluation.commands import tune as tune_command
-from foundation.console import EXIT_CODES, run
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, is_common, new_app, run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-app = typer.Typer(
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help=f"""Evaluate methods of illumination estimation.
+app = new_app(
+    f"""Evaluate methods of illumination estimation.
 
 `evaluate DATA` is short for `evaluate run DATA`.
 
 {EXIT_CODES}
-""",
+"""
 )
 app.command("run", help=run_command.HELP)(run_command.run)
 app.add_typer(paper_command.app, name="paper", help=paper_command.HELP)
@@ -43,27 +38,29 @@ app.command("tune", help=tune_command.HELP)(tune_command.tune)
 
 
 @app.callback()
-def evaluate() -> None:
-    """Keep `run` a command of its own where it is the only one."""
+def evaluate(verbose: Verbose = 0, quiet: Quiet = False, version: Version = False) -> None:
+    """Take what all commands take."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with `argv`, by default the process's own, and return one of `foundation.console.EXIT_CODES`."""
-    given = list(sys.argv[1:] if argv is None else argv)
-    whole = _with_command(given)
+    whole = _with_command(common_first(argv))
     return run(lambda: app(whole, prog_name="evaluate"), keeps=_keeps(whole))
 
 
 def _with_command(given: Sequence[str]) -> list[str]:
     """Return the arguments with the command that the short form leaves out."""
     commands = {command.name for command in app.registered_commands} | {group.name for group in app.registered_groups}
-    short = bool(given) and given[0] not in commands and given[0] not in ("-h", "--help")
-    return [*(["run"] if short else []), *given]
+    own = ("-h", "--help", "--version", "--install-completion", "--show-completion")
+    first = next((at for at, word in enumerate(given) if not is_common(word)), len(given))
+    short = first < len(given) and given[first] not in commands and given[first] not in own
+    return [*given[:first], *(["run"] if short else []), *given[first:]]
 
 
 def _keeps(given: Sequence[str]) -> bool:
     """Whether an interrupted command goes on where it was: `run` does with a results folder, which has a journal."""
-    return given[:1] == ["run"] and any(text == "--out" or text.startswith("--out=") for text in given)
+    command = next((word for word in given if not is_common(word)), "")
+    return command == "run" and any(text == "--out" or text.startswith("--out=") for text in given)
 
 
 if __name__ == "__main__":

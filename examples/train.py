@@ -1,6 +1,6 @@
 """Train a small network to see the light, from scratch, in minutes on a processor; and hold it against statistics.
 
-    pip install 'croplab[torch]'
+    pip install torch
     python examples/train.py LUT [--train FOLDER --test FOLDER] [--steps 1500]
 
 The table's lights and the pictures are divided: every fifth light and the test pictures are never trained on. Without

@@ -9,15 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import typer
-
-from foundation.console import EXIT_CODES, run
+from foundation.console import EXIT_CODES, new_app, run
 from foundation.errors import InputError
 from foundation.processors import processor_count
 from foundation.trust.secret_texts import masked, printable
 from generator.command.grouping import grouped
 from generator.command.likeness_options import LikenessOptions, choose
 from generator.command.options import (
+    CommonOptions,
     ImageOptions,
     LightOptions,
     PictureOptions,
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
     from generator.dataset.production.workers import Workers
     from generator.dataset.reader import Dataset
 
-app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
+app = new_app()
 
 CAUTION_DEG: Final = 1.0
 """Tint of the print's greys that is worth a line, degrees: learned methods err by as much on real photographs."""
@@ -67,6 +66,7 @@ def generate(
     variation: VariationOptions,
     images: ImageOptions,
     work: WorkOptions,
+    common: CommonOptions,
 ) -> None:
     """Make a dataset, or one share of it; or finish or verify one that is there."""
     _require_alone({"--verify": work.verify, "--finish": work.finish}, places.lut)

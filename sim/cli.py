@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from foundation import console
-from foundation.console import EXIT_CODES
+from foundation.console import EXIT_CODES, Quiet, Verbose, Version, common_first, new_app
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,11 +23,9 @@ if TYPE_CHECKING:
     from sim.world.drawing import Print
     from sim.world.world import World
 
-app = typer.Typer(
+app = new_app(
+    "Simulated devices on loopback connections, until interrupted; and tables that are computed.\n\n" + EXIT_CODES,
     no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Simulated devices on loopback connections, until interrupted; and tables that are computed.\n\n" + EXIT_CODES,
 )
 
 
@@ -39,11 +37,13 @@ def main(argv: Sequence[str] | None = None, read_chart: Callable[[Path], Print] 
     read_chart
         Returns the print of a chart.json. Charts are known above this package, so whoever stands there hands it in.
     """
-    return console.run(lambda: app(args=argv, prog_name="sim", obj=read_chart))
+    return console.run(lambda: app(args=common_first(argv), prog_name="sim", obj=read_chart))
 
 
 @app.callback()
-def _devices() -> None:  # pyright: ignore[reportUnusedFunction]  # typer calls it: one command alone would lose its name
+def _devices(  # pyright: ignore[reportUnusedFunction]  # typer calls it
+    verbose: Verbose = 0, quiet: Quiet = False, version: Version = False
+) -> None:
     """Serve simulated devices on loopback connections, until interrupted."""
 
 

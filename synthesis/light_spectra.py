@@ -2,9 +2,9 @@
 
 A file has a column ``wavelength`` (nm) and one for each light, whose head is its name and no number; any even or uneven
 grid from 400 to 700 nm or beyond, in proportions that are each light's own. Published spectra are those of
-colour-science: CIE A to E, daylights D, fluorescent lamps FL1 to FL12 and FL3.1 to FL3.15, high-pressure lamps HP1 to
-HP5, LED-B1 to LED-V2, indoor daylights ID50 and ID65 (CIE 15:2018), the sources of ISO 7589, and measured light sources
-by their names there.
+`sim.spectral.published`: CIE A to E, daylights D, fluorescent lamps FL1 to FL12 and FL3.1 to FL3.15, high-pressure
+lamps HP1 to HP5, LED-B1 to LED-V2, indoor daylights ID50 and ID65 (CIE 15:2018), the sources of ISO 7589, and measured
+light sources by their names there.
 ``5600K`` is a black body by Planck's law, ``daylight:6000`` the CIE daylight of a correlated colour temperature; ranges
 are ``FIRST:LAST:STEP`` with the ``K`` or the word ``daylight`` before them.
 """
@@ -14,7 +14,6 @@ from __future__ import annotations
 import csv
 import difflib
 import io
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,8 +24,10 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.lights.illuminations import Illumination, parse_ccts, shown_colour
+from foundation.colorimetry.observer import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError
 from sim.spectral.grids import regridded, require_grid
+from sim.spectral.published import PublishedSpectrum, daylight, published_spectra
 from sim.world.spectra import WAVELENGTHS_NM
 
 WAVELENGTH: Final = "wavelength"
@@ -113,7 +114,7 @@ def read_lights(given: str) -> LightSpectra:
         source: dict[str, Any] = {"from": "file", "file": path.name, "sha256": sha256_of(data)}
     else:
         lights = tuple(light for part in given.split(",") for light in _published(part.strip(), given))
-        source = {"from": "published spectra", "named": given, "colour-science": _colour_version()}
+        source = {"from": "published spectra", "named": given}
     names = [light.name for light in lights]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -195,13 +196,11 @@ def _light(name: str, power: _Array, cct_k: float | None, where: str) -> LightSp
 
 def _published(name: str, given: str) -> Iterable[LightSpectrum]:
     """Yield the lights of one entry: a published one, a set of them, black bodies, or daylights."""
-    import colour
-
     if black_bodies := re.fullmatch(r"([\d.:]+)\s*K", name, re.IGNORECASE):
         # Planck's law may be had on any grid; on a fine one its integral is kept as that of all others is.
-        shape = colour.SpectralShape(380, 780, 1)
+        wavelengths = np.arange(380.0, 781.0)
         for cct_k in parse_ccts(black_bodies[1]):
-            yield _of_colour(f"{cct_k:g}K", colour.sd_blackbody(cct_k, shape), cct_k)
+            yield _as_light(f"{cct_k:g}K", PublishedSpectrum(wavelengths, planck(wavelengths, cct_k)), cct_k)
     elif daylights := re.fullmatch(r"daylight:(.+)", name, re.IGNORECASE):
         for cct_k in parse_ccts(daylights[1].rstrip("kK")):
             if not DAYLIGHT_K[0] <= cct_k <= DAYLIGHT_K[1]:
@@ -209,20 +208,11 @@ def _published(name: str, given: str) -> Iterable[LightSpectrum]:
                     f"--lights {given}: daylight of {cct_k:g} K; the CIE defines it from {DAYLIGHT_K[0]:g} to "
                     f"{DAYLIGHT_K[1]:g} K, so name a black body, {cct_k:g}K, beyond"
                 )
-            xy = colour.temperature.CCT_to_xy_CIE_D(cct_k)
-            yield _of_colour(f"daylight {cct_k:g}K", colour.sd_CIE_illuminant_D_series(xy))
+            yield _as_light(f"daylight {cct_k:g}K", daylight(cct_k))
     else:
-        known = _known_spectra()
+        known = published_spectra()
         for key in _named(name, list(known), given):
-            yield _of_colour(key, known[key])
-
-
-def _known_spectra() -> dict[str, Any]:
-    """Return colour-science's illuminants and light sources by name."""
-    import colour
-
-    families: tuple[Any, ...] = (colour.SDS_ILLUMINANTS, colour.SDS_LIGHT_SOURCES)
-    return {str(key): spectrum for family in families for key, spectrum in family.items()}
+            yield _as_light(key, known[key])
 
 
 def _named(name: str, known: list[str], given: str) -> list[str]:
@@ -237,30 +227,15 @@ def _named(name: str, known: list[str], given: str) -> list[str]:
     raise InputError(f"--lights {given}: there is no file and no published light {name!r}; {hint}")
 
 
-def _of_colour(name: str, spectrum: Any, cct_k: float | None = None) -> LightSpectrum:
-    """Return a spectrum of colour-science as a light."""
-    wavelengths = np.asarray(spectrum.wavelengths, dtype=np.float64)
-    values = np.asarray(spectrum.values, dtype=np.float64)
-    require_grid(wavelengths, name)
-    if not math.isfinite(float(values.sum())) or values.min() < 0:
-        raise FormatError(f"{name!r} of colour-science is no light: it has values below 0; name another")
-    power = regridded(wavelengths, values[:, None], WAVELENGTHS_NM)[:, 0]
-    return _light(name, power, cct_k, "colour-science")
+def _as_light(name: str, spectrum: PublishedSpectrum, cct_k: float | None = None) -> LightSpectrum:
+    """Return a published spectrum as a light."""
+    require_grid(spectrum.wavelengths_nm, name)
+    if spectrum.power.min() < 0:
+        raise FormatError(f"{name!r} as published is no light: it has values below 0; name another")
+    power = regridded(spectrum.wavelengths_nm, spectrum.power[:, None], WAVELENGTHS_NM)[:, 0]
+    return _light(name, power, cct_k, "published spectra")
 
 
 def _linear_srgb(power: _Array) -> _Array:
     """Return the linear sRGB (3,) float64 of a light for the CIE 1931 2° observer, negative values clipped to 0."""
-    import colour
-
-    # On the grid of the observer's functions, or colour-science warns that it resamples.
-    grid = np.arange(360.0, 781.0)
-    spectrum = colour.SpectralDistribution(np.interp(grid, WAVELENGTHS_NM, power, left=0), grid)
-    xyz = np.asarray(colour.sd_to_XYZ(spectrum, k=1.0, method="Integration"), dtype=np.float64)
-    linear = np.asarray(colour.XYZ_to_sRGB(xyz / xyz[1], apply_cctf_encoding=False), dtype=np.float64)
-    return np.maximum(linear, 0.0)
-
-
-def _colour_version() -> str:
-    from importlib.metadata import version
-
-    return version("colour-science")
+    return np.maximum(linear_srgb(xyz_of(WAVELENGTHS_NM, power)), 0.0)

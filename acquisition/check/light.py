@@ -31,8 +31,8 @@ MUTED_SHARE = 0.5
 """Share of the black picture's light that must go when the picture is muted for it to be called the projector's."""
 
 MANY_REFERENCES = 150
-"""White references from which on the light is read as `build-lut` reads it, by a polynomial of up to sixth order in the
-counts; with fewer such a polynomial runs away beside them."""
+"""White references from which on the light is read as `build-lut` reads it, by a polynomial of up to eighth order in
+the counts; with fewer such a polynomial runs away beside them."""
 
 FEW_ORDER = 2
 """Order of the light's logarithm where references are few: a slope and a bend."""

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.presenter import Colour
+from foundation.colorimetry.observer import linear_srgb, planck, xyz_of
 from foundation.errors import FormatError, InputError
 from foundation.files import reading_error, write_whole
 from foundation.srgb import encode_srgb
@@ -57,7 +58,7 @@ class Illumination:
     @property
     def codes(self) -> tuple[int, int, int]:
         """Codes of red, green and blue that the projector shows, 0 … 255."""
-        return self.colour.red, self.colour.green, self.colour.blue
+        return self.colour.codes
 
 
 def shown_colour(linear: npt.ArrayLike) -> Colour:
@@ -80,13 +81,8 @@ def blackbody_light(cct_k: float) -> npt.NDArray[np.float64]:
     Planck's law at `cct_k` kelvin, CIE 1931 2° observer, sRGB primaries (IEC 61966-2-1); what lies outside the
     gamut is clipped to it.
     """
-    # colour-science takes seconds to import and only this function needs it.
-    import colour
-
-    spectrum = colour.sd_blackbody(cct_k, colour.SpectralShape(360, 780, 1))
-    xyz = np.asarray(colour.sd_to_XYZ(spectrum, k=1.0), dtype=np.float64)
-    linear = np.asarray(colour.XYZ_to_sRGB(xyz / xyz[1], apply_cctf_encoding=False), dtype=np.float64)
-    linear = np.maximum(linear, 0.0)
+    wavelengths = np.arange(360.0, 781.0)
+    linear = np.maximum(linear_srgb(xyz_of(wavelengths, planck(wavelengths, cct_k))), 0.0)
     return linear / linear.max()
 
 

@@ -96,9 +96,65 @@ def robust_fit(design: _Array, values: _Array, rounds: int) -> tuple[_Array, _Ar
 
 
 @compiled
-def _solve_positive_definite(gram: _Array, solution: _Array) -> None:
-    """Replace a right side by the solution, given the lower half of a positive definite matrix (Cholesky)."""
-    unknowns = len(solution)
+def held_out_squares(design: _Array, values: _Array, weights: _Array, counts: npt.NDArray[np.int64]) -> _Array:
+    """Return, for fits by the first counts[m] columns, the weighted mean (M,) of squared errors at points left out.
+
+    Each point as predicted by the fit to all others: its residual over 1 − its leverage (R. D. Cook, S. Weisberg,
+    *Residuals and Influence in Regression*, section 2.2), so that no fit is made twice. Of nested fits the leverages
+    are sums of one row of the design in the coordinates in which the largest fit's normal matrix is 1.
+
+    Parameters
+    ----------
+    design, values, weights
+        (N, K), (N,) and (N,) float64, C order.
+    counts
+        (M,) int64, rising, K at most.
+    """
+    points, unknowns = design.shape
+    gram, right = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    total = 0.0
+    for point in range(points):
+        line, weight = design[point], weights[point]
+        total += weight
+        for i in range(unknowns):
+            weighted = weight * line[i]
+            right[i] += weighted * values[point]
+            for j in range(i + 1):
+                gram[i, j] += weighted * line[j]
+    trace = 0.0
+    for i in range(unknowns):
+        trace += gram[i, i]
+    for i in range(unknowns):
+        gram[i, i] += _RIDGE * max(trace / unknowns, 1e-30)
+    _factorise(gram)
+    for i in range(unknowns):
+        for k in range(i):
+            right[i] -= gram[i, k] * right[k]
+        right[i] /= gram[i, i]
+    squares, row = np.zeros(len(counts)), np.zeros(unknowns)
+    for point in range(points):
+        if weights[point] == 0:
+            continue
+        leverage, predicted, column = 0.0, 0.0, 0
+        for fit in range(len(counts)):
+            while column < counts[fit]:
+                value = design[point, column]
+                for k in range(column):
+                    value -= gram[column, k] * row[k]
+                value /= gram[column, column]
+                row[column] = value
+                leverage += weights[point] * value * value
+                predicted += value * right[column]
+                column += 1
+            error = (values[point] - predicted) / max(1 - leverage, 1e-3)
+            squares[fit] += weights[point] * error * error
+    return squares / max(total, 1e-300)
+
+
+@compiled
+def _factorise(gram: _Array) -> None:
+    """Replace the lower half of a positive definite matrix by its Cholesky factor."""
+    unknowns = len(gram)
     for j in range(unknowns):
         for k in range(j):
             for i in range(j, unknowns):
@@ -106,6 +162,13 @@ def _solve_positive_definite(gram: _Array, solution: _Array) -> None:
         pivot = np.sqrt(max(gram[j, j], 1e-300))
         for i in range(j, unknowns):
             gram[i, j] /= pivot
+
+
+@compiled
+def _solve_positive_definite(gram: _Array, solution: _Array) -> None:
+    """Replace a right side by the solution, given the lower half of a positive definite matrix (Cholesky)."""
+    unknowns = len(solution)
+    _factorise(gram)
     for i in range(unknowns):
         for k in range(i):
             solution[i] -= gram[i, k] * solution[k]

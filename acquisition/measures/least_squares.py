@@ -101,6 +101,31 @@ def robust_least_squares(design: _Array, values: _Array, rounds: int) -> tuple[_
     return kernels.robust_fit(_plain(design), _plain(values), rounds)
 
 
+def held_out_squares(design: _Array, values: _Array, weights: _Array, counts: tuple[int, ...]) -> _Array:
+    """Return the mean squared error at points left out, for fits by more and more columns of one design.
+
+    Parameters
+    ----------
+    design
+        (N, K) float64.
+    values
+        (N,) float64.
+    weights
+        (N,) float64, ≥ 0; points of weight 0 count neither for the fits nor for their errors.
+    counts
+        The first so many columns make a fit; rising, K at most.
+
+    Returns
+    -------
+    ndarray
+        (M,) float64, the weighted mean for each count; every point as the fit to all others predicts it.
+    """
+    from acquisition.measures import kernels
+
+    fits = np.array(counts, dtype=np.int64)
+    return kernels.held_out_squares(_plain(design), _plain(values), _plain(weights), fits)
+
+
 def _plain(array: _Array) -> _Array:
     """Return an array as float64, C order, writable: numba compiles a function anew for each other kind."""
     return np.require(array, np.float64, ["C", "W"])

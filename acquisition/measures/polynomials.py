@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-_CACHED_ORDER: Final = 6
+_CACHED_ORDER: Final = 8
 """The highest order that flat fields are fitted with: a basis of a lower one is the beginning of this one's."""
 
 _Array = npt.NDArray[np.float64]
@@ -66,6 +66,65 @@ def _page_basis(points: bytes, page_mm: tuple[float, float], order: int) -> _Arr
     basis = np.stack([x[:, i] * y[:, j] for i, j in page_powers(order)], axis=1)
     basis.setflags(write=False)
     return basis
+
+
+def light_terms(page_mm: tuple[float, float], around: bool = False) -> tuple[_Array, tuple[int, ...]]:
+    """Return what light on a page may look like, from its simplest shapes on.
+
+    A lens's fall-off is a sum of even powers of the distance from its axis (cos⁴ of the angle to it, and less where the
+    mount shades the rim), a projector's is smooth about another point. So after a slope and a bend come the fourth and
+    the sixth power of the distance from a centre, before the terms of third and fourth order that no axis explains, and
+    the eighth before those of fifth and sixth. A centre that is free is the page's middle and, to first order of where
+    it lies, the slopes of the power: x r², y r² with r⁴.
+
+    Parameters
+    ----------
+    page_mm
+        Width and height of the page.
+    around
+        Whether the light is seen around the page's middle and not in it: polynomials of total order 0 … 3 alone then,
+        since from order 4 on there are shapes that vanish in all of the margin.
+
+    Returns
+    -------
+    terms
+        (legendre, T) float64, each column a polynomial over the page in the terms of `page_powers`; orthogonal to
+        those before it over the page, of mean square 1.
+    counts
+        Number of the first columns that make a shape, rising: each is the one before with some more.
+    """
+    half = float(np.hypot(*page_mm)) / 2
+    node, _ = np.polynomial.legendre.leggauss(_CACHED_ORDER + 2)
+    u, v = (np.asarray(axis, dtype=np.float64).ravel() for axis in np.meshgrid(node, node))
+    x, y = u * page_mm[0] / 2 / half, v * page_mm[1] / 2 / half
+    r2 = x * x + y * y
+
+    def power(order: int) -> list[_Array]:
+        return [x ** (order - j) * y**j for j in range(order + 1)]
+
+    def radial(half_power: int) -> list[_Array]:
+        return [x * r2 ** (half_power - 1), y * r2 ** (half_power - 1), r2**half_power]
+
+    # Of third order two terms besides x r² and y r², of fourth four besides r⁴, and so on.
+    groups = (
+        [power(0), power(1), power(2), power(3)]
+        if around
+        else [
+            power(0), power(1), power(2), radial(2), radial(3), power(3)[:2], power(4)[:4], radial(4),
+            [*power(5)[:4], *power(6)[:6]],
+        ]
+    )  # fmt: skip
+    columns = np.stack([column for group in groups for column in group], axis=1)
+    powers = page_powers(_CACHED_ORDER)
+    along, across = (
+        np.asarray(np.polynomial.legendre.legvander(axis, _CACHED_ORDER), dtype=np.float64) for axis in (u, v)
+    )
+    basis = np.stack([along[:, i] * across[:, j] for i, j in powers], axis=1)
+    norm = np.sqrt([1 / ((2 * i + 1) * (2 * j + 1)) for i, j in powers])
+    exact = np.asarray(np.linalg.lstsq(basis, columns, rcond=None)[0], dtype=np.float64)
+    orthogonal, triangle = np.linalg.qr(exact * norm[:, None])
+    terms = orthogonal * np.sign(np.diag(triangle)) / norm[:, None]
+    return np.ascontiguousarray(terms), tuple(np.cumsum([len(group) for group in groups]).tolist())
 
 
 def code_powers(degree: int) -> list[tuple[int, int, int]]:

@@ -9,7 +9,7 @@ Rules that hold inside:
 - What a code gives is predicted from the codes next to it in colour, which lie elsewhere on the sheet: no model of ink
   or paper, and next to nothing in common with the cell's own place.
 - A cell is judged by its neighbourhood: one deviating cell is the prediction's error or noise. Next to a stain it is
-  judged alone as well, for only half of the neighbourhood of a cell at a stain's rim is stained.
+  judged alone as well, for only half of the neighbourhood of a cell at a stain's rim is stained; that half must show.
 - Charts of less than `LEAST_BITS` cannot be judged: between four levels of a code curvature does not change slowly.
 - A deviation must be significant and large enough to matter. What is found is listed, never corrected.
 """
@@ -54,6 +54,9 @@ _LEAST_KNOWN = 9
 _LEAST_NEIGHBOURS = 5
 """Cells of a neighbourhood that must be known for its mean to count."""
 
+_MANY_BESIDE = 3
+"""Stained cells of a neighbourhood from which on it need not deviate itself for a cell to belong to the stain."""
+
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
 
@@ -72,12 +75,18 @@ class Stains:
         (C, 3) float64, deviation of each cell by itself, noise and the prediction's error included; NaN likewise.
     stained
         (C,) bool, cells to be listed.
+    level
+        (C, 3) float64, mean counts above black that were judged.
+    places_mm
+        (C, 2) where the cells lie on the sheet.
     """
 
     deviation: _Array
     error: _Array
     alone: _Array
     stained: _Mask
+    level: _Array
+    places_mm: _Array
 
     @property
     def doubtful(self) -> _Mask:
@@ -122,7 +131,7 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     """
     if bits < LEAST_BITS:
         unknown = np.full(level.shape, np.nan)
-        return Stains(unknown, unknown, unknown, np.zeros(len(level), dtype=np.bool_))
+        return Stains(unknown, unknown, unknown, np.zeros(len(level), dtype=np.bool_), level, centres_mm)
     usable = np.ones(len(level), dtype=np.bool_) if usable is None else usable
     near = np.asarray(cKDTree(centres_mm).query(centres_mm, k=min(NEIGHBOURS, len(level)))[1])
     near = near.reshape(len(level), -1)
@@ -140,7 +149,11 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
         trusted = usable & ~stained
     with np.errstate(invalid="ignore"):
         off = (np.abs(np.expm1(log_ratios)) > np.maximum(RIM_SIGMA * _usual(log_ratios), STAINED)).any(axis=1)
-    return Stains(deviation, error, np.expm1(log_ratios), stained | (off & stained[near].any(axis=1)))
+    # Part of a neighbourhood that a stain reaches deviates, too; a cell that does so alone is its prediction's error.
+    beside = stained[near].sum(axis=1)
+    reached = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1) | (beside >= _MANY_BESIDE)
+    rim = off & reached & (beside > 0)
+    return Stains(deviation, error, np.expm1(log_ratios), stained | rim, level, centres_mm)
 
 
 def _usual(log_ratios: _Array) -> _Array:

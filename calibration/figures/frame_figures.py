@@ -11,7 +11,7 @@ import numpy.typing as npt
 from acquisition.framing.movement import Shift
 from acquisition.framing.planes import Channel
 from acquisition.measures.flat_field import FlatField
-from acquisition.measures.paper import Paper
+from acquisition.measures.paper import FieldResidual, Paper
 from acquisition.session.records import FrameRecord
 from calibration.checks.frame_consistency import FrameConsistency
 
@@ -76,7 +76,8 @@ class FrameFigures:
             "error": self.paper.error.tolist(),
             "references": self.paper.references,
             "spread": self.paper.spread.tolist(),
-            "consistency": [self.consistency.scatter, self.consistency.block, *self.consistency.at_mm],
+            "left": self.paper.left.to_json(),
+            "consistency": self.consistency.to_json(),
             "greys": self.greys.tolist(),
             "grey_errors": self.grey_errors.tolist(),
             "dark": self.dark.tolist(),
@@ -90,15 +91,21 @@ class FrameFigures:
         """Return the figures of a frame from what `to_json` returned; `page_mm` is the chart's width and height."""
         red, green, blue = (tuple(np.array(factor) for factor in factors) for factors in stored["field"])
         white, error, spread = (np.array(stored[name]) for name in ("white", "error", "spread"))
-        scatter, block, x_mm, y_mm = stored["consistency"]
         return FrameFigures(
             record=record,
             black=np.array(stored["black"]),
             channel=stored["channel"],
             shift=Shift(*stored["shift"]),
             reregistered=stored["reregistered"],
-            paper=Paper(FlatField(page_mm, (red, green, blue)), white, error, stored["references"], spread),
-            consistency=FrameConsistency(scatter, block, (x_mm, y_mm)),
+            paper=Paper(
+                FlatField(page_mm, (red, green, blue)),
+                white,
+                error,
+                stored["references"],
+                spread,
+                FieldResidual.from_json(stored["left"]),
+            ),
+            consistency=FrameConsistency.from_json(stored["consistency"]),
             greys=np.array(stored["greys"]).reshape(-1, 3),
             grey_errors=np.array(stored["grey_errors"]).reshape(-1, 3),
             dark=np.array(stored["dark"]),

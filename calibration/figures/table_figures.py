@@ -17,6 +17,7 @@ from acquisition.measures.stains import Stains
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.linearity_figures import LinearityFigures
 from calibration.radiometry.dark_frames import DarkSummary
+from calibration.radiometry.drift import DriftCorrection
 from calibration.radiometry.greys import tint_deg
 from calibration.radiometry.photon_transfer import PhotonTransfer
 from calibration.radiometry.primaries import Primaries
@@ -71,6 +72,8 @@ class LightFigures:
     off_codes_deg
         (L,) float64 degrees, how far each white is from what its codes predict (`calibration.checks.light_codes`); None
         where the lights are too few or were not exposed alike.
+    drift
+        How the lights are brought to one lamp in the table; None where that was not asked for. All else is as measured.
     """
 
     white: _Array
@@ -80,6 +83,7 @@ class LightFigures:
     share_at_zero: _Array
     additivity: _Array | None
     off_codes_deg: _Array | None
+    drift: DriftCorrection | None = None
 
     @cached_property
     def white_error_deg(self) -> _Array:
@@ -201,6 +205,12 @@ class TableFigures:
     def white_frames(self) -> tuple[FrameFigures, ...]:
         """The white frames, in the order taken."""
         return tuple(frame for frame in self.frames if frame.record.kind == "white")
+
+    @property
+    def registered_frame(self) -> FrameFigures:
+        """The frame that was registered first; another where that one is not among those measured."""
+        named = (frame for frame in self.frames if frame.record.file == self.session.registered_file)
+        return next(named, self.frames[0])
 
     @property
     def largest_shift_px(self) -> float:

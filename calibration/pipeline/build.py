@@ -50,7 +50,8 @@ from calibration.pipeline.measuring import (
 )
 from calibration.pipeline.options import PAPER_OPTIONS, BuildOptions
 from calibration.pipeline.prefetching import prefetched
-from calibration.radiometry.corrections import corrections
+from calibration.radiometry.corrections import applied_drift, corrections
+from calibration.radiometry.drift import LEAST_WHITES, DriftCorrection, corrected
 from calibration.radiometry.greys import references_csv
 from calibration.table.file_names import REFERENCES, REPORT_FORMAT, REPORT_JSON, REPORT_PAGE, REPORT_VERSION, SAMPLES
 from calibration.table.provenance import Provenance
@@ -61,7 +62,7 @@ from calibration.verdict.thresholds import THRESHOLDS, Threshold
 from calibration.verdict.values import judged_values
 from calibration.verdict.verdict import judge
 from calibration.verdict.wording import refusal
-from foundation.errors import FormatError, QualityError, RegistrationError, first_of
+from foundation.errors import FormatError, QualityError, RegistrationError, counted, first_of
 from foundation.files import write_whole
 from foundation.version import software
 
@@ -71,7 +72,7 @@ REPORT_FILES = (REPORT_PAGE, REPORT_JSON)
 CHECKPOINT_EVERY = 16
 """Frames from one checkpoint to the next: what a build that is killed has to do again."""
 
-METHOD = 5
+METHOD = 6
 """Raised when samples or ground truth come out otherwise than before, so that no table is made by two methods."""
 
 _IN_PLACE = Shift(0.0, 0.0, 0.0, 0)
@@ -131,7 +132,7 @@ def build(
     Raises
     ------
     FormatError
-        A light has no accepted frame, dark frames are lacking that are to be subtracted, or a frame's file is missing
+        A light has no accepted frame, dark or white frames are lacking that are asked for, or a frame's file is missing
         or not what the journal says.
     RegistrationError
         The chart is not found, or not the one expected.
@@ -151,6 +152,7 @@ def build(
             "or take in what there is with build-lut --append"
         )
     _require_dark_frames(session, options)
+    _require_white_frames(selected, session, options)
     with unfinished_table(out) as unfinished:
         job = _Job(session, selected, options, linearity, out, unfinished, progress or _no_progress)
         return _finish(job, _take_in_all(job, job.checkpoint()), out, report, thresholds)
@@ -178,6 +180,7 @@ def append(
         job = _Job(session, selected, options, linearity, out, unfinished, progress or _no_progress)
         checkpoint = job.checkpoint()
         if complete:
+            _require_white_frames(selected, session, options)
             return _finish(job, _take_in_all(job, checkpoint), out, report, thresholds)
         frames, before = len(selected.records), 0 if checkpoint is None else len(checkpoint.frames)
         if before < frames:
@@ -256,7 +259,8 @@ class _Job:
         return {
             "software": software(),
             "method": METHOD,
-            "options": self.options.to_json(),
+            # The drift is taken out of the finished samples.
+            "options": {name: value for name, value in self.options.to_json().items() if name != "correct_drift"},
             "chart": self.session.chart.sha256,
             "lights": hashlib.sha256(repr(self.session.illuminations).encode()).hexdigest(),
             "registered": self.selected.registered.sha256,
@@ -364,6 +368,8 @@ def _finish(
     job.progress(frames, frames, "writing the report")
     figures = table_figures(work.intake, work.taken, work.camera, work.linearity)
     result = BuildResult(figures, judge(judged_values(figures), thresholds), out)
+    if figures.lights.drift is not None and not result.verdict.refused:
+        _correct_drift(work.writer, figures.lights.drift)
     # The table lists the hashes of its report.
     if report is not None:
         report(result, job.session, unfinished.folder)
@@ -373,6 +379,15 @@ def _finish(
         raise _refused(result, out, unfinished.folder)
     unfinished.publish()
     return result
+
+
+def _correct_drift(writer: LutWriter, drift: DriftCorrection) -> None:
+    """Divide every light's samples by its gains.
+
+    A build that is killed meanwhile finds other samples than its checkpoint names, and begins anew.
+    """
+    for light, gain in enumerate(drift.gains):
+        writer.put(light, corrected(writer.get(light), gain))
 
 
 def _write_table(work: _BuildState, figures: TableFigures) -> None:
@@ -386,12 +401,16 @@ def _write_table(work: _BuildState, figures: TableFigures) -> None:
         figures.sensor.saturation_counts,
         [frame.paper.field for frame in frames],
         measured=figures.sensor.saturation_measured,
-        gains=lights.gains if figures.white_frames else None,
+        gains=lights.gains if figures.white_frames and lights.drift is None else None,
         subtracted=lights.subtracted,
         at_zero=lights.share_at_zero,
     )
     if figures.primaries is not None:
         done.append(figures.primaries.correction(lights.white))
+    gain = np.ones(lights.white.shape)
+    if lights.drift is not None:
+        gain = lights.drift.gains
+        done.append(applied_drift(gain))
     provenance = Provenance(
         camera=work.camera,
         bits=session.chart.bits,
@@ -402,9 +421,12 @@ def _write_table(work: _BuildState, figures: TableFigures) -> None:
         software=software(),
         unfit=list(figures.cells.unfit),
     )
-    references = references_csv(greys.names, lights.white, lights.white_error, greys.values, greys.errors)
+    per_light = gain[:, None]
+    references = references_csv(
+        greys.names, lights.white / gain, lights.white_error / gain, greys.values / per_light, greys.errors / per_light
+    )
     files = {REFERENCES: references} if greys.names else {}
-    work.writer.finish(session.illuminations, lights.white, provenance, source_frames(records), files)
+    work.writer.finish(session.illuminations, lights.white / gain, provenance, source_frames(records), files)
 
 
 def _require_dark_frames(session: Session, options: BuildOptions) -> None:
@@ -413,6 +435,17 @@ def _require_dark_frames(session: Session, options: BuildOptions) -> None:
         raise FormatError(
             f"{session.folder} has no accepted dark frame, and --subtract-dark takes the light to subtract from them; "
             "take the session with acquire run, which takes dark frames, or build the table without --subtract-dark"
+        )
+
+
+def _require_white_frames(selected: SelectedFrames, session: Session, options: BuildOptions) -> None:
+    """Refuse to take out a drift that no frames show."""
+    count = sum(record.kind == "white" for record in selected.records)
+    if options.correct_drift and count < LEAST_WHITES:
+        raise FormatError(
+            f"{session.folder} has {counted(count, 'accepted white frame')}, and --correct-drift takes the lamp's "
+            f"drift from {LEAST_WHITES} or more; take the session with acquire run, which takes one every "
+            "sequence.reference_every lights, or build the table without --correct-drift"
         )
 
 

@@ -22,6 +22,7 @@ from calibration.figures.table_figures import (
 )
 from calibration.pipeline.baseline import Baseline
 from calibration.pipeline.intake import Intake, IntakeState
+from calibration.radiometry.drift import drift_correction
 from calibration.radiometry.projector import additivity, drift_gains
 
 _SAME_EXPOSURE = 1.01
@@ -151,6 +152,9 @@ def _light_figures(intake: Intake, taken: IntakeState, by_light: Sequence[FrameF
         off_codes_deg=angles_off_codes_deg(illuminations, white / gains, direction_error_deg(white, error))
         if _exposed_alike(by_light)
         else None,
+        drift=drift_correction(*_times_s(by_light, whites), np.array([frame.paper.white for frame in whites]))
+        if intake.baseline.options.correct_drift
+        else None,
     )
 
 
@@ -158,11 +162,16 @@ def _gains(by_light: Sequence[FrameFigures], whites: Sequence[FrameFigures]) -> 
     """Return the lamp's light at each light over that in the first white frame, (L, 3) float64; ones without one."""
     if not whites:
         return np.ones((len(by_light), 3))
+    return drift_gains(*_times_s(by_light, whites), np.array([frame.paper.white for frame in whites]))
+
+
+def _times_s(by_light: Sequence[FrameFigures], whites: Sequence[FrameFigures]) -> tuple[_Array, _Array]:
+    """Return when lights (L,) and white frames (W,) were taken, seconds since the first white frame."""
     start = whites[0].record.taken_at
     at_s, white_at_s = (
         np.array([(frame.record.taken_at - start).total_seconds() for frame in frames]) for frames in (by_light, whites)
     )
-    return drift_gains(at_s, white_at_s, np.array([frame.paper.white for frame in whites]))
+    return at_s, white_at_s
 
 
 def _exposed_alike(by_light: Sequence[FrameFigures]) -> bool:

@@ -24,6 +24,8 @@ class BuildOptions:
     corners
         Four corners (x, y) of the field of cells in the frame that is registered first, half-size px, clockwise from
         the printed top-left, for a chart without tags; None to have it found.
+    correct_drift
+        Whether the lamp's drift between white frames is taken out of samples and ground truth at the end.
 
     Raises
     ------
@@ -34,6 +36,7 @@ class BuildOptions:
     window: int = WINDOW
     subtract_dark: bool = False
     corners: Corners | None = None
+    correct_drift: bool = False
 
     def __post_init__(self) -> None:
         if self.window not in WINDOWS:

@@ -98,6 +98,19 @@ def corrections(
     return done
 
 
+def applied_drift(gains: _Array) -> dict[str, Any]:
+    """Return the entry of a drift that was taken out, gains (L, 3) float64, which stands last as it was done last."""
+    return {
+        "name": "drift",
+        "applied": True,
+        "how": "samples, ground truth and references of a light divided by it, channel by channel: the lamp's light "
+        "over that of the brightest white frame, linear in time between white frames, 1 at most; the k-th of S samples "
+        "v became floor(v / gain + ((11 k mod S) + 0.5) / S), which no other v becomes, so that it can be undone "
+        "exactly (calibration.radiometry.drift.as_measured)",
+        "per_light": gains.tolist(),
+    }
+
+
 def _dark_correction(subtracted: _Array) -> dict[str, Any]:
     return {
         "name": "dark",

@@ -26,14 +26,15 @@ from acquisition.framing.finding import Framing, find_chart
 from acquisition.framing.homography import rms
 from acquisition.framing.outline import refine_edges
 from acquisition.framing.planes import CHANNELS, Plane, frame_black, plane_of
-from acquisition.framing.sharpness import MAX_BLUR_PX, blur_px
+from acquisition.framing.sharpness import blur_px
 from acquisition.framing.tagless_field import FoundField
 from acquisition.framing.visibility import MIN_CELL_PX
+from acquisition.limits.bleed import largest_blur_px
 from calibration.registration.blocks import Blocks
 from calibration.registration.colour_checks import agreement, mismatched
 from calibration.registration.lens import Lens, fit_lens
 from calibration.registration.matching import Anchors, Matcher, not_this_chart
-from calibration.registration.registration import SAMPLE_REACH_PX, Registration
+from calibration.registration.registration import Registration
 from drivers.raw.rawfile import Mosaic
 from foundation.errors import RegistrationError
 from foundation.robust import sigma_of
@@ -54,11 +55,12 @@ MAX_BLOCK_RESIDUAL_PX = 0.5
 """RMS displacement that blocks may still need, for cells of 10 px: twice what the samples' reach allows for, and more
 than ten times what a sheet that waves by 3 mm leaves in simulated frames."""
 
-_GAUSS_NEWTON_STEPS = 5
-"""Steps at most; each is the cost of a comparison of all cells."""
+_GAUSS_NEWTON_STEPS = 8
+"""Steps at most; each is the cost of a comparison of all cells. A flat print takes two or three, curled ones five."""
 
-_SETTLED_PX = 0.01
-"""RMS movement of a step below which there is none to follow: a third of the map's own error."""
+_SETTLED_PX, _SETTLED_CELL_PX = 0.015, 0.15
+"""Movements of a step below which there is none to follow: RMS, and of the cell that moves most. Half of either is left
+at most: the map's own error. A curled rim comes last, when the RMS shows nothing of it."""
 
 _TAG_SIGMA_PX = 0.15
 """Standard error of a tag's corner: 0.085 px measured in white light, .20 in a weak one."""
@@ -138,7 +140,8 @@ def register(
         for softness in _FOLLOWED_SOFTLY:
             matcher.follow(softness)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        if matcher.step() < _SETTLED_PX:
+        moved, furthest = matcher.step()
+        if moved < _SETTLED_PX and furthest < _SETTLED_CELL_PX:
             break
     registration = _registered(chart, framing, matcher, marks, lens_rms)
     _judge(registration, MIN_AGREEMENT if chart.tags else MIN_PLAIN_AGREEMENT, what)
@@ -151,7 +154,8 @@ def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
     tags = {tag.id: tag for tag in chart.tags}
     corners_mm = np.concatenate([tags[tag.id].corners_mm for tag in framing.tags])
     corners_px = np.concatenate([tag.corners_px for tag in framing.tags])
-    return Anchors(corners_mm, corners_px, np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2)))
+    known = np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2))
+    return Anchors(corners_mm, corners_px, known, framing.plane.channel)
 
 
 def _outline(field: FoundField) -> Anchors:
@@ -208,9 +212,7 @@ def _require_size_and_focus(cell_px: float, blur: float, what: str) -> None:
             f"{what}: a cell is {cell_px:.1f} px wide, at least {MIN_CELL_PX:g} expected for 25 pixels inside it; "
             "bring the camera nearer"
         )
-    # Up to MAX_BLUR_PX cells of any size are found to a few hundredths of a pixel. What such a blur mixes into their
-    # samples depends on the cells' size; the verdict judges it as bleed.
-    allowed = max(MAX_BLUR_PX, (cell_px / 2 - SAMPLE_REACH_PX) / 2)
+    allowed = largest_blur_px(cell_px)
     if not blur <= allowed:
         raise RegistrationError(
             f"{what} is out of focus: edges are blurred by σ = {blur:.2f} px, at most {allowed:.2f} allowed for cells "
@@ -222,7 +224,7 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
     """Return the map with all figures of its quality."""
     seen, expected, paper = matcher.patches()
     there = np.asarray(np.isfinite(seen).all(axis=1))
-    residual = marks.places_px - matcher.to_pixels(marks.points_mm)
+    residual = marks.places_px - matcher.to_pixels(marks.points_mm, marks.channel)
     if framing.field is not None:
         residual = (residual * framing.field.normals).sum(axis=1, keepdims=True) * framing.field.normals
     mismatched_cells = mismatched(seen, expected, paper, chart)
@@ -234,6 +236,7 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
         framing=framing,
         lens=matcher.lens,
         displacement=matcher.displacement,
+        lateral=matcher.lateral,
         marks_residual_px=residual,
         lens_residual_px=lens_rms,
         blocks=blocks,

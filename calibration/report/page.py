@@ -7,12 +7,14 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from calibration.causes.findings import ProbableCause
 from calibration.report.plots import INK
 from calibration.report.summary import summary
 from calibration.table.provenance import Unfit
 from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import COMMAND, is_mended_by_retaking, retaken_frames
-from calibration.verdict.verdict import JudgedValue, Outcome, Verdict, format_value
+from calibration.verdict.retaking import COMMAND, findings, is_mended_by_retaking, retake_command, retaken_frames
+from calibration.verdict.verdict import JudgedValue, Outcome, format_value
+from calibration.verdict.wording import places_text
 from foundation.errors import counted, first_of
 
 MOST_UNFIT = 200
@@ -21,7 +23,7 @@ MOST_UNFIT = 200
 _CLASSES: dict[Outcome, str] = {"accept": "accept", "accept with remarks": "remark", "refuse": "refuse"}
 """Classes of the style sheet, and the words of the table's first column."""
 
-_STYLE = f"""
+STYLE = f"""
 body {{ font: 16px/1.5 system-ui, sans-serif; color: {INK}; max-width: 1100px; margin: 2rem auto; padding: 0 1rem }}
 h1 {{ font-size: 1.6rem; margin-bottom: .2rem }} h2 {{ font-size: 1.15rem; margin: 2.2rem 0 .6rem }}
 table {{ border-collapse: collapse; font-size: .95rem }} th {{ text-align: left; font-weight: 600 }}
@@ -35,6 +37,7 @@ td.accept {{ border-left-color: #2f8f46 }} td.remark {{ border-left-color: #d9a4
 td.refuse {{ border-left-color: #c8382e; font-weight: 600 }}
 td.number {{ white-space: nowrap }} figure {{ margin: 0 }} img {{ max-width: 100%; height: auto }}
 """
+"""The style sheet of a table's pages."""
 
 
 @dataclass(frozen=True)
@@ -46,24 +49,39 @@ class Picture:
     png: bytes
 
 
-def page(result: BuildResult, pictures: Sequence[Picture]) -> str:
-    """Return the text of `report.html`."""
+def page(result: BuildResult, pictures: Sequence[Picture], places: Sequence[Picture] = ()) -> str:
+    """Return the text of `report.html`.
+
+    Parameters
+    ----------
+    result
+        What the build found.
+    pictures
+        Of the figures.
+    places
+        Of frames in which something is beyond its limit, shown with its causes.
+    """
     session = result.figures.session
     title = f"Table of {session.lights} lights, {session.camera}"
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>\n"
+        f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>\n"
         f'<h1>{html.escape(title)}</h1><p class="note">Session {html.escape(session.folder.name)}</p>\n'
-        f"{_verdict(result.verdict)}{_retaking(result)}<h2>Figures</h2>{_summary(result)}"
-        f"{''.join(map(_picture, pictures))}{_unfit(result.figures.cells.unfit)}</body></html>\n"
+        f"{_verdict(result)}{_causes(result)}{_retaking(result)}{''.join(map(picture_html, places))}"
+        f"<h2>Figures</h2>{_summary(result)}"
+        f"{''.join(map(picture_html, pictures))}{_unfit(result.figures.cells.unfit)}</body></html>\n"
     )
 
 
-def _verdict(verdict: Verdict) -> str:
+def _verdict(result: BuildResult) -> str:
     """Return the verdict and its table, the worst rows first."""
+    verdict, found = result.verdict, findings(result.verdict, result.figures)
     order: tuple[Outcome, ...] = ("refuse", "accept with remarks", "accept")
-    rows = "".join(_judged(row) for row in sorted(verdict.rows, key=lambda row: order.index(row.outcome)))
+    rows = "".join(
+        _judged(row, _remedy(row, found.get(row.threshold.name)))
+        for row in sorted(verdict.rows, key=lambda row: order.index(row.outcome))
+    )
     sentence = {
         "accept": "Accepted: every figure is within its limit.",
         "accept with remarks": f"Accepted with remarks on {len(verdict.remarks)} of {len(verdict.rows)} figures.",
@@ -87,10 +105,42 @@ def _retaking(result: BuildResult) -> str:
     return f"<p>To be taken again ({counted(len(records), 'frame')}): {names}; <code>{COMMAND}</code>.{also}</p>"
 
 
-def _judged(row: JudgedValue) -> str:
+def _remedy(row: JudgedValue, found: ProbableCause | None) -> str:
+    """Return what helps against what is beyond a limit; "" where nothing is."""
+    if row.outcome == "accept" or not row.threshold.remedy:
+        return ""
+    if found is None:
+        return row.threshold.remedy
+    return found.decision.cause.remedy if found.is_known else f"it may help to {row.threshold.remedy}"
+
+
+def _causes(result: BuildResult) -> str:
+    """Return what is beyond its limit with its probable cause, frames, place and command; nothing where nothing is."""
+    rows: list[str] = []
+    for name, found in findings(result.verdict, result.figures).items():
+        title = next(row.threshold.title for row in result.verdict.rows if row.threshold.name == name)
+        cause, rule = found.decision.cause, found.decision.rule
+        probably = (
+            "not known from what was measured" if rule is None else f"<b>{html.escape(cause.name)}</b>: {rule.why}"
+        )
+        again = f"<br><code>{retake_command(found.frames)}</code>" if found.is_of_frames else ""
+        known = ", ".join(f"{key} {value:.3g}" for key, value in found.evidence.known().items())
+        rows.append(
+            f"<tr><th>{html.escape(title)}</th><td>{probably}{again}</td><td>{html.escape(places_text(found))}</td>"
+            f"<td class='note'>{html.escape(known)}</td></tr>"
+        )
+    if not rows:
+        return ""
+    return (
+        "<h2>Probable causes</h2><table><tr><th>figure</th><th>cause</th><th>frames and place</th><th>decided from</th>"
+        f"</tr>{''.join(rows)}</table>"
+    )
+
+
+def _judged(row: JudgedValue, helps: str) -> str:
     limit, name = row.threshold, _CLASSES[row.outcome]
     refuse = "" if limit.refuse is None else format_value(limit.refuse, limit.unit)
-    remedy = f". <b>{html.escape(limit.remedy)}</b>" if row.outcome != "accept" and limit.remedy else ""
+    remedy = f". <b>{html.escape(helps)}</b>" if helps else ""
     return (
         f"<tr><td class='{name}'>{name}</td><th>{html.escape(limit.title)}</th>"
         f"<td class='number'>{html.escape(format_value(row.value, limit.unit))}</td>"
@@ -109,7 +159,8 @@ def _summary(result: BuildResult) -> str:
     return f"<table>{rows}</table>"
 
 
-def _picture(picture: Picture) -> str:
+def picture_html(picture: Picture) -> str:
+    """Return a picture with its heading and caption as HTML; the file is part of the text."""
     heading = html.escape(picture.heading)
     return (
         f"<figure><h2>{heading}</h2><img alt='{heading}' "

@@ -12,8 +12,11 @@ from calibration.figures.table_figures import TableFigures
 from calibration.sampling.windows import largest_window
 from calibration.table.file_names import REPORT_FORMAT, REPORT_VERSION
 from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import retake_json, retaken_frames
+from calibration.verdict.retaking import findings, retake_command, retake_json, retaken_frames
 from calibration.verdict.values import judged_values
+
+PLACES = (7, 5)
+"""Points across and down the page whose places are told: enough to see how it hung, and how it bent, roughly."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -30,18 +33,62 @@ def report_json(result: BuildResult) -> dict[str, Any]:
         "camera": figures.session.camera,
         "lights": figures.session.lights,
         "channels": _channels(figures),
+        "chart_places": _chart_places(figures),
         "off_codes_deg": None if off_codes_deg is None else [float(f"{angle:.3g}") for angle in off_codes_deg.tolist()],
         "primaries_differ": None if primaries is None else float(f"{primaries.difference:.3g}"),
         "figures": {name: _rounded(value) for name, value in judged_values(figures).items()},
+        "causes": _causes(result),
         **retake_json(retaken_frames(verdict, figures), _registered_sha256(figures)),
         "limits": [asdict(row.threshold) | {"outcome": row.outcome} for row in verdict.rows],
     }
+
+
+def _causes(result: BuildResult) -> list[dict[str, Any]]:
+    """Return what each figure beyond its limit is probably caused by, and what that was decided from."""
+    return [
+        {
+            "figure": name,
+            "cause": found.decision.cause.name,
+            "why": "" if found.decision.rule is None else found.decision.rule.why,
+            "remedy": found.decision.cause.remedy,
+            "mends": found.decision.cause.mends,
+            "command": retake_command(found.frames) if found.is_of_frames else "",
+            "files": [frame.file for frame in found.frames],
+            "places": [
+                {
+                    "file": place.file,
+                    "x_mm": _rounded(place.x_mm),
+                    "y_mm": _rounded(place.y_mm),
+                    "size_mm": _rounded(place.size_mm),
+                }
+                for place in found.places
+            ],
+            "evidence": {known: _rounded(value) for known, value in found.evidence.known().items()},
+        }
+        for name, found in findings(result.verdict, result.figures).items()
+    ]
 
 
 def _registered_sha256(figures: TableFigures) -> str:
     """Return the hash of the frame that was registered first; of another where that one is not among those measured."""
     named = [frame for frame in figures.frames if frame.record.file == figures.session.registered_file]
     return (named or figures.frames)[0].record.sha256
+
+
+def _chart_places(figures: TableFigures) -> dict[str, Any]:
+    """Return where points of the page lie in the frame that was registered first, half-size px.
+
+    Of two tables of one chart these tell how it hung elsewhere.
+    """
+    registration = figures.registration
+    width, height = registration.colours.page_mm
+    across, down = PLACES
+    points = [(x, y) for y in np.linspace(0.05, 0.95, down) * height for x in np.linspace(0.05, 0.95, across) * width]
+    return {
+        "frame": figures.session.registered_file,
+        "mm": np.round(points, 3).tolist(),
+        "px": np.round(registration.to_pixels(points), 3).tolist(),
+    }
 
 
 def _channels(figures: TableFigures) -> dict[str, Any]:

@@ -18,9 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.framing.planes import CHANNELS, phases
+from acquisition.limits.bleed import WINDOW_PX
 from drivers.raw.rawfile import Mosaic
 
-WINDOW = 5
+WINDOW = WINDOW_PX
 """Pixels along the side of a cell's window, where the user names no other: the paper's."""
 
 _Array = npt.NDArray[np.float64]

@@ -2,39 +2,13 @@
 
 from __future__ import annotations
 
-from calibration.sampling.samples import WINDOW
+from acquisition.limits.bleed import bleed
 
 WINDOWS = (3, 5, 7, 9)
 """Sides of windows, half-size px: odd, so that a cell has a middle pixel; a cell is about 10 px wide."""
 
 SAFE_BLEED = 0.002
 """Share of a sample's light from beyond its cell that counts as none: less than half of what the verdict remarks on."""
-
-MISPLACEMENT_PX = 0.75
-"""How far a sample may lie from its place: 0.5 px of rounding and 0.25 px of registration."""
-
-_LEAST_BLUR_PX = 1e-3
-"""Keeps a perfectly sharp picture from dividing by 0."""
-
-
-def bleed(cell_px: float, blur_px: float, window: int = WINDOW) -> float:
-    """Return the share, 0 … 1, of the worst sample's light that comes from beyond its cell.
-
-    The normal integral (a Gaussian of σ `blur_px`) beyond the cell's nearest edge, for the outermost of `window` pixels
-    (2 px from the middle one of 5), misplaced by `MISPLACEMENT_PX` towards that edge.
-
-    Parameters
-    ----------
-    cell_px
-        Shorter side of a cell, half-size px.
-    blur_px
-        σ of the blur, half-size px.
-    window
-        Pixels along the side of the window.
-    """
-    from scipy.special import ndtr
-
-    return float(ndtr(-(cell_px / 2 - window // 2 - MISPLACEMENT_PX) / max(blur_px, _LEAST_BLUR_PX)))
 
 
 def largest_window(cell_px: float, blur_px: float) -> int:

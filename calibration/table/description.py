@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from calibration.table.file_names import FRAMES, SUMS
 from calibration.table.lut import Lut
 from calibration.table.provenance import Provenance
@@ -59,7 +62,7 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
             f"{len(known.unfit)} of {8**known.bits}"
             + "".join(f", {count} {cause}" for cause, count in sorted(causes.items())),
         ),
-        ("Corrections", ", ".join(str(correction.get("name", "?")) for correction in known.corrections)),
+        ("Corrections", ", ".join(_name(correction) for correction in known.corrections)),
         ("Software", known.software),
         ("Frames", frames),
         ("Session", session),
@@ -68,3 +71,9 @@ def describe(lut: Lut) -> list[tuple[str, str]]:
         ("Hashes", _hashes(known)),
         ("Table", lut.sha256),
     ]
+
+
+def _name(correction: Mapping[str, Any]) -> str:
+    """Return what a correction is called, and whether it was only recorded."""
+    name = str(correction.get("name", "?"))
+    return f"{name} (recorded, not applied)" if correction.get("applied") is False else name

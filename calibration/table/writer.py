@@ -85,6 +85,10 @@ class LutWriter:
             raise storage_error(self._path, error) from error
         self.sha256[light] = sha256_of(data)
 
+    def get(self, light: int) -> npt.NDArray[np.uint16]:
+        """Return the samples (colours, samples, 3) uint16 that were put for light number `light`, from the disk."""
+        return np.array(np.load(self._path, mmap_mode="r", allow_pickle=False)[light])
+
     def flush(self) -> None:
         """Wait until the disk holds what was put (`fsync`).
 

@@ -216,7 +216,7 @@ def _require_free(url: str) -> None:
 
 def _zarr() -> Any:
     if find_spec("zarr") is None:
-        raise InputError("published tables need zarr; install it with: pip install croplab[cluster]")
+        raise InputError("published tables need zarr; install it with: pip install zarr")
     zarr = import_module("zarr")
     import_module("zarr.codecs")
     return zarr

@@ -1,16 +1,18 @@
-"""Which frames, taken again, would mend a refused table: those that are beyond a limit by themselves.
+"""Which frames, taken again, would mend a table: those beyond a limit by themselves, and those that are a cause.
 
 What all frames share (focus from the first on, a stained print, too little light) is not mended by taking frames again;
-nothing is named for it. `report.json` names the frames in the form that `acquire run --retake bad` reads.
+nothing is named for it. A hand in one white frame looks like a stain to the mean of the white frames: its cause names
+the frame (`calibration.causes`). `report.json` names the frames in the form that `acquire run --retake bad` reads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from acquisition.session.mending.retaking import lights_text
 from acquisition.session.records import FrameRecord
+from calibration.causes.findings import ProbableCause, explain
 from calibration.figures.frame_figures import FrameFigures
 from calibration.figures.table_figures import TableFigures
 from calibration.registration.registration import Registration
@@ -18,18 +20,42 @@ from calibration.sampling.windows import bleed
 from calibration.verdict.verdict import JudgedValue, Verdict
 
 COMMAND = "acquire run LAB.toml SESSION --retake bad"
-"""What takes them again."""
+"""What takes them again, as the report names them."""
+
+
+def retake_command(records: Sequence[FrameRecord]) -> str:
+    """Return the command that takes frames again: by the lights' numbers, or by the report where one is a reference."""
+    lights = [record.illumination for record in records if record.kind == "light"]
+    numbers = [light for light in lights if light is not None]
+    return COMMAND if len(numbers) < len(records) else COMMAND.replace("bad", lights_text(numbers))
 
 
 def retaken_frames(verdict: Verdict, figures: TableFigures) -> tuple[FrameRecord, ...]:
-    """Return the frames that are beyond a refusing limit by themselves, in the order taken."""
-    refused = {frame.sha256 for row in verdict.refused for frame in _frames_of(row, figures) or ()}
-    return tuple(frame.record for frame in figures.frames if frame.record.sha256 in refused)
+    """Return the frames to be taken again, in the order taken.
+
+    Those beyond a refusing limit by themselves, and those that are the cause of a refusal or a remark.
+    """
+    named = {frame.sha256 for row in verdict.refused for frame in _frames_of(row, figures) or ()}
+    for finding in findings(verdict, figures).values():
+        if finding.is_of_frames:
+            named |= {frame.sha256 for frame in finding.frames}
+    return tuple(frame.record for frame in figures.frames if frame.record.sha256 in named)
 
 
 def is_mended_by_retaking(verdict: Verdict, figures: TableFigures) -> bool:
     """Return whether each refusal is of single frames, so that a table could be made once these are taken again."""
-    return bool(verdict.refused) and all(_frames_of(row, figures) for row in verdict.refused)
+    found = findings(verdict, figures)
+    return bool(verdict.refused) and all(
+        _frames_of(row, figures) or (row.threshold.name in found and found[row.threshold.name].is_of_frames)
+        for row in verdict.refused
+    )
+
+
+def findings(verdict: Verdict, figures: TableFigures) -> dict[str, ProbableCause]:
+    """Return what each row beyond its limit is probably caused by, by the name of the limit."""
+    rows = (*verdict.refused, *verdict.remarks)
+    explained = ((row.threshold.name, explain(row.threshold.name, row.threshold.accept, figures)) for row in rows)
+    return {name: finding for name, finding in explained if finding is not None}
 
 
 def retake_json(records: tuple[FrameRecord, ...], registered_sha256: str) -> dict[str, Any]:

@@ -75,7 +75,10 @@ def _frame_values(figures: TableFigures) -> dict[str, float]:
         values["reference_spread"] = max(float(paper.spread[int(np.argmax(paper.white))]) for paper in whites)
     if len(whites) > 1:
         white = np.array([paper.white for paper in whites])
-        values["white_drift"] = figures.white_drift
+        if (drift := figures.lights.drift) is None:
+            values["white_drift"] = figures.white_drift
+        else:
+            values["drift_left"] = drift.left
         values["white_drift_deg"] = float(angles_deg(white, np.broadcast_to(white[0], white.shape)).max())
     return values
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 
+from calibration.causes.findings import ProbableCause, explain
 from calibration.figures.table_figures import TableFigures
-from calibration.verdict.retaking import COMMAND, is_mended_by_retaking, retaken_frames
+from calibration.verdict.retaking import COMMAND, findings, is_mended_by_retaking, retake_command, retaken_frames
 from calibration.verdict.verdict import JudgedValue, Verdict
 from foundation.errors import counted, first_of
 
@@ -33,25 +34,50 @@ def refusal(verdict: Verdict, figures: TableFigures, *, reported: bool = False) 
     reported
         Whether a report was written, so that the frames it names can be taken again by it.
     """
-    worst = verdict.refused[0]
+    found = findings(verdict, figures)
+    # What is explained explains more than what comes first.
+    known = [row for row in verdict.refused if row.threshold.name in found and found[row.threshold.name].is_known]
+    worst = (*known, *verdict.refused)[0]
     remedy = worst.threshold.remedy
     more = f" (and {len(verdict.refused) - 1} more)" if len(verdict.refused) > 1 else ""
     detail = ""
     if worst.threshold.name == "unfit_share":
-        cause, count = Counter(cell.cause.split(":")[0] for cell in figures.cells.unfit).most_common(1)[0]
-        detail, remedy = f", {count} of them {cause}", _REMEDIES.get(cause, "look at the report")
+        kind, count = Counter(cell.cause.split(":")[0] for cell in figures.cells.unfit).most_common(1)[0]
+        detail, remedy = f", {count} of them {kind}", _REMEDIES.get(kind, "look at the report")
+    finding = found.get(worst.threshold.name)
+    if finding is not None and finding.is_known:
+        remedy = finding.decision.cause.remedy
     what, frames = "take the session anew", retaken_frames(verdict, figures)
     if reported and frames:
         again = f"take {counted(len(frames), 'frame')} again"
         what = (
             f"{again}: {COMMAND}" if is_mended_by_retaking(verdict, figures) else f"{again} first ({COMMAND}); {_THEN}"
         )
-    return f"{_with_place(worst, figures)}{detail}{more}; {remedy}, and {what}"
+    probably = cause_text(finding)
+    return f"{_with_place(worst, figures)}{detail}{more}; {probably}{remedy}, and {what}"
 
 
 def remark(row: JudgedValue, figures: TableFigures) -> str:
-    """Return a row that is remarked on: value, expectation, place and remedy, in a line."""
-    return f"{_with_place(row, figures)}; {row.threshold.remedy}"
+    """Return a row that is remarked on: value, expectation, place, cause, remedy and command, in a line."""
+    finding = explain(row.threshold.name, row.threshold.accept, figures)
+    remedy, again = row.threshold.remedy, ""
+    if finding is not None and finding.is_known:
+        remedy = finding.decision.cause.remedy
+        if finding.is_of_frames:
+            again = f", and take {counted(len(finding.frames), 'frame')} again: {retake_command(finding.frames)}"
+    elif row.threshold.name == "unfit_share" and figures.cells.unfit:
+        kind = Counter(cell.cause.split(":")[0] for cell in figures.cells.unfit).most_common(1)[0][0]
+        remedy = _REMEDIES.get(kind, "look at the report")
+    return f"{_with_place(row, figures)}; {cause_text(finding)}{remedy}{again}"
+
+
+def cause_text(finding: ProbableCause | None) -> str:
+    """Return the probable cause and why, before a remedy; that it is unknown, where it was asked for."""
+    if finding is None:
+        return ""
+    if finding.decision.rule is None:
+        return "the cause is not known from what was measured; it may help to "
+    return f"probably {finding.decision.cause.says} ({finding.decision.rule.why}); "
 
 
 def _with_place(row: JudgedValue, figures: TableFigures) -> str:
@@ -68,12 +94,24 @@ def _place(row: JudgedValue, figures: TableFigures) -> str:
             return f"in {softest.record.file}, whose blur is σ = {softest.blur_px:.2f} px"
         case "unlike_scatter":
             return f"in {max(figures.frames, key=lambda frame: frame.consistency.scatter).record.file}"
-        case "unlike_block":
-            frame = max(figures.frames, key=lambda frame: frame.consistency.block)
-            x_mm, y_mm = frame.consistency.at_mm
-            return f"in {frame.record.file}, about {x_mm:.0f}, {y_mm:.0f} mm from the sheet's top-left corner"
         case "off_codes_deg":
             lights = figures.lights.lights_off_codes(row.threshold.accept)
             return f"{len(lights)} lights: {first_of(lights)}"
         case _:
-            return ""
+            return places_text(explain(row.threshold.name, row.threshold.accept, figures))
+
+
+def places_text(finding: ProbableCause | None) -> str:
+    """Return the frames and the place on the print of a finding; "" where it has neither."""
+    if finding is None:
+        return ""
+    files = [frame.file for frame in finding.frames]
+    told = [f"in {first_of(files)}"] if files else []
+    if finding.places:
+        place = finding.places[0]
+        told.append(f"about {place.x_mm:.0f}, {place.y_mm:.0f} mm from the sheet's top-left corner")
+        if place.size_mm > 0:
+            told.append(f"{place.size_mm:.0f} mm across")
+        if not files:
+            told[0] = f"seen in {place.file} {told[0]}"
+    return ", ".join(told)

@@ -277,9 +277,7 @@ def library():
     try:
         import gphoto2
     except ImportError as error:
-        raise ConfigurationError(
-            "python-gphoto2 is not installed; install the extra: pip install 'croplab[gphoto2]'"
-        ) from error
+        raise ConfigurationError("python-gphoto2 is not installed; install it: pip install gphoto2") from error
     return gphoto2
 
 

@@ -13,6 +13,7 @@ Rules that hold inside:
 
 from __future__ import annotations
 
+import logging
 import secrets
 from collections.abc import Callable
 from typing import TypeVar
@@ -32,6 +33,8 @@ from drivers.pjlink.wire import (
 from drivers.projector import Fault, Lamp, Power, ProjectorIdentity
 from foundation.clock import Clock, SystemClock
 from foundation.errors import DeviceFault, DeviceRefused, LinkClosed, LinkError, LinkTimeout, ProtocolError
+
+_log = logging.getLogger(__name__)
 
 DEFAULT_TIMEOUT_S = 5.0
 """The standard asks for an answer within 2 s; real projectors take longer while they warm up."""
@@ -79,7 +82,10 @@ class _Connection:
         # Whatever stands here unasked answers no question of ours.
         self._lines.clear()
         self.link.write(wire.encode_request(request), self._timeout)
-        return wire.parse_reply(self.read_line())
+        reply = self.read_line()
+        # Without the digest, which anybody can try passwords on.
+        _log.debug("%s %s: %r", request.command, request.parameter, reply)
+        return wire.parse_reply(reply)
 
 
 class PjLinkProjector:

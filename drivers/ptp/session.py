@@ -13,6 +13,7 @@ Source: ISO 15740:2013, clause 9.3 (sessions and transactions).
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Callable, Iterator
 
 from drivers.ptp.codes import Operation, ResponseCode, describe
@@ -20,6 +21,8 @@ from drivers.ptp.messages import PtpEvent, PtpRequest, next_transaction
 from drivers.ptp.transport import Transport
 from foundation.clock import Clock
 from foundation.errors import DeviceError, DeviceRefused, LinkTimeout, ProtocolError
+
+_log = logging.getLogger(__name__)
 
 START_TIMEOUT_S = 1.5
 """Wait for the answer to OpenSession: a body that a killed host left behind never answers before a reset."""
@@ -148,6 +151,8 @@ class PtpSession:
             self._transaction = next_transaction(self._transaction)
             request = PtpRequest(operation, self._transaction, parameters)
             done = self._transport.transact(request, send=send, receive=receive, timeout=timeout)
+            answered = describe(ResponseCode, done.response.code)
+            _log.debug("%s%s: %s", describe(Operation, operation), parameters, answered)
             if done.response.ok:
                 return done.response.parameters, done.data
             # A device that declines sends no data, so that `receive` has seen nothing of a try that is repeated.

@@ -12,6 +12,7 @@ Rules that hold inside:
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -20,6 +21,8 @@ from foundation.clock import Clock, SystemClock
 from foundation.errors import LinkClosed, LinkTimeout, ProtocolError
 
 SYSTEM_CLOCK = SystemClock()
+
+_log = logging.getLogger(__name__)
 
 DEFAULT_TIMEOUT_S = 5.0
 """Epson's manual asks for an answer within 3 s, 5 s after a change of source; the others say nothing."""
@@ -141,6 +144,7 @@ class Exchange:
                     self._greet(self)
             self._discard(link)
             link.write(command, self._timeout)
+            _log.debug("sent %r", command)
         except BaseException:
             self.close()
             raise
@@ -160,6 +164,7 @@ class Exchange:
                 raise self._silent(wait) from error
             remaining = deadline - self._clock.monotonic()
         message, length = taken
+        _log.debug("received %r", self._rest[:length])
         self._rest = self._rest[length:]
         return message
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
-from foundation.console import EXIT_CODES
+from foundation.console import EXIT_CODES, shows_progress
 
 if TYPE_CHECKING:
     from evaluation.experiments.describing import DataDescription
@@ -126,6 +126,6 @@ def _described(place: str, reading: DataReading, cells: int, workers: int) -> Da
             )
         return read_statistics(place)
     data = reading.open(place)
-    with Progress(console=Console(stderr=True)) as progress:
+    with Progress(console=Console(stderr=True), disable=not shows_progress()) as progress:
         task = progress.add_task(data.name, total=len(data.scenes))
         return describe(data, cells, workers, lambda: progress.advance(task))

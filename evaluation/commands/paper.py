@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from evaluation.commands.data_options import DataReading, with_data_options
-from foundation.console import EXIT_CODES
+from foundation.console import EXIT_CODES, new_app, shows_progress
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
@@ -29,7 +29,7 @@ all of them as made with full tables of both cameras.
 {EXIT_CODES}
 """
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
+app = new_app(no_args_is_help=True)
 
 Luts = Annotated[
     list[Path], typer.Argument(metavar="LUT...", help="Tables made by build-lut, a folder each.", show_default=False)
@@ -385,6 +385,6 @@ def _progress(total: int) -> Generator[Callable[[], None]]:
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True)) as progress:
+    with Progress(console=Console(stderr=True), disable=not shows_progress()) as progress:
         task: Any = progress.add_task("images", total=total)
         yield lambda: progress.advance(task)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from evaluation.datasets.truths import Light, read_light
 from evaluation.scene import Image
 from foundation.errors import FormatError
+from generator.files.formats import decode_array
 
 Mask = npt.NDArray[np.bool_]
 """(H, W), True where a pixel must not be used."""
@@ -205,17 +206,15 @@ def decode_image(path: str, eight_bits: bool = False) -> Image:
 
 def _values(path: str) -> npt.NDArray[Any]:
     """Return whatever array a file holds."""
-    import imagecodecs
-
     ending = Path(path).suffix.lower()
     try:
         if ending == ".npy":
             return np.asarray(np.load(path, allow_pickle=False))
         data = Path(path).read_bytes()
         if ending == ".png":
-            return np.asarray(imagecodecs.png_decode(data))
+            return decode_array(data, "png")
         if ending in (".tif", ".tiff"):
-            return np.asarray(imagecodecs.tiff_decode(data))
+            return decode_array(data, "tiff")
     except Exception as error:
         reason = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
         raise FormatError(f"{path} cannot be read: {reason or type(error).__name__}; restore it") from error

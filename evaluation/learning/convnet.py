@@ -72,7 +72,7 @@ class ConvNet(FeatureLearner):
     @property
     def needs(self) -> tuple[str, str]:
         """What training needs: the module, and the command that installs it."""
-        return "torch", "pip install 'croplab[torch]'"
+        return "torch", "pip install torch"
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None
@@ -156,7 +156,7 @@ def _torch() -> ModuleType:
     try:
         import torch
     except ImportError as error:
-        raise InputError("the method convnet needs PyTorch: pip install 'croplab[torch]'") from error
+        raise InputError("the method convnet needs PyTorch: pip install torch") from error
     return torch
 
 

@@ -80,7 +80,7 @@ class RegressionTrees(FeatureLearner):
     @property
     def needs(self) -> tuple[str, str]:
         """What training needs: the module, and the command that installs it."""
-        return "sklearn", "pip install 'croplab[learn]'; a model that is trained already does without"
+        return "sklearn", "pip install scikit-learn; a model that is trained already does without"
 
     def features(
         self, image: Image, saturation: float | None = None, mask: npt.NDArray[np.bool_] | None = None

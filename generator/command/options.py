@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from foundation.console import Quiet, Verbose, Version
 from foundation.errors import InputError
 from foundation.processors import processor_count
 from generator.command.grouping import option
@@ -397,6 +398,15 @@ class WorkOptions:
     def makers(self) -> Workers:
         """Return who makes the images: as many as there are processors unless a number is given."""
         return Workers(self.engine, processor_count() if self.workers is None else self.workers)
+
+
+@dataclass(frozen=True)
+class CommonOptions:
+    """What every command takes; acts by itself where it is given."""
+
+    verbose: Verbose = 0
+    quiet: Quiet = False
+    version: Version = False
 
 
 def _size(text: str, name: str) -> tuple[int, int]:

@@ -29,6 +29,7 @@ __all__ = [
     "FORMATS",
     "Format",
     "ImageMetadata",
+    "decode_array",
     "decode_image",
     "encode_image",
     "encode_map",
@@ -66,7 +67,17 @@ def suffix_of(form: Format) -> str:
 
 
 def libraries_of(form: Format) -> tuple[str, ...]:
-    """Return the distributions whose version may change the bytes of a file of that format; none if CroP encodes it."""
+    """Return the distributions whose version may change the bytes of a file of that format; none if CroP encodes it.
+
+    Raises
+    ------
+    InputError
+        The format needs one that a plain installation has not, and that is not there.
+    """
+    if form == "jxl":
+        from generator.files.jxl import imagecodecs
+
+        imagecodecs()
     return _LIBRARIES[form]
 
 
@@ -181,13 +192,15 @@ def decode_image(data: bytes, form: Format, what: str) -> npt.NDArray[np.uint16]
         return half_size(decode_raw(data, Path(what)).counts)
     require_plausible(data, what)
     try:
-        image = _decoded(data, form)
+        image = decode_array(data, form)
+    except InputError:
+        raise
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FormatError(f"{what} cannot be read as {form}: {reason}; make it again") from error
     if image.dtype != np.uint16 or image.ndim != 3 or image.shape[2] != 3:
         raise FormatError(f"{what} holds {image.dtype} {image.shape}, expected uint16 (height, width, 3)")
-    return image
+    return image.astype(np.uint16, copy=False)
 
 
 def require_plausible(data: bytes, what: str) -> None:
@@ -223,15 +236,28 @@ def require_plausible(data: bytes, what: str) -> None:
         place += size + 12
 
 
-def _decoded(data: bytes, form: Format) -> npt.NDArray[np.uint16]:
-    import imagecodecs
+def decode_array(data: bytes, form: Format) -> npt.NDArray[np.generic]:
+    """Return the array in a file's bytes, (H, W) or (H, W, channels), uint8, uint16 or float32, as it stands there.
 
+    Raises
+    ------
+    InputError
+        The format needs a package that is not installed.
+    Exception
+        Whatever the decoder says of damaged bytes.
+    """
     if form == "png":
-        return np.asarray(imagecodecs.png_decode(data))
+        from generator.files.png import decode_png
+
+        return decode_png(data)
     if form == "tiff":
-        return np.asarray(imagecodecs.tiff_decode(data))
+        from generator.files.tiff import decode_tiff
+
+        return decode_tiff(data)
     if form == "jxl":
-        return np.asarray(imagecodecs.jpegxl_decode(data, numthreads=1))
+        from generator.files.jxl import decode_jxl
+
+        return decode_jxl(data)
     from generator.files.exr import decode_exr
 
     return decode_exr(data)

@@ -5,6 +5,8 @@ libjxl writes it; other versions may give other bytes. The file has no place for
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -17,13 +19,40 @@ def encode_jxl(image: npt.NDArray[np.uint16]) -> bytes:
     Raises
     ------
     InputError
-        libjxl cannot write the image.
+        libjxl cannot write the image, or imagecodecs is not installed.
     """
-    import imagecodecs
-
+    codecs = imagecodecs()
     try:
-        return bytes(imagecodecs.jpegxl_encode(np.ascontiguousarray(image), effort=1, lossless=True, numthreads=1))
-    except imagecodecs.JpegxlError as error:
+        return bytes(codecs.jpegxl_encode(np.ascontiguousarray(image), effort=1, lossless=True, numthreads=1))
+    except codecs.JpegxlError as error:
         raise InputError(
             f"an image of {image.shape[1]}x{image.shape[0]} px cannot be written as JPEG XL: {error}; choose png"
         ) from error
+
+
+def decode_jxl(data: bytes) -> npt.NDArray[np.generic]:
+    """Return what a JPEG XL file holds, (H, W, channels) or (H, W), uint8, uint16 or float32 as it is stored.
+
+    Raises
+    ------
+    InputError
+        imagecodecs is not installed.
+    Exception
+        Whatever libjxl says of a file that it cannot read.
+    """
+    return np.asarray(imagecodecs().jpegxl_decode(data, numthreads=1))
+
+
+def imagecodecs() -> Any:
+    """Return the module that has libjxl; a plain installation does without its 90 MB.
+
+    Raises
+    ------
+    InputError
+        It is not installed.
+    """
+    try:
+        import imagecodecs as module
+    except ImportError as error:
+        raise InputError("JPEG XL needs imagecodecs: pip install imagecodecs; or choose png") from error
+    return module

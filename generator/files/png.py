@@ -12,11 +12,10 @@ import struct
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from imagecodecs import deflate_adler32
 from isal import isal_zlib
 
 from foundation.errors import InputError
@@ -81,7 +80,8 @@ def _bands(
 
     def pack(top: int) -> tuple[memoryview, int, int]:
         data, plain = _packer().pack(np.ascontiguousarray(image[top : top + rows]), last=top + rows >= len(image))
-        return data.data, deflate_adler32(_bytes(plain)), plain.size
+        checksum = int(isal_zlib.adler32(plain.data))  # pyright: ignore  # its stub leaves the function out
+        return data.data, checksum, plain.size
 
     def keep(top: int) -> tuple[bytes, int, int]:
         data, checksum, size = pack(top)
@@ -92,11 +92,6 @@ def _bands(
             yield from pool.map(keep, tops)
     else:
         yield from map(pack, tops)
-
-
-def _bytes(data: npt.NDArray[np.uint8]) -> Any:
-    """Return the buffer of an array: imagecodecs takes it, though its type hints omit it."""
-    return data.data
 
 
 def _packer() -> Packer:
@@ -121,3 +116,24 @@ def chunk(kind: bytes, *parts: bytes | memoryview) -> Iterator[bytes | memoryvie
     yield struct.pack(">I", sum(len(part) for part in parts)) + kind
     yield from filter(None, parts)
     yield struct.pack(">I", checksum)
+
+
+def decode_png(data: bytes) -> npt.NDArray[np.generic]:
+    """Return what a PNG holds, (H, W) or (H, W, channels), RGB, uint8 or uint16, as it stands there.
+
+    Raises
+    ------
+    ValueError
+        It is no PNG, cut off, or damaged: every chunk has its checksum.
+    """
+    import cv2
+
+    # OpenCV would read other formats, too.
+    found = None
+    if data.startswith(SIGNATURE):
+        found = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if found is None:
+        raise ValueError("no whole PNG file")
+    if found.ndim == 2:
+        return found
+    return cv2.cvtColor(found, cv2.COLOR_BGR2RGB if found.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)

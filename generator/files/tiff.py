@@ -6,6 +6,8 @@ deflate, at the speed of their TIFF writers, costs more time than it saves room.
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import numpy.typing as npt
 
@@ -44,3 +46,22 @@ def encode_tiff(image: npt.NDArray[np.uint16], metadata: ImageMetadata) -> bytes
             f"an image of {width}x{height} px is too large for TIFF: {error}; choose png or exr, or make it smaller"
         ) from error
     return b"".join([start, np.ascontiguousarray(image, dtype="<u2").data])
+
+
+def decode_tiff(data: bytes) -> npt.NDArray[np.generic]:
+    """Return the first picture of a TIFF, (H, W) or (H, W, channels), uint8, uint16, float32 or whatever is stored.
+
+    OpenCV's reader is not used: of pictures stored plane by plane, and of files that are cut off, it makes others.
+
+    Raises
+    ------
+    Exception
+        Whatever tifffile says: it is no TIFF, cut off, or compressed in a way that needs a package that is not here.
+    """
+    import tifffile
+
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        page = file.pages.first
+        found = np.asarray(page.asarray())
+        # Planes that are stored one after another come as the first axis.
+        return np.moveaxis(found, 0, -1) if page.axes.startswith("S") and found.ndim == 3 else found

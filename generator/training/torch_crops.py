@@ -22,7 +22,7 @@ try:
     import torch
     from torch.utils.data import Dataset, IterableDataset, get_worker_info
 except ImportError as error:
-    raise TorchMissingError("training batches for PyTorch need it: pip install 'croplab[torch]'") from error
+    raise TorchMissingError("training batches for PyTorch need it: pip install torch") from error
 
 Item = dict[str, Any]
 """``image`` (3, height, width) float32, linear camera RGB, 1 = saturation, and ``illuminant`` (3,) float32,

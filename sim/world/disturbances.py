@@ -22,13 +22,16 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from drivers.presenter import BLACK, Colour
 from foundation.errors import ConfigurationError
-from sim.world.situation import UNDISTURBED, Blob, Patch, Place, Situation
+from sim.world.situation import UNDISTURBED, Blob, Glare, Patch, Place, Situation
 
 _HALF: Final[Place] = (-9.0, 0.5, 9.0, 9.0)
 """The lower half of the picture, its overscan included."""
 
 _QUARTER: Final[Place] = (0.5, 0.35, 1.1, 1.4)
 """A shoulder that reaches over a quarter of the chart from its lower right."""
+
+_SPOT: Final[Place] = (0.1, -0.2, 0.9, 0.8)
+"""Most of the upper half of the page: what a matt surface mirrors of a lamp is broad."""
 
 _SLANTED_DEG: Final = 30.0
 """Direction of a push, clockwise from the right: along neither axis."""
@@ -309,9 +312,22 @@ class ScrambledRows(Disturbance):
         return torn
 
 
+@dataclass(frozen=True)
+class Reflection(Disturbance):
+    """The print mirrors light into the camera: `percent` of what bare paper sends, in the middle of a soft ellipse."""
+
+    what: Literal["reflection"] = "reflection"
+    place: Place = _SPOT
+    percent: float = 3.0
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Add it."""
+        return replace(situation, glares=(*situation.glares, Glare(self.place, self.percent / 100)))
+
+
 AnyDisturbance = (
     FrozenScreen | PopUp | HalfChanged | Bump | LampStep | LampDrift | AmbientStep | Defocus | Person | SensorWarming
-    | StaleFile | ZeroedStrip | ScrambledRows
+    | StaleFile | ZeroedStrip | ScrambledRows | Reflection
 )  # fmt: skip
 """Every event, by its `what`."""
 
@@ -442,7 +458,7 @@ def drawn(seed: int, frames: int, count: int, kinds: Iterable[str] = KINDS) -> D
     return Disturbances(tuple(events))
 
 
-_LASTING: Final = (FrozenScreen, LampStep, AmbientStep, Defocus)
+_LASTING: Final = (FrozenScreen, LampStep, AmbientStep, Defocus, Reflection)
 """Events that do not end by themselves, beside a bump and what is gradual."""
 
 

@@ -11,13 +11,18 @@ Pure functions of frozen values; light is not treated here.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.world.room import Room
 from sim.world.wear import Fold
+
+_A0_DIAGONAL_MM: Final = math.hypot(1189, 841)
+"""Of a sheet of A0 (ISO 216)."""
 
 _NEWTON_STEPS = 6
 """An end to steps that do not converge; they stop earlier once every point is met within 10⁻⁷ px."""
@@ -48,7 +53,9 @@ class Waviness:
     page_mm: tuple[float, float]
 
     @classmethod
-    def random(cls, seed: int, peak_to_valley_mm: float, page_mm: tuple[float, float], modes: int = 7) -> Waviness:
+    def random(
+        cls, seed: int, peak_to_valley_mm: float, page_mm: tuple[float, float], modes: int = 7, wave_mm: float = 0.0
+    ) -> Waviness:
         """Draw a surface whose highest and lowest points lie `peak_to_valley_mm` apart.
 
         Parameters
@@ -61,11 +68,17 @@ class Waviness:
             Width and height of the page.
         modes
             Number of waves; up to 3 cycles along the longer side of the page, weaker the shorter they are.
+        wave_mm
+            The waves' length, within 15 %, in any direction; 0 for those long ones.
         """
         random = np.random.default_rng([seed, 0x77617679])
         longer = max(page_mm)
         cycles = random.uniform(-3, 3, (modes, 2)) * np.array(page_mm) / longer
         amplitudes = random.uniform(0.5, 1, modes) / (0.5 + np.hypot(cycles[:, 0], cycles[:, 1]))
+        if wave_mm:
+            length, direction = wave_mm * random.uniform(0.85, 1.15, modes), random.uniform(0, np.pi, modes)
+            cycles = np.column_stack([np.cos(direction), np.sin(direction)]) * np.array(page_mm) / length[:, None]
+            amplitudes = random.uniform(0.5, 1, modes)
         shape = cls(cycles, random.uniform(0, 2 * np.pi, modes), amplitudes, page_mm)
         x, y = np.meshgrid(np.linspace(0, page_mm[0], 201), np.linspace(0, page_mm[1], 201))
         extent = float(np.ptp(shape.height(np.stack([x, y], axis=-1))))
@@ -108,6 +121,41 @@ class Folded:
     def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the height (...) in mm, towards the camera, of points (..., 2) mm on the print, or off the page."""
         return self.surface.height(points_mm) + self.fold.height(points_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class Curled:
+    """A surface whose left and right edges stand off its middle: a cylinder, to second order a parabola.
+
+    Attributes
+    ----------
+    surface
+        What it is without the curl.
+    curl_mm
+        Height of both edges above the middle, towards the camera.
+    """
+
+    surface: Surface
+    curl_mm: float
+
+    @property
+    def page_mm(self) -> tuple[float, float]:
+        """Width and height of the page."""
+        return self.surface.page_mm
+
+    def height(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the height (...) in mm, towards the camera, of points (..., 2) mm on the print, or off the page."""
+        across = 2 * points_mm[..., 0] / self.page_mm[0] - 1
+        return self.surface.height(points_mm) + self.curl_mm * across**2
+
+
+def surface_of(room: Room, page_mm: tuple[float, float], fold: Fold | None) -> Surface:
+    """Return the shape of a room's sheet; waves and curl shrink with its size."""
+    size = math.hypot(*page_mm) / _A0_DIAGONAL_MM
+    surface: Surface = Waviness.random(room.seed, room.waviness_mm * size, page_mm, wave_mm=room.wave_mm * size)
+    if room.curl_mm:
+        surface = Curled(surface, room.curl_mm * size)
+    return surface if fold is None else Folded(surface, fold)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from foundation.colorimetry.observer import observer_cie_1931
 from foundation.srgb import decode_srgb
+from sim.spectral.published import published_spectra
 from sim.world.spectra import WAVELENGTHS_NM, YULE_NIELSEN_N, PaperName, ink_coverage, paper, print_reflectance
 
 ProfileName = Literal["unmanaged", "managed"]
@@ -109,11 +111,10 @@ def relative_lab(reflectance: NDArray[np.float64], on: PaperName = "poster") -> 
 @cache
 def _observer() -> _Array:
     """Return (81, 3): CIE 1931 colour-matching functions times D50."""
-    import colour
-
-    shape = colour.SpectralShape(float(WAVELENGTHS_NM[0]), float(WAVELENGTHS_NM[-1]), 5)
-    matching = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape).values
-    return np.asarray(matching * colour.SDS_ILLUMINANTS["D50"].copy().align(shape).values[:, None], dtype=np.float64)
+    wavelengths, functions = observer_cie_1931()
+    light = published_spectra()["D50"]
+    matching = functions[np.searchsorted(wavelengths, WAVELENGTHS_NM)]
+    return matching * light.power[np.searchsorted(light.wavelengths_nm, WAVELENGTHS_NM), None]
 
 
 def _lab(xyz: _Array) -> _Array:

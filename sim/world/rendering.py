@@ -113,7 +113,8 @@ def light(
     first_row
         Row of the visible frame that `out` begins with.
     nodes
-        (ny, nx, 2) float64, the place on the print in mm, of photosite (16 (i − 1), 16 (j − 1)) at [j, i].
+        (1 or 3, ny, nx, 2) float64, the place on the print in mm, of photosite (16 (i − 1), 16 (j − 1)) at [j, i]: one
+        for all camera channels, or one for each.
     sigma_px
         Blur and aperture, photosites.
     x_lines, y_lines
@@ -134,50 +135,56 @@ def light(
         (3, rows, columns) float32, written: signal under each primary, DN.
     """
     rows, columns = out.shape[1], out.shape[2]
-    node_columns = nodes.shape[1]
+    views, node_columns = nodes.shape[0], nodes.shape[2]
     across = np.empty((GRID_PX, 4))
     for k in range(GRID_PX):
         _cubic(k / GRID_PX, across[k])
     down = np.empty(4)
-    u_row = np.empty(node_columns)
-    v_row = np.empty(node_columns)
-    u_down = np.empty(node_columns)
-    v_down = np.empty(node_columns)
+    u_row = np.empty((views, node_columns))
+    v_row = np.empty((views, node_columns))
+    u_down = np.empty((views, node_columns))
+    v_down = np.empty((views, node_columns))
+    u_sigmas = np.empty(views)
+    v_sigmas = np.empty(views)
     u_share = np.empty(labels.shape[1])
     v_share = np.empty(labels.shape[0])
     for row in range(rows):
         y = first_row + row
         node_y = y // GRID_PX
         _cubic((y - node_y * GRID_PX) / GRID_PX, down)
-        for c in range(node_columns):
-            u_row[c] = (
-                down[0] * nodes[node_y, c, 0]
-                + down[1] * nodes[node_y + 1, c, 0]
-                + down[2] * nodes[node_y + 2, c, 0]
-                + down[3] * nodes[node_y + 3, c, 0]
-            )
-            v_row[c] = (
-                down[0] * nodes[node_y, c, 1]
-                + down[1] * nodes[node_y + 1, c, 1]
-                + down[2] * nodes[node_y + 2, c, 1]
-                + down[3] * nodes[node_y + 3, c, 1]
-            )
-            u_down[c] = (nodes[node_y + 2, c, 0] - nodes[node_y + 1, c, 0]) / GRID_PX
-            v_down[c] = (nodes[node_y + 2, c, 1] - nodes[node_y + 1, c, 1]) / GRID_PX
+        for s in range(views):
+            for c in range(node_columns):
+                u_row[s, c] = (
+                    down[0] * nodes[s, node_y, c, 0]
+                    + down[1] * nodes[s, node_y + 1, c, 0]
+                    + down[2] * nodes[s, node_y + 2, c, 0]
+                    + down[3] * nodes[s, node_y + 3, c, 0]
+                )
+                v_row[s, c] = (
+                    down[0] * nodes[s, node_y, c, 1]
+                    + down[1] * nodes[s, node_y + 1, c, 1]
+                    + down[2] * nodes[s, node_y + 2, c, 1]
+                    + down[3] * nodes[s, node_y + 3, c, 1]
+                )
+                u_down[s, c] = (nodes[s, node_y + 2, c, 0] - nodes[s, node_y + 1, c, 0]) / GRID_PX
+                v_down[s, c] = (nodes[s, node_y + 2, c, 1] - nodes[s, node_y + 1, c, 1]) / GRID_PX
         i, j = 0, 0
         for start in range(0, columns, GRID_PX):
             c = start // GRID_PX + 1
-            u_across = (u_row[c + 1] - u_row[c]) / GRID_PX
-            v_across = (v_row[c + 1] - v_row[c]) / GRID_PX
-            u_sigma = sigma_px * math.sqrt(u_across * u_across + u_down[c] * u_down[c])
-            v_sigma = sigma_px * math.sqrt(v_across * v_across + v_down[c] * v_down[c])
+            for s in range(views):
+                u_across = (u_row[s, c + 1] - u_row[s, c]) / GRID_PX
+                v_across = (v_row[s, c + 1] - v_row[s, c]) / GRID_PX
+                u_sigmas[s] = sigma_px * math.sqrt(u_across * u_across + u_down[s, c] * u_down[s, c])
+                v_sigmas[s] = sigma_px * math.sqrt(v_across * v_across + v_down[s, c] * v_down[s, c])
             for x in range(start, min(start + GRID_PX, columns)):
                 w = across[x - start]
-                u = w[0] * u_row[c - 1] + w[1] * u_row[c] + w[2] * u_row[c + 1] + w[3] * u_row[c + 2]
-                v = w[0] * v_row[c - 1] + w[1] * v_row[c] + w[2] * v_row[c + 1] + w[3] * v_row[c + 2]
+                channel = channels[y & 1, x & 1]
+                s = channel if views > 1 else 0
+                u_sigma, v_sigma = u_sigmas[s], v_sigmas[s]
+                u = w[0] * u_row[s, c - 1] + w[1] * u_row[s, c] + w[2] * u_row[s, c + 1] + w[3] * u_row[s, c + 2]
+                v = w[0] * v_row[s, c - 1] + w[1] * v_row[s, c] + w[2] * v_row[s, c + 1] + w[3] * v_row[s, c + 2]
                 i, i1 = _reached(x_lines, u, REACH * u_sigma, i)
                 j, j1 = _reached(y_lines, v, REACH * v_sigma, j)
-                channel = channels[y & 1, x & 1]
                 label = labels[j, i]
                 red, green, blue = signals[label, channel, 0], signals[label, channel, 1], signals[label, channel, 2]
                 if not _alike(labels, i, i1, j, j1):

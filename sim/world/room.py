@@ -40,8 +40,22 @@ class Room:
     waviness_mm
         Peak-to-valley height of the paper's surface on an A0 sheet; on another in proportion to its diagonal, so that
         small charts look like large ones.
+    wave_mm
+        Wavelength of the paper's waves on an A0 sheet, in proportion as above: short ones, as paper gets in damp air;
+        150 is plausible. 0: long ones, up to three over the sheet's longer side.
+    curl_mm
+        How far the sheet's left and right edges stand off its middle, towards the camera, as paper from a roll does; on
+        an A0 sheet, in proportion as above. Negative: away from the camera.
     blur_px
         Standard deviation of the lens's blur, half-size pixels; the photosite's aperture is added to it.
+    shoulder_share, shoulder_px
+        Share of the light that lies in the wide part of the lens's point spread, and that part's standard deviation
+        along each axis, half-size pixels: an exponential (`sim.optics.photographic_lens`, with the MTF and two lenses).
+    veil
+        Veiling glare: share of the frame's mean light, backdrop included, that lies evenly on all of it.
+    lateral_red_px, lateral_blue_px
+        Lateral chromatic aberration: how far out the channel sees the frame's corner against green, half-size pixels;
+        towards the axis it falls off as `sim.optics.photographic_lens` says. Negative: inwards.
     vignetting
         Share of the light that the lens loses at the frame's corner.
     projector_falloff
@@ -101,7 +115,14 @@ class Room:
     p1: float = 2e-4
     p2: float = -3e-4
     waviness_mm: float = 3.0
+    wave_mm: float = 0.0
+    curl_mm: float = 0.0
     blur_px: float = 0.5
+    shoulder_share: float = 0.0
+    shoulder_px: float = 3.0
+    veil: float = 0.0
+    lateral_red_px: float = 0.0
+    lateral_blue_px: float = 0.0
     vignetting: float = 0.25
     projector_falloff: float = 0.15
     primary_difference: float = 0.1
@@ -127,18 +148,39 @@ class Room:
         share = codes / 255
         return decode_srgb(share) if self.transfer == "srgb" else share**self.transfer
 
+    def wheel_light(self, shutter_s: float, random: np.random.Generator) -> NDArray[np.float64]:
+        """Return (3,) float64, the light of each primary that the wheel lets through over that of steady light.
+
+        Parameters
+        ----------
+        shutter_s
+            Exposure time, seconds.
+        random
+            Decides where the wheel stands when the shutter opens, and the shutter's jitter.
+        """
+        if self.wheel_hz == 0:
+            return np.ones(3)
+        start = random.uniform()
+        time = max(shutter_s + self.shutter_jitter_s * random.standard_normal(), 0)
+        turns = np.array([start, start + time * self.wheel_hz])[:, None]
+        segment = np.arange(3) / 3
+        shone = np.floor(turns) / 3 + np.clip(turns - np.floor(turns) - segment, 0, 1 / 3)
+        return 3 * (shone[1] - shone[0]) / (shutter_s * self.wheel_hz)
+
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; 0 or more is expected")
-        for name in ("fill", "focal_diagonals", "white_level_share"):
+        for name in ("fill", "focal_diagonals", "white_level_share", "shoulder_px"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; more than 0 is expected")
-        for name in ("vignetting", "projector_falloff", "black_leak", "ambient", "stain_depth"):
+        for name in (
+            "vignetting", "projector_falloff", "black_leak", "ambient", "stain_depth", "shoulder_share", "veil",
+        ):  # fmt: skip
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 … below 1 is expected")
         for name in (
-            "waviness_mm", "blur_px", "response_spread", "primary_difference", "wheel_hz", "shutter_jitter_s",
-            "stain_mm", "fold_mm", "hot_per_million", "hot_dn_per_s",
+            "waviness_mm", "wave_mm", "blur_px", "response_spread", "primary_difference", "wheel_hz",
+            "shutter_jitter_s", "stain_mm", "fold_mm", "hot_per_million", "hot_dn_per_s",
         ):  # fmt: skip
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; 0 or more is expected")

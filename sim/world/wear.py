@@ -7,10 +7,17 @@ the light or away from it. Pure functions of places on the print, millimetres fr
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sim.world.room import Room
+
+_SLANT: Final = 0.36
+"""Tangent of 20°: a projector beside the camera."""
 
 RIM_MM = 1.0
 """Over which a stain's edge fades."""
@@ -83,3 +90,16 @@ class Fold:
         away = self._away(points_mm)
         slope = -self.height(points_mm) * away / np.hypot(away, ROUND_MM) / FLANK_MM
         return 1 + self.slant * slope
+
+
+def worn(room: Room, page_mm: tuple[float, float], random: np.random.Generator) -> tuple[Stain | None, Fold | None]:
+    """Return a room's stain and fold, somewhere on a sheet of a size, clear of its edges; None where it has none."""
+    page = np.array(page_mm)
+    x, y = (page * random.uniform(0.25, 0.75, 2)).tolist()
+    taken = room.stain_depth * np.array([0.3, 0.6, 1.0])
+    red, green, blue = (1 - taken).tolist()
+    stain = Stain((x, y), room.stain_mm, (red, green, blue)) if room.stain_mm else None
+    along = math.radians(random.uniform(-6, 6))
+    crease = float(page[0] * random.uniform(0.3, 0.7)), float(page[1] / 2)
+    direction = math.sin(along), math.cos(along)
+    return stain, Fold(crease, direction, room.fold_mm, _SLANT) if room.fold_mm else None

@@ -5,7 +5,8 @@ rendered once for each primary alone (`_render`), and a frame is their weighted 
 
 - the same print, body, room, colour, settings and key give the same counts, on any number of threads;
 - every frame's noise depends on the room's seed and the key alone;
-- `project`, `white`, `reflected` and `field` are the truth that the counts were made from, for tests to compare with.
+- `project`, `white`, `reflected`, `seen` and `field` are the truth that the counts were made from, for tests to compare
+  with. They are the print's and the light's, without point spread and veil: what a perfect table would hold.
 
 Signal = ∫ primary × reflectance × sensitivity dλ, scaled so that bare paper under full white gives
 `Room.white_level_share` of the body's range in its strongest channel at 0.5 s, f/8, ISO 100.
@@ -14,7 +15,6 @@ Millimetres on the print; half-size pixels unless said; DN are raw counts above 
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -27,14 +27,16 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from foundation.processors import processor_count
+from sim.optics.falloff import lens_falloff, projector_falloff
+from sim.optics.photographic_lens import APERTURE_VARIANCE, PhotographicLens
 from sim.world.drawing import PAPER, Print, label_map
-from sim.world.geometry import Folded, View, Waviness
+from sim.world.geometry import View, surface_of
 from sim.world.profile import printed_reflectance
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import Body, HotPattern
-from sim.world.situation import UNDISTURBED, Situation, moved_back
+from sim.world.situation import UNDISTURBED, Situation, moved, moved_back
 from sim.world.spectra import projector_primaries, sensitivities
-from sim.world.wear import Fold, Stain
+from sim.world.wear import worn
 
 _BACKDROP_REFLECTANCE: Final = 0.04
 """Of what lies behind the print, at every wavelength: dark, as a backdrop should be."""
@@ -43,12 +45,6 @@ _BLOCK_ROWS: Final = 64
 """Rows that one thread works at. Noise is drawn block by block, so that another number gives other frames."""
 
 _CHANNELS: Final = "RGB"
-
-_A0_DIAGONAL_MM: Final = math.hypot(1189, 841)
-"""Of a sheet of A0 (ISO 216)."""
-
-_SLANT: Final = 0.36
-"""Tangent of 20°: a projector beside the camera."""
 
 
 class World:
@@ -62,27 +58,30 @@ class World:
         self.body = body
         self.room = room
         rows, columns = body.half_size
-        self.stain, self.fold = self._wear()
-        surface = Waviness.random(
-            room.seed, room.waviness_mm * math.hypot(*sheet.page_mm) / _A0_DIAGONAL_MM, sheet.page_mm
-        )
+        self.stain, self.fold = worn(room, sheet.page_mm, self._random(5))
         self.view = View.framed(
-            surface if self.fold is None else Folded(surface, self.fold),
+            surface_of(room, sheet.page_mm, self.fold),
             (columns, rows),
             fill=room.fill,
             focal_diagonals=room.focal_diagonals,
             turn_deg=(room.tilt_deg, room.pan_deg, room.roll_deg),
             distortion=(room.k1, room.k2, room.p1, room.p2),
         )
+        shoulders = room.shoulder_share, room.shoulder_px
+        self.lens = PhotographicLens(body.half_size, *shoulders, room.veil, room.lateral_red_px, room.lateral_blue_px)
         self._primaries = projector_primaries(room.lamp_spectrum)
         self._sensitivities = sensitivities(body.sensitivities)
         paper = np.einsum("pl,l,lc->c", self._primaries, self._reflectance([PAPER])[0], self._sensitivities)
         self._dn = room.white_level_share * (body.saturation - body.black) / float(paper.max())
-        self._lens, self._falloff = self._shading()
+        axis = 2 * self.view.centre_px[0] + 0.5, 2 * self.view.centre_px[1] + 0.5
+        self._vignetting = lens_falloff(axis, (body.visible.width, body.visible.height), room.vignetting)
+        self._falloff = projector_falloff(
+            sheet.page_mm, room.projector_falloff, room.primary_difference, self._random(2)
+        )
         self._falloff[:, 3] = self._balance()
         self.hot = HotPattern.drawn(self._random(6), body.sensor, room.hot_per_million, room.hot_dn_per_s)
         self._lock = threading.Lock()
-        self._rendered: dict[tuple[float, ...], NDArray[np.float32]] = {}
+        self._rendered: dict[tuple[float, ...], tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
 
     def expose(
         self,
@@ -115,9 +114,10 @@ class World:
         """
         from sim.world.rendering import counts
 
-        of_lamp = lamp * self._turned(settings, key) * np.array(situation.lamp)
+        body, room = self.body, self.room
+        of_lamp = lamp * room.wheel_light(settings.shutter_s, self._random(4, *key)) * np.array(situation.lamp)
         light, weights = self._lighting(colour, settings, of_lamp, situation)
-        body, visible = self.body, self.body.visible
+        visible = body.visible
         black = body.black + situation.black_dn
         noise_dn, gain_e = body.noise_dn(settings.iso), body.gain_e(settings.iso)
         frame = np.empty(body.sensor, dtype=np.uint16)
@@ -157,7 +157,7 @@ class World:
         self, colour: Colour, settings: ExposureSettings, lamp: NDArray[np.float64], situation: Situation
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return light (3, rows, columns) on the photosites and weights (3,), whose product is a frame's signal."""
-        light, ambient = self._render(situation), np.array(situation.ambient)
+        (light, veil), ambient = self._render(situation), np.array(situation.ambient)
         plain = self.decoded(colour) if situation.picture is None else situation.picture[0, 0].astype(np.float64)
         if situation.is_even:
             return light, self._collected(plain, settings, lamp, ambient).astype(np.float32)
@@ -168,21 +168,38 @@ class World:
             points = self._points(nodes, first, last)
             shown = self._collected(situation.shown(points, page, plain, self.decoded), settings, lamp, ambient)
             shown *= situation.passed(points, page)[..., None]
-            falling[:, first:last] = light[:, first:last] * shown.transpose(2, 0, 1)
+            there = self.lens.unveiled(light[:, first:last], veil, first)
+            if situation.glares:
+                there = there + self._mirrored(points, situation, first)
+            falling[:, first:last] = there * shown.transpose(2, 0, 1)
 
         _in_blocks(self.body.visible.height, block)
+        self.lens.veiled(falling, self.body.pattern)
         return falling, np.ones(3, dtype=np.float32)
+
+    def _mirrored(self, points: NDArray[np.float64], situation: Situation, first: int) -> NDArray[np.float32]:
+        """Return (3, rows, columns) float32: what photosites of rows from `first` on get by mirroring, as `_render`."""
+        row, column = np.mgrid[first : first + len(points), : points.shape[1]]
+        paper = self._signals(self._reflectance([PAPER]))[0][self._channels()[row % 2, column % 2]]
+        added = situation.mirrored(points, self.sheet.page_mm)[..., None] * self.field(points) * paper
+        return added.transpose(2, 0, 1).astype(np.float32)
+
+    def _channels(self) -> NDArray[np.int64]:
+        """Return (2, 2) int64: the camera channel of a photosite by the parity of its row and column."""
+        return np.array([_CHANNELS.index(letter) for letter in self.body.pattern], dtype=np.int64).reshape(2, 2)
 
     def decoded(self, colour: Colour) -> NDArray[np.float64]:
         """Return (3,) float64, 0 … 1: the light of each primary that a colour's codes stand for."""
-        return self.room.light_of(np.array([colour.red, colour.green, colour.blue]))
+        return self.room.light_of(np.array(colour.codes))
 
-    def signal(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float32]:
-        """Return what a frame would be without noise, black, hot photosites and clipping.
+    def signal(
+        self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0, situation: Situation = UNDISTURBED
+    ) -> NDArray[np.float32]:
+        """Return what a frame would be without noise, black, hot photosites and clipping, by a wheel's mean light.
 
         Parameters
         ----------
-        colour, settings, lamp
+        colour, settings, lamp, situation
             As for `expose`.
 
         Returns
@@ -190,12 +207,32 @@ class World:
         ndarray
             (rows, columns) float32, DN above black, of the body's visible photosites, their response included.
         """
-        drive = np.asarray(self.drive(colour, settings, lamp), dtype=np.float32)
-        return np.tensordot(drive, self._render(), 1)
+        light, drive = self._lighting(colour, settings, lamp * np.array(situation.lamp), situation)
+        return np.tensordot(drive, light, 1)
 
-    def project(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the half-size pixels where points of the print are seen: (..., 2) mm to (..., 2) px, x then y."""
-        return self.view.project(np.asarray(points_mm, dtype=np.float64))
+    def project(
+        self, points_mm: NDArray[np.float64], channel: str = "G", situation: Situation = UNDISTURBED
+    ) -> NDArray[np.float64]:
+        """Return the half-size pixels where points of the print are seen.
+
+        Parameters
+        ----------
+        points_mm
+            (..., 2) float64, millimetres.
+        channel
+            ``R``, ``G`` or ``B``: of the camera; they differ where the lens has lateral chromatic aberration.
+        situation
+            Where the chart has been moved to.
+
+        Returns
+        -------
+        ndarray
+            (..., 2) float64, x then y.
+        """
+        points = np.asarray(points_mm, dtype=np.float64)
+        if any(situation.view):
+            points = moved(points, np.array(self.sheet.page_mm) / 2, self._bumped(situation), situation.turn_deg)
+        return self.lens.shifted(self.view.project(points), channel)
 
     def white(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float64]:
         """Return (3,) float64: R, G, B of bare paper in DN above black, without clipping, where `field` is 1."""
@@ -332,24 +369,10 @@ class World:
         """
         points = np.asarray(points_mm, dtype=np.float64)
         photosites = 2 * self.project(points) + 0.5
-        from_axis = ((photosites - self._lens[:2]) ** 2).sum(axis=-1)
-        passed = 1 / (1 + self._lens[2] * from_axis) ** 2
+        from_axis = ((photosites - self._vignetting[:2]) ** 2).sum(axis=-1)
+        passed = 1 / (1 + self._vignetting[2] * from_axis) ** 2
         from_spot = ((points[..., None, :] - self._falloff[:, :2]) ** 2).sum(axis=-1)
         return passed[..., None] * self._falloff[:, 3] / (1 + self._falloff[:, 2] * from_spot)
-
-    def _shading(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the constants of the lens's and the projector's falloff, as `sim.world.rendering.light` takes them."""
-        room, visible = self.room, self.body.visible
-        axis = 2 * np.array(self.view.centre_px) + 0.5
-        corner2 = (visible.width**2 + visible.height**2) / 4
-        lens = np.array([*axis, ((1 - room.vignetting) ** -0.5 - 1) / corner2])
-        page = np.array(self.sheet.page_mm)
-        half_diagonal = float(np.hypot(*page)) / 2
-        random = self._random(2)
-        lost = room.projector_falloff * (1 + room.primary_difference * np.array([-1.0, 0.0, 1.0]))
-        aside = np.array([0.05, -0.1]) + room.primary_difference * random.uniform(-0.5, 0.5, (3, 2))
-        spots = page / 2 + half_diagonal * aside
-        return lens, np.column_stack([spots, lost / (1 - lost) / half_diagonal**2, np.ones(3)])
 
     def _balance(self) -> NDArray[np.float64]:
         """Return (3,) the gains of the primaries that give all three green's mean over the sheet."""
@@ -357,18 +380,6 @@ class World:
         x, y = np.meshgrid((np.arange(60) + 0.5) * width / 60, (np.arange(40) + 0.5) * height / 40)
         means = self.field(np.stack([x, y], axis=-1)).mean(axis=(0, 1))
         return means[1] / means
-
-    def _turned(self, settings: ExposureSettings, key: tuple[int, ...]) -> NDArray[np.float64]:
-        """Return (3,) the light of each primary that the wheel lets through, over that of steady light."""
-        if self.room.wheel_hz == 0:
-            return np.ones(3)
-        random = self._random(4, *key)
-        start = random.uniform()
-        time = max(settings.shutter_s + self.room.shutter_jitter_s * random.standard_normal(), 0)
-        turns = np.array([start, start + time * self.room.wheel_hz])[:, None]
-        segment = np.arange(3) / 3
-        shone = np.floor(turns) / 3 + np.clip(turns - np.floor(turns) - segment, 0, 1 / 3)
-        return 3 * (shone[1] - shone[0]) / (settings.shutter_s * self.room.wheel_hz)
 
     def _reflectance(self, rgb: ArrayLike) -> NDArray[np.float64]:
         """Return (N, 81): reflectance of the chart's codes (N, 3) on this print."""
@@ -382,10 +393,11 @@ class World:
     def _random(self, *key: int) -> np.random.Generator:
         return np.random.Generator(np.random.SFC64([self.room.seed, *key]))
 
-    def _render(self, situation: Situation = UNDISTURBED) -> NDArray[np.float32]:
-        """Return (3, rows, columns) float32: DN of the visible photosites under each primary alone.
+    def _render(self, situation: Situation = UNDISTURBED) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return (3, rows, columns) and (3, 2, 2) float32: DN of the visible photosites under each primary alone.
 
-        Kept are the undisturbed rendering and one other: a chart is bumped once, then it stays.
+        The second is the veil's part of it, by the parity of row and column. Kept are the undisturbed rendering and one
+        other: a chart is bumped once, then it stays.
         """
         with self._lock:
             if situation.view not in self._rendered:
@@ -394,44 +406,61 @@ class World:
                 self._rendered[situation.view] = self._lit(situation)
             return self._rendered[situation.view]
 
-    def _lit(self, situation: Situation) -> NDArray[np.float32]:
+    def _lit(self, situation: Situation) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         from sim.world.rendering import light
 
         visible, room = self.body.visible, self.room
-        drawing = label_map(self.sheet)
+        drawing, channels = label_map(self.sheet), self._channels()
         backdrop = np.full((1, len(self._sensitivities)), _BACKDROP_REFLECTANCE)
         reflectance = np.concatenate([self._reflectance(drawing.codes), backdrop])
         table = self._signals(reflectance).astype(np.float32)
         nodes = self._nodes(situation)
-        # A uniform aperture of one photosite has a variance of 1/12.
-        sigma = ((2 * room.blur_px) ** 2 + (2 * situation.defocus_px) ** 2 + 1 / 12) ** 0.5
-        channels = np.array([_CHANNELS.index(letter) for letter in self.body.pattern], dtype=np.int64).reshape(2, 2)
+        views = [nodes]
+        if self.lens.splits_colours:
+            views = [self._nodes(situation, channel) for channel in _CHANNELS]
+        sigma = ((2 * room.blur_px) ** 2 + (2 * situation.defocus_px) ** 2 + APERTURE_VARIANCE) ** 0.5
         out = np.empty((3, visible.height, visible.width), dtype=np.float32)
         # The projector stays where it is.
         falloff = self._falloff.copy()
         falloff[:, :2] = self._moved_back(falloff[:, :2], situation)
 
+        places, lines, spread = np.stack(views), (drawing.x_lines, drawing.y_lines), room.shoulder_share > 0
+
         def block(first: int, last: int) -> None:
-            response = self._random(3, first).standard_normal((last - first, visible.width), dtype=np.float32)
-            response *= np.float32(room.response_spread)
-            response += np.float32(1)
+            # Shoulders lie between the print and the photosites' response.
+            response = np.ones((last - first, visible.width), np.float32) if spread else self._response(first, last)
             if self.stain is not None or self.fold is not None:
                 response *= self._worn_rows(nodes, channels, first, last)
-            rows, lens = out[:, first:last], self._lens
-            lines = drawing.x_lines, drawing.y_lines
-            light(first, nodes, sigma, *lines, drawing.labels, table, channels, lens, falloff, response, rows)
+            rows, lens = out[:, first:last], self._vignetting
+            light(first, places, sigma, *lines, drawing.labels, table, channels, lens, falloff, response, rows)
+
+        def respond(first: int, last: int) -> None:
+            out[:, first:last] *= self._response(first, last)
 
         _in_blocks(visible.height, block)
-        return out
+        if spread:
+            self.lens.spread(out)
+            _in_blocks(visible.height, respond)
+        return out, self.lens.veiled(out, self.body.pattern)
+
+    def _response(self, first: int, last: int) -> NDArray[np.float32]:
+        """Return (rows, columns) float32, about 1: the response of the photosites of a block of rows."""
+        response = self._random(3, first).standard_normal((last - first, self.body.visible.width), dtype=np.float32)
+        response *= np.float32(self.room.response_spread)
+        response += np.float32(1)
+        return response
 
     def _moved_back(self, points_mm: NDArray[np.float64], situation: Situation) -> NDArray[np.float64]:
         """Return which points of the chart lie where, undisturbed, points (..., 2) mm of it lie."""
         if not any(situation.view):
             # Rounding would make other counts of the undisturbed chart, here and there one.
             return points_mm
+        return moved_back(points_mm, np.array(self.sheet.page_mm) / 2, self._bumped(situation), situation.turn_deg)
+
+    def _bumped(self, situation: Situation) -> NDArray[np.float64]:
+        """Return (2,) float64 mm, how far the chart has been pushed."""
         view = self.view
-        by = np.array(situation.bump_mm) + np.array(situation.bump_px) * (view.distance_mm / view.focal_px)
-        return moved_back(points_mm, np.array(self.sheet.page_mm) / 2, by, situation.turn_deg)
+        return np.array(situation.bump_mm) + np.array(situation.bump_px) * (view.distance_mm / view.focal_px)
 
     def _points(self, nodes: NDArray[np.float64], first: int, last: int) -> NDArray[np.float64]:
         """Return (rows, columns, 2) float64, mm: the places on the print that some rows of photosites see."""
@@ -452,26 +481,15 @@ class World:
         channel = channels[row % 2, column % 2]
         return np.take_along_axis(self.worn(points), channel[..., None], axis=-1)[..., 0].astype(np.float32)
 
-    def _wear(self) -> tuple[Stain | None, Fold | None]:
-        """Return the stain and the fold, somewhere on the sheet, clear of its edges."""
-        room, page, random = self.room, np.array(self.sheet.page_mm), self._random(5)
-        x, y = (page * random.uniform(0.25, 0.75, 2)).tolist()
-        taken = room.stain_depth * np.array([0.3, 0.6, 1.0])
-        red, green, blue = (1 - taken).tolist()
-        stain = Stain((x, y), room.stain_mm, (red, green, blue)) if room.stain_mm else None
-        along = math.radians(random.uniform(-6, 6))
-        crease = float(page[0] * random.uniform(0.3, 0.7)), float(page[1] / 2)
-        direction = math.sin(along), math.cos(along)
-        return stain, Fold(crease, direction, room.fold_mm, _SLANT) if room.fold_mm else None
-
-    def _nodes(self, situation: Situation) -> NDArray[np.float64]:
+    def _nodes(self, situation: Situation, channel: str = "G") -> NDArray[np.float64]:
         """Return (ny, nx, 2) float64: the place on the print of every 16th photosite, one node beyond on each side."""
         from sim.world.rendering import GRID_PX
 
         visible = self.body.visible
         y, x = (np.arange(-1, (size - 1) // GRID_PX + 3) * GRID_PX for size in (visible.height, visible.width))
         photosites = np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)
-        return self._moved_back(self.view.locate((photosites - 0.5) / 2), situation)
+        seen = self.lens.unshifted((photosites - 0.5) / 2, channel)
+        return self._moved_back(self.view.locate(seen), situation)
 
 
 def _in_blocks(rows: int, work: Callable[[int, int], None]) -> None:

@@ -38,6 +38,7 @@ from evaluation.datasets.raw_scene import Mask, RawScene, polygon_mask
 from evaluation.datasets.truths import Light, check_light, read_text
 from evaluation.scene import Image, Scene, SceneSet
 from foundation.errors import FormatError, InputError, first_of
+from generator.files.formats import decode_array
 
 _SONY: Final = (128.0, 4095.0)
 """Black level and saturation of Sony's .tiff files (1_make_mixture_map.py)."""
@@ -377,10 +378,8 @@ def _by_place(folder: Folder) -> dict[str, list[tuple[str, str]]]:
 
 def _read_mask(path: str, shape: tuple[int, int]) -> Mask:
     """Return (H, W) bool, True where a picture of one channel is 0."""
-    import imagecodecs
-
     try:
-        picture = np.asarray(imagecodecs.png_decode(Path(path).read_bytes()))
+        picture = decode_array(Path(path).read_bytes(), "png")
     except Exception as error:
         raise FormatError(f"{path} cannot be read: {error}; make it again with 2_preprocess_data.py") from error
     if picture.shape != shape:

@@ -115,7 +115,7 @@ def _by_dask(
     try:
         from distributed import KilledWorker, as_completed
     except ImportError as error:
-        raise InputError("the engine dask needs Dask; install it with: pip install croplab[cluster]") from error
+        raise InputError("the engine dask needs Dask; install it with: pip install dask distributed") from error
 
     attempts = dict.fromkeys(shards, 0)
     waiting: Iterator[int] = iter(shards)

@@ -253,7 +253,7 @@ def light_of(lut: Lut, light: int) -> Light:
         illumination=light,
         kind=shown.kind,
         cct_k=shown.cct_k,
-        codes=(shown.colour.red, shown.colour.green, shown.colour.blue),
+        codes=shown.colour.codes,
         white=(red, green, blue),
         name=shown.name,
     )

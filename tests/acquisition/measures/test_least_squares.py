@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acquisition.measures.least_squares import least_squares, linear_combinations, robust_least_squares
+from acquisition.measures.least_squares import (
+    held_out_squares,
+    least_squares,
+    linear_combinations,
+    robust_least_squares,
+)
 
 
 @pytest.mark.parametrize("unknowns", [1, 3, 10, 28])
@@ -53,3 +58,21 @@ def test_terms_are_combined_point_by_point() -> None:
     basis, factors = random.random((28, 5000)), random.random((3, 28))
     factors[1, 5:] = 0
     assert linear_combinations(basis, factors) == pytest.approx(factors @ basis, rel=1e-12)
+
+
+def test_errors_at_points_left_out_are_those_of_fits_without_them() -> None:
+    random = np.random.default_rng(6)
+    design, weights = random.uniform(-1, 1, (30, 6)), random.uniform(0, 1, 30)
+    weights[3] = 0
+    values = design @ random.uniform(-1, 1, 6) + random.normal(0, 0.3, 30)
+    counts = (1, 3, 4, 6)
+    plain: list[float] = []
+    for count in counts:
+        root, squares = np.sqrt(weights)[:, None], 0.0
+        for left_out in np.flatnonzero(weights):
+            others = np.arange(30) != left_out
+            rooted = (design[:, :count] * root)[others]
+            solution = np.asarray(np.linalg.lstsq(rooted, (values * root[:, 0])[others])[0], dtype=np.float64)
+            squares += float(weights[left_out] * (values[left_out] - design[left_out, :count] @ solution) ** 2)
+        plain.append(squares / weights.sum())
+    assert held_out_squares(design, values, weights, counts) == pytest.approx(plain, rel=1e-6)

@@ -73,7 +73,7 @@ def test_a_flickering_lamp_is_no_wrong_name() -> None:
 def test_light_added_where_primaries_overlap_is_no_wrong_name() -> None:
     """A wheel of six segments, or a white boost: yellow is brighter than red and green."""
     white = whites(Room())
-    linear = decode_srgb(np.array([[c.colour.red, c.colour.green, c.colour.blue] for c in PLAN]) / 255)
+    linear = decode_srgb(np.array([c.codes for c in PLAN]) / 255)
     full = white.max(axis=0)
     for one, other in ((0, 1), (1, 2), (0, 2)):
         segment = np.minimum(linear[:, one], linear[:, other])[:, None]
@@ -87,7 +87,7 @@ def shifted(count: int) -> npt.NDArray[np.int64]:
 
 
 def shifted_but_for_primaries(count: int) -> npt.NDArray[np.int64]:
-    alone = [np.count_nonzero([light.colour.red, light.colour.green, light.colour.blue]) == 1 for light in PLAN]
+    alone = [np.count_nonzero(light.codes) == 1 for light in PLAN]
     return np.where(alone, np.arange(count), shifted(count))
 
 

@@ -715,3 +715,12 @@ def test_a_wrong_password_over_loopback() -> None:
         projector = PjLinkProjector(lambda: TcpLink.connect(*server.address, 10.0), "guess", 10.0)
         with pytest.raises(DeviceRefused, match="refuses the password"):
             projector.power()
+
+
+def test_what_is_logged_has_neither_password_nor_digest(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("DEBUG")
+    script = Script(b"PJLINK 1 498e4a67\r", DIGEST + b"%1POWR ?\r", b"%1POWR=1\r")
+    assert driver(script, password=PASSWORD).power() is Power.ON
+    assert "POWR ?: " in caplog.text
+    assert PASSWORD not in caplog.text
+    assert DIGEST.decode("ascii") not in caplog.text

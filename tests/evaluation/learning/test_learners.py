@@ -26,7 +26,7 @@ LEARNERS = {key: learner for key, learner in standard_learners().items() if key 
 @pytest.fixture(scope="module", params=LEARNERS)
 def learner(request: pytest.FixtureRequest) -> FeatureLearner:
     if request.param == "convnet":
-        pytest.importorskip("torch", reason="PyTorch is not installed: pip install 'croplab[torch]'")
+        pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
     return LEARNERS[request.param]
 
 

@@ -187,13 +187,14 @@ def test_counts_of_the_largest_working_size_are_not_cut(learner: type[KernelRidg
 
 
 @pytest.mark.parametrize(
-    ("learner", "module", "extra"), [(RegressionTrees(), "sklearn", "learn"), (ConvNet(), "torch", "torch")]
+    ("learner", "module", "package"),
+    [(RegressionTrees(), "sklearn", "scikit-learn"), (ConvNet(), "torch", "torch")],
 )
 def test_what_is_not_installed_is_named_with_its_remedy(
-    learner: FeatureLearner, module: str, extra: str, monkeypatch: pytest.MonkeyPatch
+    learner: FeatureLearner, module: str, package: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=rf"needs {module}, which is not installed: pip install 'croplab\[{extra}\]'"):
+    with pytest.raises(InputError, match=f"needs {module}, which is not installed: pip install {package}"):
         learner.fit(world(3))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+import sys
 import zlib
 from pathlib import Path
 
@@ -31,6 +32,8 @@ from generator.files.formats import (
     libraries_of,
     suffix_of,
 )
+from generator.files.png import decode_png
+from generator.files.tiff import decode_tiff
 
 METADATA = ImageMetadata(white_level=11536, white=(2046.0, 1579.5, 4520.0), camera="Canon EOS 550D")
 WHOLE: tuple[Format, ...] = ("png", "tiff", "exr", "jxl")
@@ -215,3 +218,44 @@ def test_a_preview_is_a_jpeg_of_the_right_colour(tmp_path: Path) -> None:
     assert stream is not None
     assert stream.format_name() == "jpeg"
     assert np.abs(np.asarray(stream.read_image("uint8")).reshape(-1, 3) - [200.0, 100, 50]).max() <= 3
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("planes", [False, True])
+@pytest.mark.parametrize("compression", [None, "zlib"])
+def test_any_tiff_is_read_as_it_stands_or_not_at_all(
+    dtype: type[np.generic], planes: bool, compression: str | None
+) -> None:
+    image = noisy(30, 40).astype(dtype)
+    stream = io.BytesIO()
+    stored, config = (image.transpose(2, 0, 1), "separate") if planes else (image, "contig")
+    tifffile.imwrite(stream, stored, photometric="rgb", planarconfig=config, compression=compression)
+    found = decode_tiff(stream.getvalue())
+    assert found.dtype == image.dtype
+    np.testing.assert_array_equal(found, image)
+    with pytest.raises(Exception):  # noqa: B017, PT011  # whatever the reader says
+        decode_tiff(stream.getvalue()[: stream.tell() // 2])
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_any_png_is_read_as_it_stands_or_not_at_all(channels: int, dtype: type[np.unsignedinteger]) -> None:
+    image = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, (20, 31, channels), dtype=dtype)
+    image = image[..., 0] if channels == 1 else image
+    data = bytes(imagecodecs.png_encode(image))
+    np.testing.assert_array_equal(decode_png(data), image)
+    for damaged in (data[: len(data) // 2], data[:-20], data[:60] + b"\x99" + data[61:], b"", b"GIF89a"):
+        with pytest.raises(ValueError, match="no whole PNG"):
+            decode_png(damaged)
+
+
+def test_jpeg_xl_names_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = encode_image(noisy(4, 5), "jxl", METADATA)
+    monkeypatch.setitem(sys.modules, "imagecodecs", None)
+    for attempt in (
+        lambda: libraries_of("jxl"),
+        lambda: encode_image(noisy(4, 5), "jxl", METADATA),
+        lambda: decode_image(data, "jxl", "image.jxl"),
+    ):
+        with pytest.raises(InputError, match="pip install imagecodecs"):
+            attempt()

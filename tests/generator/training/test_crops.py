@@ -208,7 +208,7 @@ except ImportError as error:
 
 def test_pytorch_that_is_missing_is_an_import_error_and_named() -> None:
     done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH], capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr) == ("training batches for PyTorch need it: pip install 'croplab[torch]'\n", "")
+    assert (done.stdout, done.stderr) == ("training batches for PyTorch need it: pip install torch\n", "")
 
 
 def test_crops_by_colour_are_windows_of_the_image_that_is_rendered_so(

@@ -14,7 +14,7 @@ from generator.training.crops import Crops
 from generator.training.gallery import gallery_of
 from tests.generator.conftest import MakeLut
 
-torch: Any = pytest.importorskip("torch", reason="PyTorch is not installed: pip install 'croplab[torch]'")
+torch: Any = pytest.importorskip("torch", reason="PyTorch is not installed: pip install torch")
 batches: Any = pytest.importorskip("generator.training.torch_crops")
 CropDataset, CropStream, collated = batches.CropDataset, batches.CropStream, batches.collated
 

@@ -31,6 +31,7 @@ from sim.world.disturbances import (
     Moment,
     Person,
     PopUp,
+    Reflection,
     ScrambledRows,
     SensorWarming,
     StaleFile,
@@ -305,3 +306,16 @@ def test_what_a_real_screen_does_itself_is_not_pretended() -> None:
         with pytest.raises(ConfigurationError, match=f"--event: {event.what} is for the simulated screen"):
             Disturbances((Bump(px=1.0), event)).require_unshown("--event")
     Disturbances((Bump(px=1.0), Person())).require_unshown("--event")
+
+
+def test_a_reflection_adds_a_share_of_papers_light_whatever_is_printed() -> None:
+    """In the middle of its spot 5 % of what paper sends, at 1 / e² of that on its rim, on black ink as on paper."""
+    quiet = replace(TEST, read_noise_dn=0.01, sensor_noise_e=0.0, electrons_per_dn=1e6)
+    black = Print(PAGE_MM, np.array([[0.0, 0.0, PAGE_MM[0] / 2, PAGE_MM[1]]]), np.zeros((1, 3), dtype=np.uint8))
+    world = World(black, quiet, STRAIGHT)
+    glare = Reflection(place=(0.1, 0.2, 0.9, 0.8), percent=5)
+    for colour in (WHITE, RED):
+        added = taken(world, glare, colour=colour) - taken(world, colour=colour)
+        white = world.white(colour, REFERENCE_EXPOSURE)
+        for place, share in (((0.49, 0.5), 0.05), ((0.51, 0.5), 0.05), ((0.9, 0.5), 0.05 / np.e**2)):
+            np.testing.assert_allclose(at(world, *place, added), share * white, rtol=0.02, atol=1.5)

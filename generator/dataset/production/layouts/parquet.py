@@ -37,8 +37,9 @@ _GROUP_ROWS: Final = 64
 """Rows of a group at most: small images stay quick to reach too."""
 
 _MOST_THRIFT_BYTES: Final = 64 << 20
+"""Longest text in the description of a shard, of which the longest of ours are a few kilobytes."""
 _MOST_THRIFT_ITEMS: Final = 1 << 20
-"""What the description of a shard may hold: it is a few kilobytes, with a schema of some hundred characters."""
+"""Things that a list in it may hold: ours hold columns and groups, some hundred."""
 _MOST_ROWS: Final = 1 << 16
 """Rows of a group that is read: a thousand times those that are written."""
 
@@ -59,7 +60,7 @@ def require_pyarrow() -> None:
         It is not.
     """
     if find_spec("pyarrow") is None:
-        raise InputError("the layout parquet needs pyarrow; install it with: pip install croplab[parquet]")
+        raise InputError("the layout parquet needs pyarrow; install it with: pip install pyarrow")
 
 
 def schema(previews: bool, maps: bool, details: bool) -> pa.Schema:

@@ -270,7 +270,7 @@ def test_the_layout_parquet_says_what_it_needs(make: Make, monkeypatch: pytest.M
         del name
 
     monkeypatch.setattr("generator.dataset.production.layouts.parquet.find_spec", find_spec)
-    with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install croplab\[parquet\]"):
+    with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install pyarrow"):
         make("parquet")
 
 

@@ -1,0 +1,1 @@
+"""Light as the CIE's standard observer sees it."""

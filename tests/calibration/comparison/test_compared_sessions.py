@@ -1,0 +1,61 @@
+"""Sessions of the simulated lab compared, from raw frames on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from acquisition.session.folder import Session
+from calibration.cli import main
+from calibration.comparison.comparing import compare
+from calibration.comparison.sources import table_of
+from calibration.pipeline.build import build
+from calibration.pipeline.options import BuildOptions
+from sim.world.room import Room
+from tests.calibration.lab import LIGHTS, Lab, hang, take
+
+
+@pytest.fixture(scope="module")
+def folders(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Return a session in the room of `lab`, and one of another day: another sheet, other noise, a dimmer lamp."""
+    place = tmp_path_factory.mktemp("compared")
+    again = hang(room=Room(seed=7, waviness_mm=0.5, roll_deg=0.6, white_level_share=0.69))
+    for name, room in (("monday", lab), ("friday", again)):
+        take(room, place / name, LIGHTS, every=6).close()
+    return place / "monday", place / "friday"
+
+
+def test_two_days_differ_in_brightness_alone(
+    folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "report"
+    assert main(["--compare", *map(str, folders), "--json", "--out", str(out)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [each["same_within_noise"] for each in document["answers"]] == [True, False, True]
+    assert document["gains"] == pytest.approx([0.69 / 0.7] * 3, abs=2.5e-3)
+    assert document["geometry"]["turned_deg"] == pytest.approx(0.1, abs=0.01)
+    assert {path.name for path in out.iterdir()} >= {"map.png", "report.html", "cells.csv", "lights.csv"}
+    # Nothing stays beside the sessions.
+    assert {path.name for path in folders[0].parent.iterdir()} == {"monday", "friday"}
+
+
+def test_one_room_and_other_noise_are_the_same(folders: tuple[Path, Path], lab: Lab, tmp_path: Path) -> None:
+    with take(lab, tmp_path / "again", LIGHTS, every=6, frame=lambda step: lab.dng(step.colour, 900 + step.number)):
+        pass
+    options = BuildOptions()
+    with table_of(folders[0], options) as one, table_of(tmp_path / "again", options) as other:
+        found = compare(one, other)
+    assert found.same is True
+    assert float(found.lights.angle_deg.max()) < 0.03
+
+
+def test_a_table_is_compared_with_a_session(
+    folders: tuple[Path, Path], session: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    build(session, tmp_path / "lut")
+    shutil.copytree(tmp_path / "lut", tmp_path / "copy")
+    assert main(["--compare", str(tmp_path / "lut"), str(folders[0])]) == 0
+    assert "warning: both tables are of the same frames" in capsys.readouterr().out

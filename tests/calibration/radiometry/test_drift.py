@@ -1,0 +1,89 @@
+"""The lamp's drift between white frames: what it is, how far it is known, and that the counts come back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibration.radiometry.drift import as_measured, corrected, drift_correction, undetermined
+
+WHITE = np.array([3000.0, 7000.0, 4000.0])
+EVERY_S = np.arange(0.0, 3601.0, 600.0)
+LIGHTS_S = np.linspace(10, 3590, 200)
+
+
+def test_a_steady_drift_is_taken_out_to_the_last_of_it() -> None:
+    found = drift_correction(LIGHTS_S, EVERY_S, WHITE * (1 - 0.02 * EVERY_S / 3600)[:, None])
+    assert found.gains == pytest.approx(np.repeat((1 - 0.02 * LIGHTS_S / 3600)[:, None], 3, axis=1), abs=1e-6)
+    assert found.left < 1e-9
+
+
+def test_a_lamp_that_grows_brighter_is_brought_to_its_brightest() -> None:
+    found = drift_correction(LIGHTS_S, EVERY_S, WHITE * (0.9 + 0.1 * EVERY_S / 3600)[:, None])
+    assert found.gains.max() <= 1
+    assert found.gains[-1] == pytest.approx(1, abs=1e-3)
+
+
+def test_channels_drift_by_themselves() -> None:
+    drift = 1 - np.outer(EVERY_S / 3600, [0.01, 0.02, 0.03])
+    found = drift_correction(LIGHTS_S, EVERY_S, WHITE * drift)
+    assert 1 - found.gains[-1] == pytest.approx([0.01, 0.02, 0.03], abs=1e-3)
+
+
+@pytest.mark.parametrize("jump", [0.004, 0.01, 0.02])
+def test_a_jump_between_white_frames_leaves_half_of_itself_open(jump: float) -> None:
+    lamp = np.where(EVERY_S < 1500, 1.0, 1 - jump)
+    assert undetermined(LIGHTS_S, EVERY_S, WHITE * lamp[:, None]) == pytest.approx(jump / 2, rel=0.02)
+
+
+def test_a_lamp_that_warms_up_smoothly_leaves_little_open() -> None:
+    lamp = 1 - 0.02 * np.exp(-EVERY_S / 1800)
+    left = undetermined(LIGHTS_S, EVERY_S, WHITE * lamp[:, None])
+    gains = drift_correction(LIGHTS_S, EVERY_S, WHITE * lamp[:, None]).gains
+    true = (1 - 0.02 * np.exp(-LIGHTS_S / 1800)) / lamp.max()
+    missed = float(np.abs(gains[:, 0] / true - 1).max())
+    assert missed < left < 0.002
+
+
+def test_of_two_white_frames_all_may_be_a_jump() -> None:
+    both = np.array([0.0, 3600.0])
+    assert undetermined(LIGHTS_S, both, WHITE * np.array([[1.0], [0.98]])) == pytest.approx(0.02)
+
+
+def test_lights_behind_the_last_white_frame_add_what_the_lamp_did_meanwhile() -> None:
+    white = WHITE * (1 - 0.02 * EVERY_S / 3600)[:, None]
+    late = np.append(LIGHTS_S, 3600.0 + 1800.0)
+    assert undetermined(late, EVERY_S, white) == pytest.approx(0.01, rel=0.03)
+    assert undetermined(np.append(LIGHTS_S, -600.0), EVERY_S, white) == pytest.approx(0.02 / 6, rel=0.03)
+
+
+def test_one_white_frame_shows_no_drift() -> None:
+    with pytest.raises(ValueError, match="1 white frames do not show"):
+        drift_correction(LIGHTS_S, EVERY_S[:1], WHITE[None])
+
+
+@pytest.mark.parametrize("samples", [9, 25, 49, 81])
+@pytest.mark.parametrize("level", [30, 201, 9000])
+def test_the_mean_of_a_cell_is_not_rounded(level: int, samples: int) -> None:
+    counts = level + np.arange(samples, dtype=np.uint16)[None, :, None] % 5 * np.ones((1, 1, 3), dtype=np.uint16)
+    for gain in (0.97, 0.998, 0.9985, 0.9999):
+        mean = corrected(counts, np.array([gain] * 3)).mean(axis=1)
+        # Samples that are rounded alike would be off by up to half a count.
+        assert mean == pytest.approx(counts.mean(axis=1) / gain, abs=0.12), gain
+
+
+@given(st.lists(st.floats(0.5, 1.0), min_size=3, max_size=3), st.integers(0, 2**32 - 1))
+def test_every_count_comes_back_exactly(gain: list[float], seed: int) -> None:
+    stored = np.array([float(f"{value:.6f}") for value in gain])
+    counts = np.random.default_rng(seed).integers(0, 16384, (40, 25, 3), dtype=np.uint16)
+    counts[0, :, :] = np.arange(25)[:, None]
+    assert np.array_equal(as_measured(corrected(counts, stored), stored), counts)
+
+
+def test_every_count_of_a_camera_comes_back_at_awkward_gains() -> None:
+    counts = np.arange(16384, dtype=np.uint16)[:, None, None] * np.ones((1, 25, 3), dtype=np.uint16)
+    for gain in (0.5, 0.666667, 0.999999, 0.9, 0.75, 1.0):
+        stored = np.array([gain] * 3)
+        assert np.array_equal(as_measured(corrected(counts, stored), stored), counts), gain
