@@ -111,6 +111,10 @@ _NETWORK = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "
 """File systems on which several machines work and share no memory, as /proc/self/mounts names them."""
 
 
+class HeldJournalError(StorageError):
+    """Another program held the journal for as long as a write waits: waiting once more would only double that."""
+
+
 class LockPatience:
     """Waits while another program holds the journal.
 
@@ -258,10 +262,13 @@ def reading_error(path: Path, error: OSError | sqlite3.DatabaseError) -> FormatE
 def writing_error(path: Path, error: sqlite3.DatabaseError) -> FormatError | InputError | StorageError:
     """Return why a journal cannot be written, and what helps; the disk itself is asked what ails it."""
     if is_busy(error):
-        remedy = "end the other program that holds the session"
-    elif (fault := _disk_fault(path)) is not None:
+        return HeldJournalError(
+            f"cannot write {path}: {error}; end the other program that holds the session, then run the same command "
+            "again"
+        )
+    if (fault := _disk_fault(path)) is not None:
         return storage_error(path, fault)
-    elif _primary_code(error) == sqlite3.SQLITE_FULL:
+    if _primary_code(error) == sqlite3.SQLITE_FULL:
         remedy = "free space"
     elif _primary_code(error) in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM, sqlite3.SQLITE_CANTOPEN):
         remedy = "see that the folder may be written and the disk is there"
