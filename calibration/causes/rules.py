@@ -212,6 +212,7 @@ RULES: tuple[Rule, ...] = (
         (
             Condition("in_first", 0, 0),
             Condition("even_showing", 0, 0),
+            Condition("some_whites", 0, 0),
             Condition("frames", 2, _FAR),
             Condition("added", 0.004, _FAR),
             Condition("deviation", 0, _FAR),
@@ -231,9 +232,10 @@ RULES: tuple[Rule, ...] = (
         (
             Condition("in_first", 0, 0),
             Condition("even_showing", 0, 0),
+            Condition("some_whites", 0, 0),
             Condition("frames", 2, _FAR),
             Condition("deviation", -1, -0.01),
-            Condition("added", -0.004, 0.004),
+            Condition("added", -0.05, 0.05),
             Condition("kept", 0, 0.99),
             Condition("tint", 0.35, _FAR),
             Condition("share", 0, 0.2),
@@ -241,14 +243,26 @@ RULES: tuple[Rule, ...] = (
         "a place is darker in all frames, in proportion to its light, and more so in one colour",
     ),
     Rule(
+        STAIN,
+        SHEET,
+        (
+            Condition("white_residual", 0.9, 1),
+            Condition("deviation", -1, -0.03),
+            Condition("tint", 0.35, _FAR),
+            Condition("share", 0, 0.2),
+        ),
+        "white references are dark at one place in all white frames, and more so in one colour",
+    ),
+    Rule(
         SHADOW,
         SHEET,
         (
             Condition("in_first", 0, 0),
             Condition("even_showing", 0, 0),
+            Condition("some_whites", 0, 0),
             Condition("frames", 2, _FAR),
             Condition("deviation", -1, -0.005),
-            Condition("added", -0.004, 0.004),
+            Condition("added", -0.02, 0.004),
             Condition("kept", 0, 0.995),
             Condition("tint", 0, 0.25),
             Condition("share", 0, 0.5),

@@ -63,11 +63,11 @@ def refusal(verdict: Verdict, figures: TableFigures, *, reported: bool = False) 
     if finding is not None and finding.is_known:
         remedy = finding.decision.cause.remedy
     what, frames = "take the session anew", retaken_frames(verdict, figures)
-    if reported and frames:
+    command = COMMAND if reported else retake_command(frames)
+    if frames and (reported or command != COMMAND):
         again = f"take {counted(len(frames), 'frame')} again"
-        what = (
-            f"{again}: {COMMAND}" if is_mended_by_retaking(verdict, figures) else f"{again} first ({COMMAND}); {_THEN}"
-        )
+        mended = is_mended_by_retaking(verdict, figures)
+        what = f"{again}: {command}" if mended else f"{again} first ({command}); {_THEN}"
     probably = cause_text(finding)
     return f"{_with_place(worst, figures)}{detail}{more}; {probably}{remedy}, and {what}"
 
