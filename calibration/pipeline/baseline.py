@@ -37,7 +37,7 @@ from calibration.spread.correction import (
 )
 from calibration.spread.fitting import LEAST_COUNTS, LOOSE_UNEVENNESS, USUAL_UNEVENNESS
 from calibration.spread.printed_grid import printed_grid, unsuitable
-from calibration.spread.surroundings import Levels, Surroundings, photosite_offsets_px
+from calibration.spread.surroundings import FrameLevels, Surroundings, photosite_offsets_px
 from drivers.raw.rawfile import Area, Mosaic
 from foundation.errors import FormatError
 
@@ -295,7 +295,7 @@ def _spread_frame(
     whites = slice(len(points.cells_mm), len(points.cells_mm) + len(points.whites_mm))
     paper, _ = baseline.paper.read(np.where(usable[whites, None], means[whites], np.nan), decoded.record.file)
     return SpreadFrame(
-        levels=Levels(np.nan_to_num(means), beyond_print(decoded, view.beyond)),
+        levels=FrameLevels(np.nan_to_num(means), beyond_print(decoded, view.beyond)),
         around=around,
         field=paper.field.at(view.grid.points_mm),
         white=paper.white,
@@ -313,7 +313,7 @@ def _baseline(
     spread = cells.var(axis=1, ddof=1)
     if registered.lens is not None:
         means = np.concatenate([cells.mean(axis=1), references.mean(axis=1, dtype=np.float64)])
-        added = registered.lens.added(Levels(means, beyond_print(first, registered.lens.beyond)))
+        added = registered.lens.added(FrameLevels(means, beyond_print(first, registered.lens.beyond)))
         cells -= added[: len(cells), None]
         references = references - added[len(cells) :, None].astype(np.float32)
     level = cells.mean(axis=1)

@@ -28,7 +28,7 @@ from calibration.radiometry.primaries import Primaries
 from calibration.sampling.patch_statistics import patch_means, sample_noise
 from calibration.sampling.samples import Sites, gather, gather_means, gather_values, table_values
 from calibration.spread.correction import FrameCorrection
-from calibration.spread.surroundings import Levels
+from calibration.spread.surroundings import FrameLevels
 from foundation.errors import RegistrationError
 
 _Array = npt.NDArray[np.float64]
@@ -281,7 +281,7 @@ def _to_subtract(
     means = np.concatenate([cells, references.mean(axis=1, dtype=np.float64)])
     if dark is not None:
         means -= dark.patches
-    added = grid.lens.added(Levels(means, beyond_print(decoded, grid.lens.beyond))).astype(np.float32)
+    added = grid.lens.added(FrameLevels(means, beyond_print(decoded, grid.lens.beyond))).astype(np.float32)
     return added if dark is None else added + dark.patches
 
 

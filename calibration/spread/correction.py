@@ -1,7 +1,7 @@
 """The correction: what surroundings add to each patch of a frame, and what is said of it.
 
 What is subtracted from a patch's samples is one number for each channel: the light that the lens brought in, less what
-it took away. The samples' noise is not touched. Levels of a frame are taken from the frame itself, as it is: the shares
+it took away. The samples' noise is not touched. FrameLevels of a frame are taken from the frame itself, as it is: the shares
 were fitted on such levels, so that light which was spread twice is in them.
 
 P patches as in `PrintedGrid`; counts above black; half-size pixels.
@@ -24,7 +24,7 @@ from calibration.sampling.samples import Sites, sites_at
 from calibration.spread.fitting import SpreadData, fit_spread, predicted_levels
 from calibration.spread.point_spread import FAR_PX, NEAR_PX, PLACES, PointSpread, kernel_of_terms, terms_of
 from calibration.spread.printed_grid import PrintedGrid
-from calibration.spread.surroundings import Levels, NearLight, Surroundings, light_at, surroundings
+from calibration.spread.surroundings import FrameLevels, NearLight, Surroundings, light_at, surroundings
 
 _MARGIN_PX = 12.0
 """How far from the sheet's edge what lies behind it is looked at."""
@@ -81,8 +81,10 @@ class PrintView:
 
         Parameters
         ----------
-        grid, whites, photosites_px
+        grid, whites
             As the attributes.
+        photosites_px
+            (3, 2) float64, where each channel's photosites lie from a block's centre.
         field
             Of the frame that is registered first.
         registration
@@ -132,7 +134,7 @@ class FrameCorrection:
         far, veil = amounts[0, 0, near:-1], float(amounts[0, 0, -1])
         return FrameCorrection(around, around.near(amounts[:, :, :near]), far, veil, view.beyond)
 
-    def added(self, levels: Levels) -> _Array:
+    def added(self, levels: FrameLevels) -> _Array:
         """Return what the lens added to each patch, (P, 3) float64 counts; negative where it took more away."""
         around = self.around
         added = self.near.at(levels, around.local(levels)) - self.near.total * levels.patches
@@ -164,7 +166,7 @@ class SpreadFrame:
         As in `SpreadData`.
     """
 
-    levels: Levels
+    levels: FrameLevels
     around: Surroundings
     field: _Array
     white: _Array

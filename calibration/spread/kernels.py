@@ -72,7 +72,7 @@ def weights_around(
     Parameters
     ----------
     row, column, neighbours, parts
-        As in `PrintedGrid`.
+        (N,), (N,) int64, (N, 25) and (5 R, 5 K) int32, as in `PrintedGrid`.
     offset
         (N, 3, 2) float64 px along the print's axes, from a patch's centre to its window's, for each channel.
     pitch

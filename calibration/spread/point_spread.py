@@ -73,7 +73,10 @@ def kernel_of_terms() -> list[tuple[int, int | None]]:
 
 
 def groups_of_terms() -> list[npt.NDArray[np.int64]]:
-    """Return the unknowns kept or left out together: a kernel's mean shares, and how they change over the frame."""
+    """Return the unknowns (n,) int64 that are kept or left out together.
+
+    A kernel's mean shares, and how they change over the frame.
+    """
     terms = np.array([(kernel, 0 if place is None else min(place, 1)) for kernel, place in kernel_of_terms()])
     found: list[npt.NDArray[np.int64]] = []
     for kernel, changing in sorted({(int(kernel), int(changing)) for kernel, changing in terms}):
@@ -83,7 +86,7 @@ def groups_of_terms() -> list[npt.NDArray[np.int64]]:
 
 
 def free_terms() -> npt.NDArray[np.bool_]:
-    """Return which unknowns (TERMS,) bool may be of either sign: near kernels', which the print shows clearly."""
+    """Return which unknowns, (n,) bool of all, may be of either sign: near kernels', which the print shows clearly."""
     return np.arange(TERMS) < 3 * _NEAR_TERMS
 
 

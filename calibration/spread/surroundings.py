@@ -3,7 +3,7 @@
 - Near kernels are integrated over each slot and each of a window's pixels, where they lie in the frame, each channel's
   photosites in their own place; tags and margins in fifths of a slot.
 - Far kernels blur the print slot by slot, in which a patch's place within its slot does not matter.
-- Levels are what the frame itself shows: of cells and references their means, of bare paper and black ink the usual
+- FrameLevels are what the frame itself shows: of cells and references their means, of bare paper and black ink the usual
   ones in the light of the place, of what lies behind the print the mean of places beside it.
 
 Half-size pixels; P patches as in `PrintedGrid`; counts above black.
@@ -41,7 +41,7 @@ _Float = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Levels:
+class FrameLevels:
     """What a frame shows, before the lens is corrected.
 
     Attributes
@@ -108,19 +108,19 @@ class Surroundings:
         )  # fmt: skip
         return NearLight(self.neighbours, weights, others, local.sum(axis=2))
 
-    def inks(self, levels: Levels) -> tuple[_Array, _Array]:
+    def inks(self, levels: FrameLevels) -> tuple[_Array, _Array]:
         """Return bare paper and black ink (3,) float64, counts where the field is 1."""
         whites = levels.patches[self.whites] / self.light[self.whites]
         # The first colour is the code (0, 0, 0), which tags are printed with.
         return np.median(whites, axis=0), levels.patches[0] / self.light[0]
 
-    def local(self, levels: Levels) -> _Array:
+    def local(self, levels: FrameLevels) -> _Array:
         """Return (P, 3 kinds, 3) float64 counts of bare paper, black ink, and what lies behind, at each patch."""
         paper, black = self.inks(levels)
         behind = np.broadcast_to(levels.beyond, self.light.shape)
         return np.stack([self.light * paper, self.light * black, behind], axis=1)
 
-    def image(self, levels: Levels) -> _Float:
+    def image(self, levels: FrameLevels) -> _Float:
         """Return the print slot by slot, (R, K, 3) float32 counts."""
         paper, black = self.inks(levels)
         shares = self.grid.others.reshape(-1, 3)
@@ -171,7 +171,7 @@ class NearLight:
         """(P, 3) float64, the weight of each patch's own slot."""
         return self.weights[:, :, self.weights.shape[2] // 2].astype(np.float64)
 
-    def at(self, levels: Levels, local: _Array) -> _Array:
+    def at(self, levels: FrameLevels, local: _Array) -> _Array:
         """Return the light (P, 3) float64 counts; `local` is what `Surroundings.local` returns."""
         out = np.empty_like(levels.patches)
         kernels.light_around(self.neighbours, self.weights, self.others, levels.patches, local, out)
@@ -179,7 +179,7 @@ class NearLight:
 
 
 def far_taps(scale: float) -> _Float:
-    """Return the shares (odd,) float32 of slots on a line in a Gaussian's light, σ `scale` slots; they add up to 1."""
+    """Return the shares (n,) float32, n odd, of slots on a line in a Gaussian's light, σ `scale` slots; they add up to 1."""
     from scipy.special import ndtr
 
     reach = max(1, math.ceil(_FAR_REACH * scale))
@@ -203,8 +203,10 @@ def surroundings(
 
     Parameters
     ----------
-    grid, neighbours
+    grid
         The print.
+    neighbours
+        (P, 25) int32, as in `PrintedGrid`.
     mosaic_offsets_px
         (3, 2) float64, where each channel's photosites lie from a block's centre, `photosite_offsets_px`.
     frame_px

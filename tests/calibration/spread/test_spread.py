@@ -24,7 +24,7 @@ from calibration.spread.correction import (
 from calibration.spread.fitting import LEAST_COUNTS, USUAL_UNEVENNESS, colour_residual
 from calibration.spread.point_spread import PointSpread
 from calibration.spread.printed_grid import PAD, PARTS, printed_grid, unsuitable
-from calibration.spread.surroundings import Levels, Surroundings, far_taps
+from calibration.spread.surroundings import FrameLevels, Surroundings, far_taps
 
 _Array = npt.NDArray[np.float64]
 PX_MM = 0.5
@@ -58,7 +58,7 @@ class Photograph:
 
     view: PrintView
     around: Surroundings
-    seen: Levels
+    seen: FrameLevels
     clean: _Array
     true: _Array
     field: _Array
@@ -145,7 +145,7 @@ def photograph(
         )[:, None].repeat(3, axis=1),
     )  # fmt: skip
     beyond = image[:margin, :margin].mean(axis=(0, 1))
-    return Photograph(view, around, Levels(noisy, beyond), clean, of_patches * field_at * PAPER, field_at)
+    return Photograph(view, around, FrameLevels(noisy, beyond), clean, of_patches * field_at * PAPER, field_at)
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +170,7 @@ def test_a_sharp_lens_is_left_alone(sharp: Photograph) -> None:
         ({"shoulder": 0.03, "veil": 0.015}, 0.015, 0.005),
         ({"shoulder": 0.08}, 0.05, 0.01),
         ({"veil": 0.01}, 0.008, 0.005),
-        ({"shoulder": 0.06, "veil": 0.003, "growing": True}, 0.02, 0.008),
+        ({"shoulder": 0.06, "veil": 0.003, "growing": True}, 0.02, 0.01),
     ],
 )
 def test_what_a_lens_spreads_is_found_and_taken_out(lens: dict[str, float], least: float, most: float) -> None:
@@ -204,7 +204,7 @@ def test_light_of_the_surroundings_is_that_of_an_even_print_where_all_is_even(sh
         around.grid, 5, around.neighbours, around.offset_px, around.pitch_px, around.places, around.whites,
         np.ones((count, 3)), np.ones((len(around.grid.slots_mm), 3)),
     )  # fmt: skip
-    levels = Levels(np.full((count, 3), 700.0), np.full(3, 700.0))
+    levels = FrameLevels(np.full((count, 3), 700.0), np.full(3, 700.0))
     whole = np.zeros((9, 3, 3))
     whole[0] = 0.2
     near = flat.near(whole)
