@@ -233,7 +233,7 @@ def disturbed(lab: Lab, trial: Trial, step: SessionStep, shown: Colour) -> Judge
     if trial.special == "frozen":
         judgement = lab.show(lab.counts(shown), step)
     elif trial.special == "exchanged":
-        red, green, blue = step.colour.red, step.colour.green, step.colour.blue
+        red, green, blue = step.colour.codes
         judgement = lab.show(lab.counts(Colour(blue, green, red)), step)
     elif trial.special == "serial":
         judgement = lab.show(lab.counts(step.colour), step, serial="7")
@@ -322,7 +322,7 @@ def with_white_segment(room: Room, share: float) -> Projector:
     """Return a projector whose wheel has a white segment, which shows what the three colours have in common."""
 
     def light(colour: Colour, before: Colour) -> npt.NDArray[np.float64]:
-        alone = room.light_of(np.array([colour.red, colour.green, colour.blue])) / (1 + share)
+        alone = room.light_of(np.array(colour.codes)) / (1 + share)
         return np.asarray(alone + share * alone.min(), dtype=np.float64)
 
     return light
@@ -332,7 +332,7 @@ def with_memory(room: Room, share: float) -> Projector:
     """Return a projector whose primaries are weaker, by up to a share, the brighter each was in the picture before."""
 
     def light(colour: Colour, before: Colour) -> npt.NDArray[np.float64]:
-        now, past = (room.light_of(np.array([c.red, c.green, c.blue])) for c in (colour, before))
+        now, past = (room.light_of(np.array(c.codes)) for c in (colour, before))
         return np.asarray(now * (1 - share * past), dtype=np.float64)
 
     return light

@@ -19,6 +19,11 @@ class Colour:
             if not 0 <= code <= 255:
                 raise ValueError(f"{name} is {code}; a code is 0 … 255")
 
+    @property
+    def codes(self) -> tuple[int, int, int]:
+        """Red, green, and blue."""
+        return self.red, self.green, self.blue
+
 
 BLACK = Colour(0, 0, 0)
 WHITE = Colour(255, 255, 255)

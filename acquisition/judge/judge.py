@@ -28,10 +28,16 @@ from acquisition.judge.basis import FrameLight
 from acquisition.judge.evenness import judge_evenness
 from acquisition.judge.exposure import Exposure, disagreement, refusal
 from acquisition.judge.frame import Frame
-from acquisition.judge.knowledge import Examined, Knowledge, Leaning, codes_of, is_brightest_grey, primary_of
+from acquisition.judge.knowledge import Examined, Knowledge, Leaning, is_brightest_grey, primary_of
 from acquisition.judge.lights import judge_light
 from acquisition.judge.measuring import Measured, measure
-from acquisition.judge.references import judge_dark, judge_first_primary, judge_white
+from acquisition.judge.references import (
+    MOST_RESTARTS,
+    judge_dark,
+    judge_first_frames,
+    judge_first_primary,
+    judge_white,
+)
 from acquisition.lights.illuminations import Illumination
 from acquisition.session.judgement import Check, Judgement
 from acquisition.session.plan import REFERENCES, SessionStep
@@ -47,10 +53,10 @@ _CAUSES = (
 _AT_ONCE = ("camera", "chart")
 """Causes that taking the frame again never mends."""
 
-_HIDDEN = ("ambient", "dark", "white drift")
+_HIDDEN = ("ambient", "dark")
 """Causes that a reference shows and the lights between may hide: what was taken since the last good one is in doubt."""
 
-_BY_MODEL = ("light", "uniformity", "rows", "lamp")
+_BY_MODEL = ("light", "uniformity", "rows", "lamp", "white drift")
 """Causes that each light shows by itself, where frames of the primaries say what it should look like."""
 
 _NONE: npt.NDArray[np.float64] = np.full(2, np.nan)
@@ -86,7 +92,7 @@ class LiveJudge:
         self._settings = settings
         self._chart = chart if settings.judge.chart else None
         self._plan = tuple(dict.fromkeys(light.codes for light in illuminations))
-        self._known = Knowledge()
+        self._known = self._base = Knowledge()
         self._fresh = True
 
     @property
@@ -104,12 +110,18 @@ class LiveJudge:
         light = None if self._known.basis is None else self._known.basis.light(frame.measured)
         self._known = self._known.after(step, Examined(frame, light, accepted))
 
+    def after_pause(self) -> None:
+        """Take in that lamp and chart may have changed; see `acquisition.session.judgement.OutlastsPauses`."""
+        self._known = self._base = self._known.paused()
+        self._fresh = False
+
     def judge(self, file: Path, step: SessionStep) -> Judgement:
         """Return what is said of a raw file; see `acquisition.session.judgement.FrameJudge.judge`."""
         if self._fresh:
-            # What was recalled is of an earlier run: lamp and chart may have changed since.
-            self._known = self._known.paused()
-            self._fresh = False
+            self.after_pause()
+        expected, self._known = self._known.expected, replace(self._known, expected=None)
+        if expected not in (None, step.number):
+            return Judgement.of_reason("light", _BESIDE)
         try:
             mosaic = read_raw(file)
         except FormatError as error:
@@ -129,11 +141,11 @@ class LiveJudge:
             looked.leaning,
         )
         following = known.after(step, found)
-        disagreeing = _judge_basis(known, following)
+        disagreeing = _judge_basis(known, following) or judge_first_frames(known, step, cause, self._settings.judge)
         if disagreeing is not None:
-            checks = (*(check for check in checks if check.name != "uniformity"), disagreeing)
+            checks = (*(check for check in checks if check.name != disagreeing.name), disagreeing)
             cause = disagreeing
-            following = known.after(step, replace(found, accepted=False, cause=cause.name)).begun_anew()
+            following = known.after(step, replace(found, accepted=False, cause=cause.name)).begun_anew(self._base)
         self._known = following
         if cause is None:
             untold = {check.name for check in checks if check.value is None and check.name in ("movement", "blur")}
@@ -144,6 +156,9 @@ class LiveJudge:
         outlines = () if self._known.anchor is None else self._known.anchor.outlines
         paper = looked.frame.paper
         red, green, blue = paper.tolist()
+        lasting = cause is not None and _lasts(self._known, step, cause.name)
+        if disagreeing is not None:
+            lasting = self._known.restarts > MOST_RESTARTS
         return Judgement(
             checks=checks,
             seen=None if np.isnan(paper).any() else (red, green, blue),
@@ -151,7 +166,7 @@ class LiveJudge:
             preview=preview_jpeg(mosaic, black, white, outlines, boxes, cause.reason if cause else ""),
             voids=disagreeing is not None
             or (cause is not None and step.kind in REFERENCES and _voids(known, cause.name)),
-            lasting=cause is not None and _lasts(self._known, step, cause.name),
+            lasting=lasting,
         )
 
 
@@ -212,7 +227,7 @@ def _look_at_light(
 ) -> _Looked:
     """Return what is found of the light of a lit frame, and of its evenness."""
     measured = frame.measured
-    primary = primary_of(codes_of(step)) if step.kind == "response" else None
+    primary = primary_of(step.colour.codes) if step.kind == "response" else None
     checks: list[Check] = []
     if primary is not None and not known.modelled:
         checks.append(judge_first_primary(known, measured, primary))
@@ -425,6 +440,9 @@ _UNFOUNDED = (
 )
 
 
+_BESIDE = "it was under way when the frames before it were found to contradict each other; they are taken again first"
+
+
 _FOLLOWS: Mapping[str, frozenset[str]] = MappingProxyType(
     {
         "movement": frozenset({"rows", "uniformity", "blur", "light", "lamp", "white drift"}),
@@ -466,7 +484,7 @@ def _shown_white(known: Knowledge, frame: Frame) -> npt.NDArray[np.float64]:
 
 
 def _is_compared(step: SessionStep) -> bool:
-    return step.kind in REFERENCES or (step.kind == "response" and primary_of(codes_of(step)) is not None)
+    return step.kind in REFERENCES or (step.kind == "response" and primary_of(step.colour.codes) is not None)
 
 
 def _voids(known: Knowledge, cause: str) -> bool:

@@ -5,6 +5,8 @@ Rules that hold inside:
 - `after` is the only way on, for a frame just judged and for one of an earlier run, so that a run that is taken up
   again knows what an uninterrupted one would.
 - Only accepted frames teach. A refused one is kept as the frame before, and as what may be lasting.
+- Until a light is accepted, everything that is known rests on the first frames of the session or of the run, and one of
+  them may be the odd one: nothing but those that follow says so.
 """
 
 from __future__ import annotations
@@ -28,6 +30,10 @@ RECENT = 6
 
 LEANING = 3
 """Frames whose small deviations are taken together; more would take a drift that is followed for a step."""
+
+_GREYS = 4
+"""Frames of mixed light from which on white is foretold without its own: the tone curve's value, slope and bend, and
+one that tells whether they agree."""
 
 _Array = npt.NDArray[np.float64]
 
@@ -142,6 +148,18 @@ class Knowledge:
         The newest white or grey frame from before the primaries were known, by which they are held against it.
     lost
         Whether a reference of an earlier run is accepted and its measurement cannot be read.
+    founding
+        Whether no light was accepted yet in this session, or since the run was taken up again or paused.
+    first_frames
+        Frames that were accepted meanwhile.
+    doubted
+        Numbers of the steps whose frames these contradicted once.
+    restarts
+        How often these were taken again for that.
+    begun_with
+        Number of the step of the first of them; None before it.
+    expected
+        The step that comes next unless a frame was under way when that was found; None once it is there.
     """
 
     anchor: Anchor | None = None
@@ -166,6 +184,12 @@ class Knowledge:
     asked: bool = False
     witness: Measured | None = None
     lost: bool = False
+    founding: bool = True
+    first_frames: tuple[Seen, ...] = ()
+    doubted: frozenset[int] = frozenset()
+    restarts: int = 0
+    begun_with: int | None = None
+    expected: int | None = None
 
     @property
     def modelled(self) -> bool:
@@ -181,17 +205,34 @@ class Knowledge:
         """Return what is known after a pause of the run: the lamp may be at another level, the chart elsewhere."""
         if self.rested or not self.digests:
             return self
-        return replace(self, model=self.model.rested(), rested=True, recent=(), refused=("", 0), asked=False)
+        return replace(
+            self,
+            model=self.model.rested(),
+            rested=True,
+            recent=(),
+            refused=("", 0),
+            asked=False,
+            founding=True,
+            first_frames=(),
+            doubted=frozenset(),
+            begun_with=None,
+        )
 
-    def begun_anew(self) -> Knowledge:
-        """Return what is known where the frames of the primaries, or the one beside them, cannot be trusted."""
-        if not self.moved_on:
-            return Knowledge(first=self.first, recent=self.recent, digests=self.digests, refused=self.refused)
-        return replace(self, primaries=(None, None, None), basis=None, witness=None, asked=False)
+    def begun_anew(self, base: Knowledge) -> Knowledge:
+        """Return what is known where the first frames cannot be trusted: no more than `base`, before them."""
+        return replace(
+            base,
+            first=base.first or self.first,
+            recent=self.recent,
+            digests=self.digests,
+            refused=self.refused,
+            restarts=self.restarts + 1,
+            expected=self.begun_with,
+        )
 
     def after(self, step: SessionStep, found: Examined) -> Knowledge:
         """Return what is known after a frame of a step."""
-        frame, codes = found.frame, codes_of(step)
+        frame, codes = found.frame, step.colour.codes
         seen = Seen(codes, frame.measured, None if found.light is None else found.light.amounts)
         known = replace(
             self,
@@ -203,8 +244,15 @@ class Knowledge:
             count = self.refused[1] + 1 if found.cause == self.refused[0] else 1
             lamp = found.brightness if found.cause == "lamp" else float("nan")
             x, y = frame.moved_px.tolist() if found.cause == "movement" else (float("nan"), float("nan"))
-            return replace(known, refused=(found.cause, count), candidate=(lamp, x, y))
+            doubted = self.doubted | {step.number}
+            return replace(known, refused=(found.cause, count), candidate=(lamp, x, y), doubted=doubted)
         known = replace(known, refused=("", 0), candidate=(float("nan"),) * 3, first=self.first or frame.measured)
+        if known.founding:
+            begun_with = step.number if known.begun_with is None else known.begun_with
+            doubted = known.doubted - {step.number}
+            known = replace(known, doubted=doubted, begun_with=begun_with, first_frames=(*known.first_frames, seen))
+        if step.kind == "light" and not known.doubted:
+            known = replace(known, founding=False, first_frames=(), restarts=0)
         if step.kind != "dark":
             # After a step of the lamp nothing before it counts any more.
             leaning = Leaning() if found.stepped or known.rested else known.leaning.then(found.leaning)
@@ -220,6 +268,16 @@ class Knowledge:
             model = known.model.stepped(found.brightness) if found.stepped else known.model
             known = replace(known, model=model.learn(found.light.amounts, codes))
         return known
+
+    def without_white(self) -> ProjectorModel | None:
+        """Return what the first frames say of the projector without the white one; None where they are too few."""
+        others = [one for one in self.first_frames if any(one.codes) and min(one.codes) < 255]
+        if self.basis is None or sum(min(one.codes) > 0 for one in others) < _GREYS:
+            return None
+        model = ProjectorModel.unknown()
+        for one in others:
+            model = model.learn(self.basis.light(one.measured).amounts, one.codes)
+        return model
 
     def _anchored(self, anchor: Anchor) -> Knowledge:
         """Return what is known where the chart lies elsewhere: pictures of another place are no basis any more."""
@@ -245,7 +303,7 @@ class Knowledge:
             known = replace(known, dark=measured, first_dark=self.first_dark or measured)
             if known.basis is not None and known.basis.of_primaries:
                 known = replace(known, basis=known.basis.with_dark(measured))
-        primary = primary_of(codes_of(step))
+        primary = primary_of(step.colour.codes)
         if is_brightest_grey(step):
             known = replace(known, first_grey=self.first_grey or frame)
         if not self.modelled and (step.kind == "white" or (step.kind == "response" and primary is None)):
@@ -275,20 +333,14 @@ class Knowledge:
         return self
 
 
-def codes_of(step: SessionStep) -> Codes:
-    """Return the codes of red, green and blue that a step shows."""
-    return step.colour.red, step.colour.green, step.colour.blue
-
-
 def is_brightest_grey(step: SessionStep) -> bool:
     """Return whether a step shows grey at `TOP`, with which a run that is taken up again begins."""
-    return step.kind == "response" and codes_of(step) == (TOP, TOP, TOP)
+    return step.kind == "response" and step.colour.codes == (TOP, TOP, TOP)
 
 
 def primary_codes(primary: int) -> Codes:
     """Return the codes that show primary 0, 1 or 2 alone at `TOP` (`acquisition.session.plan`)."""
-    colour = PRIMARIES[primary]
-    return colour.red, colour.green, colour.blue
+    return PRIMARIES[primary].codes
 
 
 def primary_of(codes: Codes) -> int | None:

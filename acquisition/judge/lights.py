@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from acquisition.judge import limits
 from acquisition.judge.basis import FrameLight
-from acquisition.judge.knowledge import Knowledge, Leaning, Seen, codes_of, combined
+from acquisition.judge.knowledge import Knowledge, Leaning, Seen, combined
 from acquisition.judge.response import Codes, Fit, ProjectorModel
 from acquisition.session.judgement import Check
 from acquisition.session.plan import SessionStep
@@ -64,7 +64,7 @@ def judge_light(
     drift_percent
         Change of brightness that is always allowed (`[judge] drift_percent`).
     """
-    codes = codes_of(step)
+    codes = step.colour.codes
     before = known.recent[-1] if known.recent else None
     if not known.modelled:
         return LightVerdict((_without_model(light, codes, before),))

@@ -1,22 +1,34 @@
-"""Whether a dark frame is dark and as dark as before, and how far white has drifted."""
+"""Whether a dark frame is dark and as dark as before, how far white has drifted, and whether first frames agree."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from acquisition.config import JudgeSettings
 from acquisition.judge import limits
 from acquisition.judge.frame import Frame
 from acquisition.judge.knowledge import Knowledge
 from acquisition.judge.lights import same_light
 from acquisition.judge.measuring import TILE_COLUMNS, TILE_ROWS, Measured
 from acquisition.session.judgement import Check
+from acquisition.session.plan import SessionStep
 
 _SIGMAS = 6.0
 """Standard deviations of a mean's noise that no change is made of."""
 
 _TILES = 16
 """Tiles that are averaged before their change in the dark is looked at: a lamp in a corner lights as many."""
+
+MOST_RESTARTS: Final = 2
+"""How often first frames are taken again at once because others contradict them: what passes does so within a minute,
+and what comes back for the third time wants somebody who looks."""
+
+_CONTRADICTIONS: Final = ("movement", "blur", "rows", "uniformity", "light", "ambient", "lamp")
+"""Checks that hold a frame against those before it."""
 
 _STALE_LEAST = 0.02
 """Amount of light in a dark frame, of a primary, from which on the frame before may be what is seen."""
@@ -117,3 +129,60 @@ def judge_first_primary(known: Knowledge, frame: Measured, primary: int) -> Chec
             f"{name} alone was ordered, and the frame is as bright as white everywhere; does the screen stand still?"
         )
     return Check("light", round(100 * float(share[primary]), 1), 10.0, None, "%", reason)
+
+
+def judge_first_frames(known: Knowledge, step: SessionStep, cause: Check | None, judge: JudgeSettings) -> Check | None:
+    """Return why the first frames of a session or run cannot be trusted; None where nothing speaks against them.
+
+    What they show is learnt, and only later frames tell that one of them was the odd one: a step whose frame is refused
+    twice contradicts them, and before the first light white is held against what all others foretell.
+
+    Parameters
+    ----------
+    known
+        Before the frame of this step, everything learnt from the others.
+    cause
+        The check that refuses the frame; None where it is accepted.
+    judge
+        What is always allowed.
+    """
+    if not known.founding or all(not any(one.codes) for one in known.first_frames):
+        return None
+    why = cause
+    if cause is None:
+        why = _odd_white(known, judge) if step.kind == "light" else None
+    elif cause.name not in _CONTRADICTIONS or step.number not in known.doubted:
+        why = None
+    elif known.awaits_primaries and cause.value is None:
+        # What it should look like is not known yet.
+        why = None
+    if why is None:
+        return None
+    odd = f"{why.reason}; one of the first frames may be the odd one, white, dark or a primary"
+    if known.restarts < MOST_RESTARTS:
+        return replace(why, reason=f"{odd}: they are taken again")
+    return replace(
+        why,
+        reason=f"{odd}: they were taken {known.restarts + 1} times and do not agree; see that lamp, room light and "
+        "focus are steady. They are taken again after the pause, or by the same command later",
+    )
+
+
+def _odd_white(known: Knowledge, judge: JudgeSettings) -> Check | None:
+    """Return why the first white frame is not what the frames behind it foretell; None where it is."""
+    white = next((one.measured for one in known.first_frames if one.codes == (255, 255, 255)), None)
+    model = known.without_white()
+    if white is None or model is None or known.basis is None:
+        return None
+    light = known.basis.light(white)
+    fit = model.compare(light.amounts, (255, 255, 255), light.covariance)
+    limit = max(judge.light_deg, fit.angle_limit(limits.LIGHT_SIGMAS))
+    if fit.angle_deg > limit:
+        said = f"the first white frame is {fit.angle_deg:.1f}° from the light that greys and primaries foretell"
+        return Check("light", round(fit.angle_deg, 3), None, round(limit, 3), "°", said)
+    room = max(judge.drift_percent / 100, limits.BRIGHTNESS_SIGMAS * fit.brightness_sd)
+    if abs(fit.brightness) > room:
+        percent = 100 * float(np.expm1(fit.brightness))
+        said = f"the first white frame is {percent:+.1f} % as bright as greys and primaries foretell"
+        return Check("lamp", round(percent, 2), round(-100 * room, 2), round(100 * room, 2), "%", said)
+    return None

@@ -58,7 +58,7 @@ class Illumination:
     @property
     def codes(self) -> tuple[int, int, int]:
         """Codes of red, green and blue that the projector shows, 0 … 255."""
-        return self.colour.red, self.colour.green, self.colour.blue
+        return self.colour.codes
 
 
 def shown_colour(linear: npt.ArrayLike) -> Colour:

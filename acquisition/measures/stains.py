@@ -75,12 +75,18 @@ class Stains:
         (C, 3) float64, deviation of each cell by itself, noise and the prediction's error included; NaN likewise.
     stained
         (C,) bool, cells to be listed.
+    level
+        (C, 3) float64, mean counts above black that were judged.
+    places_mm
+        (C, 2) where the cells lie on the sheet.
     """
 
     deviation: _Array
     error: _Array
     alone: _Array
     stained: _Mask
+    level: _Array
+    places_mm: _Array
 
     @property
     def doubtful(self) -> _Mask:
@@ -125,7 +131,7 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     """
     if bits < LEAST_BITS:
         unknown = np.full(level.shape, np.nan)
-        return Stains(unknown, unknown, unknown, np.zeros(len(level), dtype=np.bool_))
+        return Stains(unknown, unknown, unknown, np.zeros(len(level), dtype=np.bool_), level, centres_mm)
     usable = np.ones(len(level), dtype=np.bool_) if usable is None else usable
     near = np.asarray(cKDTree(centres_mm).query(centres_mm, k=min(NEIGHBOURS, len(level)))[1])
     near = near.reshape(len(level), -1)
@@ -147,7 +153,7 @@ def find_stains(level: _Array, centres_mm: _Array, bits: int, usable: _Mask | No
     beside = stained[near].sum(axis=1)
     reached = (np.abs(np.nan_to_num(deviation)) >= DOUBTFUL).any(axis=1) | (beside >= _MANY_BESIDE)
     rim = off & reached & (beside > 0)
-    return Stains(deviation, error, np.expm1(log_ratios), stained | rim)
+    return Stains(deviation, error, np.expm1(log_ratios), stained | rim, level, centres_mm)
 
 
 def _usual(log_ratios: _Array) -> _Array:

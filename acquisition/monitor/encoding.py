@@ -36,11 +36,11 @@ def session_json(
     """
     kinds = {light.index: (light.kind, light.cct_k) for light in lights}
     shown = {step.illumination: step.colour for step in steps if step.illumination is not None}
-    codes = {index: (colour.red, colour.green, colour.blue) for index, colour in sorted(shown.items())}
+    codes = {index: colour.codes for index, colour in sorted(shown.items())}
     places = planned_places(list(codes.values()))
     return {
         "name": name,
-        "steps": [[step.number, step.kind, step.illumination, *_codes(step)] for step in steps],
+        "steps": [[step.number, step.kind, step.illumination, *step.colour.codes] for step in steps],
         "lights": [
             [index, *kinds.get(index, ("", None)), place, *codes[index]]
             for index, place in zip(codes, places, strict=True)
@@ -115,10 +115,6 @@ def to_bytes(told: Json) -> bytes:
 def digest(told: Json) -> str:
     """Return a short text that is another for other content."""
     return hashlib.blake2b(to_bytes(told), digest_size=6).hexdigest()
-
-
-def _codes(step: SessionStep) -> tuple[int, int, int]:
-    return step.colour.red, step.colour.green, step.colour.blue
 
 
 def _check(check: Check) -> list[Any]:

@@ -188,7 +188,8 @@ def _taken(
 
     taken = [attempt.kind for attempt in journal.attempts() if attempt.verdict == ACCEPTED]
     attempts = settings.sequence.attempts
-    agenda = Agenda(session.steps, session.done_steps(), attempts, first, unclosed_kinds(taken), append)
+    every = settings.sequence.reference_every
+    agenda = Agenda(session.steps, session.done_steps(), attempts, first, unclosed_kinds(taken), append, every)
     if not len(agenda):
         return RunOutcome(len(session.steps), 0, ())
     journal.note(clock.now(), "start", f"{len(agenda)} of {len(session.steps)} frames to take")

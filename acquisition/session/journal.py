@@ -17,7 +17,6 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import astuple
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -160,7 +159,7 @@ class Journal:
         with self._writing():
             self._connection.executemany(
                 "INSERT INTO plan VALUES (?, ?, ?, ?, ?, ?)",
-                [(step.number, step.kind, step.illumination, *astuple(step.colour)) for step in steps],
+                [(step.number, step.kind, step.illumination, *step.colour.codes) for step in steps],
             )
 
     def begin(self, step: SessionStep, file: str, at: datetime) -> int:

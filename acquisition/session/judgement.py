@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from acquisition.session.plan import SessionStep
 
@@ -44,6 +44,13 @@ class Check:
         """Whether nothing is wrong."""
         return not self.reason
 
+    @property
+    def is_beyond(self) -> bool:
+        """Whether the value lies outside its limits: it may follow from another check's cause, or be followed."""
+        if self.value is None:
+            return False
+        return (self.low is not None and self.value < self.low) or (self.high is not None and self.value > self.high)
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -61,7 +68,7 @@ class Judgement:
         The frame as JPEG for the eye; empty if there is none.
     voids
         What was taken before cannot be trusted: of a refused reference all since the last good one, of another refused
-        frame all since the last light.
+        frame all since the run began, or since its last pause for something lasting.
     lasting
         Taking the frame again will not help before somebody has removed the cause.
     """
@@ -103,5 +110,17 @@ class FrameJudge(Protocol):
         """Take in a frame of an earlier run: the `measurement` of its judgement, and whether it still counts.
 
         Called for all of them before the first frame is judged.
+        """
+        ...
+
+
+@runtime_checkable
+class OutlastsPauses(Protocol):
+    """A judge that wants to be told of pauses of a run."""
+
+    def after_pause(self) -> None:
+        """Take in that the run paused for something lasting, and that what is judged next ties it to what was before.
+
+        Called when everything that was taken before is judged, and when nothing is being judged.
         """
         ...

@@ -107,7 +107,10 @@ def plan_steps(
 
 
 def tie_steps(first_number: int) -> tuple[SessionStep, ...]:
-    """Return what a run that is taken up again shows first, to tie it to what was taken before: a grey, the primaries.
+    """Return what a run that is taken up again shows first, to tie it to what was taken before.
+
+    A grey and the primaries, by which the projector is known again, and a white and a dark frame, so that lights lie
+    between references of one level of the lamp.
 
     Parameters
     ----------
@@ -115,7 +118,9 @@ def tie_steps(first_number: int) -> tuple[SessionStep, ...]:
         Number of the first step; the plan's last plus one.
     """
     colours = (Colour(TOP, TOP, TOP), *PRIMARIES)
-    return tuple(SessionStep(number, "response", None, colour) for number, colour in enumerate(colours, first_number))
+    shown: list[tuple[FrameKind, Colour]] = [*(("response", colour) for colour in colours), ("white", WHITE)]
+    shown.append(("dark", BLACK))
+    return tuple(SessionStep(number, kind, None, colour) for number, (kind, colour) in enumerate(shown, first_number))
 
 
 def _shuffled(illuminations: Sequence[Illumination], seed: int) -> list[Illumination]:

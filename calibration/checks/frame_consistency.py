@@ -8,14 +8,19 @@ What is left is noise, the polynomial's own error, which is spread over the shee
 is wrong with the frame:
 
 - `scatter`, over all cells: blur mixes neighbours, and another order of cells fits nothing;
-- `block`, the mean over neighbouring cells: a hand, a shadow or a reflection lies in one place.
+- `block`, the mean over neighbouring cells: a hand, a shadow or a reflection lies in one place. A cell that is far from
+  its block, as a hot photosite makes it, counts for four standard deviations of a cell and no more.
+
+What else is known of that place, so that its cause can be told (`calibration.causes`): its colour, how large it is, and
+whether light was added there, as a reflection adds it, or taken in proportion, as a shadow does.
 
 Charts of 8 and 64 cells have no more cells than the polynomial has terms, or twice as many, and cannot be checked.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +57,19 @@ _CERTAIN = 4.0
 """Standard errors that are taken off a block's mean before it counts: among a full chart's 256 blocks noise alone
 exceeds them in one of sixty frames."""
 
+_FAR = 4.0
+"""Standard deviations of a cell beyond its block's median that it counts for at most: among 32 cells one that is
+further off then moves the mean by an eighth of a standard deviation, a fifth of what is taken off it."""
+
+_AS_MUCH = 0.3
+"""Share of the worst block's deviation from which on a block is part of the same thing."""
+
+_BRIGHT_PERCENTILE = 99.0
+"""Of the cells' expected levels, what is taken for the brightest: bare paper is not among them."""
+
+_LIGHT_ROUNDS = 8
+"""Reweighted solutions in a row of the line through a place's cells."""
+
 _MODEL_ERROR, _LEAST_ERROR = 0.02, 3.0
 """Standard error of a cell's prediction: a share of its level, and counts."""
 
@@ -71,11 +89,51 @@ class FrameConsistency:
         How far the worst block of cells is off, as a share, beyond four standard errors.
     at_mm
         The middle of that block on the print.
+    colour
+        How far that block is off in R, G and B, as shares, with their signs; 0 of a channel that is too dim.
+    share
+        Share of the blocks that are off by a third as much or more.
+    extent_mm
+        Side of a square of the area of these.
+    added
+        Light that these blocks' cells have besides their own, as a share of the brightest cells'.
+    kept
+        Share of their own light that they have.
     """
 
     scatter: float = 0.0
     block: float = 0.0
     at_mm: tuple[float, float] = (0.0, 0.0)
+    colour: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    share: float = 0.0
+    extent_mm: float = 0.0
+    added: float = 0.0
+    kept: float = 1.0
+
+    def to_json(self) -> list[Any]:
+        """Return the values as JSON can hold them; `from_json` restores them to the last bit."""
+        return list(astuple(self))
+
+    @staticmethod
+    def from_json(stored: list[Any]) -> FrameConsistency:
+        """Return the values of what `to_json` returned."""
+        scatter, block, (x_mm, y_mm), (red, green, blue), share, extent_mm, added, kept = stored
+        return FrameConsistency(scatter, block, (x_mm, y_mm), (red, green, blue), share, extent_mm, added, kept)
+
+
+@dataclass(frozen=True, eq=False)
+class _Deviations:
+    """What is left of one channel.
+
+    `seen` and `expected` (N,) counts, NaN of cells that are not compared, `scatter` of all cells, and of each block
+    (B,) its `mean` deviation, a share, and how far that is `off` beyond noise.
+    """
+
+    seen: _Array
+    expected: _Array
+    scatter: float
+    mean: _Array
+    off: _Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +187,8 @@ class ConsistencyCheck:
         terms = code_polynomial(np.asarray(rgb)[self.cells], DEGREE)
         self._usable = usable[self.cells]
         self._channels = [_Channel.of(terms, level[self.cells, channel], self._usable) for channel in range(3)]
-        self._block, self._middles = _blocks(cells_mm[self.cells])
+        block, self._middles, self._block_mm2 = _blocks(cells_mm[self.cells])
+        self._members = _members(block, len(self._middles))
 
     def compare(self, mean: _Array, variance: _Array) -> FrameConsistency:
         """Return how far a frame is consistent with the reference.
@@ -141,22 +200,42 @@ class ConsistencyCheck:
         variance
             (N, 3) float64, of these means.
         """
-        worst = FrameConsistency()
         light = np.median(mean[self._usable], axis=0)
-        for channel in np.flatnonzero(light >= 0.2 * light.max()):
-            here = self._of_channel(self._channels[channel], mean[:, channel], variance[:, channel])
-            at_mm = here.at_mm if here.block > worst.block else worst.at_mm
-            worst = FrameConsistency(max(worst.scatter, here.scatter), max(worst.block, here.block), at_mm)
-        return worst
-
-    def _of_channel(self, known: _Channel, mean: _Array, variance: _Array) -> FrameConsistency:
-        if len(known.there) < CELLS_A_TERM * known.terms.shape[1]:
+        found = {
+            int(channel): self._of_channel(self._channels[channel], mean[:, channel], variance[:, channel])
+            for channel in np.flatnonzero(light >= 0.2 * light.max())
+        }
+        known = {channel: one for channel, one in found.items() if one is not None}
+        if not known:
             return FrameConsistency()
+        scatter = max(one.scatter for one in known.values())
+        off = np.max([one.off for one in known.values()], axis=0)
+        worst = int(np.argmax(off))
+        if not off[worst] > 0:
+            return FrameConsistency(scatter)
+        there = np.flatnonzero(off >= _AS_MUCH * off[worst])
+        red, green, blue = (float(known[c].mean[worst]) if c in known else 0.0 for c in range(3))
+        x, y = self._middles[worst].tolist()
+        added, kept = _light_of(list(known.values()), self._members[there])
+        return FrameConsistency(
+            scatter=scatter,
+            block=float(off[worst]),
+            at_mm=(x, y),
+            colour=(red, green, blue),
+            share=len(there) / len(off),
+            extent_mm=float(np.sqrt(len(there) * self._block_mm2)),
+            added=added,
+            kept=kept,
+        )
+
+    def _of_channel(self, known: _Channel, mean: _Array, variance: _Array) -> _Deviations | None:
+        if len(known.there) < CELLS_A_TERM * known.terms.shape[1]:
+            return None
         design, level, seen = known.design, known.level[known.some], mean[known.some]
         # Weights are those of the expected levels, not of the levels seen: covered cells would count most.
         sigma = _MODEL_ERROR * float(np.median(seen / level)) * level + _LEAST_ERROR
         if not sigma.min() > 0:
-            return FrameConsistency()
+            return None
         weights = 1 / sigma**2
         solution = least_squares(design, seen, weights)
         for _ in range(_ROUNDS):
@@ -166,25 +245,77 @@ class ConsistencyCheck:
         expected, there = product(known.terms, solution) * known.level, known.there
         there = there[expected[there] > LEAST_COUNTS]
         if len(there) < LEAST_CELLS:
-            return FrameConsistency()
-        deviation = np.clip(mean[there] / expected[there] - 1, -1, 1)
-        spread2 = sigma_of(deviation - np.median(deviation)) ** 2
+            return None
+        deviation = np.full(len(mean) + 1, np.nan)
+        deviation[there] = np.clip(mean[there] / expected[there] - 1, -1, 1)
+        spread2 = sigma_of(deviation[there] - np.median(deviation[there])) ** 2
         noise2 = float(np.median(variance[there] / expected[there] ** 2))
-        block = self._block[there]
-        count = np.bincount(block, minlength=len(self._middles))
-        total = np.bincount(block, deviation, len(self._middles))
-        full = np.flatnonzero(count >= LEAST_CELLS)
-        scatter = float(np.sqrt(max(spread2 - noise2, 0)))
-        if not len(full):
-            return FrameConsistency(scatter)
-        off = np.abs(total[full] / count[full]) - _CERTAIN * np.sqrt(spread2 / count[full])
-        worst = full[int(np.argmax(off))]
-        x, y = self._middles[worst].tolist()
-        return FrameConsistency(scatter, max(float(off.max()), 0.0), (x, y))
+        average, count = _bounded_means(deviation[self._members], _FAR * float(np.sqrt(spread2)))
+        off = np.abs(average) - _CERTAIN * np.sqrt(spread2 / np.maximum(count, 1))
+        compared = np.isfinite(deviation[:-1])
+        return _Deviations(
+            seen=np.where(compared, mean, np.nan),
+            expected=np.where(compared, expected, np.nan),
+            scatter=float(np.sqrt(max(spread2 - noise2, 0))),
+            mean=average,
+            off=np.where(count >= LEAST_CELLS, off, 0.0),
+        )
 
 
-def _blocks(cells_mm: _Array) -> tuple[npt.NDArray[np.int64], _Array]:
-    """Return the block (C,) of each cell and the blocks' middles (B, 2): squares of about `BLOCK_CELLS`, or fewer."""
+def _bounded_means(values: _Array, far: float) -> tuple[_Array, npt.NDArray[np.int64]]:
+    """Return the means (B,) of the rows of values (B, M), NaN left out, and of how many.
+
+    No value counts for more than `far` beyond the row's median.
+    """
+    ordered = np.sort(values, axis=1)
+    count = np.isfinite(ordered).sum(axis=1)
+    # NaN sorts last, so the middle of what is known stands at half their number.
+    low, high = (np.maximum(count - 1, 0) // 2)[:, None], np.minimum(count // 2, values.shape[1] - 1)[:, None]
+    middle = 0.5 * (np.take_along_axis(ordered, low, axis=1) + np.take_along_axis(ordered, high, axis=1))
+    bounded = np.nan_to_num(np.clip(values, middle - far, middle + far))
+    return bounded.sum(axis=1) / np.maximum(count, 1), count
+
+
+def _light_of(channels: list[_Deviations], members: npt.NDArray[np.int64]) -> tuple[float, float]:
+    """Return the light added, a share of the brightest cells', and the share of their own light that is kept.
+
+    Of the cells `members` (B, M), −1 for none, by least absolute deviations, so that a few cells do not decide.
+    """
+    cells = members[members >= 0]
+    own: list[_Array] = []
+    seen: list[_Array] = []
+    for one in channels:
+        top = float(np.nanpercentile(one.expected, _BRIGHT_PERCENTILE))
+        there = cells[np.isfinite(one.expected[cells])]
+        own.append(one.expected[there] / top)
+        seen.append(one.seen[there] / top)
+    x, y = np.concatenate(own), np.concatenate(seen)
+    if len(x) < LEAST_CELLS:
+        return 0.0, 1.0
+    design, weights = np.column_stack([np.ones(len(x)), x]), np.ones(len(x))
+    solution = np.array([0.0, 1.0])
+    for _ in range(_LIGHT_ROUNDS):
+        solution = least_squares(design, y, weights)
+        residual = np.abs(y - design @ solution)
+        weights = 1 / np.maximum(residual, 0.1 * float(np.median(residual)) + 1e-9)
+    return float(solution[0]), float(solution[1])
+
+
+def _members(block: npt.NDArray[np.int64], blocks: int) -> npt.NDArray[np.int64]:
+    """Return the cells (B, M) of each block, given the block (C,) of each cell; −1 beyond the last of a block."""
+    count = np.bincount(block, minlength=blocks)
+    members = np.full((blocks, int(count.max(initial=1))), -1, dtype=np.int64)
+    order = np.argsort(block, kind="stable")
+    begin = np.repeat(np.cumsum(count) - count, count)
+    members[block[order], np.arange(len(block)) - begin] = order
+    return members
+
+
+def _blocks(cells_mm: _Array) -> tuple[npt.NDArray[np.int64], _Array, float]:
+    """Return the block (C,) of each cell, the blocks' middles (B, 2), and the area of one, mm².
+
+    They are squares of about `BLOCK_CELLS`, or fewer.
+    """
     low, size = cells_mm.min(axis=0), np.maximum(np.ptp(cells_mm, axis=0), 1e-9)
     cells = min(BLOCK_CELLS, max(LEAST_CELLS + 8, len(cells_mm) // 16))
     side = float(np.sqrt(size[0] * size[1] * cells / len(cells_mm)))
@@ -193,4 +324,5 @@ def _blocks(cells_mm: _Array) -> tuple[npt.NDArray[np.int64], _Array]:
     at = np.minimum((cells_mm - low) / size * across, across - 1e-9).astype(np.int64)
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
     middles = np.column_stack([x.ravel(), y.ravel()])
-    return at[:, 1] * columns + at[:, 0], low + (middles + 0.5) * size / across
+    area_mm2 = float(size[0] * size[1]) / (columns * rows)
+    return at[:, 1] * columns + at[:, 0], low + (middles + 0.5) * size / across, area_mm2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,10 @@ import numpy.typing as npt
 from acquisition.framing.movement import Shift
 from acquisition.framing.planes import Channel
 from acquisition.measures.flat_field import FlatField
-from acquisition.measures.paper import Paper
+from acquisition.measures.paper import FieldResidual, Paper
 from acquisition.session.records import FrameRecord
 from calibration.checks.frame_consistency import FrameConsistency
+from drivers.raw.origin import FrameOrigin
 
 _Array = npt.NDArray[np.float64]
 
@@ -48,6 +49,8 @@ class FrameFigures:
         σ of the frame's blur, half-size px: that of the frame registered last, plus the change since.
     exposure
         Shutter time × ISO speed / f-number² by the raw file, s; 0 where it does not state them.
+    origin
+        Camera, lens and exposure as the raw file states them.
     """
 
     record: FrameRecord
@@ -63,6 +66,7 @@ class FrameFigures:
     share_at_zero: float
     blur_px: float
     exposure: float
+    origin: FrameOrigin
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures, but for the record, as JSON can hold them; `from_json` restores them to the last bit."""
@@ -76,13 +80,15 @@ class FrameFigures:
             "error": self.paper.error.tolist(),
             "references": self.paper.references,
             "spread": self.paper.spread.tolist(),
-            "consistency": [self.consistency.scatter, self.consistency.block, *self.consistency.at_mm],
+            "left": self.paper.left.to_json(),
+            "consistency": self.consistency.to_json(),
             "greys": self.greys.tolist(),
             "grey_errors": self.grey_errors.tolist(),
             "dark": self.dark.tolist(),
             "share_at_zero": self.share_at_zero,
             "blur_px": self.blur_px,
             "exposure": self.exposure,
+            "origin": asdict(self.origin),
         }
 
     @staticmethod
@@ -90,19 +96,26 @@ class FrameFigures:
         """Return the figures of a frame from what `to_json` returned; `page_mm` is the chart's width and height."""
         red, green, blue = (tuple(np.array(factor) for factor in factors) for factors in stored["field"])
         white, error, spread = (np.array(stored[name]) for name in ("white", "error", "spread"))
-        scatter, block, x_mm, y_mm = stored["consistency"]
         return FrameFigures(
             record=record,
             black=np.array(stored["black"]),
             channel=stored["channel"],
             shift=Shift(*stored["shift"]),
             reregistered=stored["reregistered"],
-            paper=Paper(FlatField(page_mm, (red, green, blue)), white, error, stored["references"], spread),
-            consistency=FrameConsistency(scatter, block, (x_mm, y_mm)),
+            paper=Paper(
+                FlatField(page_mm, (red, green, blue)),
+                white,
+                error,
+                stored["references"],
+                spread,
+                FieldResidual.from_json(stored["left"]),
+            ),
+            consistency=FrameConsistency.from_json(stored["consistency"]),
             greys=np.array(stored["greys"]).reshape(-1, 3),
             grey_errors=np.array(stored["grey_errors"]).reshape(-1, 3),
             dark=np.array(stored["dark"]),
             share_at_zero=stored["share_at_zero"],
             blur_px=stored["blur_px"],
             exposure=stored["exposure"],
+            origin=FrameOrigin(**stored["origin"]),
         )

@@ -14,8 +14,12 @@ import numpy.typing as npt
 
 from calibration.registration.raster import Raster, tiles
 
-_LEAST_SCORE = 0.3
-"""Correlation below which a block does not count; other cells than the chart's give about 0."""
+_LEAST_SCORE, _LEAST_SCORE_OF_FEW = 0.3, 0.5
+"""Correlation below which a block does not count; other cells than the chart's give about 0, but for chance, which in
+blocks of few cells reaches .4."""
+
+_FEW_CELLS = 64
+"""Cells from which on a block has not few."""
 
 _NEIGHBOUR_BLOCKS = 1.6
 """Blocks that are nearer, in units of their spacing, are neighbours: the eight around."""
@@ -23,8 +27,9 @@ _NEIGHBOUR_BLOCKS = 1.6
 _MOST_DISAGREEMENT = 0.6
 """Cells that a block may move otherwise than its neighbours: more is the neighbouring cell."""
 
-_MOVE_SIGMA_CELLS = 0.05
-"""Standard error of a block's place, in cells: a quarter of an element of the coarse raster."""
+_MOVE_SIGMA_CELLS = 0.02
+"""Standard error of a block's place, in cells: a tenth of an element of the coarse raster, 0.2 px of cells of 10 px
+(simulated frames)."""
 
 _Float = npt.NDArray[np.float32]
 _Array = npt.NDArray[np.float64]
@@ -43,11 +48,14 @@ class FoundBlocks:
         (B, 2) float64, how far from there they were found, on the print.
     score
         (B,) float64, correlation with the print, −1 … 1.
+    least_score
+        Below it a block does not count.
     """
 
     centres_mm: _Array
     moves_mm: _Array
     score: _Array
+    least_score: float = _LEAST_SCORE
 
     def information(self, moves_px: _Array, spacing_mm: _Array, cell_px: float) -> _Array:
         """Return the inverse covariance (B, 2, 2) float64 px⁻² of the blocks' places.
@@ -61,11 +69,14 @@ class FoundBlocks:
         cell_px
             Half-size pixels along a cell's side.
         """
-        weight = _weights(self.centres_mm, moves_px, self.score, spacing_mm, cell_px)
+        score = np.where(self.score > self.least_score, self.score, 0.0)
+        weight = _weights(self.centres_mm, moves_px, score, spacing_mm, cell_px)
         return (weight / (_MOVE_SIGMA_CELLS * cell_px) ** 2)[:, None, None] * np.eye(2)
 
 
-def find_blocks(raster: Raster, expected: _Float, seen: _Float, there: _Mask, size: int, reach: int) -> FoundBlocks:
+def find_blocks(
+    raster: Raster, expected: _Float, seen: _Float, there: _Mask, size: int, reach: int, cells: int
+) -> FoundBlocks:
     """Return where square blocks of the print are found in a rectified frame, by normalised correlation.
 
     Parameters
@@ -78,6 +89,8 @@ def find_blocks(raster: Raster, expected: _Float, seen: _Float, there: _Mask, si
         (H, W) bool, where the frame exists; blocks beyond are left out.
     size, reach
         Elements along a block's side, and how far it is looked for.
+    cells
+        Cells in a block.
     """
     # Square roots keep a bright light's gradient from deciding; noise is even after it too (Anscombe 1948).
     expected, seen = (np.sqrt(np.maximum(picture, 0)) for picture in (expected, seen))
@@ -94,7 +107,10 @@ def find_blocks(raster: Raster, expected: _Float, seen: _Float, there: _Mask, si
         moves.append(move - reach)
         scores.append(score)
     return FoundBlocks(
-        np.array(centres).reshape(-1, 2), np.array(moves).reshape(-1, 2) * raster.step_mm, np.array(scores)
+        np.array(centres).reshape(-1, 2),
+        np.array(moves).reshape(-1, 2) * raster.step_mm,
+        np.array(scores),
+        _LEAST_SCORE if cells >= _FEW_CELLS else _LEAST_SCORE_OF_FEW,
     )
 
 
@@ -112,12 +128,12 @@ def _peak(match: _Array) -> tuple[float, _Array]:
 
 
 def _weights(centres_mm: _Array, moves_px: _Array, score: _Array, spacing_mm: _Array, cell_px: float) -> _Array:
-    """Return the weight (B,) of each block: its score squared, 0 where it is low or the neighbours disagree."""
+    """Return the weight (B,) of each block: its score squared, 0 where it is 0 or the neighbours disagree."""
     apart = np.abs(centres_mm[:, None] - centres_mm[None]) / spacing_mm
     near = np.asarray((apart < _NEIGHBOUR_BLOCKS).all(axis=-1))
-    weight = np.where(score > _LEAST_SCORE, score**2, 0.0)
+    weight = score**2
     for index in range(len(score)):
-        around = near[index] & (score > _LEAST_SCORE)
+        around = near[index] & (score > 0)
         usual = np.median(moves_px[around], axis=0) if around.sum() >= 3 else moves_px[index]
         if np.linalg.norm(moves_px[index] - usual) > _MOST_DISAGREEMENT * cell_px:
             weight[index] = 0.0

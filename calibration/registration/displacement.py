@@ -13,8 +13,9 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
-_ROUGHNESS_PX = 0.1
-"""Usual second difference of the displacement between knots: a wave of 2 px amplitude every 30 knots."""
+ROUGHNESS_PX = 0.2
+"""Usual second difference of the displacement between knots: a wave of 2 px amplitude every 20 knots, or of 0.2 px
+every 6. Where cells measure it, shorter waves are followed as well."""
 
 _RIDGE = 1e-3
 """px⁻², on the diagonal: keeps knots that no measurement reaches solvable, and is nothing to a measured cell's."""
@@ -61,7 +62,9 @@ class Displacement:
         """Return the displacement (N, 2) float64 px at points (N, 2) mm."""
         return np.asarray(self.basis(points_mm) @ self.coefficients.reshape(-1, 2))
 
-    def fitted(self, points_mm: _Array, information: _Array, pull: _Array) -> Displacement:
+    def fitted(
+        self, points_mm: _Array, information: _Array, pull: _Array, roughness_px: float = ROUGHNESS_PX
+    ) -> Displacement:
         """Return the smooth displacement most likely for measured places.
 
         Minimises ``Σ ½ dᵀ A d − pullᵀ d + ½ |second differences|² / roughness²``.
@@ -74,11 +77,13 @@ class Displacement:
             (N, 2, 2) A: inverse covariance of each measurement, px⁻²; 0 where nothing was seen.
         pull
             (N, 2) A times the measured displacement, px⁻¹.
+        roughness_px
+            Usual second difference between knots.
         """
         basis = self.basis(points_mm)
         rows, columns = self.coefficients.shape[:2]
         blocks = [[basis.T @ sparse.diags_array(information[:, i, j]) @ basis for j in (0, 1)] for i in (0, 1)]
-        penalty = _second_differences(rows, columns) / _ROUGHNESS_PX**2
+        penalty = _second_differences(rows, columns) / roughness_px**2
         penalty = penalty + sparse.identity(rows * columns) * _RIDGE
         matrix = sparse.block_array([[blocks[0][0] + penalty, blocks[0][1]], [blocks[1][0], blocks[1][1] + penalty]])
         right = np.concatenate([basis.T @ pull[:, 0], basis.T @ pull[:, 1]])

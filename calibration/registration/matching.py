@@ -6,7 +6,8 @@ Rules that hold inside:
   on the frame itself), and a smooth displacement is fitted to what does not coincide.
 - First whole blocks are found where they are, by correlation (`block_search`); then all cells move together, by
   Gauss-Newton steps (`tile_comparison`). Without the first the second locks onto the neighbouring cell.
-- All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres.
+- All colours are used, each in its own place: red and blue photosites lie a quarter pixel beside the blocks' centres,
+  and the lens's lateral chromatic aberration is measured with the map, which is green's.
 
 Source: B. D. Lucas and T. Kanade, "An iterative image registration technique", IJCAI 1981.
 """
@@ -22,19 +23,25 @@ from scipy import ndimage, sparse
 
 from acquisition.chart.model import PAPER_WHITE, Chart
 from acquisition.framing.homography import rms
-from acquisition.framing.planes import Plane
+from acquisition.framing.planes import CHANNELS, Channel, Plane
 from calibration.registration.block_search import find_blocks
 from calibration.registration.blocks import Blocks, fit_blocks
 from calibration.registration.colour_checks import slipped_parts
 from calibration.registration.colour_model import ColourModel, fit_colours
 from calibration.registration.displacement import Displacement
+from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.lens import Lens
 from calibration.registration.raster import Raster
 from calibration.registration.tile_comparison import TileComparison, compare_tiles
 from foundation.errors import RegistrationError
 
-_COARSE_CELLS = 10
-"""Cells along a block that is searched for: found to 0.14 px RMS where the sheet waves by 3 mm, in simulated frames."""
+_COARSE_BLOCKS = ((10, 1.5), (5, 1.0))
+"""Cells along the blocks that are searched for, and how far, first and then: large ones are never taken for others,
+small ones follow waves of 150 mm and curled edges to 0.2 … 0.3 px RMS, in simulated frames (of 6 mm)."""
+
+_COARSE_ROUGHNESS_PX = 2.0
+"""Usual second difference of the displacement between knots of a sheet that waves by 6 mm every 150 mm. A smoother one
+leaves 1 to 2 px there, which the fine comparison needs ten steps for."""
 
 _BLOCK_CELLS = 8
 """Cells along the window of the fine comparison: blocks of 6 leave larger errors at the worst cell, .40 px for .38."""
@@ -90,11 +97,14 @@ class Anchors:
         (N, 2) float64 where they are seen.
     information
         (N, 2, 2) float64, inverse covariance of the places, px⁻².
+    channel
+        The colour that they were seen in; "G" where it is all of them.
     """
 
     points_mm: _Array
     places_px: _Array
     information: _Array
+    channel: Channel = "G"
 
 
 class Matcher:
@@ -119,6 +129,8 @@ class Matcher:
     ----------
     displacement
         What is added to the lens; zero at first.
+    lateral
+        Where red and blue lie against green; none at first.
     colours
         The frame's colour model, fitted again as the map moves.
     """
@@ -131,6 +143,8 @@ class Matcher:
         self._smooth_order = not chart.tags
         self._planes = planes
         self.lens = lens
+        height, width = planes[0].values.shape
+        self.lateral = LateralColour.unmeasured((width, height))
         self._anchors = anchors
         self.blur_px = blur_px
         self.cell_px = cell_px
@@ -167,16 +181,17 @@ class Matcher:
         self.colours = self._fit_colours()
         self._left: TileComparison | None = None
 
-    def to_pixels(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the half-size pixels (N, 2) float64 of points (N, 2) mm by the map of the moment."""
-        return self.lens.to_pixels(points_mm) + self.displacement.at(points_mm)
+    def to_pixels(self, points_mm: npt.ArrayLike, channel: Channel = "G") -> _Array:
+        """Return the half-size pixels (N, 2) float64 where a channel sees points (N, 2) mm by the map of the moment."""
+        places = self.lens.to_pixels(points_mm) + self.displacement.at(points_mm)
+        return places + self.lateral.shift_px(places, channel)
 
     def _seen(self) -> _Array:
         """Return the camera RGB (N, 3) at the middle of every patch, counts, NaN outside the frame."""
         places = self.to_pixels(self._centres)
         seen = np.empty((len(places), 3))
         for column, plane in enumerate(self._planes):
-            x, y = (places - plane.offset_px).T
+            x, y = (places + self.lateral.shift_px(places, plane.channel) - plane.offset_px).T
             smooth = cv2.blur(plane.values, (3, 3))
             seen[:, column] = ndimage.map_coordinates(smooth, [y, x], order=1, cval=float("nan"))
         return seen
@@ -227,10 +242,13 @@ class Matcher:
         places = raster.element_places(self.to_pixels)
         image = np.empty((*raster.shape, 3), dtype=np.float32)
         for channel, plane in enumerate(self._planes):
+            own = places
+            if plane.channel != "G" and self.lateral.terms_px.any():
+                own = raster.element_places(lambda points, colour=plane.channel: self.to_pixels(points, colour))
             image[..., channel] = cv2.remap(
                 plane.values,
-                places[..., 0] - np.float32(plane.offset_px[0]),
-                places[..., 1] - np.float32(plane.offset_px[1]),
+                own[..., 0] - np.float32(plane.offset_px[0]),
+                own[..., 1] - np.float32(plane.offset_px[1]),
                 cv2.INTER_CUBIC,
                 borderMode=cv2.BORDER_REPLICATE,
             )
@@ -251,29 +269,32 @@ class Matcher:
         RegistrationError
             Too little of the chart is in the frame, or the cells are not the chart's.
         """
-        raster = Raster.of(self._low, self._cell / _COARSE_PER_CELL, self._cells_across * _COARSE_PER_CELL)
+        n, across = _COARSE_PER_CELL, int(self._cells_across.min())
+        blocks = [int(np.clip(across // 3, 2, cells)) for cells, _ in _COARSE_BLOCKS]
+        reaches = [round(n * min(far, 0.25 * blocks[0])) for _, far in _COARSE_BLOCKS]
+        # The raster goes on beyond the outermost cells as far as they are looked for, so that blocks reach the rim.
+        step, beyond = self._cell / n, max(reaches)
+        raster = Raster.of(self._low - beyond * step, step, self._cells_across * n + 2 * beyond)
         cover = raster.coverage(self._centres, self._sizes)
-        block = int(np.clip(self._cells_across.min() // 3, 2, _COARSE_CELLS))
-        reach = round(_COARSE_PER_CELL * min(1.5, 0.25 * block))
         best = 0.0
-        for _ in range(2):
+        for block, reach in zip(blocks, reaches, strict=True):
             template = self._template(raster, cover, self._elements(raster, max(self.blur_px, 0.7)))
             image, there = self._rectified(raster)
             # What is printed in the margin must not move cells.
-            bare = ~raster.near(cover, _COARSE_PER_CELL)
+            bare = ~raster.near(cover, n)
             image[bare] = template[bare]
-            found = find_blocks(raster, template, image, there, block * _COARSE_PER_CELL, reach)
+            found = find_blocks(raster, template, image, there, block * n, reach, block**2)
             if not len(found.score):
                 raise RegistrationError(
                     f"{what}: too little of the chart lies in the picture; bring all of it into the picture"
                 )
             centre = found.centres_mm
-            best = float(np.median(found.score))
+            best = max(best, float(np.median(found.score)))
             shift = self.to_pixels(centre + found.moves_mm) - self.to_pixels(centre)
             information = found.information(shift, self._cell * block, self.cell_px)
             total = self.displacement.at(centre) + shift
             self.displacement = self.displacement.fitted(
-                centre, information, np.einsum("nij,nj->ni", information, total)
+                centre, information, np.einsum("nij,nj->ni", information, total), _COARSE_ROUGHNESS_PX
             )
             self.colours = self._fit_colours()
         if best < _LEAST_BLOCK_SCORE:
@@ -281,8 +302,8 @@ class Matcher:
                 what, f"blocks of cells correlate by {best:.2f} with the chart's, {_LEAST_BLOCK_SCORE:g} expected"
             )
 
-    def follow(self, sigma_cells: float) -> float:
-        """Move the map by one Gauss-Newton step of what is coarser than cells; return the RMS movement, px.
+    def follow(self, sigma_cells: float) -> None:
+        """Move the map by one Gauss-Newton step of what is coarser than cells.
 
         Blurred by `sigma_cells`, the steps between cells are gone, and with them the danger to lock onto the
         neighbouring cell; folds of a smooth order and the texture of a random one remain. Where the colours only rise
@@ -290,9 +311,8 @@ class Matcher:
         """
         # What the colours leave is alike over many cells: a window is about one measurement.
         repeat = (_FOLLOWED_CELLS * _COARSE_PER_CELL) ** 2 / _WINDOW_WORTH
-        moved = self._move(self._compared_softly(sigma_cells).weakened(repeat))
+        self._move(self._compared_softly(sigma_cells).weakened(repeat))
         self.colours = self._fit_colours()
-        return moved
 
     def _compared_softly(self, sigma_cells: float) -> TileComparison:
         """Return the comparison of print and frame, both blurred by some cells."""
@@ -338,8 +358,8 @@ class Matcher:
         )
         return self._low + places * self._cell, parts
 
-    def step(self) -> float:
-        """Move the map by one Gauss-Newton step of all cells together; return the RMS movement, px."""
+    def step(self) -> tuple[float, float]:
+        """Move the map by one Gauss-Newton step of all cells together; return the RMS and largest movement, px."""
         raster, n = self._raster, self._per_cell
         template = self._template(raster, self._cover, self._elements(raster, self.blur_px))
         image, there = self._rectified(raster)
@@ -350,23 +370,44 @@ class Matcher:
         )
         if self._smooth_order:
             compared = compared.weakened(_COLOURS_REPEAT)
-        before = self.displacement
+        points = compared.points_mm
+        before, places = self.displacement, self.to_pixels(points)
+        shifted = [self.lateral.shift_px(places, channel) for channel in CHANNELS]
+        self.lateral = self.lateral.remeasured(*self._in_blocks(compared, places))
+        turned = np.stack([self.lateral.shift_px(places, channel) for channel in CHANNELS]) - shifted
+        compared = compared.after(turned)
         moved = self._move(compared)
-        self._left = compared.after(self.displacement.at(compared.points_mm) - before.at(compared.points_mm))
+        self._left = compared.after(self.displacement.at(points) - before.at(points))
         return moved
 
-    def _move(self, compared: TileComparison) -> float:
-        """Move the map to where tiles and anchors measured it; return the RMS movement of the tiles, px."""
+    def _in_blocks(self, compared: TileComparison, places_px: _Array) -> tuple[_Array, _Array, _Array]:
+        """Return middles (B, 2) px of blocks of cells, and their information (3, B, 2, 2) and pull (3, B, 2)."""
+        column, row = np.floor((compared.points_mm - self._low) / (self._cell * self._block_cells)).astype(int).T
+        number = row * (column.max() + 1) + column
+        count = int(number.max()) + 1
+
+        def summed(values: _Array) -> _Array:
+            total = np.zeros((count, *values.shape[1:]))
+            np.add.at(total, number, values)
+            return total
+
+        tiles = np.maximum(np.bincount(number, minlength=count), 1)
+        information, pull = (np.stack([summed(one) for one in channels]) for channels in compared.of_channels)
+        return summed(places_px) / tiles[:, None], information, pull
+
+    def _move(self, compared: TileComparison) -> tuple[float, float]:
+        """Move the map to where tiles and anchors measured it; return the tiles' RMS and largest movement, px."""
         anchors, points = self._anchors, compared.points_mm
         all_points = np.concatenate([points, anchors.points_mm])
         all_information = np.concatenate([compared.information, anchors.information])
         before = self.displacement.at(all_points)
-        off = anchors.places_px - self.to_pixels(anchors.points_mm)
+        off = anchors.places_px - self.to_pixels(anchors.points_mm, anchors.channel)
         anchored = np.einsum("nij,nj->ni", anchors.information, off)
         total = np.concatenate([compared.pull, anchored]) + np.einsum("nij,nj->ni", all_information, before)
         self.displacement = self.displacement.fitted(all_points, all_information, total)
         moved = (self.displacement.at(all_points) - before)[: len(points)]
-        return rms(moved[compared.information[:, 0, 0] > 0])
+        moved = moved[compared.information[:, 0, 0] > 0]
+        return rms(moved), float(np.linalg.norm(moved, axis=1).max(initial=0.0))
 
 
 def not_this_chart(what: str, measured: str) -> RegistrationError:

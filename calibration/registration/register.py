@@ -55,11 +55,12 @@ MAX_BLOCK_RESIDUAL_PX = 0.5
 """RMS displacement that blocks may still need, for cells of 10 px: twice what the samples' reach allows for, and more
 than ten times what a sheet that waves by 3 mm leaves in simulated frames."""
 
-_GAUSS_NEWTON_STEPS = 5
-"""Steps at most; each is the cost of a comparison of all cells."""
+_GAUSS_NEWTON_STEPS = 8
+"""Steps at most; each is the cost of a comparison of all cells. A flat print takes two or three, curled ones five."""
 
-_SETTLED_PX = 0.01
-"""RMS movement of a step below which there is none to follow: a third of the map's own error."""
+_SETTLED_PX, _SETTLED_CELL_PX = 0.015, 0.15
+"""Movements of a step below which there is none to follow: RMS, and of the cell that moves most. Half of either is left
+at most: the map's own error. A curled rim comes last, when the RMS shows nothing of it."""
 
 _TAG_SIGMA_PX = 0.15
 """Standard error of a tag's corner: 0.085 px measured in white light, .20 in a weak one."""
@@ -139,7 +140,8 @@ def register(
         for softness in _FOLLOWED_SOFTLY:
             matcher.follow(softness)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        if matcher.step() < _SETTLED_PX:
+        moved, furthest = matcher.step()
+        if moved < _SETTLED_PX and furthest < _SETTLED_CELL_PX:
             break
     registration = _registered(chart, framing, matcher, marks, lens_rms)
     _judge(registration, MIN_AGREEMENT if chart.tags else MIN_PLAIN_AGREEMENT, what)
@@ -152,7 +154,8 @@ def _tag_corners(framing: Framing, chart: Chart) -> Anchors:
     tags = {tag.id: tag for tag in chart.tags}
     corners_mm = np.concatenate([tags[tag.id].corners_mm for tag in framing.tags])
     corners_px = np.concatenate([tag.corners_px for tag in framing.tags])
-    return Anchors(corners_mm, corners_px, np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2)))
+    known = np.broadcast_to(np.eye(2) / _TAG_SIGMA_PX**2, (len(corners_mm), 2, 2))
+    return Anchors(corners_mm, corners_px, known, framing.plane.channel)
 
 
 def _outline(field: FoundField) -> Anchors:
@@ -221,7 +224,7 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
     """Return the map with all figures of its quality."""
     seen, expected, paper = matcher.patches()
     there = np.asarray(np.isfinite(seen).all(axis=1))
-    residual = marks.places_px - matcher.to_pixels(marks.points_mm)
+    residual = marks.places_px - matcher.to_pixels(marks.points_mm, marks.channel)
     if framing.field is not None:
         residual = (residual * framing.field.normals).sum(axis=1, keepdims=True) * framing.field.normals
     mismatched_cells = mismatched(seen, expected, paper, chart)
@@ -233,6 +236,7 @@ def _registered(chart: Chart, framing: Framing, matcher: Matcher, marks: Anchors
         framing=framing,
         lens=matcher.lens,
         displacement=matcher.displacement,
+        lateral=matcher.lateral,
         marks_residual_px=residual,
         lens_residual_px=lens_rms,
         blocks=blocks,

@@ -9,10 +9,12 @@ import numpy.typing as npt
 
 from acquisition.framing.finding import Framing
 from acquisition.framing.homography import rms
+from acquisition.framing.planes import Channel
 from acquisition.limits.bleed import SAMPLE_REACH_PX
 from calibration.registration.blocks import Blocks
 from calibration.registration.colour_model import ColourModel
 from calibration.registration.displacement import Displacement
+from calibration.registration.lateral_colour import LateralColour
 from calibration.registration.lens import Lens
 
 CLEARANCE_PX = 1.75
@@ -31,7 +33,9 @@ class Registration:
     framing
         The tags, or the field's outline, as found.
     lens, displacement
-        The two parts of the map.
+        The two parts of the map of green.
+    lateral
+        Where red and blue lie against it.
     marks_residual_px
         (N, 2) float64, the tags' corners against the final map; of a chart without tags the field's outline, across.
     lens_residual_px
@@ -55,6 +59,7 @@ class Registration:
     framing: Framing
     lens: Lens
     displacement: Displacement
+    lateral: LateralColour
     marks_residual_px: _Array
     lens_residual_px: float
     blocks: Blocks
@@ -65,9 +70,13 @@ class Registration:
     cell_px: float
     shift_px: tuple[float, float] = (0.0, 0.0)
 
-    def to_pixels(self, points_mm: npt.ArrayLike) -> _Array:
-        """Return the half-size pixels (N, 2) float64, x then y, of points (N, 2) on the print."""
-        return self.lens.to_pixels(points_mm) + self.displacement.at(points_mm) + self.shift_px
+    def to_pixels(self, points_mm: npt.ArrayLike, channel: Channel = "G") -> _Array:
+        """Return the half-size pixels (N, 2) float64, x then y, where a channel sees points (N, 2) on the print.
+
+        The lens shifts red and blue against green. Samples are taken where green is.
+        """
+        places = self.lens.to_pixels(points_mm) + self.displacement.at(points_mm) + self.shift_px
+        return places + self.lateral.shift_px(places, channel)
 
     def shifted(self, dx: float, dy: float) -> Registration:
         """Return this registration for a frame in which the chart lies (dx, dy) px further."""

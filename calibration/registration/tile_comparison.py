@@ -39,21 +39,34 @@ class TileComparison:
         (N, 2) float64 px⁻¹, information times the measured displacement.
     score
         (N,) float64, correlation of frame and print around each tile, −1 … 1; 0 where nothing can be compared.
+    of_channels
+        (3, N, 2, 2) and (3, N, 2) float64, what red, green and blue contribute to information and pull.
     """
 
     points_mm: _Array
     information: _Array
     pull: _Array
     score: _Array
+    of_channels: tuple[_Array, _Array]
+
+    @classmethod
+    def of(cls, points_mm: _Array, information: _Array, pull: _Array, score: _Array) -> TileComparison:
+        """Return the comparison from the channels' information (3, N, 2, 2) and pull (3, N, 2)."""
+        return cls(points_mm, information.sum(axis=0), pull.sum(axis=0), score, (information, pull))
 
     def after(self, moved_px: _Array) -> TileComparison:
-        """Return what is left to do once the map has moved by (N, 2) px at the tiles."""
-        left = self.pull - np.einsum("nij,nj->ni", self.information, moved_px)
-        return TileComparison(self.points_mm, self.information, left, self.score)
+        """Return what is left to do once the map has moved by (N, 2) px at the tiles.
+
+        `moved_px` may be (3, N, 2), of red, green and blue each its own.
+        """
+        information, pull = self.of_channels
+        moved = np.broadcast_to(moved_px, pull.shape)
+        return self.of(self.points_mm, information, pull - np.einsum("cnij,cnj->cni", information, moved), self.score)
 
     def weakened(self, times: float) -> TileComparison:
         """Return the same with the weight of fewer measurements: one for each `times` that repeat each other."""
-        return TileComparison(self.points_mm, self.information / times, self.pull / times, self.score)
+        information, pull = self.of_channels
+        return self.of(self.points_mm, information / times, pull / times, self.score)
 
 
 def compare_tiles(
@@ -90,7 +103,7 @@ def compare_tiles(
     mean = _LocalMean(weight, window, without_gradient)
     agreeing = np.zeros(raster.shape, dtype=np.float32)
     expected_power, seen_power = np.zeros_like(agreeing), np.zeros_like(agreeing)
-    sums = np.zeros((*raster.tiles(size), 5), dtype=np.float64)
+    sums = np.zeros((3, *raster.tiles(size), 5), dtype=np.float64)
     for channel in range(3):
         model, values = expected[..., channel], seen[..., channel]
         gy, gx = np.gradient(model)
@@ -113,16 +126,18 @@ def compare_tiles(
             )
         gx, gy = gx * gain, gy * gain
         for place, (one, other) in enumerate(((gx, gx), (gx, gy), (gy, gy), (gx, error), (gy, error))):
-            sums[..., place] += sums_of(huber * one * other, size)
+            sums[channel, ..., place] = sums_of(huber * one * other, size)
     score = agreeing / np.sqrt(np.maximum(expected_power * seen_power, np.float32(1e-6)))
     score *= mean.share > _LEAST_SHARE
     points = raster.points_of_tiles(size)
-    information, pull = to_pixel_units(sums.reshape(-1, 5), jacobians(to_pixels, points, raster.step_mm))
+    slopes = jacobians(to_pixels, points, raster.step_mm)
+    units = [to_pixel_units(one.reshape(-1, 5), slopes) for one in sums]
+    information, pull = np.stack([one for one, _ in units]), np.stack([one for _, one in units])
     # Neighbouring raster elements repeat each other's noise where they are finer than the photosites.
     repeat = max(1.0, (size / cell_px) ** 2)
     score = tile_middles(score, size).ravel().astype(np.float64)
     good = (score >= MIN_SCORE) / repeat
-    return TileComparison(points, information * good[:, None, None], pull * good[:, None], score)
+    return TileComparison.of(points, information * good[:, None, None], pull * good[:, None], score)
 
 
 class _LocalMean:

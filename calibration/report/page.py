@@ -7,12 +7,14 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from calibration.causes.findings import ProbableCause
 from calibration.report.plots import INK
 from calibration.report.summary import summary
 from calibration.table.provenance import Unfit
 from calibration.verdict.result import BuildResult
-from calibration.verdict.retaking import COMMAND, is_mended_by_retaking, retaken_frames
-from calibration.verdict.verdict import JudgedValue, Outcome, Verdict, format_value
+from calibration.verdict.retaking import COMMAND, findings, is_mended_by_retaking, retake_command, retaken_frames
+from calibration.verdict.verdict import JudgedValue, Outcome, format_value
+from calibration.verdict.wording import places_text
 from foundation.errors import counted, first_of
 
 MOST_UNFIT = 200
@@ -47,8 +49,18 @@ class Picture:
     png: bytes
 
 
-def page(result: BuildResult, pictures: Sequence[Picture]) -> str:
-    """Return the text of `report.html`."""
+def page(result: BuildResult, pictures: Sequence[Picture], places: Sequence[Picture] = ()) -> str:
+    """Return the text of `report.html`.
+
+    Parameters
+    ----------
+    result
+        What the build found.
+    pictures
+        Of the figures.
+    places
+        Of frames in which something is beyond its limit, shown with its causes.
+    """
     session = result.figures.session
     title = f"Table of {session.lights} lights, {session.camera}"
     return (
@@ -56,15 +68,20 @@ def page(result: BuildResult, pictures: Sequence[Picture]) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>\n"
         f'<h1>{html.escape(title)}</h1><p class="note">Session {html.escape(session.folder.name)}</p>\n'
-        f"{_verdict(result.verdict)}{_retaking(result)}<h2>Figures</h2>{_summary(result)}"
+        f"{_verdict(result)}{_causes(result)}{_retaking(result)}{''.join(map(picture_html, places))}"
+        f"<h2>Figures</h2>{_summary(result)}"
         f"{''.join(map(picture_html, pictures))}{_unfit(result.figures.cells.unfit)}</body></html>\n"
     )
 
 
-def _verdict(verdict: Verdict) -> str:
+def _verdict(result: BuildResult) -> str:
     """Return the verdict and its table, the worst rows first."""
+    verdict, found = result.verdict, findings(result.verdict, result.figures)
     order: tuple[Outcome, ...] = ("refuse", "accept with remarks", "accept")
-    rows = "".join(_judged(row) for row in sorted(verdict.rows, key=lambda row: order.index(row.outcome)))
+    rows = "".join(
+        _judged(row, _remedy(row, found.get(row.threshold.name)))
+        for row in sorted(verdict.rows, key=lambda row: order.index(row.outcome))
+    )
     sentence = {
         "accept": "Accepted: every figure is within its limit.",
         "accept with remarks": f"Accepted with remarks on {len(verdict.remarks)} of {len(verdict.rows)} figures.",
@@ -88,10 +105,42 @@ def _retaking(result: BuildResult) -> str:
     return f"<p>To be taken again ({counted(len(records), 'frame')}): {names}; <code>{COMMAND}</code>.{also}</p>"
 
 
-def _judged(row: JudgedValue) -> str:
+def _remedy(row: JudgedValue, found: ProbableCause | None) -> str:
+    """Return what helps against what is beyond a limit; "" where nothing is."""
+    if row.outcome == "accept" or not row.threshold.remedy:
+        return ""
+    if found is None:
+        return row.threshold.remedy
+    return found.decision.cause.remedy if found.is_known else f"it may help to {row.threshold.remedy}"
+
+
+def _causes(result: BuildResult) -> str:
+    """Return what is beyond its limit with its probable cause, frames, place and command; nothing where nothing is."""
+    rows: list[str] = []
+    for name, found in findings(result.verdict, result.figures).items():
+        title = next(row.threshold.title for row in result.verdict.rows if row.threshold.name == name)
+        cause, rule = found.decision.cause, found.decision.rule
+        probably = (
+            "not known from what was measured" if rule is None else f"<b>{html.escape(cause.name)}</b>: {rule.why}"
+        )
+        again = f"<br><code>{retake_command(found.frames)}</code>" if found.is_of_frames else ""
+        known = ", ".join(f"{key} {value:.3g}" for key, value in found.evidence.known().items())
+        rows.append(
+            f"<tr><th>{html.escape(title)}</th><td>{probably}{again}</td><td>{html.escape(places_text(found))}</td>"
+            f"<td class='note'>{html.escape(known)}</td></tr>"
+        )
+    if not rows:
+        return ""
+    return (
+        "<h2>Probable causes</h2><table><tr><th>figure</th><th>cause</th><th>frames and place</th><th>decided from</th>"
+        f"</tr>{''.join(rows)}</table>"
+    )
+
+
+def _judged(row: JudgedValue, helps: str) -> str:
     limit, name = row.threshold, _CLASSES[row.outcome]
     refuse = "" if limit.refuse is None else format_value(limit.refuse, limit.unit)
-    remedy = f". <b>{html.escape(limit.remedy)}</b>" if row.outcome != "accept" and limit.remedy else ""
+    remedy = f". <b>{html.escape(helps)}</b>" if helps else ""
     return (
         f"<tr><td class='{name}'>{name}</td><th>{html.escape(limit.title)}</th>"
         f"<td class='number'>{html.escape(format_value(row.value, limit.unit))}</td>"

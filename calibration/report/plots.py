@@ -71,7 +71,7 @@ def png_of(draw: Callable[..., None], *arguments: Any) -> bytes:
     return stream.getvalue()
 
 
-def _viewable(picture: _Image) -> _Image:
+def viewable(picture: _Image) -> _Image:
     """Return an image (H, W, 3) float32 to look at, 0 … 1: each channel to its paper white, sRGB's curve roughly."""
     white = np.maximum(np.percentile(picture[::4, ::4].reshape(-1, 3), _PAPER_PERCENTILE, axis=0), 1)
     return np.clip(picture / white, 0, 1).astype(np.float32) ** np.float32(1 / _GAMMA)
@@ -85,7 +85,7 @@ def draw_registration(figure: Any, picture: _Image, chart: Chart, registration: 
     height, width = picture.shape[:2]
     figure.set_size_inches(10, 10 * height / width + 2.4)
     whole, crops = figure.subfigures(2, 1, height_ratios=(10 * height / width, 2.4))
-    shown = _viewable(picture)
+    shown = viewable(picture)
     step = max(1, width // 1400)
     axes = whole.subplots()
     axes.imshow(shown[::step, ::step], extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="antialiased")
@@ -369,7 +369,7 @@ def draw_worst_cells(figure: Any, picture: _Image, chart: Chart, registration: R
     samples = samples.reshape(len(at), window**2, 3)
     difference, sigma = rim_difference(samples, sample_noise(samples))
     score = (difference / np.maximum(sigma, 1e-6)).max(axis=1)
-    shown = _viewable(picture)
+    shown = viewable(picture)
     order = np.argsort(-score)[:WORST_CELLS]
     for axes, index in zip(figure.subplots(2, WORST_CELLS // 2).ravel(), order, strict=False):
         cell = int(at[index])

@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from acquisition.chart.model import Chart
 from acquisition.measures.flat_field import FlatField
@@ -19,6 +20,12 @@ from acquisition.session.folder import Session
 from calibration.figures.table_figures import TableFigures
 from calibration.report.half_size import half_size
 from calibration.report.page import Picture, page
+from calibration.report.places import (
+    LabelledPlace,
+    draw_places,
+    draw_reference_residuals,
+    reference_residuals,
+)
 from calibration.report.plots import (
     WORST_CELLS,
     draw_chromaticities,
@@ -33,8 +40,12 @@ from calibration.report.plots import (
 from calibration.report.report_json import report_json
 from calibration.table.file_names import REPORT_JSON, REPORT_PAGE
 from calibration.verdict.result import BuildResult
+from calibration.verdict.retaking import findings
 from drivers.raw.rawfile import read_raw
 from foundation.files import write_whole
+
+MOST_FRAMES = 4
+"""Frames that are drawn with their places: each is read again, and more are looked at by nobody."""
 
 
 def write_report(result: BuildResult, session: Session, folder: Path) -> None:
@@ -49,11 +60,12 @@ def write_report(result: BuildResult, session: Session, folder: Path) -> None:
     folder
         Where the files are written.
     """
-    write_whole(folder / REPORT_PAGE, page(result, _pictures(result.figures, session)))
+    write_whole(folder / REPORT_PAGE, page(result, _pictures(result, session), _place_pictures(result, session)))
     write_whole(folder / REPORT_JSON, json.dumps(report_json(result), indent=2) + "\n")
 
 
-def _pictures(figures: TableFigures, session: Session) -> list[Picture]:
+def _pictures(result: BuildResult, session: Session) -> list[Picture]:
+    figures = result.figures
     chart, registration, window = session.chart, figures.registration, figures.cells.window
     frame = half_size(read_raw(session.folder / figures.session.registered_file))
     codes = np.array([light.codes for light in session.illuminations])
@@ -78,6 +90,7 @@ def _pictures(figures: TableFigures, session: Session) -> list[Picture]:
             f"samples and ground truth. Contours are 2 % apart. {_primaries_caption(figures)}",
             png_of(draw_field, chart, _registered_field(figures)),
         ),
+        *_residual_picture(chart, figures, frame),
         *_print_picture(chart, figures.cells.stains),
         Picture(
             "The lights",
@@ -99,6 +112,40 @@ def _pictures(figures: TableFigures, session: Session) -> list[Picture]:
             png_of(draw_worst_cells, frame, chart, registration, window),
         ),
     ]
+
+
+def _place_pictures(result: BuildResult, session: Session) -> list[Picture]:
+    """Return a picture of each frame in which something is beyond its limit at a place, which is circled."""
+    by_file: dict[str, list[LabelledPlace]] = {}
+    titles = {row.threshold.name: row.threshold.title for row in result.verdict.rows}
+    for name, found in findings(result.verdict, result.figures).items():
+        cause = found.decision.cause.name if found.is_known else "cause not known"
+        for place in found.places:
+            by_file.setdefault(place.file, []).append((f"{titles[name]}: {cause}", place))
+    pictures: list[Picture] = []
+    for file, places in list(by_file.items())[:MOST_FRAMES]:
+        picture = half_size(read_raw(session.folder / file))
+        drawn = png_of(draw_places, picture, session.chart, result.figures.registration, places)
+        caption = (
+            f"{file}, contrast stretched, with what is beyond its limits circled; places lie as in the frame that was "
+            "registered first."
+        )
+        pictures.append(Picture(f"Where it is: {Path(file).stem}", caption, drawn))
+    return pictures
+
+
+def _residual_picture(chart: Chart, figures: TableFigures, picture: npt.NDArray[np.float32]) -> list[Picture]:
+    """Return the picture of what the field leaves of the references, none where there are none."""
+    places_mm = np.array([reference.centre_mm for reference in chart.white_references], dtype=np.float64).reshape(-1, 2)
+    residual = reference_residuals(picture, places_mm, figures.registration, figures.registered_frame)
+    if not np.isfinite(residual).any():
+        return []
+    caption = (
+        "White references about the field, in the frame that was registered. Left, on the print: noise has no order, "
+        "what lies or shines on the print is one place. Right, by the distance from the middle: a bend at its end is "
+        "fall-off that the field does not follow."
+    )
+    return [Picture("What the field leaves", caption, png_of(draw_reference_residuals, chart, places_mm, residual))]
 
 
 def _registered_field(figures: TableFigures) -> FlatField:

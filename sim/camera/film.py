@@ -146,7 +146,7 @@ class WorldFilm:
         moment = Moment(len(self._before), seconds, colour, tuple(self._before))
         lamp = self._light() * (1 - self._world.room.lamp_drift_per_hour * seconds / 3600)
         # The noise is that of the frame that was ordered, whatever there is to see.
-        key = (colour.red, colour.green, colour.blue, self._exposed[colour])
+        key = (*colour.codes, self._exposed[colour])
         self._exposed[colour] += 1
         self._before.append((seconds, colour))
         stale = self._disturbances.stale(moment)

@@ -73,7 +73,7 @@ class ReplayFilm:
         frames = self._frames.get(colour, [])
         number = self._exposed[colour]
         if number >= len(frames):
-            codes = (colour.red, colour.green, colour.blue)
+            codes = colour.codes
             raise DeviceRefused(
                 f"the recording has {len(frames)} frames under the colour {codes}, frame {number + 1} was asked for; "
                 "replay it with the illuminations and sequence settings it was taken with"

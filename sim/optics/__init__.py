@@ -1,1 +1,1 @@
-"""The lens of the simulated room: what it does to the light beside a Gaussian blur."""
+"""What lens and projector do to the light beside a Gaussian blur: shoulders, veil, lateral colour, fall-off."""

@@ -19,16 +19,20 @@ from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
 
 from drivers.presenter import BLACK, Colour
 from foundation.errors import ConfigurationError
-from sim.world.situation import UNDISTURBED, Blob, Patch, Place, Situation
+from sim.world.situation import UNDISTURBED, Blob, Glare, Patch, Place, Situation
 
 _HALF: Final[Place] = (-9.0, 0.5, 9.0, 9.0)
 """The lower half of the picture, its overscan included."""
 
 _QUARTER: Final[Place] = (0.5, 0.35, 1.1, 1.4)
 """A shoulder that reaches over a quarter of the chart from its lower right."""
+
+_SPOT: Final[Place] = (0.1, -0.2, 0.9, 0.8)
+"""Most of the upper half of the page: what a matt surface mirrors of a lamp is broad."""
 
 _SLANTED_DEG: Final = 30.0
 """Direction of a push, clockwise from the right: along neither axis."""
@@ -309,9 +313,22 @@ class ScrambledRows(Disturbance):
         return torn
 
 
+@dataclass(frozen=True)
+class Reflection(Disturbance):
+    """The print mirrors light into the camera: `percent` of what bare paper sends, in the middle of a soft ellipse."""
+
+    what: Literal["reflection"] = "reflection"
+    place: Place = _SPOT
+    percent: float = 3.0
+
+    def changed(self, situation: Situation, moment: Moment) -> Situation:
+        """Add it."""
+        return replace(situation, glares=(*situation.glares, Glare(self.place, self.percent / 100)))
+
+
 AnyDisturbance = (
     FrozenScreen | PopUp | HalfChanged | Bump | LampStep | LampDrift | AmbientStep | Defocus | Person | SensorWarming
-    | StaleFile | ZeroedStrip | ScrambledRows
+    | StaleFile | ZeroedStrip | ScrambledRows | Reflection
 )  # fmt: skip
 """Every event, by its `what`."""
 
@@ -405,8 +422,33 @@ def read_disturbances(listed: Sequence[Any], where: str, key: str = "simulated.e
         first = error.errors()[0]
         place = [part for part in first["loc"] if part not in KINDS]
         at = ".".join([f"{key}[{place[0]}]" if place else key, *(str(part) for part in place[1:])])
-        hint = f"; known are {', '.join(KINDS)}" if first["type"].startswith("union_tag") else ""
-        raise ConfigurationError(f"{where}: {at}: {first['msg']}, got {first['input']!r}{hint}") from error
+        raise ConfigurationError(f"{where}: {at}{_said_of(first)}") from error
+
+
+def _said_of(fault: ErrorDetails) -> str:
+    """Return what is wrong with a table or a key of it, behind its place, and what is expected."""
+    given = f" = {fault['input']!r}"
+    kinds = ", ".join(KINDS)
+    known = {"union_tag_not_found": f"{given} does not say what happens; add what, one of {kinds}"}
+    known["union_tag_invalid"] = f"{given}: there is no such event; what is one of {kinds}"
+    known["extra_forbidden"] = known["unexpected_keyword_argument"] = " is no key of this event; remove it"
+    known["missing"] = " is missing; add it"
+    for words, expected in _EXPECTED.items():
+        if fault["type"].startswith(words):
+            return f"{given}: {expected} is expected; correct it"
+    return known.get(fault["type"], f"{given}: {fault['msg'].removeprefix('Value error, ')}; correct it")
+
+
+_EXPECTED: Final = {
+    "float_": "a number",
+    "int_": "a whole number",
+    "bool_": "true or false",
+    "tuple_type": "a list of numbers",
+    "too_": "a shorter list",
+    "dataclass_type": "a table",
+    "model_attributes_type": "a table",
+}
+"""What a value should have been, by the first words of the kind of fault."""
 
 
 def drawn(seed: int, frames: int, count: int, kinds: Iterable[str] = KINDS) -> Disturbances:
@@ -442,7 +484,7 @@ def drawn(seed: int, frames: int, count: int, kinds: Iterable[str] = KINDS) -> D
     return Disturbances(tuple(events))
 
 
-_LASTING: Final = (FrozenScreen, LampStep, AmbientStep, Defocus)
+_LASTING: Final = (FrozenScreen, LampStep, AmbientStep, Defocus, Reflection)
 """Events that do not end by themselves, beside a bump and what is gradual."""
 
 

@@ -148,6 +148,25 @@ class Room:
         share = codes / 255
         return decode_srgb(share) if self.transfer == "srgb" else share**self.transfer
 
+    def wheel_light(self, shutter_s: float, random: np.random.Generator) -> NDArray[np.float64]:
+        """Return (3,) float64, the light of each primary that the wheel lets through over that of steady light.
+
+        Parameters
+        ----------
+        shutter_s
+            Exposure time, seconds.
+        random
+            Decides where the wheel stands when the shutter opens, and the shutter's jitter.
+        """
+        if self.wheel_hz == 0:
+            return np.ones(3)
+        start = random.uniform()
+        time = max(shutter_s + self.shutter_jitter_s * random.standard_normal(), 0)
+        turns = np.array([start, start + time * self.wheel_hz])[:, None]
+        segment = np.arange(3) / 3
+        shone = np.floor(turns) / 3 + np.clip(turns - np.floor(turns) - segment, 0, 1 / 3)
+        return 3 * (shone[1] - shone[0]) / (shutter_s * self.wheel_hz)
+
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"seed is {self.seed}; 0 or more is expected")

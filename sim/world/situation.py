@@ -76,6 +76,29 @@ class Blob:
         return 1 - (1 - self.left) * inside * inside * (3 - 2 * inside)
 
 
+@dataclass(frozen=True)
+class Glare:
+    """Light that the print's surface mirrors into the camera, unlike what ink and paper scatter: a broad, soft spot.
+
+    Attributes
+    ----------
+    place
+        Where it is seen: an ellipse that touches the sides of its place at 1 / e² of its light in the middle.
+    share
+        Of the light that bare paper sends there; it has the colour of the projector's light, ambient light included.
+    """
+
+    place: Place
+    share: float = 0.03
+
+    def added(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the mirrored light (...) at points (..., 2) of the page, shares of it, over that of bare paper."""
+        left, top, right, bottom = self.place
+        x, y = at[..., 0], at[..., 1]
+        away2 = ((2 * x - left - right) / (right - left)) ** 2 + ((2 * y - top - bottom) / (bottom - top)) ** 2
+        return self.share * np.exp(-2 * away2)
+
+
 @dataclass(frozen=True, eq=False)
 class Situation:
     """What is otherwise than in the undisturbed room while one frame is exposed.
@@ -93,6 +116,8 @@ class Situation:
         Of other colours in the picture, each over those before it.
     blobs
         What stands before the chart.
+    glares
+        What the print mirrors into the camera.
     bump_px, bump_mm
         How far the chart has moved in its plane, right and down, in half-size pixels at its middle and in millimetres;
         both count.
@@ -109,6 +134,7 @@ class Situation:
     picture: NDArray[np.float32] | None = None
     patches: tuple[Patch, ...] = ()
     blobs: tuple[Blob, ...] = ()
+    glares: tuple[Glare, ...] = ()
     bump_px: tuple[float, float] = (0.0, 0.0)
     bump_mm: tuple[float, float] = (0.0, 0.0)
     turn_deg: float = 0.0
@@ -119,7 +145,7 @@ class Situation:
     def is_even(self) -> bool:
         """Whether every place of the chart gets, and shows, the same share of each primary's light."""
         plain = self.picture is None or self.picture.shape[:2] == (1, 1)
-        return plain and not self.patches and not self.blobs
+        return plain and not self.patches and not self.blobs and not self.glares
 
     @property
     def view(self) -> tuple[float, ...]:
@@ -170,6 +196,14 @@ class Situation:
         for blob in self.blobs:
             left *= blob.passed(at)
         return left
+
+    def mirrored(self, points_mm: NDArray[np.float64], page_mm: tuple[float, float]) -> NDArray[np.float64]:
+        """Return the light (...) float64 that points (..., 2) mm of the print mirror, over what bare paper sends."""
+        at = points_mm / np.array(page_mm)
+        added = np.zeros(points_mm.shape[:-1])
+        for glare in self.glares:
+            added += glare.added(at)
+        return added
 
 
 UNDISTURBED: Final = Situation()

@@ -27,13 +27,14 @@ from numpy.typing import ArrayLike, NDArray
 from drivers.camera import ExposureSettings
 from drivers.presenter import Colour
 from foundation.processors import processor_count
+from sim.optics.falloff import lens_falloff, projector_falloff
 from sim.optics.photographic_lens import APERTURE_VARIANCE, PhotographicLens
 from sim.world.drawing import PAPER, Print, label_map
 from sim.world.geometry import View, surface_of
 from sim.world.profile import printed_reflectance
 from sim.world.room import REFERENCE_EXPOSURE, Room
 from sim.world.sensors import Body, HotPattern
-from sim.world.situation import UNDISTURBED, Situation, moved_back
+from sim.world.situation import UNDISTURBED, Situation, moved, moved_back
 from sim.world.spectra import projector_primaries, sensitivities
 from sim.world.wear import worn
 
@@ -72,7 +73,11 @@ class World:
         self._sensitivities = sensitivities(body.sensitivities)
         paper = np.einsum("pl,l,lc->c", self._primaries, self._reflectance([PAPER])[0], self._sensitivities)
         self._dn = room.white_level_share * (body.saturation - body.black) / float(paper.max())
-        self._vignetting, self._falloff = self._shading()
+        axis = 2 * self.view.centre_px[0] + 0.5, 2 * self.view.centre_px[1] + 0.5
+        self._vignetting = lens_falloff(axis, (body.visible.width, body.visible.height), room.vignetting)
+        self._falloff = projector_falloff(
+            sheet.page_mm, room.projector_falloff, room.primary_difference, self._random(2)
+        )
         self._falloff[:, 3] = self._balance()
         self.hot = HotPattern.drawn(self._random(6), body.sensor, room.hot_per_million, room.hot_dn_per_s)
         self._lock = threading.Lock()
@@ -109,9 +114,10 @@ class World:
         """
         from sim.world.rendering import counts
 
-        of_lamp = lamp * self._turned(settings, key) * np.array(situation.lamp)
+        body, room = self.body, self.room
+        of_lamp = lamp * room.wheel_light(settings.shutter_s, self._random(4, *key)) * np.array(situation.lamp)
         light, weights = self._lighting(colour, settings, of_lamp, situation)
-        body, visible = self.body, self.body.visible
+        visible = body.visible
         black = body.black + situation.black_dn
         noise_dn, gain_e = body.noise_dn(settings.iso), body.gain_e(settings.iso)
         frame = np.empty(body.sensor, dtype=np.uint16)
@@ -162,22 +168,38 @@ class World:
             points = self._points(nodes, first, last)
             shown = self._collected(situation.shown(points, page, plain, self.decoded), settings, lamp, ambient)
             shown *= situation.passed(points, page)[..., None]
-            falling[:, first:last] = self.lens.unveiled(light[:, first:last], veil, first) * shown.transpose(2, 0, 1)
+            there = self.lens.unveiled(light[:, first:last], veil, first)
+            if situation.glares:
+                there = there + self._mirrored(points, situation, first)
+            falling[:, first:last] = there * shown.transpose(2, 0, 1)
 
         _in_blocks(self.body.visible.height, block)
         self.lens.veiled(falling, self.body.pattern)
         return falling, np.ones(3, dtype=np.float32)
 
+    def _mirrored(self, points: NDArray[np.float64], situation: Situation, first: int) -> NDArray[np.float32]:
+        """Return (3, rows, columns) float32: what photosites of rows from `first` on get by mirroring, as `_render`."""
+        row, column = np.mgrid[first : first + len(points), : points.shape[1]]
+        paper = self._signals(self._reflectance([PAPER]))[0][self._channels()[row % 2, column % 2]]
+        added = situation.mirrored(points, self.sheet.page_mm)[..., None] * self.field(points) * paper
+        return added.transpose(2, 0, 1).astype(np.float32)
+
+    def _channels(self) -> NDArray[np.int64]:
+        """Return (2, 2) int64: the camera channel of a photosite by the parity of its row and column."""
+        return np.array([_CHANNELS.index(letter) for letter in self.body.pattern], dtype=np.int64).reshape(2, 2)
+
     def decoded(self, colour: Colour) -> NDArray[np.float64]:
         """Return (3,) float64, 0 … 1: the light of each primary that a colour's codes stand for."""
-        return self.room.light_of(np.array([colour.red, colour.green, colour.blue]))
+        return self.room.light_of(np.array(colour.codes))
 
-    def signal(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float32]:
-        """Return what a frame would be without noise, black, hot photosites and clipping.
+    def signal(
+        self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0, situation: Situation = UNDISTURBED
+    ) -> NDArray[np.float32]:
+        """Return what a frame would be without noise, black, hot photosites and clipping, by a wheel's mean light.
 
         Parameters
         ----------
-        colour, settings, lamp
+        colour, settings, lamp, situation
             As for `expose`.
 
         Returns
@@ -185,10 +207,12 @@ class World:
         ndarray
             (rows, columns) float32, DN above black, of the body's visible photosites, their response included.
         """
-        drive = np.asarray(self.drive(colour, settings, lamp), dtype=np.float32)
-        return np.tensordot(drive, self._render()[0], 1)
+        light, drive = self._lighting(colour, settings, lamp * np.array(situation.lamp), situation)
+        return np.tensordot(drive, light, 1)
 
-    def project(self, points_mm: NDArray[np.float64], channel: str = "G") -> NDArray[np.float64]:
+    def project(
+        self, points_mm: NDArray[np.float64], channel: str = "G", situation: Situation = UNDISTURBED
+    ) -> NDArray[np.float64]:
         """Return the half-size pixels where points of the print are seen.
 
         Parameters
@@ -197,13 +221,18 @@ class World:
             (..., 2) float64, millimetres.
         channel
             ``R``, ``G`` or ``B``: of the camera; they differ where the lens has lateral chromatic aberration.
+        situation
+            Where the chart has been moved to.
 
         Returns
         -------
         ndarray
             (..., 2) float64, x then y.
         """
-        return self.lens.shifted(self.view.project(np.asarray(points_mm, dtype=np.float64)), channel)
+        points = np.asarray(points_mm, dtype=np.float64)
+        if any(situation.view):
+            points = moved(points, np.array(self.sheet.page_mm) / 2, self._bumped(situation), situation.turn_deg)
+        return self.lens.shifted(self.view.project(points), channel)
 
     def white(self, colour: Colour, settings: ExposureSettings, lamp: float = 1.0) -> NDArray[np.float64]:
         """Return (3,) float64: R, G, B of bare paper in DN above black, without clipping, where `field` is 1."""
@@ -345,38 +374,12 @@ class World:
         from_spot = ((points[..., None, :] - self._falloff[:, :2]) ** 2).sum(axis=-1)
         return passed[..., None] * self._falloff[:, 3] / (1 + self._falloff[:, 2] * from_spot)
 
-    def _shading(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the constants of the lens's and the projector's falloff, as `sim.world.rendering.light` takes them."""
-        room, visible = self.room, self.body.visible
-        axis = 2 * np.array(self.view.centre_px) + 0.5
-        corner2 = (visible.width**2 + visible.height**2) / 4
-        lens = np.array([*axis, ((1 - room.vignetting) ** -0.5 - 1) / corner2])
-        page = np.array(self.sheet.page_mm)
-        half_diagonal = float(np.hypot(*page)) / 2
-        random = self._random(2)
-        lost = room.projector_falloff * (1 + room.primary_difference * np.array([-1.0, 0.0, 1.0]))
-        aside = np.array([0.05, -0.1]) + room.primary_difference * random.uniform(-0.5, 0.5, (3, 2))
-        spots = page / 2 + half_diagonal * aside
-        return lens, np.column_stack([spots, lost / (1 - lost) / half_diagonal**2, np.ones(3)])
-
     def _balance(self) -> NDArray[np.float64]:
         """Return (3,) the gains of the primaries that give all three green's mean over the sheet."""
         width, height = self.sheet.page_mm
         x, y = np.meshgrid((np.arange(60) + 0.5) * width / 60, (np.arange(40) + 0.5) * height / 40)
         means = self.field(np.stack([x, y], axis=-1)).mean(axis=(0, 1))
         return means[1] / means
-
-    def _turned(self, settings: ExposureSettings, key: tuple[int, ...]) -> NDArray[np.float64]:
-        """Return (3,) the light of each primary that the wheel lets through, over that of steady light."""
-        if self.room.wheel_hz == 0:
-            return np.ones(3)
-        random = self._random(4, *key)
-        start = random.uniform()
-        time = max(settings.shutter_s + self.room.shutter_jitter_s * random.standard_normal(), 0)
-        turns = np.array([start, start + time * self.room.wheel_hz])[:, None]
-        segment = np.arange(3) / 3
-        shone = np.floor(turns) / 3 + np.clip(turns - np.floor(turns) - segment, 0, 1 / 3)
-        return 3 * (shone[1] - shone[0]) / (settings.shutter_s * self.room.wheel_hz)
 
     def _reflectance(self, rgb: ArrayLike) -> NDArray[np.float64]:
         """Return (N, 81): reflectance of the chart's codes (N, 3) on this print."""
@@ -407,7 +410,7 @@ class World:
         from sim.world.rendering import light
 
         visible, room = self.body.visible, self.room
-        drawing = label_map(self.sheet)
+        drawing, channels = label_map(self.sheet), self._channels()
         backdrop = np.full((1, len(self._sensitivities)), _BACKDROP_REFLECTANCE)
         reflectance = np.concatenate([self._reflectance(drawing.codes), backdrop])
         table = self._signals(reflectance).astype(np.float32)
@@ -416,14 +419,12 @@ class World:
         if self.lens.splits_colours:
             views = [self._nodes(situation, channel) for channel in _CHANNELS]
         sigma = ((2 * room.blur_px) ** 2 + (2 * situation.defocus_px) ** 2 + APERTURE_VARIANCE) ** 0.5
-        channels = np.array([_CHANNELS.index(letter) for letter in self.body.pattern], dtype=np.int64).reshape(2, 2)
         out = np.empty((3, visible.height, visible.width), dtype=np.float32)
         # The projector stays where it is.
         falloff = self._falloff.copy()
         falloff[:, :2] = self._moved_back(falloff[:, :2], situation)
 
-        places, lines = np.stack(views), (drawing.x_lines, drawing.y_lines)
-        spread = room.shoulder_share > 0
+        places, lines, spread = np.stack(views), (drawing.x_lines, drawing.y_lines), room.shoulder_share > 0
 
         def block(first: int, last: int) -> None:
             # Shoulders lie between the print and the photosites' response.
@@ -454,9 +455,12 @@ class World:
         if not any(situation.view):
             # Rounding would make other counts of the undisturbed chart, here and there one.
             return points_mm
+        return moved_back(points_mm, np.array(self.sheet.page_mm) / 2, self._bumped(situation), situation.turn_deg)
+
+    def _bumped(self, situation: Situation) -> NDArray[np.float64]:
+        """Return (2,) float64 mm, how far the chart has been pushed."""
         view = self.view
-        by = np.array(situation.bump_mm) + np.array(situation.bump_px) * (view.distance_mm / view.focal_px)
-        return moved_back(points_mm, np.array(self.sheet.page_mm) / 2, by, situation.turn_deg)
+        return np.array(situation.bump_mm) + np.array(situation.bump_px) * (view.distance_mm / view.focal_px)
 
     def _points(self, nodes: NDArray[np.float64], first: int, last: int) -> NDArray[np.float64]:
         """Return (rows, columns, 2) float64, mm: the places on the print that some rows of photosites see."""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from functools import cache
 from io import BytesIO
 from pathlib import Path
@@ -18,11 +17,10 @@ from acquisition.chart.model import Chart
 from acquisition.chart.printing import drawing
 from acquisition.lights.illuminations import Illumination, plan_illuminations
 from acquisition.session.folder import Session
-from acquisition.session.incoming import ReceivedFile
-from acquisition.session.judgement import Judgement
-from acquisition.session.plan import SessionStep, plan_steps
+from acquisition.session.plan import SessionStep
 from acquisition.session.records import ACCEPTED
-from drivers.camera import CapturedFrame, ExposureSettings
+from benchmarks.sessions import record_session
+from drivers.camera import ExposureSettings
 from drivers.presenter import WHITE, Colour
 from drivers.raw.rawfile import Mosaic, read_raw
 from sim.camera.dng import write_dng
@@ -107,20 +105,14 @@ def take(
     verdict: Callable[[SessionStep], str] | None = None,
 ) -> Session:
     """Return an open session with an accepted frame for every step of the plan."""
-    with Session.create(folder, "rig = 'simulated'\n", lab.chart, lights) as session:
-        for step in plan_steps(lights, every):
-            data = lab.dng(step.colour, step.number) if frame is None else frame(step)
-            at = TAKEN_AT + timedelta(seconds=4 * step.number)
-            path = session.frames_folder / f"{step.stem}.dng"
-            attempt = session.journal.begin(step, f"frames/{path.name}", at)
-            path.write_bytes(data)
-            captured = CapturedFrame(path.name, len(data), at)
-            received = ReceivedFile(path, len(data), hashlib.sha256(data).hexdigest(), captured)
-            refused = verdict is not None and verdict(step) != ACCEPTED
-            judgement = Judgement.of_reason("exposure", "as the test asks" if refused else None)
-            session.commit(attempt, received, judgement, exposure_s=SETTINGS.shutter_s, ended_at=at)
-        session.write_frames_csv()
-    return Session.open(folder)
+
+    def planned(step: SessionStep) -> bytes:
+        return lab.dng(step.colour, step.number)
+
+    def reason(step: SessionStep) -> str | None:
+        return "as the test asks" if verdict is not None and verdict(step) != ACCEPTED else None
+
+    return record_session(folder, lab.chart, lights, frame or planned, every=every, reason=reason)
 
 
 def renumbered(lights: Sequence[Illumination]) -> tuple[Illumination, ...]:

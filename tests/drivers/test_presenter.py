@@ -14,7 +14,7 @@ CODES = st.integers(0, 255)
 @given(CODES, CODES, CODES)
 def test_every_code_of_a_byte_is_a_colour(red: int, green: int, blue: int) -> None:
     colour = Colour(red, green, blue)
-    assert (colour.red, colour.green, colour.blue) == (red, green, blue)
+    assert colour.codes == (red, green, blue)
     assert colour == Colour(red, green, blue)
 
 

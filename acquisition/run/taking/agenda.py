@@ -7,8 +7,10 @@ Rules that hold inside:
 
 - Open steps are taken in the plan's order, so that a refused one comes before those behind it.
 - A reference that voids other frames is taken again before them: it shows whether the cause is still there.
-- Lights are followed by a white and a dark frame. Where the last lights of a run have none behind them, because they
-  were taken again, another pair is put behind the plan.
+- Lights are followed by a white and a dark frame. Where lights that are taken again would have none behind them,
+  another pair is put behind the plan before they are, so that a run that is killed meanwhile is not complete.
+- A refused reference may void all lights since the last good one. Where more lights than usual are taken again in a
+  row, a pair comes between them, too.
 """
 
 from __future__ import annotations
@@ -40,6 +42,8 @@ class Agenda:
         Kinds of references that must still follow lights that were taken in earlier runs; see `unclosed_kinds`.
     append
         Given a reference's kind, puts one behind the plan and returns it; None: nothing is put there.
+    reference_every
+        Lights that are taken in a row without references between them; None: as many as the plan has.
     """
 
     def __init__(
@@ -50,6 +54,7 @@ class Agenda:
         first: Iterable[int] = (),
         unclosed: Collection[str] = (),
         append: Callable[[FrameKind], SessionStep] | None = None,
+        reference_every: int | None = None,
     ) -> None:
         self._steps = {step.number: step for step in steps}
         self._first = list(first)
@@ -64,6 +69,8 @@ class Agenda:
         self._append = append
         planned = {step.kind for step in steps}
         self._closing: list[FrameKind] = [kind for kind in REFERENCES if kind in planned]
+        self._reference_every = reference_every
+        self._lights_since = dict.fromkeys(self._closing, 0)
 
     def __len__(self) -> int:
         """Return how many steps are without an accepted frame, given up or under way included."""
@@ -85,6 +92,8 @@ class Agenda:
         number = next((number for number in self._first if number in ready), min(ready, default=None))
         if number is None and not self._under_way:
             number = self._closed()
+        if number is not None and self._steps[number].kind == "light":
+            number = self._between(number)
         return None if number is None else self._steps[number]
 
     def begin(self, step: SessionStep) -> None:
@@ -116,6 +125,9 @@ class Agenda:
         self._forget_first(step.number)
         if step.kind == "light":
             self._unclosed.update(REFERENCES)
+            self._lights_since = {kind: count + 1 for kind, count in self._lights_since.items()}
+        elif step.kind in self._lights_since:
+            self._lights_since[step.kind] = 0
         self._unclosed.discard(step.kind)
         # A dark frame is accepted where no light reaches the chart, too.
         if step.kind != "dark":
@@ -138,21 +150,23 @@ class Agenda:
             return False
         return True
 
-    def void(self, numbers: Iterable[int], reason: str, *, before_others: bool = False) -> None:
-        """Open steps again whose frames cannot be trusted any more; those without a try left are given up.
-
-        Parameters
-        ----------
-        before_others
-            Whether they are tried before all other steps, in the order of the plan.
-        """
-        numbers = sorted(numbers)
-        if before_others:
-            self._first = [*numbers, *(number for number in self._first if number not in numbers)]
-        for number in numbers:
+    def void(self, numbers: Iterable[int], reason: str) -> None:
+        """Open steps again whose frames cannot be trusted any more; those without a try left are given up."""
+        for number in sorted(numbers):
             self._open.add(number)
             if self._tries[number] >= self._attempts:
                 self._give_up(number, reason)
+
+    def begin_with(self, steps: Iterable[SessionStep]) -> None:
+        """Take steps, old or new, before all others in the order of the plan, with all their tries."""
+        steps = sorted(steps, key=lambda step: step.number)
+        numbers = [step.number for step in steps]
+        self._steps |= {step.number: step for step in steps}
+        self._open |= set(numbers)
+        self._first = [*numbers, *(number for number in self._first if number not in numbers)]
+        for number in numbers:
+            self._tries[number] = 0
+            self._given_up.pop(number, None)
 
     def _give_up(self, number: int, reason: str) -> None:
         if number not in self._given_up:
@@ -171,11 +185,30 @@ class Agenda:
         for kind in self._closing:
             if self._append is not None and kind in self._unclosed:
                 self._unclosed.discard(kind)
-                step = self._append(kind)
-                self._steps[step.number] = step
-                self._open.add(step.number)
-                return step.number
+                return self._appended(self._append, kind)
         return None
+
+    def _between(self, light: int) -> int:
+        """Return what is taken now where a light is next: a reference, where too many lights were taken since the last.
+
+        References that will follow are in the plan when this returns.
+        """
+        if self._append is None:
+            return light
+        for kind in self._closing:
+            if not any(number > light and self._steps[number].kind == kind for number in self._open):
+                self._appended(self._append, kind)
+            coming = any(self._steps[number].kind == kind for number in self._under_way)
+            if self._reference_every and self._lights_since[kind] >= self._reference_every and not coming:
+                self._lights_since[kind] = 0
+                return self._appended(self._append, kind)
+        return light
+
+    def _appended(self, append: Callable[[FrameKind], SessionStep], kind: FrameKind) -> int:
+        step = append(kind)
+        self._steps[step.number] = step
+        self._open.add(step.number)
+        return step.number
 
 
 def unclosed_kinds(taken: Iterable[str]) -> frozenset[str]:

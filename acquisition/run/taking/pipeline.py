@@ -29,9 +29,11 @@ from typing import TypeVar
 
 from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
-from acquisition.run.lamp import await_health, health_fault
+from acquisition.run.lamp import HealthWatch, await_health
 from acquisition.run.patience import Patience, Pause, is_curable
 from acquisition.run.taking.agenda import Agenda, step_name
+from acquisition.run.taking.following import followed_changes
+from acquisition.run.taking.resuming import tie
 from acquisition.run.taking.saving import FilledFile, Saved, Saver, download
 from acquisition.session.folder import Session
 from acquisition.session.judgement import Check, Judgement
@@ -143,7 +145,11 @@ class Pipeline:
         self._pending: deque[_Pending] = deque()
         self._void_ahead: dict[int, str] = {}
         self._pauses: dict[str, Pause] = {}
+        self._begun_after = max((attempt.id for attempt in session.journal.attempts()), default=0)
+        self._health = HealthWatch(devices.projector, devices.clock)
+        self._doubtful = False
         self._lasting = ""
+        self._lasts_for: SessionStep | None = None
         self._probing: tuple[Pause, float] | None = None
 
     def run(self) -> None:
@@ -193,7 +199,7 @@ class Pipeline:
         # While it is doubtful whether frames can be had at all, one is taken at a time.
         ahead = 0 if self._probing else AHEAD
         following = self._show_following() if ahead else None
-        attempt = replace(attempt, checks=(*attempt.checks, *self._projector_check()))
+        attempt = replace(attempt, checks=(*attempt.checks, *self._projector_check(attempt.step)))
         self._hand_over(attempt)
         self._collect(ahead)
         if attempt.device_fault:
@@ -259,11 +265,12 @@ class Pipeline:
             return (Check("screen", reason=str(error)),)
         return (Check("screen"),)
 
-    def _projector_check(self) -> tuple[Check, ...]:
+    def _projector_check(self, step: SessionStep) -> tuple[Check, ...]:
         """Ask the projector for its health; it answers while the next light settles."""
         if self._devices.projector is None:
             return ()
-        fault = health_fault(self._devices.projector)
+        fault = self._health.fault(thorough=step.kind == "dark" or self._doubtful)
+        self._doubtful = False
         return (Check("projector", reason="" if fault is None else str(fault)),)
 
     def _hand_over(self, attempt: _Attempt) -> None:
@@ -322,6 +329,18 @@ class Pipeline:
                 pause.wait(fault)
         self._probing = pause, min(max(2 * pause_s, PROBE_S), LONGEST_PROBE_S)
         self._agenda.retry()
+        if self._lasts_for is not None and self._lasts_for.kind != "dark":
+            self._tie()
+
+    def _tie(self) -> None:
+        """Take the frames first that tie what follows to what was taken: what lasted may have changed for good."""
+        journal = self._session.journal
+        attempts = self._insist(journal.attempts, _DISK)
+        if any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in attempts):
+            numbers = self._insist(lambda: tie(self._session), _DISK)
+            self._agenda.begin_with(step for step in self._session.steps if step.number in numbers)
+        self._begun_after = attempts[-1].id
+        self._saver.after_pause()
 
     def _insist(
         self, action: Callable[[], _Result], name: str, curable: Callable[[CropError], bool] = is_curable
@@ -370,34 +389,36 @@ class Pipeline:
             ),
             _DISK,
         )
-        if judgement.accepted:
+        void = self._void_ahead.pop(attempt.number, "")
+        if judgement.accepted and void:
+            self._agenda.withdraw(step)
+            self._void_rows((attempt.number,), void)
+        elif judgement.accepted:
             self._agenda.accept(step)
-            self._tell_movement(step, judgement)
-            if self._probing and step.kind != "dark":
+            for what, sentence in followed_changes(step, judgement, self._session.steps, self._settings.judge):
+                self._patience.report(what, sentence)
+            if self._probing and self._shows_mended(step):
                 self._probing[0].over()
                 self._probing = None
         else:
             self._refuse(step, judgement)
-        if (reason := self._void_ahead.pop(attempt.number, "")) and judgement.accepted:
-            self._void({attempt.number: step.number}, reason)
         if judgement.voids and step.kind in REFERENCES:
             self._void_since_reference(attempt, judgement.reason)
         elif judgement.voids:
-            self._void_since_light(attempt, judgement.reason)
+            self._void_first_frames(attempt, judgement.reason)
         self._observe(Taken(step, judgement, len(self._agenda)))
 
-    def _tell_movement(self, step: SessionStep, judgement: Judgement) -> None:
-        """Say that the chart lies elsewhere than before, where its new place is followed."""
-        moved = next((check.value for check in judgement.checks if check.name == "movement"), None)
-        if moved is not None and moved > self._settings.judge.moved_px:
-            self._patience.report(
-                "moved",
-                f"{step_name(step)}: the chart lies {moved:.2f} px from where it was; the run goes on with its new "
-                "place, and build-lut follows it with a remark. Fix camera and print; to have all lights of one place, "
-                "begin a new session",
-            )
+    def _shows_mended(self, step: SessionStep) -> bool:
+        """Return whether an accepted frame of a step shows that what lasted is over.
+
+        What ties halves is accepted at another level of the lamp, and a dark frame where no light reaches the chart.
+        """
+        if self._lasts_for is None:
+            return step.kind != "dark"
+        return step.kind == "light" or step.number == self._lasts_for.number
 
     def _refuse(self, step: SessionStep, judgement: Judgement) -> None:
+        self._doubtful = True
         first = judgement.lasting or (judgement.voids and step.kind in REFERENCES)
         again = self._agenda.refuse(step, judgement.reason, before_others=first)
         # What would be taken again without a good reference would be voided again, all night.
@@ -408,7 +429,7 @@ class Pipeline:
         sentence = f"{step_name(step)}: {judgement.reason}"
         self._patience.report("refused", f"{sentence} ({then})")
         if pauses:
-            self._lasting = sentence
+            self._lasting, self._lasts_for = sentence, step
 
     def _void_since_reference(self, refused: _Attempt, why: str) -> None:
         """Void what was taken since the last good reference of the refused one's kind, frames under way included.
@@ -428,29 +449,32 @@ class Pipeline:
         # Their frames have left the camera; whether they are accepted is known only later.
         self._void_ahead.update({pending.attempt.number: reason for pending in self._pending})
 
-    def _void_since_light(self, refused: _Attempt, why: str) -> None:
-        """Void what was taken since the last light: the frames by which those to come would be judged."""
-        reason = f"taken together with {step_name(refused.step)}, which was refused: {why}"
-        since: dict[int, int] = {}
-        for attempt in self._session.journal.attempts():
-            if attempt.verdict == ACCEPTED and attempt.id < refused.number:
-                since = {} if attempt.kind == "light" else {**since, attempt.id: attempt.step}
-        # The refused one is taken again in its place among them.
-        self._void(since, reason, (*since.values(), refused.step.number))
+    def _void_first_frames(self, refused: _Attempt, why: str) -> None:
+        """Void what this run has taken, since its last pause for something lasting: by that others are judged."""
+        reason = f"the first frames contradict {step_name(refused.step)}: {why}"
+        since = {
+            attempt.id: attempt.step
+            for attempt in self._session.journal.attempts()
+            if attempt.verdict == ACCEPTED and self._begun_after < attempt.id < refused.number
+        }
+        self._void_rows(since, reason)
+        # The refused one, and what is under way, are taken again in their places among them.
+        again = {refused.step.number, *since.values(), *(pending.attempt.step.number for pending in self._pending)}
+        self._agenda.begin_with(step for step in self._session.steps if step.number in again)
         self._void_ahead.update({pending.attempt.number: reason for pending in self._pending})
 
-    def _void(self, attempts: Mapping[int, int], reason: str, first: Collection[int] = ()) -> None:
-        """Void accepted attempts, given with the numbers of their steps, and have the steps taken again.
+    def _void(self, attempts: Mapping[int, int], reason: str) -> None:
+        """Void accepted attempts, given with the numbers of their steps, and have the steps taken again."""
+        self._agenda.void(attempts.values(), reason)
+        if self._agenda.is_stuck:
+            self._lasting, self._lasts_for = reason, None
+        self._void_rows(attempts, reason)
 
-        Steps numbered `first` are taken before all others.
-        """
+    def _void_rows(self, attempts: Collection[int], reason: str) -> None:
         if not attempts:
             return
         now = self._devices.clock.now()
         self._insist(lambda: self._session.journal.void(tuple(attempts), now, reason), _DISK)
-        self._agenda.void({*attempts.values(), *first}, reason, before_others=bool(first))
-        if self._agenda.is_stuck:
-            self._lasting = reason
         self._patience.report("voided", f"{counted(len(attempts), 'frame')}, to be taken again: {reason}")
 
     def _salvage(self, error: BaseException) -> None:
@@ -464,4 +488,4 @@ class Pipeline:
 
 def of_disk(fault: CropError) -> bool:
     """Return whether a fault is one of the disk."""
-    return isinstance(fault, StorageError)
+    return isinstance(fault, StorageError) and is_curable(fault)

@@ -15,7 +15,7 @@ from typing import Self
 
 from acquisition.session.folder import Session
 from acquisition.session.incoming import IncomingFile, ReceivedFile
-from acquisition.session.judgement import Check, FrameJudge, Judgement
+from acquisition.session.judgement import Check, FrameJudge, Judgement, OutlastsPauses
 from acquisition.session.plan import SessionStep
 from acquisition.session.records import preview_path
 from drivers.camera import Camera, CapturedFrame
@@ -102,6 +102,11 @@ class Saver:
             it: what it would learn from a frame of something else would spoil its judgement of those that follow.
         """
         return self._thread.submit(self._save, filled, step, device_checks)
+
+    def after_pause(self) -> None:
+        """Tell the judge of a pause, if it wants to know; every file that was handed over must be judged."""
+        if isinstance(self._judge, OutlastsPauses):
+            self._judge.after_pause()
 
     def _save(self, filled: FilledFile, step: SessionStep, device_checks: tuple[Check, ...]) -> Saved:
         begun = time.perf_counter()

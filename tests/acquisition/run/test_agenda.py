@@ -100,13 +100,35 @@ def test_a_reference_that_voids_is_probed_before_what_it_voids() -> None:
     assert take(agenda) == [4, 2, 3, 5, 6, 7, 8, 9]
 
 
-def test_what_is_voided_can_come_before_all_others() -> None:
-    agenda = Agenda(STEPS, {0, 1, 2, 8, 9}, 3, first=(8,))
-    refused = begun(agenda)
-    agenda.accept(refused)
+def test_first_frames_that_are_voided_come_before_all_others_with_all_their_tries() -> None:
+    agenda = Agenda(STEPS, {0, 1, 2, 8, 9}, 2, first=(8,))
+    agenda.accept(begun(agenda))
     agenda.refuse(begun(agenda), "somebody passed")
-    agenda.void([9, 8, 3], "voided", before_others=True)
-    assert take(agenda) == [3, 8, 9, 4, 5, 6, 7]
+    agenda.begin_with([STEPS[9], STEPS[8], STEPS[3]])
+    assert take(agenda, {3: 1}) == [3, 3, 8, 9, 4, 5, 6, 7]
+    assert not agenda.given_up
+
+
+def test_a_kill_among_lights_that_are_taken_again_leaves_their_closing_frames_open() -> None:
+    agenda = agenda_of({step.number for step in STEPS} - {6})
+    agenda.accept(begun(agenda))
+    assert len(agenda) == 2, "the white and the dark frame are in the plan before the light is accepted"
+
+
+def test_many_lights_taken_again_in_a_row_have_references_between_them() -> None:
+    agenda = agenda_of({0, 1, 4, 5, 8, 9}, reference_every=2)
+    assert take(agenda) == [2, 3, 12, 13, 6, 7, 10, 11], "a refused one voids two of them at most"
+    whole = agenda_of(set(), reference_every=2)
+    assert take(whole) == list(range(10)), "the plan has its own"
+    ahead = agenda_of(set(), reference_every=2)
+    before, order = begun(ahead), [0]
+    while (step := ahead.next()) is not None or len(ahead):
+        if step is not None:
+            ahead.begin(step)
+            order.append(step.number)
+        ahead.accept(before)
+        before = step or before
+    assert order == list(range(10)), "also while the verdict on one of them is awaited"
 
 
 def test_the_last_lights_that_are_voided_are_closed_again() -> None:

@@ -90,11 +90,11 @@ def test_a_run_that_is_taken_up_shows_the_ties_first(folder: Path) -> None:
     lab = lab_with_response(folder)
     interrupt_after(lab, 5)
     first = tie(lab.session)
-    assert first == (8, 9, 10, 11)
+    assert first == (8, 9, 10, 11, 12, 13)
     lab.camera.exposed.clear()
     assert take_session(lab.session, lab.devices, SETTINGS, first=first).complete
-    assert lab.camera.exposed[:4] == TIES
-    assert len(lab.session.steps) == 12
+    assert lab.camera.exposed[:6] == TIES
+    assert len(lab.session.steps) == 14
 
 
 def test_ties_that_were_interrupted_are_taken_anew(folder: Path) -> None:
@@ -102,11 +102,11 @@ def test_ties_that_were_interrupted_are_taken_anew(folder: Path) -> None:
     interrupt_after(lab, 5)
     interrupt_after(lab, 2, tie(lab.session))
     again = tie(lab.session)
-    assert again == (8, 9, 10, 11), "no further steps"
+    assert again == (8, 9, 10, 11, 12, 13), "no further steps"
     lab.camera.exposed.clear()
-    interrupt_after(lab, 5, again)
-    assert lab.camera.exposed[:4] == TIES, "those that were taken are taken again: the chart may have moved since"
-    assert tie(lab.session) == (12, 13, 14, 15), "behind another light they are new"
+    interrupt_after(lab, 7, again)
+    assert lab.camera.exposed[:6] == TIES, "those that were taken are taken again: the chart may have moved since"
+    assert tie(lab.session) == (14, 15, 16, 17, 18, 19), "behind another light they are new"
 
 
 def test_another_camera_or_projector_is_refused(folder: Path) -> None:

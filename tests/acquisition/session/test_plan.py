@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple
-
 from acquisition.lights.illuminations import Illumination
 from acquisition.session.plan import RESPONSE, SessionStep, plan_steps, tie_steps
 from drivers.presenter import BLACK, WHITE, Colour
@@ -43,17 +41,20 @@ def test_response_frames_come_after_the_first_pair_and_are_taken_for_nothing_els
     assert "".join(step.kind[0] for step in steps) == "wd" + "r" * len(RESPONSE) + "llwdllwdlwd"
     response = [step for step in steps if step.kind == "response"]
     assert tuple(step.colour for step in response) == RESPONSE
-    assert all(step.illumination is None and max(astuple(step.colour)) < 255 for step in response)
+    assert all(step.illumination is None and max(step.colour.codes) < 255 for step in response)
     assert response[0].stem == "0002_response"
     assert len(set(RESPONSE)) == len(RESPONSE)
 
 
 def test_the_steps_that_tie_a_run_to_the_one_before_go_on_in_number() -> None:
     steps = tie_steps(40)
-    assert [step.number for step in steps] == [40, 41, 42, 43]
+    assert [step.number for step in steps] == [40, 41, 42, 43, 44, 45]
     assert [step.colour for step in steps] == [
         Colour(250, 250, 250),
         Colour(250, 0, 0),
         Colour(0, 250, 0),
         Colour(0, 0, 250),
+        Colour(255, 255, 255),
+        Colour(0, 0, 0),
     ]
+    assert [step.kind for step in steps] == [*["response"] * 4, "white", "dark"]

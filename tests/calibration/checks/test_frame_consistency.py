@@ -5,6 +5,8 @@ A healthy frame passes half of either limit; noise alone would need five standar
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -71,6 +73,42 @@ def test_a_shadow_is_found_where_it_lies(sheet: Sheet, left: float) -> None:
     like = sheet.compared(sheet.other * np.where(under, left, 1.0)[:, None])
     assert like.block > (LIMITS["unlike_block"].refuse or np.inf)
     assert np.abs(np.array(like.at_mm) - middle).max() < 45
+
+
+@pytest.mark.parametrize(
+    ("added", "kept"), [(0.0, 0.7), (0.25, 0.0), (0.03, 1.0)], ids=["shadow", "hand", "reflection"]
+)
+def test_it_is_told_whether_light_was_added_or_taken(sheet: Sheet, added: float, kept: float) -> None:
+    under = np.linalg.norm(sheet.places - (200, 130), axis=1) < 45
+    top = np.percentile(sheet.other, 99, axis=0)
+    like = sheet.compared(np.where(under[:, None], added * top + kept * sheet.other, sheet.other))
+    assert like.block > LIMITS["unlike_block"].accept
+    # Blocks at its rim are half under it.
+    assert like.added == pytest.approx(added, abs=0.01 + 0.3 * added)
+    assert like.kept == pytest.approx(kept, abs=0.3 * abs(1 - kept) + 0.02)
+    assert 0.6 * 80 < like.extent_mm < 2 * 80
+    assert like.share < 0.3
+
+
+def test_a_stain_s_colour_is_told(sheet: Sheet) -> None:
+    under = np.linalg.norm(sheet.places - (200, 130), axis=1) < 45
+    like = sheet.compared(sheet.other * np.where(under[:, None], [0.97, 0.94, 0.9], 1.0))
+    assert like.colour == pytest.approx((-0.03, -0.06, -0.1), abs=0.02)
+
+
+@pytest.mark.parametrize("excess", [120.0, 3000.0])
+def test_one_hot_photosite_is_no_hand(sheet: Sheet, excess: float) -> None:
+    """3000 counts in one of 25 samples of a dark cell, and in all of them."""
+    seen = sheet.other.copy()
+    dark = np.argsort(seen[:, 0])[sheet.random.integers(300, 600, 3)]
+    seen[dark, 0] += excess
+    like = sheet.compared(seen)
+    assert like.block < 0.5 * LIMITS["unlike_block"].accept
+
+
+def test_what_is_found_is_restored_from_a_checkpoint(sheet: Sheet) -> None:
+    like = sheet.compared(sheet.other * np.where(sheet.places[:, :1] < 60, 0.9, 1.0))
+    assert FrameConsistency.from_json(json.loads(json.dumps(like.to_json()))) == like
 
 
 def test_cells_that_were_covered_from_the_start_do_not_count(sheet: Sheet) -> None:

@@ -35,8 +35,10 @@ def test_a_table_carries_its_verdict(session: Session, tmp_path: Path) -> None:
     assert report["verdict"] == result.verdict.outcome != "refuse"
     assert report["figures"].keys() == judged_values(result.figures).keys()
     assert {limit["name"] for limit in report["limits"]} == report["figures"].keys()
-    # No series of exposures was given, and the lights are few.
-    assert report["figures"].keys() == {limit.name for limit in THRESHOLDS} - {"linearity", "off_codes_deg"}
+    # No series of exposures was given, and no drift was to be taken out.
+    assert report["figures"].keys() == {limit.name for limit in THRESHOLDS} - {
+        "linearity", "drift_left"
+    }  # fmt: skip
     page = (tmp_path / "lut" / "report.html").read_text()
     assert "class='verdict " in page
     for limit in report["limits"]:

@@ -16,7 +16,7 @@ def test_blocks_are_found_where_they_are() -> None:
     seen = np.roll(expected, (3, -4), axis=(0, 1))
     there = np.ones(raster.shape, dtype=np.bool_)
     there[:, 150:] = False
-    found = find_blocks(raster, expected, seen, there, 40, 8)
+    found = find_blocks(raster, expected, seen, there, 40, 8, 64)
     assert 4 <= len(found.score) < 20
     assert (found.score > 0.99).all()
     assert found.moves_mm == pytest.approx(np.broadcast_to([-4 * 2.0, 3 * 1.5], found.moves_mm.shape), abs=0.1)

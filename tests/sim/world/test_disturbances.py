@@ -31,6 +31,7 @@ from sim.world.disturbances import (
     Moment,
     Person,
     PopUp,
+    Reflection,
     ScrambledRows,
     SensorWarming,
     StaleFile,
@@ -277,19 +278,24 @@ def test_every_event_is_there_when_said_and_leaves_other_frames_as_they_are(bare
 @pytest.mark.parametrize(
     ("event", "words"),
     [
-        ({"what": "earthquake"}, "known are frozen screen, pop-up, half-changed"),
-        ({"from_frame": 3}, "simulated.events[0]"),
+        ({"what": "earthquake"}, "there is no such event; what is one of frozen screen, pop-up, half-changed"),
+        ({"from_frame": 3}, "does not say what happens; add what, one of frozen screen"),
+        ({"what": "bump", "px": "far"}, "simulated.events[0].px = 'far': a number is expected"),
+        ({"what": "bump", "px": 1, "from_frame": 1.5}, "simulated.events[0].from_frame = 1.5: a whole number"),
+        ("bump", "simulated.events[0] = 'bump'"),
         ({"what": "bump", "size": 3}, "simulated.events[0].size"),
         ({"what": "pop-up", "colour": [1, 2]}, "simulated.events[0].colour"),
         ({"what": "lamp drift"}, "to_frame or to_s: one of them must be given"),
         ({"what": "person", "from_frame": 5, "to_frame": 3}, "ends with to_frame = 3 before it begins"),
     ],
 )
-def test_an_event_that_cannot_be_is_one_sentence(event: dict[str, Any], words: str) -> None:
+def test_an_event_that_cannot_be_is_one_sentence(event: Any, words: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         read_disturbances([event], "LAB.toml")
     assert str(caught.value).startswith("LAB.toml: simulated.events[0]")
     assert words in str(caught.value)
+    assert "Input" not in str(caught.value)
+    assert "valid" not in str(caught.value)
 
 
 def test_a_seed_draws_the_same_events() -> None:
@@ -305,3 +311,16 @@ def test_what_a_real_screen_does_itself_is_not_pretended() -> None:
         with pytest.raises(ConfigurationError, match=f"--event: {event.what} is for the simulated screen"):
             Disturbances((Bump(px=1.0), event)).require_unshown("--event")
     Disturbances((Bump(px=1.0), Person())).require_unshown("--event")
+
+
+def test_a_reflection_adds_a_share_of_papers_light_whatever_is_printed() -> None:
+    """In the middle of its spot 5 % of what paper sends, at 1 / e² of that on its rim, on black ink as on paper."""
+    quiet = replace(TEST, read_noise_dn=0.01, sensor_noise_e=0.0, electrons_per_dn=1e6)
+    black = Print(PAGE_MM, np.array([[0.0, 0.0, PAGE_MM[0] / 2, PAGE_MM[1]]]), np.zeros((1, 3), dtype=np.uint8))
+    world = World(black, quiet, STRAIGHT)
+    glare = Reflection(place=(0.1, 0.2, 0.9, 0.8), percent=5)
+    for colour in (WHITE, RED):
+        added = taken(world, glare, colour=colour) - taken(world, colour=colour)
+        white = world.white(colour, REFERENCE_EXPOSURE)
+        for place, share in (((0.49, 0.5), 0.05), ((0.51, 0.5), 0.05), ((0.9, 0.5), 0.05 / np.e**2)):
+            np.testing.assert_allclose(at(world, *place, added), share * white, rtol=0.02, atol=1.5)

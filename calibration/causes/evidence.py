@@ -1,0 +1,118 @@
+"""What is known of a deviation, in plain numbers, whichever figure shows it: what the table of causes decides by.
+
+What was not measured is NaN, and decides nothing. Shares are 0 … 1 unless said.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cache
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of a deviation.
+
+    Attributes
+    ----------
+    frames
+        Frames of the print that were compared.
+    showing
+        Share of them that show it.
+    even_showing
+        Share of the white frames, but the one compared with, that show it; 0 where there is no other.
+    white_residual
+        Share of the white frames whose references are off there by half as much or more.
+    some_whites
+        1 where the references of some white frames are off there and those of others not; else 0.
+    spot
+        Share of the cells there that are not of their codes' colours in the mean of the white frames.
+    in_first
+        1 where all frames differ at one place from the frame that they are compared with, so that it is there; else 0.
+    share
+        Share of the print that deviates.
+    deviation
+        How far the place is off, relative, with its sign: below 0 it is darker; the channel that deviates most.
+    tint
+        How differently the channels are off, over `deviation`'s size: 0 where all are off alike.
+    added
+        Light that cells have there besides their own, whatever their colour, of paper white.
+    kept
+        Share of their own light that they have.
+    rim
+        Mean residual of the outermost references, relative, with its sign.
+    rim_frames
+        Share of the white frames in which it is below −0.5 %.
+    radial
+        Share of the residuals' variance that distance from the middle explains.
+    hot
+        Share of the cells concerned that hold a photosite which is hot in every dark frame.
+    scatter
+        Spread of all cells of the frame about their codes' colours, relative.
+    softer
+        Light of neighbouring cells added by the frame's blur, in the worst sample.
+    moved_px
+        How far the chart lies from where it was registered, half-size px.
+    anew
+        Share of the frames in which the chart had to be registered again.
+    agreement
+        Correlation of the cells with the chart where it was registered.
+    exposure
+        Exposure of the frame by its file over the other frames'.
+    brightness
+        Light of the frame over what its code gives.
+    off_codes_deg
+        Angle between a light's white and what its codes give, degrees.
+    named_right
+        1 where a light's white is what its codes give, 0 where it is what another light's give.
+    cameras
+        Cameras or lenses among the frames, by their files.
+    room
+        Light while the projector shows black, of white.
+    room_change
+        Change of it between dark frames, of white.
+    veil
+        Light of the whole frame that the lens spreads over each place, of paper white.
+    """
+
+    frames: float = NAN
+    showing: float = NAN
+    even_showing: float = NAN
+    white_residual: float = NAN
+    some_whites: float = NAN
+    spot: float = NAN
+    in_first: float = NAN
+    share: float = NAN
+    deviation: float = NAN
+    tint: float = NAN
+    added: float = NAN
+    kept: float = NAN
+    rim: float = NAN
+    rim_frames: float = NAN
+    radial: float = NAN
+    hot: float = NAN
+    scatter: float = NAN
+    softer: float = NAN
+    moved_px: float = NAN
+    anew: float = NAN
+    agreement: float = NAN
+    exposure: float = NAN
+    brightness: float = NAN
+    off_codes_deg: float = NAN
+    named_right: float = NAN
+    cameras: float = NAN
+    room: float = NAN
+    room_change: float = NAN
+    veil: float = NAN
+
+    def known(self) -> dict[str, float]:
+        """Return what was measured, by name."""
+        return {name: value for name in evidence_names() if (value := getattr(self, name)) == value}
+
+
+@cache
+def evidence_names() -> tuple[str, ...]:
+    """Return the names of what evidence may hold, in its order."""
+    return tuple(field.name for field in fields(Evidence))

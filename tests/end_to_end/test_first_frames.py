@@ -1,0 +1,150 @@
+"""Trouble in a first frame, and changes that last: the session ends complete, without the frame that was off."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquisition.chart.layout import design_chart
+from acquisition.config import load_lab
+from acquisition.lights.illuminations import plan_illuminations, save_illuminations
+from acquisition.run.run import run_session
+from acquisition.session.folder import Session
+from acquisition.session.records import ACCEPTED, Attempt
+from foundation.errors import QualityError
+
+pytestmark = pytest.mark.slow
+
+LAB = """
+rig = "simulated"
+chart = "chart.json"
+illuminations = "illuminations.csv"
+[sequence]
+reference_every = 6
+patience_s = 60
+warm_up_s = 0
+[simulated]
+body = "Test"
+seed = 3
+events = [{events}]
+[simulated.room]
+wheel_hz = 60
+transfer = 2.2
+"""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A session that was taken: the sentences of its run, why it ended, its attempts."""
+
+    said: tuple[str, ...]
+    end: str
+    attempts: tuple[Attempt, ...]
+
+    @property
+    def exposed(self) -> list[Attempt]:
+        return [attempt for attempt in self.attempts if attempt.has_frame]
+
+    @property
+    def verdicts(self) -> Counter[str | None]:
+        return Counter(attempt.verdict for attempt in self.attempts)
+
+
+def run(folder: Path, *events: Mapping[str, object], more: str = "", lights: int = 6) -> Run:
+    """Take a session of some lights of the plan in a room where events happen."""
+    design_chart(3, "A7").save(folder / "chart.json")
+    plan = plan_illuminations()
+    order: list[int] = np.random.default_rng(3).permutation(len(plan)).tolist()
+    some = [replace(plan[k], index=n) for n, k in enumerate(order[:lights])]
+    save_illuminations(some, folder / "illuminations.csv")
+    listed = ", ".join(
+        "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in event.items()) + "}" for event in events
+    )
+    (folder / "LAB.toml").write_text(LAB.format(events=listed) + more)
+    return again(folder)
+
+
+def again(folder: Path) -> Run:
+    """Run the same command once more."""
+    said: list[str] = []
+    end = ""
+    try:
+        outcome = run_session(load_lab(folder / "LAB.toml"), folder / "session", lambda done, total: None, said.append)
+        end = "complete" if outcome.complete else "; ".join(outcome.refused)
+    except QualityError as error:
+        end = str(error)
+    with Session.open(folder / "session") as session:
+        return Run(tuple(said), end, tuple(session.journal.attempts()))
+
+
+def of(said: Sequence[str], word: str) -> list[str]:
+    return [sentence for sentence in said if sentence.startswith(f"{word}: ")]
+
+
+@pytest.mark.parametrize(
+    ("frame", "event"),
+    [
+        (0, {"what": "lamp step", "percent": -10}),
+        (0, {"what": "lamp step", "percent": -3}),
+        (0, {"what": "defocus", "px": 1}),
+        (1, {"what": "ambient step", "percent": 1}),
+        (2, {"what": "pop-up", "place": [-9, -9, 9, 9], "colour": [250, 250, 0]}),
+        (4, {"what": "lamp step", "percent": 0, "rgb": [0, 0, -10]}),
+    ],
+)
+def test_a_first_frame_that_is_the_odd_one_is_taken_again(tmp_path: Path, frame: int, event: dict[str, object]) -> None:
+    taken = run(tmp_path, {**event, "from_frame": frame, "to_frame": frame})
+    assert taken.end == "complete", taken.said
+    assert taken.exposed[frame].verdict == "voided"
+    assert "first frames" in of(taken.said, "voided")[0]
+    # Once, and nothing of the table's frames is lost by it.
+    assert taken.verdicts["voided"] < 35
+
+
+def test_first_frames_that_never_agree_pause_the_run_with_what_to_do(tmp_path: Path) -> None:
+    flicker = [{"what": "lamp step", "percent": -10, "from_frame": n, "to_frame": n} for n in range(0, 400, 2)]
+    taken = run(tmp_path, *flicker)
+    assert taken.end != "complete"
+    asked = [sentence for sentence in of(taken.said, "refused") if "the same command later" in sentence]
+    assert asked
+    assert "one of the first frames may be the odd one" in asked[0]
+    assert not any(attempt.kind == "light" and attempt.verdict == ACCEPTED for attempt in taken.attempts)
+
+
+@pytest.mark.parametrize("event", [{"what": "lamp step", "percent": -10}, {"what": "bump", "px": 1.3}])
+def test_a_lasting_change_is_followed_after_a_pause_and_said(tmp_path: Path, event: dict[str, object]) -> None:
+    taken = run(tmp_path, {**event, "from_frame": 27})
+    assert taken.end == "complete", taken.said
+    assert of(taken.said, "retry")
+    told = of(taken.said, "level" if event["what"] == "lamp step" else "moved")
+    assert len(told) == 1, taken.said
+    if event["what"] == "lamp step":
+        assert "10.1 % weaker" in told[0] or "10.0 % weaker" in told[0] or "9.9 % weaker" in told[0]
+        kinds = [attempt.kind for attempt in taken.attempts if attempt.verdict == ACCEPTED]
+        ties = max(n for n, kind in enumerate(kinds) if kind == "response")
+        assert kinds[ties + 1 : ties + 3] == ["white", "dark"], "references at the new level, before any light"
+
+
+def test_a_lamp_that_fails_is_refused_alike_by_the_run_and_by_the_next(tmp_path: Path) -> None:
+    first = run(tmp_path, {"what": "lamp step", "percent": -21, "from_frame": 27})
+    assert "paper white is -21 %" in first.end
+    assert first.verdicts["voided"] == 0, "each light before was judged by itself"
+    second = again(tmp_path)
+    assert "paper white is -21 %" in second.end
+    assert second.verdicts["voided"] == 0
+
+
+def test_the_lamps_level_of_a_run_that_is_taken_up_is_said(tmp_path: Path) -> None:
+    taken = run(tmp_path, {"what": "lamp step", "percent": -50, "from_frame": 27})
+    assert taken.end != "complete"
+    for settings in (tmp_path / "LAB.toml", tmp_path / "session" / "session.toml"):
+        settings.write_text(settings.read_text().replace("-50", "-8"))
+    resumed = again(tmp_path)
+    assert resumed.end == "complete", resumed.said
+    assert "8.0 % weaker" in of(resumed.said, "level")[0] or "8.1 % weaker" in of(resumed.said, "level")[0]
