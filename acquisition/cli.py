@@ -57,9 +57,9 @@ def init(
 ) -> None:
     """Begin a lab: a commented LAB.toml, the chart to print and the 707 lights.
 
-    Writes LAB/LAB.toml, chart/ (as acquire chart does, without the TIFF) and illuminations.csv (as acquire
-    illuminations does). A chart or lights that are there already stay as they are; a LAB.toml that is there is an
-    error.
+    Reads no file. Writes LAB/LAB.toml, chart/ (as acquire chart does, without the TIFF) and illuminations.csv (as
+    acquire illuminations does). A chart or lights that are there already stay as they are; a LAB.toml that is there
+    is an error.
     """
     from importlib.resources import files
 

@@ -7,14 +7,14 @@ print and noise are the simulated lab's; a print shop's profile makes greys grey
 
 from __future__ import annotations
 
-from contextlib import suppress
+import subprocess
+import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
-from foundation.console import progress
-from foundation.errors import InputError
+from foundation.errors import InputError, StorageError
 from foundation.hashing import sha256_of
-from foundation.processors import processor_count
 from foundation.version import software
 
 DEMO: Final = "demo:"
@@ -64,13 +64,16 @@ def table_folder(given: Path, cache: Path | None = None) -> Path:
 
 
 def _make(folder: Path) -> None:
-    from synthesis.light_spectra import read_lights
-    from synthesis.settings import ComputedChart, TableSettings
-    from synthesis.table import compute_table
-    from synthesis.tasks import table_task
-
-    settings = TableSettings(room={"profile": "managed", "paper": "matt"}, chart=ComputedChart(bits=BITS))
-    task = table_task(CAMERA, settings, DEMO, read_lights(LIGHTS))
+    """Have ``sim table`` make it, as a user would: this package knows tables and nothing that makes them."""
+    options = ["--camera", CAMERA, "--lights", LIGHTS, "--print", "managed", "--paper", "matt"]
+    with TemporaryDirectory() as place:
+        settings = Path(place) / "settings.toml"
+        settings.write_text(f"[chart]\nbits = {BITS}\n", encoding="utf-8")
+        words = [sys.executable, "-m", "synthesis.cli", "table", str(folder), *options, "--settings", str(settings)]
+        done = subprocess.run(words, stdout=subprocess.DEVNULL, check=False)
     # Another program may have made it meanwhile, of the same bytes.
-    with progress("lights of a table to begin with, once") as told, suppress(InputError):
-        compute_table(task, folder, processor_count(), told)
+    if done.returncode and not (folder / "lut.json").is_file():
+        raise StorageError(
+            f"the table for {DEMO} could not be made in {folder}: sim table ended with exit code {done.returncode}, and "
+            "says above why; mend that, or make a table elsewhere with sim table"
+        )
