@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from acquisition.chart.model import Chart
-from acquisition.check.findings import GRADES, LIMITS, CheckReport
+from acquisition.check.findings import GRADES, CheckReport
 from acquisition.check.light import light_share
 from acquisition.check.looking import ChartFigures, CheckFrames
 from acquisition.check.print_state import Spot
 from acquisition.framing.annotated import annotated_png
+from acquisition.framing.sharpness import MAX_BLUR_PX
 
 COLOURS = {"fault": "#b42318", "remark": "#b54708", "not checked": "#667085", "good": "#027a48"}
 """Of the grades: dark enough to be read on white."""
@@ -136,7 +137,7 @@ def _per_cent(share: float) -> str:
 
 def _draw_sharpness(axes: Any, figures: ChartFigures, chart: Chart) -> None:
     points, sigma = figures.blur.points_mm, figures.blur.sigma_px
-    worst = LIMITS["sharpness"].tolerable[1] or 1.0
+    worst = MAX_BLUR_PX
     marks = axes.scatter(
         points[:, 0], points[:, 1], c=sigma, s=380, cmap="RdYlGn_r", vmin=0.3, vmax=worst + 0.3, edgecolors="0.3"
     )

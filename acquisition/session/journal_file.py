@@ -27,9 +27,11 @@ from pathlib import Path
 from typing import TypeVar
 from urllib.parse import quote
 
+from acquisition.session.journal_schema import MOST_BYTES, limit_values, require_plain_schema, require_sound_rows
 from foundation.errors import FormatError, InputError, StorageError
 from foundation.files import disk_remedy_of, partial_path, storage_error, sync_folder
 from foundation.files import reading_error as file_reading_error
+from foundation.trust.foreign_folders import require_plain_folder
 
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
@@ -174,6 +176,7 @@ def open_to_read(path: Path) -> tuple[sqlite3.Connection, int]:
     FormatError
         The journal cannot be read, is damaged, or of a version not known here.
     """
+    require_plain_folder(path.parent, MOST_BYTES)
     try:
         # A run has all three; without the third nobody is at work, and reading in place would make it.
         if _is_write_ahead(path) and not _beside(path, "-shm").exists():
@@ -197,6 +200,7 @@ def open_for_run(path: Path, patience: LockPatience) -> sqlite3.Connection:
     StorageError
         It can be read, but not written.
     """
+    require_plain_folder(path.parent, MOST_BYTES)
     try:
         connection = patience.insist(lambda: _connect(path, "rw"))
         version = patience.insist(lambda: _checked(path, connection))
@@ -387,6 +391,8 @@ def _is_write_ahead(path: Path) -> bool:
 def _checked(path: Path, connection: sqlite3.Connection) -> int:
     """Return the journal's version; close the connection and refuse what is not known or lacks a table."""
     try:
+        limit_values(connection)
+        require_plain_schema(path, connection)
         version = connection.execute("PRAGMA user_version").fetchone()[0]
         tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if version not in READABLE:
@@ -398,6 +404,7 @@ def _checked(path: Path, connection: sqlite3.Connection) -> int:
             raise FormatError(
                 f"{path} is damaged: it lacks its table {' and '.join(sorted(lacking))}; restore it from a copy"
             )
+        require_sound_rows(path, connection, version)
     except BaseException:
         connection.close()
         raise

@@ -14,7 +14,7 @@ import numpy as np
 from acquisition.session.records import FrameRecord
 from calibration.causes.cause import UNKNOWN
 from calibration.causes.evidence import Evidence
-from calibration.causes.light_evidence import dark_evidence, light_evidence
+from calibration.causes.light_evidence import camera_evidence, dark_evidence, light_evidence, name_evidence
 from calibration.causes.place_evidence import (
     MOST_PLACES,
     Gathered,
@@ -203,6 +203,15 @@ _GATHERERS: dict[str, Callable[[TableFigures, float], Gathered | None]] = {
     "unfit_share": lambda figures, limit: print_evidence(figures, "unfit_share"),
     "reference_spread": lambda figures, limit: print_evidence(figures, "reference_spread"),
     "additivity": light_evidence,
+    "white_short": light_evidence,
+    "other_exposure": light_evidence,
+    "off_brightness": light_evidence,
+    "white_frame_brightness": light_evidence,
+    "off_codes_deg": name_evidence,
+    "exchanged_lights": name_evidence,
+    "white_frame_deg": name_evidence,
+    "other_camera": camera_evidence,
+    "other_lens": camera_evidence,
     "white_drift": _drift,
     "white_drift_deg": _drift,
     "leak_share": dark_evidence,

@@ -200,7 +200,8 @@ def test_a_light_taken_again_is_taken_in_again(
     change = "UPDATE attempts SET sha256=?, file=? WHERE illumination=?"
     alter(session, change, [(other.sha256, other.file, "2"), (one.sha256, one.file, "3")])
     show(session, 100)
-    append(session, tmp_path / "lut")
+    # The two bear each other's names now, for which the table would be refused.
+    append(session, tmp_path / "lut", thresholds=())
     lut, before = open_lut(tmp_path / "lut"), np.load(BytesIO(undisturbed["samples.npy"]))
     assert np.array_equal(lut.samples[2], before[3])
     assert np.array_equal(lut.samples[3], before[2])
@@ -247,5 +248,5 @@ def test_the_frames_of_a_table_are_found_again(session: Session, session_under_w
     assert f"{first} cannot be read" in gone
     assert f"{second} has changed" in changed
     os.truncate(tmp_path / "lut" / "samples.npy", 1000)
-    with pytest.raises(FormatError, match=r"cannot read .*samples\.npy"):
+    with pytest.raises(FormatError, match=r"samples\.npy has 1000 bytes, 537728 expected"):
         open_lut(tmp_path / "lut")
