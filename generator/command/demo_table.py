@@ -74,6 +74,6 @@ def _make(folder: Path) -> None:
     # Another program may have made it meanwhile, of the same bytes.
     if done.returncode and not (folder / "lut.json").is_file():
         raise StorageError(
-            f"the table for {DEMO} could not be made in {folder}: sim table ended with exit code {done.returncode}, and "
-            "says above why; mend that, or make a table elsewhere with sim table"
+            f"the table for {DEMO} could not be made in {folder}: sim table ended with exit code {done.returncode}, "
+            "and says above why; mend that, or make a table elsewhere with sim table"
         )
