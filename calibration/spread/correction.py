@@ -1,7 +1,7 @@
 """The correction: what surroundings add to each patch of a frame, and what is said of it.
 
 What is subtracted from a patch's samples is one number for each channel: the light that the lens brought in, less what
-it took away. The samples' noise is not touched. FrameLevels of a frame are taken from the frame itself, as it is: the shares
+it took away. The samples' noise is not touched. Levels of a frame are taken from the frame itself, as it is: the shares
 were fitted on such levels, so that light which was spread twice is in them.
 
 P patches as in `PrintedGrid`; counts above black; half-size pixels.

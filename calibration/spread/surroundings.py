@@ -3,7 +3,7 @@
 - Near kernels are integrated over each slot and each of a window's pixels, where they lie in the frame, each channel's
   photosites in their own place; tags and margins in fifths of a slot.
 - Far kernels blur the print slot by slot, in which a patch's place within its slot does not matter.
-- FrameLevels are what the frame itself shows: of cells and references their means, of bare paper and black ink the usual
+- Levels are what the frame itself shows: of cells and references their means, of bare paper and black ink the usual
   ones in the light of the place, of what lies behind the print the mean of places beside it.
 
 Half-size pixels; P patches as in `PrintedGrid`; counts above black.
@@ -179,7 +179,7 @@ class NearLight:
 
 
 def far_taps(scale: float) -> _Float:
-    """Return the shares (n,) float32, n odd, of slots on a line in a Gaussian's light, σ `scale` slots; they add up to 1."""
+    """Return the shares (n,) float32, n odd, of slots on a line in a Gaussian's light, σ `scale` slots, of sum 1."""
     from scipy.special import ndtr
 
     reach = max(1, math.ceil(_FAR_REACH * scale))
