@@ -17,7 +17,7 @@ from acquisition.run.planning.work import planned_steps, require_same
 from acquisition.run.rig.opening import open_rig
 from acquisition.run.sequencer import RunOutcome, take_session
 from acquisition.run.taking.pipeline import Taken
-from acquisition.run.taking.resuming import check_frames, require_same_devices, tie
+from acquisition.run.taking.resuming import check_frames, clock_note, require_same_devices, tie
 from acquisition.session.folder import Session, session_exists
 from acquisition.session.heartbeat import signs_of_life
 from acquisition.session.mending.redaction import secrets_warning
@@ -86,6 +86,8 @@ def run_session(
             session = opened.enter_context(_begun(settings, folder))
             session.journal.be_patient(settings.sequence.patience_s, announce)
         require_same_devices(session, devices, settings)
+        if note := clock_note(session, devices.clock):
+            announce(note)
         first = tie(session)
         total = len(session.steps)
         observe(len(session.done_steps()), total)

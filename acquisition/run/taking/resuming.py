@@ -17,9 +17,11 @@ from acquisition.config import LabSettings
 from acquisition.run.devices import Devices
 from acquisition.session.folder import Session
 from acquisition.session.plan import SessionStep, tie_steps
+from acquisition.session.progress import duration_text
 from acquisition.session.records import ACCEPTED, Attempt
 from drivers.camera import CameraIdentity
 from drivers.projector import ProjectorIdentity
+from foundation.clock import Clock, SteadyClock
 from foundation.errors import DeviceRefused, first_of
 from foundation.version import software
 
@@ -79,6 +81,23 @@ def require_same_devices(session: Session, devices: Devices, settings: LabSettin
     for what, name in {**names, "software": software()}.items():
         if known.get(what) != name:
             session.journal.record(what, name)
+
+
+def clock_note(session: Session, clock: Clock) -> str:
+    """Return what to say where the machine's clock is behind the session's last frame, with the remedy; else nothing.
+
+    Parameters
+    ----------
+    clock
+        The run's; it goes on behind that frame.
+    """
+    if not isinstance(clock, SteadyClock) or not clock.behind_s:
+        return ""
+    return (
+        f"clock: it is {duration_text(clock.behind_s)} behind the last frame of {session.folder}, or was ahead when "
+        "that was taken; the session's time goes on from there, so that its frames stay in their order; set the "
+        "machine's clock right"
+    )
 
 
 def _camera_name(body: CameraIdentity) -> str:
